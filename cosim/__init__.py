@@ -1,0 +1,1 @@
+"""Co-simulation: regional controllers in a SUMO city."""

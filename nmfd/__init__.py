@@ -1,0 +1,1 @@
+"""Regional (NMFD) traffic model, controllers on it, and the closed loop."""

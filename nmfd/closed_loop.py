@@ -1,0 +1,42 @@
+"""The one closed loop: every plant and every controller meet here."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from nmfd.scenario import Scenario
+from nmfd.types import Controller, Measurement, Plant, Trajectory
+
+
+def run(
+    plant: Plant, controller: Controller, scenario: Scenario, *, seed: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> Trajectory:
+    """Drive `plant` with `controller` for `scenario.steps` control intervals.
+
+    The controller sees every x_ij with Gaussian noise of `scenario.measurement_std`, drawn from `seed`; the
+    trajectory holds the exact state. `progress(done, steps)` is called after every interval.
+    """
+    random = np.random.default_rng([seed, 0x6E6F6973])
+    controller.reset()
+    states, controls, decision_time = [plant.reset(seed)], [], []
+    completed = [plant.completed()]
+    begin = time.perf_counter()
+    for k in range(scenario.steps):
+        noise = scenario.measurement_std * random.standard_normal(states[-1].accumulation.shape)
+        seen = Measurement(
+            step=k, time=states[-1].time, accumulation=states[-1].accumulation + noise, backlog=states[-1].backlog)
+        before = time.perf_counter()
+        controls.append(controller.act(seen))
+        decision_time.append(time.perf_counter() - before)
+        states.append(plant.step(controls[-1]))
+        completed.append(plant.completed())
+        if progress:
+            progress(k + 1, scenario.steps)
+    return Trajectory(
+        controller=controller.name, plant=type(plant).__name__, seed=seed, step=scenario.step,
+        accumulation=np.stack([s.accumulation for s in states]), backlog=np.stack([s.backlog for s in states]),
+        completed=np.array(completed), perimeter=np.stack([c.perimeter for c in controls]),
+        splits=np.stack([c.splits for c in controls]), decision_time=np.array(decision_time),
+        status=tuple(c.status for c in controls), wall_time=time.perf_counter() - begin)

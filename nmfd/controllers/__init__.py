@@ -1,0 +1,1 @@
+"""Controllers behind one `act(measurement)`; `registry` finds them by name."""

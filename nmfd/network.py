@@ -1,0 +1,160 @@
+"""Regions, their adjacency, control bounds and MFDs; loaded from network.toml and checked."""
+
+import hashlib
+import json
+from collections import deque
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from nmfd import toml
+from nmfd.errors import InputError
+from nmfd.mfd import Mfd
+
+
+@dataclass(frozen=True, kw_only=True)
+class Network:
+    """R regions, numbered from 0.
+
+    name
+    region_names: R names
+    positions: (R, 2), where a region is drawn on the map [any unit]
+    adjacency: (R, R) bool, symmetric, false on the diagonal
+    mfds: one outflow MFD per region
+    u_min, u_max: bounds of the perimeter control [-]
+    folder: where network.toml was, or None
+    """
+
+    name: str
+    region_names: tuple[str, ...]
+    positions: np.ndarray
+    adjacency: np.ndarray
+    mfds: tuple[Mfd, ...]
+    u_min: float
+    u_max: float
+    folder: Path | None = None
+
+    @property
+    def regions(self) -> int:
+        """R."""
+        return len(self.region_names)
+
+    @cached_property
+    def hops(self) -> np.ndarray:
+        """(R, R) int: boundaries to cross on a shortest way; -1 where there is none."""
+        return _hops(self.adjacency)
+
+    @cached_property
+    def split_mask(self) -> np.ndarray:
+        """(R, R, R) bool, [i, h, j]: theta_ihj may be positive.
+
+        h must be adjacent to i, j != i, and j must be reachable from h without coming back to i.
+        """
+        mask = np.zeros((self.regions,) * 3, dtype=bool)
+        for i in range(self.regions):
+            without_i = self.adjacency.copy()
+            without_i[i, :] = without_i[:, i] = False
+            mask[i] = self.adjacency[i][:, None] & (_hops(without_i) >= 0)
+            mask[i, :, i] = False
+        return mask
+
+    @cached_property
+    def nominal_splits(self) -> np.ndarray:
+        """(R, R, R), [i, h, j]: theta that follows the shortest ways, equally where there are several [-]."""
+        closer = self.hops[None, :, :] == self.hops[:, None, :] - 1
+        theta = (self.adjacency[:, :, None] & closer & self.split_mask).astype(float)
+        return theta / np.maximum(theta.sum(axis=1, keepdims=True), 1.0)
+
+    @cached_property
+    def hash(self) -> str:
+        """A fingerprint of all that the dynamics depend on; a policy is valid for one network only."""
+        content = [
+            self.adjacency.astype(int).tolist(), [[m.a, m.b, m.c, m.jam] for m in self.mfds], self.u_min, self.u_max]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+
+def _hops(adjacency: np.ndarray) -> np.ndarray:
+    regions = len(adjacency)
+    hops = np.full((regions, regions), -1)
+    for origin in range(regions):
+        hops[origin, origin] = 0
+        queue = deque([origin])
+        while queue:
+            here = queue.popleft()
+            for there in np.flatnonzero(adjacency[here]):
+                if hops[origin, there] < 0:
+                    hops[origin, there] = hops[origin, here] + 1
+                    queue.append(there)
+    return hops
+
+
+def load_network(folder: Path | str) -> Network:
+    """Read `folder`/network.toml.
+
+    Raises InputError for a missing file, an unknown key, a wrong type or range, an adjacency that is not symmetric
+    or not connected, or an MFD that is none. The table [sumo] is left to the microsimulation.
+    """
+    folder = Path(folder)
+    root = toml.read(folder / "network.toml")
+    name = root.text("name")
+    perimeter = root.table("perimeter")
+    u_min = perimeter.number("min", low=0.0, high=1.0)
+    u_max = perimeter.number("max", low=0.0, high=1.0)
+    perimeter.close()
+    if u_min >= u_max:
+        raise root.error("perimeter", f"min must be less than max, got min = {u_min:g} and max = {u_max:g}")
+    default_mfd = _mfd(root.table("mfd")) if root.has("mfd") else None
+    rows = root.tables("regions")
+    if not rows:
+        raise root.error("regions", "empty; add at least one [[regions]] table")
+    names, positions, neighbours, mfds = [], [], [], []
+    for number, row in enumerate(rows):
+        names.append(row.text("name", str(number)))
+        positions.append(row.numbers("position", length=2))
+        neighbours.append(row.integers("adjacent", high=len(rows) - 1))
+        mfds.append(_mfd(row.table("mfd")) if default_mfd is None or row.has("mfd") else default_mfd)
+        row.close()
+    root.table("sumo", None)
+    root.close()
+    adjacency = np.zeros((len(rows), len(rows)), dtype=bool)
+    for i, regions in enumerate(neighbours):
+        adjacency[i, list(regions)] = True
+    network = Network(
+        name=name, region_names=tuple(names), positions=np.array(positions), adjacency=adjacency, mfds=tuple(mfds),
+        u_min=u_min, u_max=u_max, folder=folder)
+    _check_graph(network, root)
+    return network
+
+
+def _mfd(table: toml.Table) -> Mfd:
+    mfd = Mfd(a=table.number("a"), b=table.number("b"), c=table.number("c"), jam=table.number("jam", above=0.0))
+    table.close()
+    if problem := mfd.problem():
+        raise table.error("c" if mfd.c <= 0 else "jam", problem)
+    return mfd
+
+
+def _check_graph(network: Network, root: toml.Table) -> None:
+    for i in range(network.regions):
+        if network.adjacency[i, i]:
+            raise root.error(f"regions[{i}].adjacent", f"region {i} is listed as adjacent to itself; remove it")
+        for h in np.flatnonzero(network.adjacency[i] & ~network.adjacency[:, i]):
+            raise root.error(
+                f"regions[{i}].adjacent",
+                f"not symmetric: region {i} lists {h}, but region {h} does not list {i}; add or remove one of them")
+    if (network.hops < 0).any():
+        i, j = np.argwhere(network.hops < 0)[0]
+        raise root.error("regions", f"region {j} cannot be reached from region {i}; connect them with adjacent")
+
+
+def check_step(network: Network, step: float, where: str) -> None:
+    """InputError unless forward Euler with `step` [s] keeps every accumulation non-negative (step * q <= 1)."""
+    for region, mfd in enumerate(network.mfds):
+        grid = np.linspace(0.0, mfd.jam, 2001)
+        fastest = float(mfd.rate(grid).max())
+        if step * fastest > 1.0:
+            raise InputError(
+                f"{where}: step: {step:g} s is too long for region {region} of network {network.name}, whose vehicles "
+                f"leave at up to {fastest:.3g} 1/s; allowed is at most {1.0 / fastest:.3g} s")

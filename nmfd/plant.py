@@ -1,0 +1,44 @@
+"""The regional plants: the NMFD itself and its acyclic variant."""
+
+import numpy as np
+import torch
+
+from nmfd import dynamics
+from nmfd.scenario import Scenario
+from nmfd.types import Controls, Measurement
+
+
+class NmfdPlant:
+    """The regional model as a plant (nmfd.types.Plant), in float64."""
+
+    def __init__(self, scenario: Scenario):
+        self._scenario = scenario
+        self._parameters = dynamics.parameters(scenario.network)
+        self._advance = dynamics.INTEGRATORS[scenario.integrator]
+        self._demand = torch.from_numpy(scenario.demand)
+
+    def reset(self, seed: int) -> Measurement:
+        """Empty network; the model is deterministic, `seed` changes nothing."""
+        self._k, self._entered = 0, 0.0
+        self._x = torch.zeros_like(self._demand[0])
+        return self._measurement()
+
+    def step(self, controls: Controls) -> Measurement:
+        demand = self._demand[self._k]
+        self._x = self._advance(
+            self._parameters, self._x, demand, torch.from_numpy(controls.perimeter), torch.from_numpy(controls.splits),
+            self._scenario.step)
+        self._entered += float(demand.sum()) * self._scenario.step
+        self._k += 1
+        return self._measurement()
+
+    def completed(self) -> float:
+        return self._entered - float(self._x.sum())
+
+    def close(self) -> None:
+        pass
+
+    def _measurement(self) -> Measurement:
+        x = self._x.numpy()
+        return Measurement(
+            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=np.zeros_like(x))

@@ -1,0 +1,83 @@
+"""Demand, noise, horizon: loaded from scenario.toml and checked."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nmfd import toml
+from nmfd.network import Network, check_step, load_network
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """T control intervals on a network.
+
+    name, network
+    step: control interval, and integration step of the regional model [s]
+    steps: T
+    demand: (T, R, R) [veh/s], [k, i, j] = vehicles that start in i bound for j, during interval k
+    measurement_std: of the Gaussian noise on every x_ij that a controller sees [veh]
+    integrator: "euler" or "rk4"
+    protected: the regions that gating protects
+    folder: where scenario.toml was, or None
+    """
+
+    name: str
+    network: Network
+    step: float
+    steps: int
+    demand: np.ndarray
+    measurement_std: float = 0.0
+    integrator: str = "euler"
+    protected: tuple[int, ...] = ()
+    folder: Path | None = None
+
+
+def trapezoid(time: np.ndarray, *, start: float, peak: float, ramp_up: float, flat: float, ramp_down: float):
+    """Demand [veh/s] at `time` (T,) [s]: rises from 0 at `start`, stays at `peak` for `flat` and falls to 0."""
+    end = start + ramp_up + flat + ramp_down
+    rising = (time - start) / ramp_up if ramp_up > 0 else np.where(time >= start, 1.0, 0.0)
+    falling = (end - time) / ramp_down if ramp_down > 0 else np.where(time < end, 1.0, 0.0)
+    return peak * np.clip(np.minimum(rising, falling), 0.0, 1.0)
+
+
+def load_scenario(folder: Path | str) -> Scenario:
+    """Read `folder`/scenario.toml and its network. Raises InputError; the table [sumo] is left to cosim."""
+    folder = Path(folder)
+    root = toml.read(folder / "scenario.toml")
+    name = root.text("name")
+    network = load_network(folder / root.text("network"))
+    step = root.number("step", above=0.0)
+    steps = root.integer("steps", low=1)
+    integrator = root.text("integrator", "euler", ("euler", "rk4"))
+    protected = root.integers("protected", (), high=network.regions - 1)
+    noise = root.table("noise", None)
+    measurement_std = noise.number("measurement_std", 0.0, low=0.0)
+    noise.close()
+    demand = np.zeros((steps, network.regions, network.regions))
+    time = step * np.arange(steps)
+    for row in root.tables("demand"):
+        pair = [_region(row, key, network) for key in ("from", "to")]
+        rate = trapezoid(
+            time, start=row.number("start", low=0.0), peak=row.number("peak", low=0.0),
+            ramp_up=row.number("ramp_up", low=0.0), flat=row.number("flat", low=0.0),
+            ramp_down=row.number("ramp_down", low=0.0))
+        demand[:, pair[0], pair[1]] += rate
+        if row.flag("both_ways", False):
+            demand[:, pair[1], pair[0]] += rate
+        row.close()
+    root.table("sumo", None)
+    root.close()
+    check_step(network, step, str(folder / "scenario.toml"))
+    return Scenario(
+        name=name, network=network, step=step, steps=steps, demand=demand, measurement_std=measurement_std,
+        integrator=integrator, protected=protected, folder=folder)
+
+
+def _region(row: toml.Table, key: str, network: Network) -> int:
+    value = row.integer(key)
+    if value >= network.regions:
+        raise row.error(
+            key, f"region {value} is unknown; network {network.name} has the regions 0 to {network.regions - 1}")
+    return value

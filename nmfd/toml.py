@@ -1,0 +1,119 @@
+"""Reading TOML tables with checked keys, types and ranges: the edge at which files are validated."""
+
+import tomllib
+from pathlib import Path
+
+from nmfd.errors import InputError
+
+
+def read(path: Path) -> "Table":
+    """The root table of a TOML file; InputError if it is missing or not TOML."""
+    path = Path(path)
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give the path of an existing one") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give a readable file") from None
+    try:
+        return Table(tomllib.loads(content.decode()), path)
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is not UTF-8 text; save it as UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: is not valid TOML: {error}; correct the line named") from None
+
+
+class Table:
+    """One TOML table. Every key is taken once; `close` complains of the keys that nobody took."""
+
+    def __init__(self, values: dict, path: Path, prefix: str = ""):
+        self._values, self._path, self._prefix = dict(values), path, prefix
+        self._known: list[str] = []
+
+    def error(self, key: str, problem: str) -> InputError:
+        return InputError(f"{self._path}: {self._prefix}{key}: {problem}")
+
+    def has(self, key: str) -> bool:
+        return key in self._values
+
+    def _take(self, key, default, required_as):
+        self._known.append(key)
+        if key in self._values:
+            return self._values.pop(key)
+        if default is ...:
+            raise self.error(key, f"missing; add {key} = {required_as}")
+        return default
+
+    def text(self, key: str, default=..., choices: tuple[str, ...] | None = None) -> str:
+        value = self._take(key, default, f'"{choices[0]}"' if choices else '"..."')
+        if value is None:
+            return value
+        if not isinstance(value, str):
+            raise self.error(key, f"expected text in quotes, got {value!r} instead")
+        if choices and value not in choices:
+            raise self.error(key, f"expected one of {', '.join(choices)}, got {value!r} instead")
+        return value
+
+    def number(self, key: str, default=..., *, low=-float("inf"), high=float("inf"), above=None) -> float:
+        """A finite number in [low, high], and above `above` if that is given."""
+        value = self._take(key, default, "<number>")
+        if value is default and not isinstance(value, (int, float)):
+            return value
+        allowed = f"a number above {above:g}" if above is not None else f"a number in [{low:g}, {high:g}]"
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise self.error(key, f"expected {allowed}, got {value!r} instead")
+        if not low <= value <= high or abs(value) == float("inf") or (above is not None and value <= above):
+            raise self.error(key, f"expected {allowed}, got {value!r} instead")
+        return float(value)
+
+    def integer(self, key: str, default=..., *, low: int = 0, high: int | None = None) -> int:
+        value = self._take(key, default, "<whole number>")
+        if value is default and not isinstance(value, int):
+            return value
+        allowed = f"a whole number from {low}" + (f" to {high}" if high is not None else " up")
+        if isinstance(value, bool) or not isinstance(value, int) or value < low or (high is not None and value > high):
+            raise self.error(key, f"expected {allowed}, got {value!r} instead")
+        return value
+
+    def flag(self, key: str, default=...) -> bool:
+        value = self._take(key, default, "true or false")
+        if not isinstance(value, bool):
+            raise self.error(key, f"expected true or false, got {value!r} instead")
+        return value
+
+    def numbers(self, key: str, default=..., *, length: int | None = None) -> tuple[float, ...]:
+        value = self._take(key, default, "[<number>, ...]")
+        if value is default and not isinstance(value, (list, tuple)):
+            return value
+        good = isinstance(value, (list, tuple)) and all(
+            isinstance(v, (int, float)) and not isinstance(v, bool) for v in value)
+        if not good or (length is not None and len(value) != length):
+            raise self.error(key, f"expected a list of {length or ''} numbers, got {value!r} instead")
+        return tuple(float(v) for v in value)
+
+    def integers(self, key: str, default=..., *, high: int) -> tuple[int, ...]:
+        """Distinct whole numbers from 0 to `high`."""
+        value = self._take(key, default, "[<region>, ...]")
+        good = isinstance(value, (list, tuple)) and all(
+            isinstance(v, int) and not isinstance(v, bool) and 0 <= v <= high for v in value)
+        if not good or len(set(value)) != len(value):
+            raise self.error(key, f"expected a list of distinct whole numbers from 0 to {high}, got {value!r} instead")
+        return tuple(value)
+
+    def table(self, key: str, default=...) -> "Table":
+        value = self._take(key, {} if default is None else default, "a table")
+        if not isinstance(value, dict):
+            raise self.error(key, f"expected a table [{key}], got {value!r} instead")
+        return Table(value, self._path, f"{self._prefix}{key}.")
+
+    def tables(self, key: str, default=...) -> list["Table"]:
+        value = self._take(key, default, f"a list of tables [[{key}]]")
+        if not isinstance(value, (list, tuple)) or not all(isinstance(v, dict) for v in value):
+            raise self.error(key, f"expected a list of tables [[{key}]], got {value!r} instead")
+        return [Table(v, self._path, f"{self._prefix}{key}[{n}].") for n, v in enumerate(value)]
+
+    def close(self) -> None:
+        """InputError that names every key that was not expected."""
+        if self._values:
+            key = next(iter(self._values))
+            raise self.error(key, f"unknown key; allowed here: {', '.join(self._known)}; remove or correct it")

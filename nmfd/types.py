@@ -1,0 +1,95 @@
+"""What plants, controllers and the closed loop hand to one another."""
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """What a controller sees at the start of control interval `step`.
+
+    step: k = 0, 1, ...
+    time: seconds since the start [s]
+    accumulation: (R, R) [veh], [i, j] = in region i bound for j
+    backlog: (R, R) [veh], [i, j] = waiting outside the network to enter region i, bound for j; zero in the NMFD
+    """
+
+    step: int
+    time: float
+    accumulation: np.ndarray
+    backlog: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Controls:
+    """What a controller asks for during one control interval.
+
+    perimeter: (R, R) [-], [i, h] = u_ih, share of the desired transfer flow from i to h that may pass;
+        ignored where h is not adjacent to i
+    splits: (R, R, R) [-], [i, h, j] = theta_ihj, share of the vehicles in i bound for j that head for h
+    status: "ok", or why these controls are a fallback
+    """
+
+    perimeter: np.ndarray
+    splits: np.ndarray
+    status: str = "ok"
+
+
+class Plant(Protocol):
+    """A city, regional or microscopic. `step` is one control interval."""
+
+    def reset(self, seed: int) -> Measurement:
+        """Start again from the beginning; the exact state."""
+
+    def step(self, controls: Controls) -> Measurement:
+        """Apply `controls` for one control interval; the exact state at its end."""
+
+    def completed(self) -> float:
+        """Trips ended since the reset [veh]."""
+
+    def close(self) -> None:
+        """Release what the plant holds; nothing may be called afterwards but `reset`."""
+
+
+class Controller(Protocol):
+    """Anything that turns measurements into controls."""
+
+    name: str
+
+    def reset(self) -> None:
+        """Forget everything of an earlier run."""
+
+    def act(self, measurement: Measurement) -> Controls:
+        """The controls of the interval that begins now."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectory:
+    """One closed-loop run of T control intervals.
+
+    controller, plant, seed
+    step: control interval [s]
+    accumulation: (T+1, R, R) [veh]
+    backlog: (T+1, R, R) [veh]
+    completed: (T+1,) [veh], cumulative
+    perimeter: (T, R, R) [-]
+    splits: (T, R, R, R) [-]
+    decision_time: (T,) [s], wall time of `Controller.act`
+    status: T strings, "ok" or the declared fallback
+    wall_time: of the whole loop [s]
+    """
+
+    controller: str
+    plant: str
+    seed: int
+    step: float
+    accumulation: np.ndarray
+    backlog: np.ndarray
+    completed: np.ndarray
+    perimeter: np.ndarray
+    splits: np.ndarray
+    decision_time: np.ndarray
+    status: tuple[str, ...] = field(repr=False)
+    wall_time: float
