@@ -38,5 +38,6 @@ def run(
         controller=controller.name, plant=type(plant).__name__, seed=seed, step=scenario.step,
         accumulation=np.stack([s.accumulation for s in states]), backlog=np.stack([s.backlog for s in states]),
         completed=np.array(completed), perimeter=np.stack([c.perimeter for c in controls]),
-        splits=np.stack([c.splits for c in controls]), decision_time=np.array(decision_time),
+        splits=np.stack([scenario.network.nominal_splits if c.splits is None else c.splits for c in controls]),
+        decision_time=np.array(decision_time),
         status=tuple(c.status for c in controls), wall_time=time.perf_counter() - begin)

@@ -13,8 +13,7 @@ from nmfd.network import Network
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
-    """The network as tensors. a, b, c, jam: (R,) of the MFDs; adjacency: (R, R), 0 or 1; trips: (R, R), 1 off the
-    diagonal."""
+    """The network as tensors. a, b, c, jam: (R,) of the MFDs; adjacency, off_diagonal: (R, R), 0 or 1."""
 
     a: torch.Tensor
     b: torch.Tensor
@@ -70,3 +69,10 @@ def rk4(p: Parameters, x, demand, perimeter, splits, step: float) -> torch.Tenso
 
 
 INTEGRATORS = {"euler": euler, "rk4": rk4}
+
+
+def advance(p: Parameters, x, demand, perimeter, splits, step: float, *, integrator="euler", substeps=1):
+    """x after one control interval of `step` [s], in `substeps` equal steps under constant controls and demand."""
+    for _ in range(substeps):
+        x = INTEGRATORS[integrator](p, x, demand, perimeter, splits, step / substeps)
+    return x

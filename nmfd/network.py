@@ -116,7 +116,7 @@ def load_network(folder: Path | str) -> Network:
         neighbours.append(row.integers("adjacent", high=len(rows) - 1))
         mfds.append(_mfd(row.table("mfd")) if default_mfd is None or row.has("mfd") else default_mfd)
         row.close()
-    root.table("sumo", None)
+    root.raw_table("sumo")
     root.close()
     adjacency = np.zeros((len(rows), len(rows)), dtype=bool)
     for i, regions in enumerate(neighbours):
@@ -156,5 +156,6 @@ def check_step(network: Network, step: float, where: str) -> None:
         fastest = float(mfd.rate(grid).max())
         if step * fastest > 1.0:
             raise InputError(
-                f"{where}: step: {step:g} s is too long for region {region} of network {network.name}, whose vehicles "
-                f"leave at up to {fastest:.3g} 1/s; allowed is at most {1.0 / fastest:.3g} s")
+                f"{where}: step: an integration step of {step:g} s is too long for region {region} of network "
+                f"{network.name}, whose vehicles leave at up to {fastest:.3g} 1/s; allowed is at most "
+                f"{1.0 / fastest:.3g} s: raise substeps or shorten step")

@@ -14,7 +14,6 @@ class NmfdPlant:
     def __init__(self, scenario: Scenario):
         self._scenario = scenario
         self._parameters = dynamics.parameters(scenario.network)
-        self._advance = dynamics.INTEGRATORS[scenario.integrator]
         self._demand = torch.from_numpy(scenario.demand)
 
     def reset(self, seed: int) -> Measurement:
@@ -25,9 +24,10 @@ class NmfdPlant:
 
     def step(self, controls: Controls) -> Measurement:
         demand = self._demand[self._k]
-        self._x = self._advance(
-            self._parameters, self._x, demand, torch.from_numpy(controls.perimeter), torch.from_numpy(controls.splits),
-            self._scenario.step)
+        splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
+        self._x = dynamics.advance(
+            self._parameters, self._x, demand, torch.from_numpy(controls.perimeter), torch.from_numpy(splits),
+            self._scenario.step, integrator=self._scenario.integrator, substeps=self._scenario.substeps)
         self._entered += float(demand.sum()) * self._scenario.step
         self._k += 1
         return self._measurement()

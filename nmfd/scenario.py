@@ -1,6 +1,7 @@
 """Demand, noise, horizon: loaded from scenario.toml and checked."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,14 @@ class Scenario:
     """T control intervals on a network.
 
     name, network
-    step: control interval, and integration step of the regional model [s]
+    step: control interval [s]
     steps: T
     demand: (T, R, R) [veh/s], [k, i, j] = vehicles that start in i bound for j, during interval k
     measurement_std: of the Gaussian noise on every x_ij that a controller sees [veh]
-    integrator: "euler" or "rk4"
+    integrator: "euler" or "rk4", of the regional model
+    substeps: integration steps of the regional model per control interval
     protected: the regions that gating protects
+    controller_options: controller name -> its table in [controllers], checked by that controller
     folder: where scenario.toml was, or None
     """
 
@@ -30,7 +33,9 @@ class Scenario:
     demand: np.ndarray
     measurement_std: float = 0.0
     integrator: str = "euler"
+    substeps: int = 1
     protected: tuple[int, ...] = ()
+    controller_options: Mapping[str, dict] = field(default_factory=dict)
     folder: Path | None = None
 
 
@@ -51,6 +56,7 @@ def load_scenario(folder: Path | str) -> Scenario:
     step = root.number("step", above=0.0)
     steps = root.integer("steps", low=1)
     integrator = root.text("integrator", "euler", ("euler", "rk4"))
+    substeps = root.integer("substeps", 1, low=1)
     protected = root.integers("protected", (), high=network.regions - 1)
     noise = root.table("noise", None)
     measurement_std = noise.number("measurement_std", 0.0, low=0.0)
@@ -67,12 +73,14 @@ def load_scenario(folder: Path | str) -> Scenario:
         if row.flag("both_ways", False):
             demand[:, pair[1], pair[0]] += rate
         row.close()
-    root.table("sumo", None)
+    controller_options = root.raw_table("controllers")
+    root.raw_table("sumo")
     root.close()
-    check_step(network, step, str(folder / "scenario.toml"))
+    check_step(network, step / substeps, str(folder / "scenario.toml"))
     return Scenario(
         name=name, network=network, step=step, steps=steps, demand=demand, measurement_std=measurement_std,
-        integrator=integrator, protected=protected, folder=folder)
+        integrator=integrator, substeps=substeps, protected=protected, controller_options=controller_options,
+        folder=folder)
 
 
 def _region(row: toml.Table, key: str, network: Network) -> int:

@@ -29,6 +29,7 @@ class Table:
     def __init__(self, values: dict, path: Path, prefix: str = ""):
         self._values, self._path, self._prefix = dict(values), path, prefix
         self._known: list[str] = []
+        self._taken: dict = {}
 
     def error(self, key: str, problem: str) -> InputError:
         return InputError(f"{self._path}: {self._prefix}{key}: {problem}")
@@ -39,7 +40,8 @@ class Table:
     def _take(self, key, default, required_as):
         self._known.append(key)
         if key in self._values:
-            return self._values.pop(key)
+            self._taken[key] = self._values.pop(key)
+            return self._taken[key]
         if default is ...:
             raise self.error(key, f"missing; add {key} = {required_as}")
         return default
@@ -105,6 +107,11 @@ class Table:
         if not isinstance(value, dict):
             raise self.error(key, f"expected a table [{key}], got {value!r} instead")
         return Table(value, self._path, f"{self._prefix}{key}.")
+
+    def raw_table(self, key: str) -> dict:
+        """A table that somebody else checks; empty if missing."""
+        self.table(key, None)
+        return self._taken.get(key, {})
 
     def tables(self, key: str, default=...) -> list["Table"]:
         value = self._take(key, default, f"a list of tables [[{key}]]")

@@ -28,12 +28,13 @@ class Controls:
 
     perimeter: (R, R) [-], [i, h] = u_ih, share of the desired transfer flow from i to h that may pass;
         ignored where h is not adjacent to i
-    splits: (R, R, R) [-], [i, h, j] = theta_ihj, share of the vehicles in i bound for j that head for h
+    splits: (R, R, R) [-], [i, h, j] = theta_ihj, share of the vehicles in i bound for j that head for h;
+        None without route guidance: drivers keep the routes they have (in the regional model the nominal splits)
     status: "ok", or why these controls are a fallback
     """
 
     perimeter: np.ndarray
-    splits: np.ndarray
+    splits: np.ndarray | None
     status: str = "ok"
 
 
@@ -75,7 +76,7 @@ class Trajectory:
     backlog: (T+1, R, R) [veh]
     completed: (T+1,) [veh], cumulative
     perimeter: (T, R, R) [-]
-    splits: (T, R, R, R) [-]
+    splits: (T, R, R, R) [-]; the nominal splits where there was no route guidance
     decision_time: (T,) [s], wall time of `Controller.act`
     status: T strings, "ok" or the declared fallback
     wall_time: of the whole loop [s]

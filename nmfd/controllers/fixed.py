@@ -1,4 +1,4 @@
-"""No control: perimeter open, nominal split ratios."""
+"""No control: perimeter open, no route guidance."""
 
 import numpy as np
 
@@ -7,14 +7,13 @@ from nmfd.types import Controls, Measurement
 
 
 class NoControl:
-    """u = u_max everywhere and the nominal (shortest-path) split ratios."""
+    """u = u_max everywhere, no route guidance."""
 
     name = "no-control"
 
     def __init__(self, scenario: Scenario):
         network = scenario.network
-        self._controls = Controls(
-            perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=network.nominal_splits)
+        self._controls = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None)
 
     def reset(self) -> None:
         pass
