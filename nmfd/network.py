@@ -3,7 +3,8 @@
 import hashlib
 import json
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -24,6 +25,8 @@ class Network:
     adjacency: (R, R) bool, symmetric, false on the diagonal
     mfds: one outflow MFD per region
     u_min, u_max: bounds of the perimeter control [-]
+    own_splits: {(i, j): {h: share}}, what drivers do by themselves where it was measured; elsewhere they follow the
+        fewest boundaries
     folder: where network.toml was, or None
     """
 
@@ -34,6 +37,7 @@ class Network:
     mfds: tuple[Mfd, ...]
     u_min: float
     u_max: float
+    own_splits: Mapping[tuple[int, int], Mapping[int, float]] = field(default_factory=dict)
     folder: Path | None = None
 
     @property
@@ -62,16 +66,22 @@ class Network:
 
     @cached_property
     def nominal_splits(self) -> np.ndarray:
-        """(R, R, R), [i, h, j]: theta that follows the shortest ways, equally where there are several [-]."""
+        """(R, R, R), [i, h, j]: theta without guidance [-]: `own_splits`, else the fewest boundaries, equally where
+        there are several such ways."""
         closer = self.hops[None, :, :] == self.hops[:, None, :] - 1
         theta = (self.adjacency[:, :, None] & closer & self.split_mask).astype(float)
-        return theta / np.maximum(theta.sum(axis=1, keepdims=True), 1.0)
+        for (i, j), shares in self.own_splits.items():
+            theta[i, :, j] = 0.0
+            theta[i, list(shares), j] = list(shares.values())
+        sums = theta.sum(axis=1, keepdims=True)
+        return theta / np.where(sums > 0, sums, 1.0)
 
     @cached_property
     def hash(self) -> str:
         """A fingerprint of all that the dynamics depend on; a policy is valid for one network only."""
         content = [
-            self.adjacency.astype(int).tolist(), [[m.a, m.b, m.c, m.jam] for m in self.mfds], self.u_min, self.u_max]
+            self.adjacency.astype(int).tolist(), [[m.a, m.b, m.c, m.jam] for m in self.mfds], self.u_min, self.u_max,
+            self.nominal_splits.round(12).tolist()]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
@@ -116,6 +126,11 @@ def load_network(folder: Path | str) -> Network:
         neighbours.append(row.integers("adjacent", high=len(rows) - 1))
         mfds.append(_mfd(row.table("mfd")) if default_mfd is None or row.has("mfd") else default_mfd)
         row.close()
+    own_splits = {}
+    for row in root.tables("own_splits", ()):
+        here, to = row.integer("region", high=len(rows) - 1), row.integer("destination", high=len(rows) - 1)
+        own_splits[here, to] = _shares(row, neighbours[here])
+        row.close()
     root.raw_table("sumo")
     root.close()
     adjacency = np.zeros((len(rows), len(rows)), dtype=bool)
@@ -123,9 +138,22 @@ def load_network(folder: Path | str) -> Network:
         adjacency[i, list(regions)] = True
     network = Network(
         name=name, region_names=tuple(names), positions=np.array(positions), adjacency=adjacency, mfds=tuple(mfds),
-        u_min=u_min, u_max=u_max, folder=folder)
+        u_min=u_min, u_max=u_max, own_splits=own_splits, folder=folder)
     _check_graph(network, root)
+    for i, j in own_splits:
+        for h in own_splits[i, j]:
+            if not network.split_mask[i, h, j]:
+                raise root.error("own_splits", f"from region {i} to {j} by way of {h} leads back into {i}; remove it")
     return network
+
+
+def _shares(row: toml.Table, neighbours: tuple[int, ...]) -> dict[int, float]:
+    via, share = row.integers("next", high=10**6), row.numbers("share")
+    if not via or not set(via) <= set(neighbours):
+        raise row.error("next", f"expected some of the adjacent regions {list(neighbours)}, got {list(via)} instead")
+    if len(share) != len(via) or min(share) < 0 or abs(sum(share) - 1.0) > 1e-3:
+        raise row.error("share", f"expected {len(via)} numbers >= 0 with sum 1, got {list(share)} instead")
+    return dict(zip(via, share, strict=True))
 
 
 def _mfd(table: toml.Table) -> Mfd:

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from nmfd import dynamics
+from nmfd import acyclic, dynamics
 from nmfd.scenario import Scenario
 from nmfd.types import Controls, Measurement
 
@@ -40,5 +40,60 @@ class NmfdPlant:
 
     def _measurement(self) -> Measurement:
         x = self._x.numpy()
+        return Measurement(
+            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=np.zeros_like(x))
+
+
+class AcyclicPlant:
+    """The acyclic regional model as a plant (nmfd.types.Plant), in float64."""
+
+    def __init__(self, scenario: Scenario):
+        self._scenario = scenario
+        self._model = acyclic.build(scenario.network)
+
+    def reset(self, seed: int) -> Measurement:
+        """Empty network; the model is deterministic, `seed` changes nothing."""
+        self._k, self._entered, self._forced = 0, 0.0, 0.0
+        self._x = np.zeros(len(self._model.region))
+        return self._measurement()
+
+    @property
+    def state(self) -> np.ndarray:
+        """x_ogij (C,) [veh], in the cells of `nmfd.acyclic.build`."""
+        return self._x.copy()
+
+    @property
+    def forced_moves(self) -> float:
+        """Vehicles since the reset [veh] whose region theta left them no way on, sent to the least-bad next region.
+
+        Taken at the rate of the beginning of each control interval.
+        """
+        return self._forced
+
+    def step(self, controls: Controls) -> Measurement:
+        scenario, model = self._scenario, self._model
+        demand = scenario.demand[self._k]
+        splits = scenario.network.nominal_splits if controls.splits is None else controls.splits
+        theta, forced = acyclic.shares(model, splits)
+        if forced.any():
+            ahead = model.move_next[model.fallback[forced]]
+            passing = controls.perimeter[model.region[forced], ahead] * acyclic.rate(model, self._x)[
+                model.region[forced]] * self._x[forced]
+            self._forced += scenario.step * float(passing.sum())
+        self._x = acyclic.advance(
+            model, self._x, demand, controls.perimeter, theta, scenario.step, integrator=scenario.integrator,
+            substeps=scenario.substeps)
+        self._entered += float(demand.sum()) * scenario.step
+        self._k += 1
+        return self._measurement()
+
+    def completed(self) -> float:
+        return self._entered - float(self._x.sum())
+
+    def close(self) -> None:
+        pass
+
+    def _measurement(self) -> Measurement:
+        x = acyclic.translate(self._model, self._x)
         return Measurement(
             step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=np.zeros_like(x))

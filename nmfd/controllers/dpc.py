@@ -1,0 +1,160 @@
+"""Differentiable predictive control: a neural policy from the measured state to admissible controls.
+
+As in Tumu et al.: an MLP backbone with one decoder for the perimeter (scaled sigmoid) and one for the split ratios
+(masked softmax), so that every output satisfies the constraints by construction. Trained by nmfd.training.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from nmfd.errors import InputError
+from nmfd.network import Network
+from nmfd.scenario import Scenario
+from nmfd.types import Controls, Measurement
+
+FORMAT = 1
+
+
+class SoftExponential(nn.Module):
+    """Trainable activation between logarithm, identity and exponential (Godfrey and Gashler, 2015), per unit.
+
+    f(a, x) = -ln(1 - a (x + a)) / a for a < 0, x at a = 0, (exp(a x) - 1) / a + a for a > 0. The logarithm is odd-
+    extended below its pole, so that f is defined and increasing for every x.
+    """
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.alpha = nn.Parameter(torch.zeros(width))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        small = self.alpha.abs() < 1e-4
+        safe = torch.where(small, torch.full_like(self.alpha, 1e-4), self.alpha)
+        rising = torch.expm1((safe * x).clamp(max=20.0)) / safe + safe
+        logarithm = -torch.log((1.0 - safe * (x + safe)).clamp(min=1e-6)) / safe
+        return torch.where(small, x, torch.where(safe > 0, rising, logarithm))
+
+
+ACTIVATIONS = {
+    "gelu": lambda width: nn.GELU(), "relu": lambda width: nn.ReLU(), "tanh": lambda width: nn.Tanh(),
+    "soft-exponential": SoftExponential}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Architecture:
+    """width: units per hidden layer; layers: hidden layers of the backbone; activation: a key of ACTIVATIONS;
+    guidance: with a decoder for the split ratios."""
+
+    width: int = 128
+    layers: int = 2
+    activation: str = "gelu"
+    guidance: bool = False
+
+
+class Policy(nn.Module):
+    """State x (..., R, R) [veh] -> perimeter (..., R, R) [-] and splits (..., R, R, R) [-], or None without guidance.
+
+    scale: (R, 1) [veh], the normalisation of the state: the critical accumulation of each region.
+    """
+
+    def __init__(self, network: Network, architecture: Architecture):
+        super().__init__()
+        regions, width = network.regions, architecture.width
+        self.architecture, self.regions = architecture, regions
+        self.u_min, self.u_max = network.u_min, network.u_max
+        self.register_buffer("scale", torch.tensor([[m.critical] for m in network.mfds], dtype=torch.float32))
+        self.register_buffer("adjacency", torch.tensor(network.adjacency, dtype=torch.float32), persistent=False)
+        layers: list[nn.Module] = []
+        for layer in range(architecture.layers):
+            layers += [nn.Linear(regions**2 if layer == 0 else width, width),
+                       ACTIVATIONS[architecture.activation](width)]
+        self.backbone = nn.Sequential(*layers)
+        self.perimeter_decoder = nn.Linear(width, regions**2)
+        if architecture.guidance:
+            self.splits_decoder = nn.Linear(width, regions**3)
+            mask = torch.tensor(network.split_mask)
+            # A softmax over nothing but -inf is NaN: rows with no way out (j = i) get finite logits and are zeroed.
+            blocked = ~mask & mask.any(dim=1, keepdim=True)
+            bias = torch.zeros(mask.shape).masked_fill(blocked, -torch.inf)
+            self.register_buffer("split_mask", mask.float(), persistent=False)
+            self.register_buffer("split_bias", bias, persistent=False)
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        hidden = self.backbone((x / self.scale).flatten(-2))
+        shape = (self.regions,) * 2
+        open_share = torch.sigmoid(self.perimeter_decoder(hidden)).unflatten(-1, shape)
+        perimeter = (self.u_min + (self.u_max - self.u_min) * open_share) * self.adjacency
+        if not self.architecture.guidance:
+            return perimeter, None
+        logits = self.splits_decoder(hidden).unflatten(-1, (self.regions, *shape)) + self.split_bias
+        return perimeter, torch.softmax(logits, dim=-2) * self.split_mask
+
+
+class DpcController:
+    """A trained policy as a controller (nmfd.types.Controller), "dpc-pc" or "dpc-pcrg"."""
+
+    def __init__(self, policy: Policy):
+        self._policy = policy.eval()
+        self.name = "dpc-pcrg" if policy.architecture.guidance else "dpc-pc"
+        self._u_max = policy.u_max * policy.adjacency.numpy().astype(float)
+
+    def reset(self) -> None:
+        pass
+
+    def act(self, measurement: Measurement) -> Controls:
+        with torch.inference_mode():
+            x = torch.from_numpy(measurement.accumulation.astype(np.float32))
+            perimeter, splits = self._policy(x)
+        perimeter = perimeter.numpy().astype(float)
+        splits = None if splits is None else splits.numpy().astype(float)
+        if not np.isfinite(perimeter).all() or (splits is not None and not np.isfinite(splits).all()):
+            return Controls(perimeter=self._u_max, splits=None, status="dpc: policy returned NaN, perimeter opened")
+        if splits is not None:  # float32 sums miss 1 by 1e-7
+            splits /= np.where(splits.sum(axis=1, keepdims=True) > 0, splits.sum(axis=1, keepdims=True), 1.0)
+        return Controls(perimeter=perimeter, splits=splits)
+
+
+def checkpoint(policy: Policy, network: Network, configuration: Mapping) -> dict:
+    """What a policy file holds: weights with the normalisation, architecture, network hash, configuration."""
+    return {
+        "format": FORMAT, "architecture": asdict(policy.architecture), "network": network.name,
+        "network_hash": network.hash, "configuration": dict(configuration),
+        "weights": {key: value.detach().clone() for key, value in policy.state_dict().items()}}
+
+
+def load_policy(path: Path, network: Network) -> tuple[Policy, dict]:
+    """The policy in `path` and its whole checkpoint. InputError if it is none, or was trained for another network.
+
+    No code of the file is executed (weights_only).
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such policy; train one with 'nmfd train'") from None
+    except Exception:
+        raise InputError(f"{path}: is not a policy file; train one with 'nmfd train'") from None
+    try:
+        if content["format"] != FORMAT:
+            raise InputError(f"{path}: format: expected {FORMAT}, got {content['format']!r} instead; train it again")
+        if content["network_hash"] != network.hash:
+            raise InputError(
+                f"{path}: network_hash: the policy was trained for network {content['network']!r} "
+                f"({content['network_hash']}), not for {network.name!r} ({network.hash}); train one with 'nmfd train'")
+        policy = Policy(network, Architecture(**content["architecture"]))
+        policy.load_state_dict(content["weights"])
+    except (KeyError, TypeError, RuntimeError, AttributeError):
+        raise InputError(f"{path}: is damaged or of another version; train it again with 'nmfd train'") from None
+    return policy, content
+
+
+def load(path: Path, scenario: Scenario, *, guidance: bool) -> DpcController:
+    """The controller in the policy file `path`; InputError if it does not fit the scenario's network or the name."""
+    policy, _ = load_policy(path, scenario.network)
+    if policy.architecture.guidance != guidance:
+        has, wanted = ("dpc-pc", "dpc-pcrg") if guidance else ("dpc-pcrg", "dpc-pc")
+        raise InputError(f"{path}: is a {has} policy, not {wanted}; choose --controller {has} or another file")
+    return DpcController(policy)

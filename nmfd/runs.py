@@ -1,0 +1,234 @@
+"""Run folders: trajectories, summary.csv and manifest.json, written so that an interruption costs one run at most.
+
+    <folder>/manifest.json              what was run, with which files and versions; one entry per session
+    <folder>/summary.csv                one row per finished run (metrics.summary)
+    <folder>/<controller>-<seed>.npz    its trajectory, without wall times: the same run gives the same bytes
+"""
+
+import csv
+import hashlib
+import json
+import math
+import os
+import platform
+import re
+import subprocess
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from datetime import datetime
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+from nmfd.errors import InputError
+from nmfd.metrics import summary
+from nmfd.scenario import Scenario
+from nmfd.types import Trajectory
+
+COLUMNS = {
+    "controller": str, "seed": int, "plant": str, "total_time_spent_veh_s": float, "final_accumulation_veh": float,
+    "max_accumulation_veh": float, "completed_veh": float, "evaluation_time_s": float,
+    "control_step_ms_median": float, "control_step_ms_max": float, "solver_failures": int,
+}
+PACKAGES = ("numpy", "torch", "casadi", "libsumo", "perimeter-cosim")
+_ARRAYS = ("accumulation", "backlog", "completed", "perimeter", "splits")
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[Path]:
+    """A temporary name in the folder of `path` to write to; it becomes `path` if all goes well, else it goes.
+
+    The suffix of `path` is kept, because matplotlib and NumPy choose the format by it.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem}-{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """`text` in `path`, atomically."""
+    with atomic(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """All of `trajectory` but its wall times in an .npz file without pickles, atomically."""
+    with atomic(path) as temporary:
+        np.savez_compressed(
+            temporary, controller=np.array(trajectory.controller), plant=np.array(trajectory.plant),
+            seed=np.array(trajectory.seed), step=np.array(trajectory.step), status=np.array(trajectory.status),
+            **{name: getattr(trajectory, name) for name in _ARRAYS})
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """What `write_trajectory` wrote; the wall times, which are in summary.csv, are NaN. Raises InputError."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return Trajectory(
+                controller=str(file["controller"]), plant=str(file["plant"]), seed=int(file["seed"]),
+                step=float(file["step"]), status=tuple(str(s) for s in file["status"]),
+                decision_time=np.full(len(file["status"]), math.nan), wall_time=math.nan,
+                **{name: file[name] for name in _ARRAYS})
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such trajectory; run it again") from None
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise InputError(f"{path}: is no trajectory ({error}); delete it and run it again") from None
+
+
+def write_summary(path: Path, rows: list[dict]) -> None:
+    """`rows` of metrics.summary as summary.csv, atomically."""
+    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=list(COLUMNS), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def read_summary(path: Path) -> list[dict]:
+    """The rows of summary.csv with the types of metrics.summary. Raises InputError."""
+    with Path(path).open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        if reader.fieldnames != list(COLUMNS):
+            raise InputError(f"{path}: expected the columns {', '.join(COLUMNS)}; delete the folder and run again")
+        try:
+            return [{name: convert(row[name]) for name, convert in COLUMNS.items()} for row in reader]
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{path}: {error}; delete the folder and run again") from None
+
+
+def scenario_hash(scenario: Scenario) -> str:
+    """A fingerprint of all that a run on `scenario` depends on, whatever its files are called."""
+    settings = [
+        scenario.network.hash, scenario.step, scenario.steps, scenario.measurement_std, scenario.integrator,
+        scenario.substeps, scenario.protected, scenario.controller_options]
+    text = json.dumps(settings, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode() + np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16]
+
+
+def file_hash(path: Path) -> str:
+    """A fingerprint of the bytes of a file."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
+
+
+def provenance() -> dict:
+    """Date, versions, and the commit of the checkout that this package lies in; commit is None outside one."""
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            versions[package] = metadata.version(package)
+    here = Path(__file__).resolve()
+    # An installed copy may lie inside somebody else's checkout: the commit counts only if this file is tracked.
+    tracked = _git(here.parent, "ls-files", "--error-unmatch", here.name) is not None
+    commit = _git(here.parent, "rev-parse", "HEAD") if tracked else None
+    changes = _git(here.parent, "status", "--porcelain", "--untracked-files=no") if commit else None
+    return {
+        "date": datetime.now().astimezone().isoformat(timespec="seconds"), "versions": versions,
+        "commit": commit, "dirty": None if changes is None else bool(changes)}
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def default_folder(scenario: Scenario) -> Path:
+    """runs/<scenario>-<timestamp> in the current folder, a name not taken yet."""
+    stem = f"{re.sub(r'[^\w.-]+', '-', scenario.name)}-{datetime.now():%Y%m%d-%H%M%S}"
+    candidates = (Path("runs") / (stem + (f"-{n}" if n > 1 else "")) for n in range(1, 1000))
+    return next(folder for folder in candidates if not folder.exists())
+
+
+class RunFolder:
+    """A folder of runs of one configuration, open for more of them. Made by `open_folder`."""
+
+    def __init__(self, path: Path, order: list[tuple[str, int]], rows: list[dict]):
+        self.path, self._order = path, order
+        self._rows = {(row["controller"], row["seed"]): row for row in rows}
+
+    @property
+    def finished(self) -> set[tuple[str, int]]:
+        """(controller, seed) of every run that is here with its row and its trajectory."""
+        return {run for run in self._rows if self.trajectory_path(*run).is_file()}
+
+    def trajectory_path(self, controller: str, seed: int) -> Path:
+        return self.path / f"{controller}-{seed}.npz"
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Write a finished run at once: its trajectory, then summary.csv, which is what makes it count."""
+        run = trajectory.controller, trajectory.seed
+        write_trajectory(self.trajectory_path(*run), trajectory)
+        self._rows[run] = summary(trajectory)
+        write_summary(self.path / "summary.csv", self.rows())
+
+    def rows(self) -> list[dict]:
+        """The rows of summary.csv, in the order in which the runs were asked for."""
+        return [self._rows[run] for run in self._order if run in self._rows]
+
+    def trajectories(self) -> list[Trajectory]:
+        """The finished runs, in the order in which they were asked for."""
+        return [read_trajectory(self.trajectory_path(*run)) for run in self._order if run in self.finished]
+
+
+@contextmanager
+def open_folder(
+    path: Path, *, configuration: Mapping, order: list[tuple[str, int]], session: Mapping | None = None,
+) -> Iterator[RunFolder]:
+    """A RunFolder at `path` for the runs `order` of `configuration` (JSON types only); made if it is not there.
+
+    Finished runs of the same configuration are kept. Raises InputError if the folder holds another configuration
+    or is no run folder. When the body fails before any run is finished, everything made here is removed again.
+    `session` is added to the provenance that every opening leaves in manifest.json.
+    """
+    path = Path(path)
+    configuration = json.loads(json.dumps(configuration))
+    manifest_path, summary_path = path / "manifest.json", path / "summary.csv"
+    sessions, rows = [], []
+    if manifest_path.is_file():
+        sessions = _sessions_of_same(manifest_path, configuration)
+        rows = read_summary(summary_path) if summary_path.is_file() else []
+    elif path.exists() and not path.is_dir():
+        raise InputError(f"{path}: is a file; choose another folder with --out")
+    elif path.is_dir() and any(path.iterdir()):
+        raise InputError(f"{path}: is not empty and holds no manifest.json; choose another folder with --out")
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        manifest = {"configuration": configuration, "sessions": [*sessions, {**provenance(), **(session or {})}]}
+        write_text(manifest_path, json.dumps(manifest, indent=2) + "\n")
+        yield RunFolder(path, order, rows)
+    except BaseException:
+        if not summary_path.exists() and not sessions:
+            manifest_path.unlink(missing_ok=True)
+            for folder in made:
+                with suppress(OSError):
+                    folder.rmdir()
+        raise
+
+
+def _sessions_of_same(manifest_path: Path, configuration: dict) -> list:
+    try:
+        manifest = json.loads(manifest_path.read_text(encoding="utf-8"))
+        there, sessions = manifest["configuration"], list(manifest["sessions"])
+        different = [key for key in {**configuration, **there} if configuration.get(key) != there.get(key)]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"{manifest_path}: is no manifest of a run; choose another folder with --out") from None
+    if different:
+        key = different[0]
+        raise InputError(
+            f"{manifest_path.parent}: holds runs of another configuration ({key}: {json.dumps(there.get(key))} there, "
+            f"{json.dumps(configuration.get(key))} asked for); choose another folder with --out")
+    return sessions
+
+
+def labelled(trajectory: Trajectory, *, controller: str, plant: str) -> Trajectory:
+    """`trajectory` under the names of the command line, which summary.csv shows."""
+    return replace(trajectory, controller=controller, plant=plant)
