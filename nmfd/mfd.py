@@ -52,3 +52,38 @@ class Mfd:
             if rate.min() <= 0:
                 return f"the outflow is not positive at {grid[rate.argmin()]:.0f} veh, below jam = {self.jam:g}"
         return None
+
+
+def fit(accumulation, outflow, *, jam: float, max_rate: float = np.inf, bins: int = 24) -> Mfd:
+    """The cubic closest to samples (n,) [veh], (n,) [veh/s] that is safe to use: least squares over bin means.
+
+    The rate q(x) = a x^2 + b x + c is kept positive and falling on [0, jam] and at most `max_rate` [1/s] (the inverse
+    of the integration step); beyond `jam` [veh], where there is no data, the outflow stays constant. Every bin of
+    accumulation counts alike, so that the many samples of an empty city do not decide. Raises ValueError without
+    samples.
+    """
+    from scipy.optimize import minimize  # slow to import, and only identification needs it
+
+    x, g = np.asarray(accumulation, dtype=float) / jam, np.asarray(outflow, dtype=float)
+    good = np.isfinite(x) & np.isfinite(g) & (x > 0) & (x <= 1.0)
+    if not good.any():
+        raise ValueError("no samples to fit an MFD to")
+    x, g = x[good], g[good]
+    number = np.minimum((x * bins).astype(int), bins - 1)
+    used = np.unique(number)
+    x = np.array([x[number == n].mean() for n in used])
+    g = np.array([g[number == n].mean() for n in used])
+    # Scaled: g = (A x^2 + B x + C) x with x in [0, 1]. Falling: B <= 0 and 2 A + B <= 0 (q' is linear in x).
+    # Positive at the jam: A + B + C >= floor.
+    scale = g.max()
+    design = np.stack([x**3, x**2, x], axis=1)
+    floor, ceiling = 0.01, min(max_rate * jam / scale, 1e3)
+    result = minimize(
+        lambda p: ((design @ p - g / scale) ** 2).sum(), x0=np.array([0.0, -1.0, 2.0]),
+        jac=lambda p: 2.0 * design.T @ (design @ p - g / scale), method="SLSQP", options={"maxiter": 500, "ftol": 1e-14},
+        constraints={
+            "type": "ineq", "fun": lambda p: np.array(
+                [-p[1], -2 * p[0] - p[1], p[0] + p[1] + p[2] - floor, p[2] - floor, ceiling - p[2]]),
+            "jac": lambda p: np.array([[0, -1, 0], [-2, -1, 0], [1, 1, 1], [0, 0, 1], [0, 0, -1]], dtype=float)})
+    third, second, first = (float(p) for p in result.x * scale)
+    return Mfd(a=third / jam**3, b=second / jam**2, c=first / jam, jam=jam)

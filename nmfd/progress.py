@@ -1,5 +1,6 @@
 """One line of progress on stderr, where that is a terminal; silence elsewhere."""
 
+import shutil
 import sys
 import time
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ class ProgressLine:
         self._begin, self._drawn, self._width = time.monotonic(), -INTERVAL, 0
 
     def __call__(self, done: int, total: int, note: str = "") -> None:
-        """`note` is put behind the remaining time, such as a validation loss."""
+        """`note`, such as a validation loss, is put behind the remaining time."""
         now = time.monotonic()
         if now - self._drawn < INTERVAL and done < total:
             return
@@ -35,6 +36,7 @@ class ProgressLine:
         self._stream.flush()
 
     def _write(self, text: str) -> None:
+        text = text[:shutil.get_terminal_size().columns - 1]  # a line that wraps could not be drawn over
         self._stream.write("\r" + text.ljust(self._width))
         self._stream.flush()
         self._width = len(text)

@@ -1,6 +1,6 @@
 """Run folders: trajectories, summary.csv and manifest.json, written so that an interruption costs one run at most.
 
-    <folder>/manifest.json              what was run, with which files and versions; one entry per session
+    <folder>/manifest.json              configuration, controllers, and seeds, versions and commit of every session
     <folder>/summary.csv                one row per finished run (metrics.summary)
     <folder>/<controller>-<seed>.npz    its trajectory, without wall times: the same run gives the same bytes
 """
@@ -13,7 +13,8 @@ import os
 import platform
 import re
 import subprocess
-from collections.abc import Iterator, Mapping
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
@@ -78,7 +79,7 @@ def read_trajectory(path: Path) -> Trajectory:
                 **{name: file[name] for name in _ARRAYS})
     except FileNotFoundError:
         raise InputError(f"{path}: no such trajectory; run it again") from None
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: is no trajectory ({error}); delete it and run it again") from None
 
 
@@ -140,9 +141,14 @@ def _git(folder: Path, *arguments: str) -> str | None:
     return done.stdout.strip() if done.returncode == 0 else None
 
 
+def file_name(name: str) -> str:
+    """`name` with everything that is awkward in a file name replaced."""
+    return re.sub(r"[^\w.-]+", "-", name)
+
+
 def default_folder(scenario: Scenario) -> Path:
     """runs/<scenario>-<timestamp> in the current folder, a name not taken yet."""
-    stem = f"{re.sub(r'[^\w.-]+', '-', scenario.name)}-{datetime.now():%Y%m%d-%H%M%S}"
+    stem = f"{file_name(scenario.name)}-{datetime.now():%Y%m%d-%H%M%S}"
     candidates = (Path("runs") / (stem + (f"-{n}" if n > 1 else "")) for n in range(1, 1000))
     return next(folder for folder in candidates if not folder.exists())
 
@@ -150,14 +156,15 @@ def default_folder(scenario: Scenario) -> Path:
 class RunFolder:
     """A folder of runs of one configuration, open for more of them. Made by `open_folder`."""
 
-    def __init__(self, path: Path, order: list[tuple[str, int]], rows: list[dict]):
-        self.path, self._order = path, order
+    def __init__(self, path: Path, order: Sequence[tuple[str, int]], rows: list[dict]):
+        self.path = path
         self._rows = {(row["controller"], row["seed"]): row for row in rows}
+        self._order = [*(run for run in self._rows if run not in order), *order]
 
     @property
-    def finished(self) -> set[tuple[str, int]]:
-        """(controller, seed) of every run that is here with its row and its trajectory."""
-        return {run for run in self._rows if self.trajectory_path(*run).is_file()}
+    def finished(self) -> list[tuple[str, int]]:
+        """(controller, seed) of every run that is here with its row and its trajectory; `order`'s own come last."""
+        return [run for run in self._order if run in self._rows and self.trajectory_path(*run).is_file()]
 
     def trajectory_path(self, controller: str, seed: int) -> Path:
         return self.path / f"{controller}-{seed}.npz"
@@ -170,63 +177,74 @@ class RunFolder:
         write_summary(self.path / "summary.csv", self.rows())
 
     def rows(self) -> list[dict]:
-        """The rows of summary.csv, in the order in which the runs were asked for."""
+        """The rows of summary.csv, one per finished run."""
         return [self._rows[run] for run in self._order if run in self._rows]
 
     def trajectories(self) -> list[Trajectory]:
-        """The finished runs, in the order in which they were asked for."""
-        return [read_trajectory(self.trajectory_path(*run)) for run in self._order if run in self.finished]
+        """The finished runs."""
+        return [read_trajectory(self.trajectory_path(*run)) for run in self.finished]
 
 
 @contextmanager
 def open_folder(
-    path: Path, *, configuration: Mapping, order: list[tuple[str, int]], session: Mapping | None = None,
+    path: Path, *, configuration: Mapping, order: Sequence[tuple[str, int]],
+    controllers: Mapping[str, Mapping] | None = None, session: Mapping | None = None,
 ) -> Iterator[RunFolder]:
-    """A RunFolder at `path` for the runs `order` of `configuration` (JSON types only); made if it is not there.
+    """A RunFolder at `path` for the runs `order`, as (controller, seed); made if it is not there.
 
-    Finished runs of the same configuration are kept. Raises InputError if the folder holds another configuration
-    or is no run folder. When the body fails before any run is finished, everything made here is removed again.
-    `session` is added to the provenance that every opening leaves in manifest.json.
+    configuration: what all runs have in common; the same at every opening (JSON types only, as all of these)
+    controllers: what the runs of each controller depend on besides, such as the hash of a policy; a later opening
+        may add controllers but not change one
+    session: added to the provenance that every opening leaves in manifest.json
+
+    Finished runs are kept. Raises InputError if the folder holds another configuration or is no run folder. When
+    the body fails before any run is finished, everything made here is removed again.
     """
     path = Path(path)
-    configuration = json.loads(json.dumps(configuration))
+    configuration, controllers = json.loads(json.dumps([configuration, controllers or {}]))
     manifest_path, summary_path = path / "manifest.json", path / "summary.csv"
     sessions, rows = [], []
     if manifest_path.is_file():
-        sessions = _sessions_of_same(manifest_path, configuration)
+        sessions, controllers = _continued(manifest_path, configuration, controllers)
         rows = read_summary(summary_path) if summary_path.is_file() else []
     elif path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; choose another folder with --out")
     elif path.is_dir() and any(path.iterdir()):
         raise InputError(f"{path}: is not empty and holds no manifest.json; choose another folder with --out")
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    sessions.append({**provenance(), "seeds": sorted({seed for _, seed in order}), **(session or {})})
+    manifest = {"configuration": configuration, "controllers": controllers, "sessions": sessions}
+    folder = RunFolder(path, order, rows)
     try:
         path.mkdir(parents=True, exist_ok=True)
-        manifest = {"configuration": configuration, "sessions": [*sessions, {**provenance(), **(session or {})}]}
         write_text(manifest_path, json.dumps(manifest, indent=2) + "\n")
-        yield RunFolder(path, order, rows)
+        yield folder
     except BaseException:
-        if not summary_path.exists() and not sessions:
-            manifest_path.unlink(missing_ok=True)
-            for folder in made:
+        if not summary_path.exists() and len(sessions) == 1:
+            for file in (manifest_path, *(folder.trajectory_path(*run) for run in order)):
                 with suppress(OSError):
-                    folder.rmdir()
+                    file.unlink()
+            for parent in made:
+                with suppress(OSError):
+                    parent.rmdir()
         raise
 
 
-def _sessions_of_same(manifest_path: Path, configuration: dict) -> list:
+def _continued(manifest_path: Path, configuration: dict, controllers: dict) -> tuple[list, dict]:
+    """The sessions so far, and the controllers there and in `controllers`. InputError where they do not agree."""
     try:
         manifest = json.loads(manifest_path.read_text(encoding="utf-8"))
-        there, sessions = manifest["configuration"], list(manifest["sessions"])
-        different = [key for key in {**configuration, **there} if configuration.get(key) != there.get(key)]
+        sessions, known = list(manifest["sessions"]), dict(manifest["controllers"])
+        there = {**{name: known.get(name, controllers[name]) for name in controllers}, **manifest["configuration"]}
     except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(f"{manifest_path}: is no manifest of a run; choose another folder with --out") from None
-    if different:
-        key = different[0]
-        raise InputError(
-            f"{manifest_path.parent}: holds runs of another configuration ({key}: {json.dumps(there.get(key))} there, "
-            f"{json.dumps(configuration.get(key))} asked for); choose another folder with --out")
-    return sessions
+    asked = {**controllers, **configuration}
+    for key in {**asked, **there}:
+        if asked.get(key) != there.get(key):
+            raise InputError(
+                f"{manifest_path.parent}: holds runs of another configuration ({key}: {json.dumps(there.get(key))} "
+                f"there, {json.dumps(asked.get(key))} asked for); choose another folder with --out")
+    return sessions, {**known, **controllers}
 
 
 def labelled(trajectory: Trajectory, *, controller: str, plant: str) -> Trajectory:

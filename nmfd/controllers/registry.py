@@ -37,19 +37,14 @@ def _mpc_pcrg(scenario: Scenario) -> Controller:
     return EconomicMpc(scenario, guidance=True)
 
 
-def _dpc(path: Path, scenario: Scenario) -> Controller:
-    from nmfd.controllers import dpc
-
-    return dpc.load(path, scenario)
-
-
 _WITHOUT_POLICY: dict[str, Callable[[Scenario], Controller]] = {
     "no-control": _no_control,
     "pi-gating": _pi_gating,
     "mpc-pc": _mpc_pc,
     "mpc-pcrg": _mpc_pcrg,
 }
-_WITH_POLICY: dict[str, Callable[[Path, Scenario], Controller]] = {"dpc-pc": _dpc, "dpc-pcrg": _dpc}
+# Whether the policy guides routes too. The same as training.NAMES, which cannot be read without importing torch.
+_WITH_POLICY = {"dpc-pc": False, "dpc-pcrg": True}
 
 
 def names() -> tuple[str, ...]:
@@ -80,7 +75,7 @@ def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Pa
                 f"{policy}: controller {name} reads no policy; only {' and '.join(policy_names())} do: leave it out")
         return None
     if policy is None and scenario.folder is None:
-        raise InputError(f"controller {name}: scenario {scenario.name} has no folder to find a policy in; give its file")
+        raise InputError(f"controller {name}: scenario {scenario.name} has no folder with policies; give a file")
     path = scenario.folder / f"{name}.pt" if policy is None else Path(policy)
     if not path.is_file():
         scenario_text = "SCENARIO" if scenario.folder is None else scenario.folder
@@ -98,7 +93,6 @@ def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Contro
     path = policy_path(name, scenario, policy)
     if path is None:
         return _WITHOUT_POLICY[name](scenario)
-    controller = _WITH_POLICY[name](path, scenario)
-    if controller.name != name:
-        raise InputError(f"{path}: holds a policy for {controller.name}, not for {name}; give the right file")
-    return controller
+    from nmfd.controllers import dpc
+
+    return dpc.load(path, scenario, guidance=_WITH_POLICY[name])

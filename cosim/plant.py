@@ -1,0 +1,226 @@
+"""The SUMO city as a plant: the same protocol as the regional plants, the same controllers."""
+
+import tempfile
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cosim.actuate import HOLD_BACK, MODES, Actuator, GatewaySignal
+from cosim.city import ensure_built
+from cosim.guidance import Guide
+from cosim.measure import Meter
+from cosim.regions import City, Gateway, check_adjacency, load_city
+from cosim.sumo import Session
+from cosim.trips import write_trips
+from nmfd import toml
+from nmfd.errors import InputError
+from nmfd.scenario import Scenario
+from nmfd.types import Controls, Measurement
+
+PRODUCTION_EVERY = 10.0  # s, between two samples of the production
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """[sumo] of scenario.toml.
+
+    step_length: of SUMO [s]; time_to_teleport: [s], -1 for never; collision_action: SUMO's
+    actuation: "hold-back" or "redistribute"; min_green: of a gateway movement [s]
+    compliance: share of the decisions in which a driver follows the route guidance [-]
+    rerouting: share of the drivers with SUMO's own rerouting device [-]
+    """
+
+    step_length: float = 1.0
+    time_to_teleport: float = -1.0
+    collision_action: str = "warn"
+    actuation: str = HOLD_BACK
+    min_green: float = 5.0
+    compliance: float = 1.0
+    rerouting: float = 0.0
+
+
+def settings(scenario: Scenario) -> Settings:
+    """Read and check the table [sumo] of the scenario. Raises InputError."""
+    if scenario.folder is None:
+        return Settings()
+    path, default = scenario.folder / "scenario.toml", Settings()
+    table = toml.Table(toml.read(path).raw_table("sumo"), path, "sumo.")
+    chosen = Settings(
+        step_length=table.number("step_length", default.step_length, above=0.0, high=1.0),
+        time_to_teleport=table.number("time_to_teleport", default.time_to_teleport, low=-1.0),
+        collision_action=table.text("collision_action", default.collision_action, ("none", "warn", "teleport", "remove")),
+        actuation=table.text("actuation", default.actuation, MODES),
+        min_green=table.number("min_green", default.min_green, low=1.0),
+        compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
+        rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0))
+    table.close()
+    if abs(scenario.step / chosen.step_length - round(scenario.step / chosen.step_length)) > 1e-9:
+        raise InputError(
+            f"{path}: sumo.step_length: expected a divisor of the control interval {scenario.step:g} s, got "
+            f"{chosen.step_length:g} instead")
+    return chosen
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record:
+    """What a closed-loop trajectory does not hold, per control interval k = 0 .. T-1.
+
+    departures: (T, R, R) [veh]; arrivals: (T, R) [veh], by the region of the destination
+    crossings: (T, R, R, R) [veh], [i, h, j] = from i to h, bound for j
+    production: (T, R) [veh m/s], mean of samples; mean_accumulation: (T, R) [veh], of the same samples
+    gateway_green: (T, G) [s], green shown per gateway, its links' mean; NaN without a signal
+    gateway_flow: (T, G) [veh] over the boundary there
+    gateway_queue: (T, G) [veh] halting before it at the end of the interval
+    teleports: (T,); guided: (T, R, R, R) [veh], reroutes by route guidance
+    """
+
+    departures: np.ndarray
+    arrivals: np.ndarray
+    crossings: np.ndarray
+    production: np.ndarray
+    mean_accumulation: np.ndarray
+    gateway_green: np.ndarray
+    gateway_flow: np.ndarray
+    gateway_queue: np.ndarray
+    teleports: np.ndarray
+    guided: np.ndarray
+
+
+class SumoPlant:
+    """A SUMO simulation of the scenario's city (nmfd.types.Plant).
+
+    `record()` tells what happened; `trips` is their number; `sumo_time` [s] is the wall time inside SUMO's own step
+    since the reset.
+    """
+
+    def __init__(self, scenario: Scenario, *, overrides: Settings | None = None):
+        """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network."""
+        self._scenario = scenario
+        self._settings = overrides or settings(scenario)
+        files = ensure_built(scenario.network)
+        self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
+        check_adjacency(self.city, scenario.network)
+        self._net_file = files.net_file
+        self._folder = tempfile.TemporaryDirectory(prefix="cosim-")
+        self._session: Session | None = None
+
+    def reset(self, seed: int) -> Measurement:
+        """Trips, drivers and reroutes all follow from `seed`."""
+        self._end_session()
+        scenario, chosen = self._scenario, self._settings
+        routes = Path(self._folder.name) / "trips.rou.xml"
+        self.trips = write_trips(self.city, scenario.demand, scenario.step, seed, routes)
+        options = ()
+        if chosen.rerouting > 0:
+            options = ("--device.rerouting.probability", str(chosen.rerouting), "--device.rerouting.period", "60")
+        self._session = Session(
+            self._net_file, routes, seed=seed, step_length=chosen.step_length,
+            time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action, options=options)
+        self._meter = Meter(self._session, self.city)
+        self._guide = Guide(
+            self._session, self.city, compliance=chosen.compliance,
+            random=np.random.default_rng([seed, 0x67756964]))
+        self._signals = self._gateway_signals()
+        self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
+        self._k, self._rows = 0, []
+        return self._measurement()
+
+    def step(self, controls: Controls) -> Measurement:
+        network, session, meter = self._scenario.network, self._session, self._meter
+        before = self._totals()
+        self._actuator.command(controls.perimeter, network.u_min, network.u_max)
+        self._guide.command(controls.splits)
+        begin, steps = session.time, round(self._scenario.step / session.step_length)
+        every = max(1, round(PRODUCTION_EVERY / session.step_length))
+        samples = []
+        for n in range(steps):
+            self._actuator.play(session.time)
+            session.step()
+            self._guide.apply(meter.observe())
+            if n % every == every - 1:
+                samples.append(self._sample())
+        self._k += 1
+        assert abs(session.time - begin - self._scenario.step) < 1e-6
+        measurement = self._measurement()
+        after = self._totals()
+        row = {key: after[key] - before[key] for key in after}
+        row["production"], row["mean_accumulation"] = np.mean(samples, axis=0) if samples else np.full(
+            (2, network.regions), np.nan)
+        row["gateway_queue"] = np.array([session.halting(g.from_edge) for g in self.city.gateways])
+        self._rows.append(row)
+        return measurement
+
+    def completed(self) -> float:
+        return float(self._meter.arrivals.sum())
+
+    def close(self) -> None:
+        self._end_session()
+        self._folder.cleanup()
+
+    def record(self) -> Record:
+        """Of all control intervals since the reset."""
+        return Record(**{key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]})
+
+    @property
+    def sumo_time(self) -> float:
+        return self._session.sumo_time
+
+    @property
+    def session(self) -> Session:
+        """The running simulation, for tests and for watching."""
+        return self._session
+
+    def leaks(self) -> list[Gateway]:
+        """Gateways that no fixed-time signal controls: perimeter control does not reach them."""
+        return [g for g in self.city.gateways if g.signal not in self._signals]
+
+    def _end_session(self) -> None:
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def _gateway_signals(self) -> dict[str, GatewaySignal]:
+        movements: dict[str, dict[int, tuple[int, int]]] = {}
+        for gateway in self.city.gateways:
+            if gateway.signal is not None:
+                for link in gateway.links:
+                    movements.setdefault(gateway.signal, {})[link] = (gateway.source, gateway.target)
+        signals = {}
+        for signal in sorted(movements):
+            programme = self._session.programme(signal)
+            if programme.static:
+                signals[signal] = GatewaySignal(
+                    programme, movements[signal], min_green=self._settings.min_green,
+                    mode=self._settings.actuation, start=self._session.time)
+        return signals
+
+    def _measurement(self) -> Measurement:
+        return Measurement(
+            step=self._k, time=self._k * self._scenario.step, accumulation=self._meter.accumulation(),
+            backlog=self._meter.backlog())
+
+    def _sample(self) -> tuple[np.ndarray, np.ndarray]:
+        production, accumulation = np.zeros((2, self.city.regions))
+        for edge in self.city.edges:
+            vehicles = self._session.vehicle_count(edge)
+            if vehicles:
+                region = self.city.region_of[edge]
+                accumulation[region] += vehicles
+                production[region] += vehicles * self._session.mean_speed(edge)
+        return production, accumulation
+
+    def _totals(self) -> dict[str, np.ndarray]:
+        # Several movements may lead from one region to one edge: they share its flow.
+        alike = Counter((g.source, g.to_edge) for g in self.city.gateways)
+        green = {signal: filtered.green_time() for signal, filtered in self._signals.items()}
+        return {
+            "departures": self._meter.departures.copy(), "arrivals": self._meter.arrivals.copy(),
+            "crossings": self._meter.crossings.copy(), "teleports": np.array(self._meter.teleports),
+            "guided": self._guide.realised.copy(),
+            "gateway_flow": np.array([
+                self._meter.entry_flow[g.source, g.to_edge] / alike[g.source, g.to_edge] for g in self.city.gateways]),
+            "gateway_green": np.array([
+                np.mean([green[g.signal][link] for link in g.links]) if g.signal in green else np.nan
+                for g in self.city.gateways])}

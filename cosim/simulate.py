@@ -1,0 +1,79 @@
+"""One closed-loop run in SUMO: a task that can be handed to another process, and all that came of it."""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from nmfd.scenario import Scenario, load_scenario
+from nmfd.types import Trajectory
+
+# Columns of sumo.csv, beside those of summary.csv.
+FACTS = (
+    "controller", "seed", "trips", "departed_veh", "final_backlog_veh", "total_backlog_veh_s", "teleports",
+    "leaking_share", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """scenario: its folder; policy: of a DPC controller, instead of the scenario's own; steps: control intervals, all
+    if None; demand_factor: all flows of the scenario are multiplied by it."""
+
+    scenario: Path
+    controller: str
+    seed: int
+    policy: Path | None = None
+    steps: int | None = None
+    demand_factor: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """trajectory; record: the fields of cosim.plant.Record; facts: a row of sumo.csv."""
+
+    trajectory: Trajectory
+    record: dict[str, np.ndarray]
+    facts: dict[str, float | int | str]
+
+
+def scenario_of(task: Task) -> Scenario:
+    """The scenario with the horizon and demand of `task`. Raises InputError."""
+    scenario = load_scenario(task.scenario)
+    steps = scenario.steps if task.steps is None else min(task.steps, scenario.steps)
+    return replace(scenario, steps=steps, demand=task.demand_factor * scenario.demand[:steps])
+
+
+def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> Result:
+    """Run `task` in this process, which must hold no other SUMO session. Raises InputError."""
+    import torch
+
+    from cosim.plant import SumoPlant
+    from nmfd import closed_loop
+    from nmfd.controllers import registry
+
+    torch.set_num_threads(1)  # runs stand side by side, one core each
+    begin = time.perf_counter()
+    scenario = scenario_of(task)
+    controller = registry.make(task.controller, scenario, policy=task.policy)
+    plant = SumoPlant(scenario)
+    try:
+        trajectory = replace(
+            closed_loop.run(plant, controller, scenario, seed=task.seed, progress=progress), plant="sumo")
+        record = plant.record()
+        departed = int(record.departures.sum())
+        backlog = trajectory.backlog.sum(axis=(1, 2))
+        leaks, flow = set(plant.leaks()), record.gateway_flow.sum(axis=0)
+        leaking = sum(passed for gateway, passed in zip(plant.city.gateways, flow, strict=True) if gateway in leaks)
+        facts = {
+            "controller": task.controller, "seed": task.seed, "trips": plant.trips, "departed_veh": departed,
+            "final_backlog_veh": int(backlog[-1]), "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
+            "teleports": int(record.teleports.sum()),
+            "leaking_share": float(leaking / max(flow.sum(), 1)),
+            "wall_time_s": trajectory.wall_time, "sumo_time_s": plant.sumo_time,
+            "overhead_share": 1.0 - plant.sumo_time / trajectory.wall_time,
+            "setup_time_s": time.perf_counter() - begin - trajectory.wall_time}
+    finally:
+        plant.close()
+    return Result(trajectory=trajectory, record=asdict(record), facts=facts)

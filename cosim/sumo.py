@@ -1,0 +1,166 @@
+"""The SUMO session: the only file that imports libsumo. At most one simulation per process."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import libsumo
+
+from nmfd.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """One phase of a signal programme: duration [s] and one character per link (SUMO's G g y r u o O s)."""
+
+    duration: float
+    state: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Programme:
+    """A signal programme. position [s]: where in its cycle it was when it was read; static: fixed-time."""
+
+    signal: str
+    phases: tuple[Phase, ...]
+    position: float
+    static: bool
+
+    @property
+    def cycle(self) -> float:
+        """[s]"""
+        return sum(phase.duration for phase in self.phases)
+
+
+class Session:
+    """One running simulation.
+
+    libsumo holds a single simulation per process and a second start would silently replace the first: here it is an
+    error. `sumo_time` [s] is the wall time spent inside SUMO's own step.
+    """
+
+    _open = False
+
+    def __init__(
+        self, net_file: Path, route_file: Path, *, seed: int, step_length: float = 1.0,
+        time_to_teleport: float = -1.0, collision_action: str = "warn", options: tuple[str, ...] = (),
+    ):
+        """Raises RuntimeError if another session is open in this process, InputError if SUMO refuses to start."""
+        if Session._open:
+            raise RuntimeError("a SUMO session is already open in this process; close it first")
+        self.sumo_time, self.time, self.step_length = 0.0, 0.0, step_length
+        command = [
+            "sumo", "--net-file", str(net_file), "--route-files", str(route_file), "--seed", str(seed),
+            "--step-length", str(step_length), "--time-to-teleport", str(time_to_teleport), "--collision.action",
+            collision_action, "--no-step-log", "true", "--no-warnings", "true", "--duration-log.disable", "true",
+            "--ignore-route-errors", "false", *options]
+        try:
+            libsumo.start(command)
+        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+            raise InputError(f"{net_file}: SUMO cannot run it with {route_file}: {_one_line(error)}") from None
+        Session._open = True
+
+    def close(self) -> None:
+        if Session._open:
+            Session._open = False
+            libsumo.close()
+
+    def step(self) -> None:
+        """Advance by one simulation step."""
+        before = time.perf_counter()
+        try:
+            libsumo.simulationStep()
+        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+            raise RuntimeError(f"SUMO stopped at {self.time:g} s: {_one_line(error)}") from None
+        self.sumo_time += time.perf_counter() - before
+        self.time = libsumo.simulation.getTime()
+
+    # Vehicles: what happened in the last step.
+
+    def loaded(self) -> tuple[str, ...]:
+        return libsumo.simulation.getLoadedIDList()
+
+    def departed(self) -> tuple[str, ...]:
+        return libsumo.simulation.getDepartedIDList()
+
+    def arrived(self) -> tuple[str, ...]:
+        return libsumo.simulation.getArrivedIDList()
+
+    def started_teleport(self) -> tuple[str, ...]:
+        return libsumo.simulation.getStartingTeleportIDList()
+
+    def ended_teleport(self) -> tuple[str, ...]:
+        return libsumo.simulation.getEndingTeleportIDList()
+
+    # Vehicles: the present state.
+
+    def running(self) -> tuple[str, ...]:
+        """On the road; teleporting ones are not."""
+        return libsumo.vehicle.getIDList()
+
+    def pending(self) -> tuple[str, ...]:
+        """Due to depart, but not yet inserted: the backlog."""
+        return libsumo.simulation.getPendingVehicles()
+
+    def road(self, vehicle: str) -> str:
+        """The edge it is on, normal or internal."""
+        return libsumo.vehicle.getRoadID(vehicle)
+
+    def route(self, vehicle: str) -> tuple[str, ...]:
+        return libsumo.vehicle.getRoute(vehicle)
+
+    def set_route(self, vehicle: str, edges: list[str]) -> bool:
+        """Give a vehicle on edges[0] a new route; False where SUMO refuses it (the old route then stays)."""
+        try:
+            libsumo.vehicle.setRoute(vehicle, edges)
+        except libsumo.TraCIException:
+            return False
+        return True
+
+    # Edges.
+
+    def vehicles_on(self, edge: str) -> tuple[str, ...]:
+        return libsumo.edge.getLastStepVehicleIDs(edge)
+
+    def vehicle_count(self, edge: str) -> int:
+        return libsumo.edge.getLastStepVehicleNumber(edge)
+
+    def mean_speed(self, edge: str) -> float:
+        """[m/s], the speed limit if empty"""
+        return libsumo.edge.getLastStepMeanSpeed(edge)
+
+    def halting(self, edge: str) -> int:
+        """Vehicles on `edge` slower than 0.1 m/s."""
+        return libsumo.edge.getLastStepHaltingNumber(edge)
+
+    def travel_time(self, edge: str) -> float:
+        """[s], at the present mean speed"""
+        return libsumo.edge.getTraveltime(edge)
+
+    # Signals.
+
+    def programme(self, signal: str) -> Programme:
+        """The programme that runs on `signal` now."""
+        active = libsumo.trafficlight.getProgram(signal)
+        for logic in libsumo.trafficlight.getAllProgramLogics(signal):
+            if logic.programID == active:
+                elapsed = sum(p.duration for p in logic.phases[:libsumo.trafficlight.getPhase(signal) + 1])
+                left = libsumo.trafficlight.getNextSwitch(signal) - libsumo.simulation.getTime()
+                return Programme(
+                    signal=signal, phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
+                    position=elapsed - left,
+                    static=logic.type == libsumo.constants.TRAFFICLIGHT_TYPE_STATIC)
+        raise RuntimeError(f"signal {signal} has no programme {active}")
+
+    def signals(self) -> tuple[str, ...]:
+        return libsumo.trafficlight.getIDList()
+
+    def signal_state(self, signal: str) -> str:
+        return libsumo.trafficlight.getRedYellowGreenState(signal)
+
+    def set_signal_state(self, signal: str, state: str) -> None:
+        libsumo.trafficlight.setRedYellowGreenState(signal, state)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,194 @@
+"""The benchmark: controllers x seeds on a regional plant, with a table and the paper's figures."""
+
+import math
+import statistics
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nmfd import closed_loop, plots, runs
+from nmfd.controllers import registry
+from nmfd.plant import AcyclicPlant, NmfdPlant
+from nmfd.scenario import Scenario
+from nmfd.types import Trajectory
+from nmfd.workers import Failure, RunFailed, attempt, outcomes
+
+PLANTS = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
+REFERENCE = "no-control"
+# Two-sided 95 % quantiles of Student's t for 1, 2, ... degrees of freedom; a series gives the rest to three digits.
+STUDENT = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
+CAPTION = (
+    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against no-control; control: time of all\n"
+    "decisions of a run; step: median / longest decision; failures: decisions that were a fallback, all seeds")
+
+
+def run_one(
+    run: tuple[str, int], *, scenario: Scenario, plant: str, policies: Mapping[str, Path],
+    progress: Callable[[int, int], None] | None = None,
+) -> Trajectory:
+    """The closed loop of `run` = (controller, seed), on one thread."""
+    torch.set_num_threads(1)
+    name, seed = run
+    controller = registry.make(name, scenario, policy=policies.get(name))
+    trajectory = closed_loop.run(PLANTS[plant](scenario), controller, scenario, seed=seed, progress=progress)
+    return runs.labelled(trajectory, controller=name, plant=plant)
+
+
+def benchmark(
+    scenario: Scenario, controllers: Sequence[str], seeds: Sequence[int], plant: str, *, out: Path,
+    policies: Mapping[str, Path] | None = None, workers: int = 1,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> list[dict]:
+    """Run what is not yet in the run folder `out`, add the figures, and return all rows of its summary.csv.
+
+    progress: called with the control intervals done and to do, and what is running.
+
+    Raises InputError, before anything is written, for a controller that cannot be made; RunFailed at the end if runs
+    failed, which the message names. Every finished run is kept, whatever happens to the others.
+    """
+    policies = policies or {}
+    for name in controllers:
+        registry.make(name, scenario, policy=policies.get(name))
+    configuration, settings = _configuration(scenario, controllers, plant, policies)
+    wanted = [(name, seed) for name in controllers for seed in seeds]
+    session = {"scenario_folder": str(scenario.folder), "workers": workers}
+    with runs.open_folder(
+            out, configuration=configuration, controllers=settings, order=wanted, session=session) as folder:
+        todo = [run for run in wanted if run not in folder.finished]
+        failures = []
+        work = partial(run_one, scenario=scenario, plant=plant, policies=policies)
+        for run, outcome in _results(work, todo, workers, scenario.steps, progress):
+            if isinstance(outcome, Failure):
+                failures.append(f"controller {run[0]}, seed {run[1]}: {outcome.reason}")
+            else:
+                folder.add(outcome)
+        if folder.finished:
+            draw(folder.path, scenario, folder.trajectories())
+        if failures:
+            raise RunFailed("; ".join(failures))
+        return folder.rows()
+
+
+def _configuration(scenario: Scenario, controllers, plant: str, policies) -> tuple[dict, dict]:
+    """What all runs have in common, and what each controller depends on besides."""
+    settings = {}
+    for name in controllers:
+        policy = registry.policy_path(name, scenario, policies.get(name))
+        settings[name] = {} if policy is None else {"policy_hash": runs.file_hash(policy)}
+    common = {
+        "scenario": scenario.name, "scenario_hash": runs.scenario_hash(scenario), "network": scenario.network.name,
+        "network_hash": scenario.network.hash, "plant": plant, "step_s": scenario.step, "steps": scenario.steps,
+        "measurement_std_veh": scenario.measurement_std}
+    return common, settings
+
+
+def _results(work, todo: Sequence[tuple[str, int]], workers: int, steps: int, progress) -> Iterator[tuple]:
+    """(run, trajectory or Failure) of every run, in this process if there is one worker."""
+    report = progress or (lambda done, total, note: None)
+    total = steps * len(todo)
+    if workers > 1:
+        for done, (run, outcome) in enumerate(outcomes(work, todo, min(workers, len(todo))), start=1):
+            report(done * steps, total, f"{done}/{len(todo)} runs, last {run[0]} {run[1]}")
+            yield run, outcome
+        return
+    for done, run in enumerate(todo):
+        def tick(k, _, before=done * steps, note=f"{run[0]}, seed {run[1]}"):
+            report(before + k, total, note)
+
+        yield run, attempt(partial(work, progress=tick), run)
+
+
+def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -> None:
+    """The paper's figures of `trajectories` and of their scenario, as png files in `folder`."""
+    drawing = plots.figure(8.0, 4.6)
+    ax = plots.total_accumulation(drawing.subplots(), trajectories)
+    plots.legend_below(drawing, [ax], columns=6)
+    plots.save(drawing, folder / "total_accumulation.png")
+    network = scenario.network
+    drawing, axes = plots.panels(network.regions)
+    for region, ax in enumerate(axes):
+        plots.region_accumulation(ax, network, region, trajectories)
+    plots.legend_below(drawing, axes, columns=min(3, network.regions))
+    plots.save(drawing, folder / "region_accumulation.png")
+    draw_scenario(folder, scenario)
+
+
+def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
+    """Spawn matrix, region map and MFDs of `scenario`, as png files in `folder`."""
+    network = scenario.network
+    drawing = plots.figure(11.0, 4.8)
+    left, right = drawing.subplots(1, 2)
+    plots.spawn_matrix(left, scenario)
+    plots.demand(right, scenario)
+    plots.legend_below(drawing, [right], columns=6)
+    files = [plots.save(drawing, folder / "spawn_matrix.png")]
+    drawing = plots.figure(5.5, 5.0)
+    plots.region_map(drawing.subplots(), network)
+    files.append(plots.save(drawing, folder / "region_map.png"))
+    kinds: dict = {}
+    for region, mfd in enumerate(network.mfds):
+        kinds.setdefault(mfd, []).append(region)
+    drawing, axes = plots.panels(len(kinds))
+    for ax, (mfd, regions) in zip(axes, kinds.items(), strict=True):
+        plots.mfd(ax, mfd)
+        ax.set_title("region " + ", ".join(map(str, regions)) if len(kinds) > 1 else "every region", fontsize="medium")
+    plots.legend_below(drawing, axes, columns=2 if len(axes) < 3 else 4)
+    files.append(plots.save(drawing, folder / "mfd.png"))
+    return files
+
+
+def student(degrees: int) -> float:
+    """The two-sided 95 % quantile of Student's t."""
+    if degrees <= len(STUDENT):
+        return STUDENT[degrees - 1]
+    z = 1.959964
+    terms = ((z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384)
+    return z + sum(term / degrees**n for n, term in enumerate(terms, start=1))
+
+
+def interval(values: Sequence[float]) -> float:
+    """Half of the 95 % interval of the mean of `values`; NaN of a single one."""
+    if len(values) < 2:
+        return math.nan
+    return student(len(values) - 1) * statistics.stdev(values) / math.sqrt(len(values))
+
+
+def table(rows: Sequence[Mapping]) -> str:
+    """The rows of summary.csv as text: one line per controller, means over seeds, TTS with its 95 % interval."""
+    groups: dict[str, list[Mapping]] = {}
+    for row in rows:
+        groups.setdefault(row["controller"], []).append(row)
+    tts = {name: [row["total_time_spent_veh_s"] for row in group] for name, group in groups.items()}
+    lines = [["controller", "seeds", "TTS [veh s]", "change", "final [veh]", "max [veh]", "completed [veh]",
+              "control [s]", "step [ms]", "failures"]]
+    for name, group in groups.items():
+        def mean(column, group=group):
+            return statistics.fmean(row[column] for row in group)
+
+        spread = interval(tts[name])
+        change = ""
+        if REFERENCE in tts and name != REFERENCE:
+            change = f"{100 * (statistics.fmean(tts[name]) / statistics.fmean(tts[REFERENCE]) - 1):+.1f} %"
+        lines.append([
+            name, str(len(group)), _scientific(statistics.fmean(tts[name])) + (
+                "" if math.isnan(spread) else f" ± {_scientific(spread, 1)}"),
+            change, f"{mean('final_accumulation_veh'):,.0f}", f"{mean('max_accumulation_veh'):,.0f}",
+            f"{mean('completed_veh'):,.0f}", f"{mean('evaluation_time_s'):.3g}",
+            f"{mean('control_step_ms_median'):.3g} / {max(row['control_step_ms_max'] for row in group):.3g}",
+            str(sum(row["solver_failures"] for row in group))])
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    text = [
+        "  ".join([line[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(line[1:], widths[1:], strict=True))])
+        for line in lines]
+    return "\n".join([*text, CAPTION])
+
+
+def _scientific(value: float, digits: int = 4) -> str:
+    """Like 1.7730e8."""
+    if value == 0:
+        return "0"
+    mantissa, exponent = f"{value:.{digits}e}".split("e")
+    return f"{mantissa}e{int(exponent)}"

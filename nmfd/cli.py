@@ -1,0 +1,192 @@
+"""The command line `nmfd`. Heavy modules are imported inside the commands, so that the help answers at once."""
+
+import shlex
+from pathlib import Path
+
+import click
+
+from nmfd.command_line import Commands, Interrupted
+from nmfd.errors import InputError
+
+FOLDER = click.Path(path_type=Path, file_okay=False)
+FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@click.group(name="nmfd", cls=Commands)
+@click.version_option(package_name="perimeter-cosim", prog_name="nmfd")
+def main() -> None:
+    """Perimeter control and route guidance on the regional traffic model (NMFD).
+
+    \b
+    Example:
+      nmfd benchmark scenarios/economic_mpc --controllers no-control,pi-gating
+    """
+
+
+@main.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--controllers", required=True, metavar="A,B,...",
+              help="Which to run: no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc, dpc-pcrg.")
+@click.option("--seeds", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+              help="Run seeds 0 to N-1 of the measurement noise.")
+@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", show_default=True,
+              help="The model that the controllers act on.")
+@click.option("--workers", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+              help="Runs at a time, each on one core. Timings are cleanest with 1.")
+@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
+              help="The policy file of a DPC controller, if not SCENARIO/NAME.pt. May be repeated.")
+@click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
+def benchmark(
+    scenario: Path, controllers: str, seeds: int, plant: str, workers: int, policies: tuple[str, ...],
+    out: Path | None,
+) -> None:
+    """Run controllers on a regional model; print a table and write a run folder.
+
+    SCENARIO is a folder with a scenario.toml. The run folder holds summary.csv, the trajectories, manifest.json and
+    figures. Every finished run is kept: the same command with the same --out goes on where it was interrupted, and
+    other controllers or more seeds are added to what is there.
+
+    \b
+    Examples:
+      nmfd benchmark scenarios/economic_mpc --controllers no-control,pi-gating
+      nmfd benchmark scenarios/economic_mpc --controllers no-control,dpc-pc \\
+          --seeds 5 --plant acyclic --workers 2 --policy dpc-pc=mine.pt --out runs/mine
+    """
+    names = _names(controllers)
+    files = _policies(policies, names)
+
+    from nmfd import benchmarks, runs
+    from nmfd.progress import progress_line
+    from nmfd.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    out = runs.default_folder(loaded) if out is None else out
+    try:
+        with progress_line("benchmark") as progress:
+            rows = benchmarks.benchmark(
+                loaded, names, range(seeds), plant, out=out, policies=files, workers=workers, progress=progress)
+    except KeyboardInterrupt:
+        if not (out / "summary.csv").exists():
+            raise Interrupted("interrupted before a run was finished; nothing is kept") from None
+        raise Interrupted(
+            f"interrupted; finished runs are in {out}: the same command with --out {_quoted(out)} goes on") from None
+    click.echo(f"{loaded.name}, {plant} plant, {loaded.steps} control intervals of {loaded.step:g} s")
+    click.echo(benchmarks.table(rows))
+    click.echo(f"Written to {out}")
+
+
+@main.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--controller", required=True, metavar="NAME", help="dpc-pc or dpc-pcrg.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True,
+              help="Of the initial weights and the training scenarios.")
+@click.option("--steps", type=click.IntRange(min=1), metavar="N",
+              help="Adam steps. [default: what scenario.toml says, else 400]")
+@click.option("--out", type=FILE, metavar="FILE", help="The policy file. [default: SCENARIO/NAME.pt]")
+@click.option("--resume", is_flag=True, help="Go on with an interrupted training.")
+def train(scenario: Path, controller: str, seed: int, steps: int | None, out: Path | None, resume: bool) -> None:
+    """Train a DPC policy on a scenario.
+
+    The policy that does best in validation is in the policy file at any time; Ctrl-C keeps it, and --resume goes on.
+
+    \b
+    Examples:
+      nmfd train scenarios/economic_mpc --controller dpc-pcrg
+      nmfd train scenarios/economic_mpc --controller dpc-pc --steps 200 --out mine.pt
+    """
+    from nmfd import training
+    from nmfd.progress import progress_line
+    from nmfd.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    training.settings(loaded, controller, steps)  # complains of the name before a file is named after it
+    file = scenario / f"{controller}.pt" if out is None else out
+    if not file.parent.is_dir():
+        raise InputError(f"{file.parent}: no such folder for the policy; make it or choose another --out")
+    state = file.with_name(file.name + ".resume")
+    before = _stamp(state)
+    notes = ["no validation yet"]
+    try:
+        with progress_line(controller) as line:
+            def progress(done: int, total: int, note: str) -> None:
+                notes.append(note)
+                if line:
+                    line(done, total, note)
+
+            training.train(loaded, controller, seed=seed, out=file, steps=steps, resume=resume, progress=progress)
+    except KeyboardInterrupt:
+        if not resume and _stamp(state) == before:
+            raise Interrupted("interrupted before the first validation; nothing is kept") from None
+        again = f"nmfd train {_quoted(scenario)} --controller {controller}"
+        again += f" --seed {seed}" if seed else ""
+        again += f" --steps {steps}" if steps else ""
+        again += f" --out {_quoted(out)}" if out else ""
+        raise Interrupted(f"interrupted; the best policy so far is {file}; go on with: {again} --resume") from None
+    click.echo(f"{controller}: {notes[-1]} in validation")
+    click.echo(f"Written to {file}")
+
+
+@main.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--out", type=FOLDER, metavar="DIR", help="Where the figures go. [default: runs/<scenario>-show]")
+def show(scenario: Path, out: Path | None) -> None:
+    """Draw a scenario: its demand, region map and MFDs.
+
+    \b
+    Example:
+      nmfd show scenarios/economic_mpc --out figures
+    """
+    from nmfd import benchmarks, runs
+    from nmfd.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    out = Path("runs") / f"{runs.file_name(loaded.name)}-show" if out is None else out
+    out.mkdir(parents=True, exist_ok=True)
+    files = benchmarks.draw_scenario(out, loaded)
+    total = loaded.step * loaded.demand.sum()
+    click.echo(
+        f"{loaded.name}: {loaded.network.regions} regions, {total:,.0f} trips between "
+        f"{int((loaded.demand.sum(axis=0) > 0).sum())} pairs, peak {loaded.demand.sum(axis=(1, 2)).max():.3g} veh/s, "
+        f"{loaded.steps} control intervals of {loaded.step:g} s")
+    for file in files:
+        click.echo(f"Written to {file}")
+
+
+def _names(controllers: str) -> list[str]:
+    """The controllers in a list separated by commas. InputError for an unknown, repeated or empty name."""
+    from nmfd.controllers import registry
+
+    names = [name.strip() for name in controllers.split(",")]
+    for name in names:
+        registry.check(name)
+    if repeated := [name for n, name in enumerate(names) if name in names[:n]]:
+        raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
+    return names
+
+
+def _policies(options: tuple[str, ...], names: list[str]) -> dict[str, Path]:
+    """NAME=FILE options as a table. InputError for another form, or a controller that is not run."""
+    files: dict[str, Path] = {}
+    for option in options:
+        name, equals, file = option.partition("=")
+        if not equals or not file:
+            raise InputError(f"--policy: expected NAME=FILE, such as dpc-pc=mine.pt, got {option!r} instead")
+        if name not in names:
+            raise InputError(f"--policy: {name!r} is not among --controllers {','.join(names)}; add it there")
+        if name in files:
+            raise InputError(f"--policy: {name} is there twice; give one file for each controller")
+        files[name] = Path(file)
+    return files
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))
+
+
+def _stamp(path: Path) -> int | None:
+    """When `path` was written last [ns]; None without it."""
+    return path.stat().st_mtime_ns if path.exists() else None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""Perimeter commands on signals: yellow, minimum green, no new conflicts, the original programme at u_max."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from cosim.actuate import MODES, GatewaySignal
+from cosim.sumo import Phase, Programme
+
+MIN_GREEN = 5.0
+
+# Two crossing streets with a left-turn tail; link 1 is a gateway in both phases of its street, link 3 turns on a g that
+# never ends, and the green of link 4 runs over the end of the cycle.
+PHASES = [("GGrgG", 30), ("yGrgG", 3), ("rGrgy", 6), ("ryrgr", 3), ("rrGgr", 40), ("rrygr", 3), ("rrrgG", 5)]
+SINGLE = [("Gr", 42), ("yr", 3), ("rG", 4), ("rG", 38), ("ry", 3)]
+
+
+def programme(phases, position=0.0):
+    return Programme(
+        signal="s", phases=tuple(Phase(duration=d, state=s) for s, d in phases), position=position, static=True)
+
+
+def play(phases, movements, mode, commands, *, position=0.0, interval=90):
+    """The state of every second, under a new command (R, R) every `interval` seconds."""
+    signal = GatewaySignal(programme(phases, position), movements, min_green=MIN_GREEN, mode=mode, start=0.0)
+    states, shown = [], ""
+    for second in range(len(commands) * interval):
+        if second % interval == 0:
+            signal.command(commands[second // interval])
+        if second >= signal.next_change:
+            shown = signal.update(float(second))
+        states.append(shown)
+    return states
+
+
+def runs(states, link):
+    """[(character class, seconds)] of one link: G for any green."""
+    text = "".join("G" if s[link] in "Gg" else s[link] for s in states)
+    return [(key, len(list(group))) for key, group in itertools.groupby(text)]
+
+
+def check(states, phases, min_green=MIN_GREEN):
+    """What must hold under any command; the first and the last run of every link may be cut off by the simulation."""
+    together = {
+        pair for state, _ in phases
+        for pair in itertools.combinations([n for n, c in enumerate(state) if c in "Gg"], 2)}
+    for state in set(states):
+        for pair in itertools.combinations([n for n, c in enumerate(state) if c in "Gg"], 2):
+            assert pair in together, f"{state} shows {pair} green together"
+    originals = [s for s, d in phases for _ in range(int(d))] * 3
+    for link in range(len(phases[0][0])):
+        least = min([length for c, length in runs(originals, link)[1:-1] if c == "G"], default=min_green)
+        yellow = [length for c, length in runs(originals, link)[1:-1] if c == "y"]
+        sequence = runs(states, link)
+        for (before, length), (after, _) in itertools.pairwise(sequence):
+            assert (before, after) != ("G", "r"), f"link {link} goes from green to red without yellow"
+        for n, (shown, length) in enumerate(sequence[1:-1], start=1):
+            if shown == "G":
+                assert length >= min(min_green, least), f"link {link} is green for {length} s"
+            if shown == "y" and yellow and sequence[n - 1][0] == "G":
+                assert length >= min(yellow), f"link {link} is yellow for {length} s"
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("phases", [PHASES, SINGLE])
+def test_u_max_is_the_original_programme(mode, phases):
+    movements = {link: (0, 1) for link in range(1, len(phases[0][0]))}
+    states = play(phases, movements, mode, [np.ones((2, 2))] * 4, position=17.0)
+    original = [s for s, d in phases for _ in range(int(d))]
+    assert states == [original[(second + 17) % 90] for second in range(360)]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("phases", [PHASES, SINGLE])
+def test_random_commands_are_safe(mode, phases):
+    random = np.random.default_rng(3)
+    for trial in range(40):
+        links = random.permutation(len(phases[0][0]))[: random.integers(1, len(phases[0][0]) + 1)]
+        movements = {int(link): (0, int(link) + 1) for link in links}
+        commands = random.uniform(-0.2, 1.2, (30, 6, 6)).clip(0, 1)
+        states = play(
+            phases, movements, mode, list(commands), position=float(random.integers(90)),
+            interval=int(random.choice([30, 45, 90, 170])))
+        check(states, phases)
+
+
+def test_green_falls_from_the_original_to_the_minimum():
+    green = []
+    for share in np.linspace(0.0, 1.0, 11):
+        states = play(PHASES, {0: (0, 1)}, "hold-back", [np.full((2, 2), share)] * 3)
+        green.append(sum(s[0] in "Gg" for s in states[90:180]))
+    assert green[0] == MIN_GREEN and green[-1] == 30
+    assert (np.diff(green) >= 2).all()
+
+
+def test_hold_back_touches_the_gateway_only():
+    held = play(PHASES, {0: (0, 1)}, "hold-back", [np.zeros((2, 2))] * 3)
+    free = play(PHASES, {0: (0, 1)}, "hold-back", [np.ones((2, 2))] * 3)
+    assert [s[1:] for s in held] == [s[1:] for s in free]
+
+
+def test_redistribute_gives_the_seconds_to_the_crossing_street():
+    free = play(SINGLE, {0: (0, 1)}, "redistribute", [np.ones((2, 2))] * 3)[90:180]
+    held = play(SINGLE, {0: (0, 1)}, "redistribute", [np.zeros((2, 2))] * 3)[90:180]
+    assert sum(s[0] == "G" for s in held) == MIN_GREEN
+    assert sum(s[1] == "G" for s in held) == sum(s[1] == "G" for s in free) + 42 - MIN_GREEN
+
+
+def test_green_time_is_what_was_shown():
+    signal = GatewaySignal(programme(PHASES), {0: (0, 1)}, min_green=MIN_GREEN, mode="hold-back", start=0.0)
+    signal.command(np.full((2, 2), 0.5))
+    green, shown = 0, ""
+    for second in range(271):
+        if second >= signal.next_change:
+            shown = signal.update(float(second))
+        green += shown[0] in "Gg" and second < 270
+    assert signal.green_time()[0] == green > 0
