@@ -68,7 +68,7 @@ def run(
 @click.option("--controller", default="no-control", show_default=True, metavar="NAME", help=CONTROLLER_HELP)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
-@click.option("--out", type=FOLDER, metavar="DIR", help="The run folder of a scenario. [default: runs/<scenario>-<time>]")
+@click.option("--out", type=FOLDER, metavar="DIR", help="Run folder of a SCENARIO. [default: runs/<scenario>-<time>]")
 def compare(target: Path, controller: str, seed: int, steps: int | None, out: Path | None) -> None:
     """Compare microsimulated accumulations with what the regional model predicts.
 
@@ -130,7 +130,7 @@ def identify(scenario: Path, levels: str, seeds: int, workers: int, out: Path | 
     except ValueError:
         factors = [0.0]
     if not all(0.0 < factor <= 10.0 for factor in factors):
-        raise InputError(f"--levels: expected numbers above 0 and up to 10, such as 0.6,0.8,1.0, got {levels!r} instead")
+        raise InputError(f"--levels: expected numbers above 0 up to 10, such as 0.6,0.8,1.0, got {levels!r} instead")
     loaded = load_scenario(scenario)
     out = Path("runs") / f"{runs.file_name(loaded.name)}-identify" if out is None else out
     try:

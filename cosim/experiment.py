@@ -19,8 +19,8 @@ from nmfd.workers import Failure, RunFailed, attempt, outcomes
 
 REFERENCE = "no-control"
 CAPTION = (
-    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; backlog: not inserted\n"
-    "at the end; step: median / longest decision; outside SUMO: share of the wall time outside SUMO's own step")
+    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; backlog: not\n"
+    "inserted at the end; step: median / longest decision; outside SUMO: share of the wall time not in its own step")
 
 
 def experiment(

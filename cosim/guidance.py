@@ -59,15 +59,13 @@ class Guide:
         if here is None or self._region[here] != event.region:  # on a junction already: too late to turn
             return
         cost = ways.cost(here, target)
-        reachable = np.isfinite(cost)
-        shares = self._splits[event.region, :, event.destination][ways.next_region] * reachable
-        by_region = np.zeros(self._city.regions)
-        by_region[np.unique(ways.next_region[shares > 0])] = 1.0
-        weights = self._splits[event.region, :, event.destination] * by_region
-        if weights.sum() <= 0:
+        reachable = np.isfinite(np.minimum.reduceat(cost, ways.begins))
+        shares = np.cumsum(self._splits[event.region, ways.neighbours, event.destination] * reachable)
+        if shares[-1] <= 0:
             return
-        following = self._random.choice(len(weights), p=weights / weights.sum())
-        gateway = int(np.argmin(np.where(ways.next_region == following, cost, np.inf)))
+        n = int(np.searchsorted(shares, self._random.random() * shares[-1], side="right"))
+        following = int(ways.neighbours[n])
+        gateway = int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]]))
         route = [self._city.edges[n] for n in ways.route(here, gateway, target)]
         if self._session.set_route(event.vehicle, route):
             self.realised[event.region, following, event.destination] += 1
@@ -80,7 +78,7 @@ class Guide:
             self._ways[region] = _Ways(
                 first=np.array([self._index[g.from_edge] for g in gateways]),
                 second=np.array([self._index[g.to_edge] for g in gateways]),
-                next_region=np.array([g.target for g in gateways]),
+                next_region=np.array([g.target for g in gateways]),  # sorted, as the gateways are
                 inside=self._graph(self._region == region, reverse=True),
                 outside=self._graph(self._region != region, reverse=False), time=self._time)
         return self._ways[region]
@@ -95,10 +93,15 @@ class Guide:
 
 
 class _Ways:
-    """Fastest ways out of one region by each of its G gateways (first[g] -> second[g], into next_region[g])."""
+    """Fastest ways out of one region by each of its G gateways (first[g] -> second[g], into next_region[g]).
+
+    Gateways begins[n] to ends[n] - 1 lead into region neighbours[n].
+    """
 
     def __init__(self, *, first, second, next_region, inside, outside, time):
-        self._first, self._second, self.next_region = first, second, next_region
+        self._first, self._second = first, second
+        self.neighbours, self.begins = np.unique(next_region, return_index=True)
+        self.ends = np.append(self.begins[1:], len(next_region))
         self._to_gateway, self._after = dijkstra(inside, indices=first, return_predecessors=True)
         self._from_gateway, self._before = dijkstra(outside, indices=second, return_predecessors=True)
         self._enter = time[second]

@@ -39,8 +39,8 @@ class Event:
 class Meter:
     """Follows every vehicle from loading to arrival.
 
-    Regions change when a vehicle is seen on the first edge behind a gateway (polled every step), or at the latest
-    when `accumulation` looks at every vehicle. A teleporting vehicle counts where it was last seen.
+    Regions change when a vehicle is seen on the first edge behind a gateway (polled), or at the latest when
+    `accumulation` looks at every vehicle. A teleporting vehicle counts where it was last seen.
 
     departures (R, R), arrivals (R,), crossings (R, R, R) [i, h, j], teleports, and entry_flow, (source region, first
     edge behind the boundary) -> vehicles seen there: all since the beginning [veh].
@@ -52,6 +52,10 @@ class Meter:
         self._teleporting: set[str] = set()
         entries = sorted({g.to_edge for g in city.gateways})
         self._entries = {edge: city.region_of[edge] for edge in entries}
+        # Polled often enough that no vehicle gets past the middle of an entry edge unseen.
+        shortest = min((city.length[edge] / city.speed[edge] for edge in entries), default=2.0)
+        self._poll_every = max(1, int(min(0.5 * shortest, 3.0) / session.step_length))
+        self._steps = 0
         self._seen: dict[str, tuple[str, ...]] = dict.fromkeys(entries, ())
         self._running = np.zeros((city.regions, city.regions), dtype=int)
         self.teleports = 0
@@ -77,7 +81,8 @@ class Meter:
             self.departures[known.origin, known.destination] += 1
             events.append(Event(
                 vehicle=vehicle, source=None, region=known.origin, destination=known.destination, edge=known.edge))
-        for edge, region in self._entries.items():
+        self._steps += 1
+        for edge, region in self._entries.items() if self._steps % self._poll_every == 0 else ():
             present = session.vehicles_on(edge)
             if present != self._seen[edge]:
                 for vehicle in set(present).difference(self._seen[edge]):

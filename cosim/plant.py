@@ -50,7 +50,8 @@ def settings(scenario: Scenario) -> Settings:
     chosen = Settings(
         step_length=table.number("step_length", default.step_length, above=0.0, high=1.0),
         time_to_teleport=table.number("time_to_teleport", default.time_to_teleport, low=-1.0),
-        collision_action=table.text("collision_action", default.collision_action, ("none", "warn", "teleport", "remove")),
+        collision_action=table.text(
+            "collision_action", default.collision_action, ("none", "warn", "teleport", "remove")),
         actuation=table.text("actuation", default.actuation, MODES),
         min_green=table.number("min_green", default.min_green, low=1.0),
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),

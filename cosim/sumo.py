@@ -102,12 +102,10 @@ class Session:
         """Due to depart, but not yet inserted: the backlog."""
         return libsumo.simulation.getPendingVehicles()
 
-    def road(self, vehicle: str) -> str:
-        """The edge it is on, normal or internal."""
-        return libsumo.vehicle.getRoadID(vehicle)
-
-    def route(self, vehicle: str) -> tuple[str, ...]:
-        return libsumo.vehicle.getRoute(vehicle)
+    # Asked so often that a Python call around them would cost as much as SUMO's answer:
+    # road(vehicle), the edge it is on, normal or internal; route(vehicle), its edges.
+    road = staticmethod(libsumo.vehicle.getRoadID)
+    route = staticmethod(libsumo.vehicle.getRoute)
 
     def set_route(self, vehicle: str, edges: list[str]) -> bool:
         """Give a vehicle on edges[0] a new route; False where SUMO refuses it (the old route then stays)."""
@@ -117,25 +115,13 @@ class Session:
             return False
         return True
 
-    # Edges.
-
-    def vehicles_on(self, edge: str) -> tuple[str, ...]:
-        return libsumo.edge.getLastStepVehicleIDs(edge)
-
-    def vehicle_count(self, edge: str) -> int:
-        return libsumo.edge.getLastStepVehicleNumber(edge)
-
-    def mean_speed(self, edge: str) -> float:
-        """[m/s], the speed limit if empty"""
-        return libsumo.edge.getLastStepMeanSpeed(edge)
-
-    def halting(self, edge: str) -> int:
-        """Vehicles on `edge` slower than 0.1 m/s."""
-        return libsumo.edge.getLastStepHaltingNumber(edge)
-
-    def travel_time(self, edge: str) -> float:
-        """[s], at the present mean speed"""
-        return libsumo.edge.getTraveltime(edge)
+    # Edges: the vehicles on one and their number, mean speed [m/s] (the limit if empty), vehicles slower than 0.1 m/s,
+    # and travel time at the present mean speed [s].
+    vehicles_on = staticmethod(libsumo.edge.getLastStepVehicleIDs)
+    vehicle_count = staticmethod(libsumo.edge.getLastStepVehicleNumber)
+    mean_speed = staticmethod(libsumo.edge.getLastStepMeanSpeed)
+    halting = staticmethod(libsumo.edge.getLastStepHaltingNumber)
+    travel_time = staticmethod(libsumo.edge.getTraveltime)
 
     # Signals.
 

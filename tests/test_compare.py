@@ -1,0 +1,114 @@
+"""Comparison and identification on records whose truth is known: made by the regional model itself."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cosim.compare import errors, outflow_samples, predict, predict_next
+from cosim.identify import network_toml, own_splits
+from cosim.simulate import Result
+from nmfd import dynamics, mfd
+from nmfd.network import load_network
+from nmfd.scenario import load_scenario
+from nmfd.types import Trajectory
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return replace(load_scenario(ROOT / "scenarios" / "economic_mpc"), measurement_std=0.0)
+
+
+@pytest.fixture(scope="module")
+def result(scenario):
+    """A run of the regional model under random controls, recorded as if it were the microsimulation."""
+    random, network = np.random.default_rng(0), scenario.network
+    p, x = dynamics.parameters(network), torch.zeros((7, 7), dtype=torch.float64)
+    states, perimeter, crossings, arrivals = [x.numpy()], [], [], []
+    splits = torch.from_numpy(network.nominal_splits)
+    for k in range(scenario.steps):
+        u = random.uniform(network.u_min, network.u_max, 7)[:, None] * network.adjacency  # one u per region, see below
+        completions, transfers = dynamics.flows(p, x, torch.from_numpy(u), splits)
+        x = dynamics.euler(p, x, torch.from_numpy(scenario.demand[k]), torch.from_numpy(u), splits, scenario.step)
+        states.append(x.numpy())
+        perimeter.append(u)
+        crossings.append(scenario.step * transfers.numpy())
+        arrivals.append(scenario.step * completions.numpy())
+    trajectory = Trajectory(
+        controller="random", plant="sumo", seed=0, step=scenario.step, accumulation=np.stack(states),
+        backlog=np.zeros((scenario.steps + 1, 7, 7)), completed=np.zeros(scenario.steps + 1),
+        perimeter=np.stack(perimeter), splits=np.repeat(network.nominal_splits[None], scenario.steps, axis=0),
+        decision_time=np.zeros(scenario.steps), status=("ok",) * scenario.steps, wall_time=1.0)
+    record = {
+        "departures": scenario.step * scenario.demand, "crossings": np.stack(crossings), "arrivals": np.stack(arrivals)}
+    return Result(trajectory=trajectory, record=record, facts={})
+
+
+def test_a_perfect_model_has_no_error(scenario, result):
+    rows = errors(scenario, result, predict(scenario, result))
+    assert [row["region"] for row in rows] == [*range(7), "all"]
+    for row in rows:
+        assert max(row["rmse_veh"], abs(row["bias_veh"]), row["next_interval_rmse_veh"]) < 1e-6
+
+
+def test_a_model_that_discharges_too_slowly_holds_too_many(scenario, result):
+    slow = tuple(replace(m, a=0.9 * m.a, b=0.9 * m.b, c=0.9 * m.c) for m in scenario.network.mfds)
+    wrong = replace(scenario, network=replace(scenario.network, mfds=slow))
+    rows = errors(wrong, result, predict(wrong, result))
+    assert rows[-1]["bias_veh"] > 100 and rows[-1]["rmse_share"] > 0.01
+    assert rows[-1]["next_interval_rmse_veh"] < rows[-1]["rmse_veh"]
+
+
+def test_several_intervals_ahead(scenario, result):
+    simulated = result.trajectory.accumulation.sum(-1)
+    assert np.abs(predict_next(scenario, result, 10) - simulated[10:]).max() < 1e-6
+
+
+def test_outflow_samples_lie_on_the_mfd(scenario, result):
+    for region in (0, 3):
+        cloud = outflow_samples([result.trajectory], [result.record], scenario.network.u_max, region)
+        points = np.concatenate(list(cloud.values()))
+        expected = scenario.network.mfds[region].outflow(points[:, 0])
+        # The samples are taken at the middle of an interval, the flows at its beginning.
+        assert np.abs(points[:, 1] - expected).mean() < 0.03 * scenario.network.mfds[region].capacity
+        fitted = mfd.fit(points[:, 0], points[:, 1], jam=float(points[:, 0].max()))
+        seen = np.linspace(0.0, fitted.jam, 50)
+        assert fitted.problem() is None
+        assert np.abs(fitted.outflow(seen) - scenario.network.mfds[region].outflow(seen)).max() < 0.3
+
+
+def test_own_splits_are_the_crossings_shares(scenario, result):
+    network = scenario.network
+    found = own_splits(network, [result.record])
+    assert found[0, 6] == {3: 1.0}
+    mixed = {"crossings": result.record["crossings"].copy()}
+    mixed["crossings"][:, 0, 1, 6] = mixed["crossings"][:, 0, 3, 6] / 3.0
+    assert own_splits(network, [mixed])[0, 6] == pytest.approx({1: 0.25, 3: 0.75})
+
+
+def test_network_file_comes_back_the_same(scenario, result, tmp_path):
+    network = scenario.network
+    mixed = {"crossings": result.record["crossings"].copy()}
+    mixed["crossings"][:, 0, 1, 6] = mixed["crossings"][:, 0, 3, 6] / 3.0
+    network = replace(network, own_splits=own_splits(network, [mixed]))
+    text = network_toml(network, ROOT / "networks" / "grid7" / "network.toml", "a test")
+    (tmp_path / "network.toml").write_text(text)
+    again = load_network(tmp_path)
+    assert again.hash == network.hash
+    assert '[sumo]\nrecipe = "city.toml"' in text
+
+
+@pytest.mark.parametrize("jam", [9000.0, 2500.0])
+def test_fit_is_safe_and_close(jam):
+    truth = load_network(ROOT / "networks" / "hexagon7").mfds[0]
+    random = np.random.default_rng(1)
+    x = random.uniform(0.0, jam, 400)
+    fitted = mfd.fit(x, truth.outflow(x) + random.normal(0.0, 0.2, x.size), jam=jam)
+    grid = np.linspace(0.0, 3.0 * jam, 1000)
+    assert (fitted.outflow(grid)[1:] > 0).all() and (np.diff(fitted.rate(grid)) <= 1e-12).all()
+    inside = grid[grid <= jam]
+    assert np.abs(fitted.outflow(inside) - truth.outflow(inside)).max() < 0.3

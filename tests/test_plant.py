@@ -1,0 +1,165 @@
+"""The SUMO plant: ledger, signals second by second, guidance, reproducibility. Small, seeded simulations of grid7."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_actuate import MIN_GREEN, check
+
+from cosim.measure import LedgerError
+from cosim.plant import Settings, SumoPlant
+from cosim.sumo import Session
+from nmfd.scenario import load_scenario
+from nmfd.types import Controls
+
+SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
+INTERVALS = 4
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    """The beginning of the peak, where the demand already flows."""
+    loaded = load_scenario(SCENARIO)
+    return replace(loaded, steps=INTERVALS, demand=loaded.demand[12 : 12 + INTERVALS])
+
+
+def random_controls(scenario, random, *, guidance=False):
+    network = scenario.network
+    perimeter = random.uniform(network.u_min - 0.2, network.u_max + 0.2, (network.regions,) * 2)
+    perimeter = np.clip(perimeter, network.u_min, network.u_max)
+    splits = random.random(network.split_mask.shape) * network.split_mask
+    splits /= np.where(splits.sum(axis=1, keepdims=True) > 0, splits.sum(axis=1, keepdims=True), 1.0)
+    return Controls(perimeter=perimeter, splits=splits if guidance else None)
+
+
+@pytest.fixture
+def plant_of(scenario):
+    """Plants that are closed in any case: SUMO allows one session per process."""
+    plants = []
+
+    def make(**overrides):
+        plants.append(SumoPlant(scenario, overrides=Settings(**overrides)))
+        return plants[-1]
+
+    yield make
+    for plant in plants:
+        plant.close()
+
+
+def drive(plant, scenario, *, seed=1, guidance=False, each_second=None):
+    """Run under random controls; the measurements and the plant's record."""
+    random = np.random.default_rng(seed)
+    measurements = [plant.reset(seed)]
+    if each_second:
+        step = plant.session.step
+        plant.session.step = lambda: (step(), each_second(plant.session))
+    for _ in range(scenario.steps):
+        measurements.append(plant.step(random_controls(scenario, random, guidance=guidance)))
+    return measurements, plant.record()
+
+
+@pytest.mark.parametrize("actuation", ["hold-back", "redistribute"])
+def test_signals_stay_safe_under_random_commands(scenario, plant_of, actuation):
+    plant, shown = plant_of(actuation=actuation), {}
+
+    def watch(session):
+        for signal in session.signals():
+            shown.setdefault(signal, []).append(session.signal_state(signal))
+
+    plant.reset(1)
+    original = {signal: plant.session.programme(signal) for signal in plant.session.signals()}
+    drive(plant, scenario, each_second=watch)
+    changed = 0
+    for signal, states in shown.items():
+        phases = [(phase.state, phase.duration) for phase in original[signal].phases]
+        check(states, phases, MIN_GREEN)
+        cycle = [state for state, duration in phases for _ in range(int(duration))]
+        begin = int(original[signal].position)
+        changed += states != [cycle[(n + begin) % len(cycle)] for n in range(len(states))]
+    assert len(shown) > 90 and 20 < changed < 90
+
+
+def test_open_gateways_leave_sumo_alone(scenario, plant_of):
+    """Every state at u_max is what SUMO shows by itself."""
+    plant, shown = plant_of(), []
+    network = scenario.network
+    open_gateways = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None)
+    for actuated in (True, False):
+        plant.reset(1)
+        if not actuated:
+            plant.session.set_signal_state = None  # would fail if anything were played
+            plant._actuator._signals.clear()
+        states = []
+        step = plant.session.step
+        plant.session.step = lambda step=step, states=states, session=plant.session: (
+            step(), states.append([session.signal_state(s) for s in session.signals()]))
+        final = [plant.step(open_gateways) for _ in range(3)][-1]
+        shown.append((states, final.accumulation.tolist()))
+    assert shown[0] == shown[1]
+
+
+@pytest.mark.parametrize("guidance", [False, True])
+def test_ledger_and_crossings_balance(scenario, plant_of, guidance):
+    measurements, record = drive(plant_of(), scenario, guidance=guidance)
+    for k, (before, after) in enumerate(zip(measurements[:-1], measurements[1:], strict=True)):
+        crossings = record.crossings[k]
+        expected = before.accumulation + record.departures[k] - crossings.sum(1) + crossings.sum(0)
+        expected -= np.diag(record.arrivals[k])
+        assert (after.accumulation == expected).all()
+        assert (crossings.sum(axis=2)[~scenario.network.adjacency] == 0).all()
+    demand = scenario.step * scenario.demand.sum()
+    entered = record.departures.sum() + measurements[-1].backlog.sum()
+    assert abs(entered - demand) <= scenario.network.regions**2
+    assert record.arrivals.sum() > 100
+
+
+def test_ledger_notices_a_lost_vehicle(scenario, plant_of):
+    plant = plant_of()
+    plant.reset(1)
+    plant.step(random_controls(scenario, np.random.default_rng(0)))
+    plant._meter.departures[0, 4] += 1
+    with pytest.raises(LedgerError, match="vehicles are in the city"):
+        plant.step(random_controls(scenario, np.random.default_rng(0)))
+
+
+def test_teleporting_vehicles_stay_in_the_ledger(scenario, plant_of):
+    plant = plant_of(time_to_teleport=20.0)
+    measurements, record = drive(plant, scenario, seed=2)
+    assert record.teleports.sum() > 0
+    inside = record.departures.sum() - record.arrivals.sum()
+    assert measurements[-1].accumulation.sum() == inside
+
+
+def test_guided_vehicles_go_where_theta_sends_them(scenario, plant_of):
+    """All vehicles in region 2 bound for 4 are sent through 0: with full compliance none leaves for 3 or 5."""
+    network, plant = scenario.network, plant_of()
+    splits = network.nominal_splits.copy()
+    splits[2, :, 4] = 0.0
+    splits[2, 0, 4] = 1.0
+    plant.reset(1)
+    for _ in range(scenario.steps):
+        plant.step(Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=splits))
+    record = plant.record()
+    crossings = record.crossings.sum(axis=0)[2, :, 4]
+    assert record.guided.sum(axis=0)[2, 0, 4] > 20
+    assert crossings[0] > 10 and crossings[0] > 0.9 * crossings.sum()
+
+
+def test_compliance_zero_reroutes_nobody(scenario, plant_of):
+    _, record = drive(plant_of(compliance=0.0), scenario, guidance=True)
+    assert record.guided.sum() == 0
+
+
+def test_same_seed_same_city(scenario, plant_of):
+    plant = plant_of()
+    runs = [drive(plant, scenario, seed=seed, guidance=True) for seed in (3, 3, 4)]
+    final = [measurements[-1].accumulation.tolist() for measurements, _ in runs]
+    assert final[0] == final[1] != final[2]
+    assert (runs[0][1].gateway_flow == runs[1][1].gateway_flow).all()
+
+
+def test_second_session_is_refused(scenario, plant_of):
+    plant_of().reset(1)
+    with pytest.raises(RuntimeError, match="already open"):
+        Session(Path("a"), Path("b"), seed=0)
