@@ -62,7 +62,7 @@ def _fit(cloud: dict[str, np.ndarray], step: float) -> mfd.Mfd:
     if len(points) < 10:
         raise InputError(
             "--levels: a region was nearly empty in all loading runs; give higher levels, or a scenario that uses it")
-    return mfd.fit(points[:, 0], points[:, 1], jam=float(points[:, 0].max()), max_rate=1.0 / step)
+    return mfd.fit(points[:, 0], points[:, 1], max_rate=1.0 / step)
 
 
 def own_splits(network: Network, records: Sequence[dict]) -> dict[tuple[int, int], dict[int, float]]:

@@ -54,36 +54,43 @@ class Mfd:
         return None
 
 
-def fit(accumulation, outflow, *, jam: float, max_rate: float = np.inf, bins: int = 24) -> Mfd:
-    """The cubic closest to samples (n,) [veh], (n,) [veh/s] that is safe to use: least squares over bin means.
+def fit(accumulation, outflow, *, max_rate: float = np.inf, bins: int = 24) -> Mfd:
+    """The curve closest to samples (n,) [veh], (n,) [veh/s] that is safe to use: least squares over bin means.
 
-    The rate q(x) = a x^2 + b x + c is kept positive and falling on [0, jam] and at most `max_rate` [1/s] (the inverse
-    of the integration step); beyond `jam` [veh], where there is no data, the outflow stays constant. Every bin of
-    accumulation counts alike, so that the many samples of an empty city do not decide. Raises ValueError without
-    samples.
+    The rate q(x) = a x^2 + b x + c is kept positive and falling up to the jam accumulation and at most `max_rate`
+    [1/s] (the inverse of the integration step). The jam accumulation is that of the best fit, at most the largest
+    sample: where there is no data the outflow stays constant. Every bin of accumulation counts alike, so that the
+    many samples of an empty city do not decide. Raises ValueError without samples.
     """
-    from scipy.optimize import minimize  # slow to import, and only identification needs it
-
-    x, g = np.asarray(accumulation, dtype=float) / jam, np.asarray(outflow, dtype=float)
-    good = np.isfinite(x) & np.isfinite(g) & (x > 0) & (x <= 1.0)
+    x, g = np.asarray(accumulation, dtype=float), np.asarray(outflow, dtype=float)
+    good = np.isfinite(x) & np.isfinite(g) & (x > 0)
     if not good.any():
         raise ValueError("no samples to fit an MFD to")
     x, g = x[good], g[good]
-    number = np.minimum((x * bins).astype(int), bins - 1)
+    number = np.minimum((bins * x / x.max()).astype(int), bins - 1)
     used = np.unique(number)
-    x = np.array([x[number == n].mean() for n in used])
-    g = np.array([g[number == n].mean() for n in used])
-    # Scaled: g = (A x^2 + B x + C) x with x in [0, 1]. Falling: B <= 0 and 2 A + B <= 0 (q' is linear in x).
+    mean_x = np.array([x[number == n].mean() for n in used])
+    mean_g = np.array([g[number == n].mean() for n in used])
+    candidates = [_fit_cubic(mean_x, mean_g, float(share * x.max()), max_rate) for share in np.linspace(0.2, 1.0, 17)]
+    return min(candidates, key=lambda curve: ((curve.outflow(mean_x) - mean_g) ** 2).sum())
+
+
+def _fit_cubic(x: np.ndarray, g: np.ndarray, jam: float, max_rate: float) -> Mfd:
+    """The best curve with a given jam accumulation."""
+    from scipy.optimize import minimize  # slow to import, and only identification needs it
+
+    # Scaled: g = (A y^2 + B y + C) y with y = x / jam, at most 1. Falling: B <= 0 and 2 A + B <= 0 (q' is linear).
     # Positive at the jam: A + B + C >= floor.
-    scale = g.max()
-    design = np.stack([x**3, x**2, x], axis=1)
+    y, scale = np.minimum(x / jam, 1.0), g.max()
+    design = np.stack([y**3, y**2, y], axis=1)
     floor, ceiling = 0.01, min(max_rate * jam / scale, 1e3)
     result = minimize(
         lambda p: ((design @ p - g / scale) ** 2).sum(), x0=np.array([0.0, -1.0, 2.0]),
-        jac=lambda p: 2.0 * design.T @ (design @ p - g / scale), method="SLSQP", options={"maxiter": 500, "ftol": 1e-14},
+        jac=lambda p: 2.0 * design.T @ (design @ p - g / scale), method="SLSQP",
+        options={"maxiter": 500, "ftol": 1e-14},
         constraints={
             "type": "ineq", "fun": lambda p: np.array(
                 [-p[1], -2 * p[0] - p[1], p[0] + p[1] + p[2] - floor, p[2] - floor, ceiling - p[2]]),
             "jac": lambda p: np.array([[0, -1, 0], [-2, -1, 0], [1, 1, 1], [0, 0, 1], [0, 0, -1]], dtype=float)})
-    third, second, first = (float(p) for p in result.x * scale)
+    third, second, first = (float(value) for value in result.x * scale)
     return Mfd(a=third / jam**3, b=second / jam**2, c=first / jam, jam=jam)
