@@ -1,0 +1,144 @@
+"""The command line `cosim`: run, compare and identify on a few control intervals, and its error lines."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+from click.testing import CliRunner
+
+from cosim.cli import main
+from nmfd.controllers.dpc import Architecture, Policy, checkpoint
+from nmfd.network import load_network
+from nmfd.runs import COLUMNS
+from nmfd.scenario import load_scenario
+
+ROOT = Path(__file__).parents[1]
+GRID = ROOT / "networks" / "grid7"
+STEPS = "3"
+
+
+def cosim(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def good(result):
+    assert result.exit_code == 0, result.output + str(result.exception)
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A copy of grid7_peak and its network, so that tests may change them; six intervals, earlier peak."""
+    folder = tmp_path_factory.mktemp("small")
+    shutil.copytree(GRID, folder / "networks" / "grid7")
+    source = ROOT / "scenarios" / "grid7_peak" / "scenario.toml"
+    text = source.read_text().replace("ramp_up = 900.0", "ramp_up = 90.0")
+    (folder / "scenarios" / "small").mkdir(parents=True)
+    (folder / "scenarios" / "small" / "scenario.toml").write_text(text)
+    scenario = load_scenario(folder / "scenarios" / "small")
+    for name, guidance in (("dpc-pc", False), ("dpc-pcrg", True)):
+        torch.manual_seed(0)
+        policy = Policy(scenario.network, Architecture(width=8, guidance=guidance))
+        torch.save(checkpoint(policy, scenario.network, {}), scenario.folder / f"{name}.pt")
+    return scenario.folder
+
+
+@pytest.mark.parametrize("controller", ["no-control", "pi-gating", "mpc-pc", "mpc-pcrg", "dpc-pc", "dpc-pcrg"])
+def test_every_controller_runs(small, tmp_path, controller):
+    out = tmp_path / "run"
+    text = good(cosim("run", small, "--controller", controller, "--steps", STEPS, "--out", out))
+    summary, facts = pd.read_csv(out / "summary.csv"), pd.read_csv(out / "sumo.csv")
+    assert list(summary.columns) == list(COLUMNS) and len(summary) == len(facts) == 1
+    assert summary.loc[0, "plant"] == "sumo" and summary.loc[0, "solver_failures"] == 0
+    assert 0 < facts.loc[0, "overhead_share"] < 1 and "outside SUMO" in text and controller in text
+    assert facts.loc[0, "departed_veh"] - summary.loc[0, "completed_veh"] == summary.loc[0, "final_accumulation_veh"]
+    assert (out / "total_accumulation.png").stat().st_size > 10_000
+
+
+def test_run_against_and_compare(small, tmp_path):
+    out = tmp_path / "run"
+    arguments = ("run", small, "--controller", "pi-gating", "--against", "no-control", "--steps", STEPS, "--out", out)
+    text = good(cosim(*arguments))
+    assert "no-control" in text and "pi-gating" in text and "change" in text
+    before = (out / "summary.csv").read_bytes()
+    good(cosim(*arguments))  # everything is there already
+    assert (out / "summary.csv").read_bytes() == before
+    assert json.loads((out / "manifest.json").read_text())["configuration"]["plant"] == "sumo"
+    text = good(cosim("compare", out, "--controller", "pi-gating"))
+    rows = pd.read_csv(out / "compare-pi-gating-0.csv")
+    assert list(rows["region"]) == ["0", "1", "2", "3", "4", "5", "6", "all"] and "RMSE" in text
+    assert (rows["rmse_veh"] >= rows["bias_veh"].abs() - 1e-9).all()
+    for picture in ("accumulation", "mfd"):
+        assert (out / f"compare-pi-gating-0-{picture}.png").stat().st_size > 10_000
+
+
+def test_compare_runs_a_scenario_itself(small, tmp_path):
+    good(cosim("compare", small, "--steps", STEPS, "--out", tmp_path / "run"))
+    assert (tmp_path / "run" / "compare-no-control-0.csv").is_file()
+
+
+def test_identify_writes_a_network_that_loads(small, tmp_path):
+    folder = small.parent.parent
+    shutil.copytree(folder, tmp_path / "city")
+    scenario, network = tmp_path / "city" / "scenarios" / "small", tmp_path / "city" / "networks" / "grid7"
+    text = (scenario / "scenario.toml").read_text()
+    (scenario / "scenario.toml").write_text(text.replace("steps = 80", "steps = 7"))
+    before = load_network(network)
+    out = tmp_path / "identify"
+    good(cosim("identify", scenario, "--levels", "1.0", "--seeds", "2", "--out", out))
+    after = load_network(network)
+    assert after.hash != before.hash and (after.adjacency == before.adjacency).all()
+    assert after.own_splits and all(mfd.problem() is None for mfd in after.mfds)
+    assert len(pd.read_csv(out / "samples.csv")) > 40 and (out / "mfd.png").is_file()
+
+
+def error_line(result):
+    assert result.exit_code == 2, result.output + str(result.exception)
+    assert result.stderr.startswith("cosim: error: ") and result.stderr.count("\n") == 1, result.stderr
+    return result.stderr
+
+
+@pytest.mark.parametrize("old, new, expected", [
+    ("compliance = 1.0", "complience = 1.0", "sumo.complience: unknown key"),
+    ("compliance = 1.0", "compliance = 2.0", "sumo.compliance: expected a number in [0, 1], got 2.0 instead"),
+    ('actuation = "hold-back"', 'actuation = "hold"', "sumo.actuation: expected one of hold-back, redistribute"),
+    ("step_length = 1.0", "step_length = 0.7", "sumo.step_length: expected a divisor of the control interval"),
+    ("steps = 80", 'steps = "80"', "scenario.toml: steps: "),
+    ("from = 2", "from = 9", "region 9 is unknown"),
+    ("../../networks/grid7", "../../networks/none", "network.toml: no such file"),
+    ("../../networks/grid7", str(ROOT / "networks" / "hexagon7"), "sumo"),
+])
+def test_scenario_errors(small, tmp_path, old, new, expected):
+    shutil.copytree(small.parent.parent, tmp_path / "city")
+    file = tmp_path / "city" / "scenarios" / "small" / "scenario.toml"
+    assert old in file.read_text()
+    file.write_text(file.read_text().replace(old, new, 1))
+    out = tmp_path / "out"
+    assert expected in error_line(cosim("run", file.parent, "--controller", "no-control", "--out", out))
+    assert not out.exists()
+
+
+def test_policy_for_another_network(small, tmp_path):
+    network = load_network(ROOT / "networks" / "hexagon7")
+    torch.save(checkpoint(Policy(network, Architecture(width=8)), network, {}), tmp_path / "other.pt")
+    result = cosim("run", small, "--controller", "dpc-pc", "--policy", tmp_path / "other.pt", "--out", tmp_path / "out")
+    assert "other.pt: network_hash: the policy was trained for network 'hexagon7'" in error_line(result)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("arguments, expected", [
+    (("run", "{small}", "--controller", "nobody"), "controller 'nobody' is unknown; choose from no-control"),
+    (("run", "{small}"), "--controller"),
+    (("run", "{tmp}/none", "--controller", "no-control"), "scenario.toml: no such file"),
+    (("run", "{small}", "--controller", "no-control", "--steps", "0"), "--steps"),
+    (("run", "{small}", "--controller", "no-control", "--policy", "x.pt"), "reads no policy"),
+    (("identify", "{small}", "--levels", "a,b"), "--levels: expected numbers above 0 up to 10"),
+    (("compare", "{tmp}"), "scenario.toml: no such file"),
+    (("drive",), "drive"),
+])
+def test_command_line_errors(small, tmp_path, arguments, expected):
+    filled = [argument.format(small=small, tmp=tmp_path) for argument in arguments]
+    assert expected in error_line(cosim(*filled))
