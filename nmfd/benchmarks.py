@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
+from scipy.special import stdtrit
 
-from nmfd import closed_loop, plots, runs
+from nmfd import closed_loop, runs
 from nmfd.controllers import registry
 from nmfd.plant import AcyclicPlant, NmfdPlant
 from nmfd.scenario import Scenario
@@ -18,8 +18,6 @@ from nmfd.workers import Failure, RunFailed, attempt, outcomes
 
 PLANTS = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
-# Two-sided 95 % quantiles of Student's t for 1, 2, ... degrees of freedom; a series gives the rest to three digits.
-STUDENT = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
 CAPTION = (
     "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against no-control; control: time of all\n"
     "decisions of a run; step: median / longest decision; failures: decisions that were a fallback, all seeds")
@@ -103,6 +101,8 @@ def _results(work, todo: Sequence[tuple[str, int]], workers: int, steps: int, pr
 
 def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -> None:
     """The paper's figures of `trajectories` and of their scenario, as png files in `folder`."""
+    from nmfd import plots  # workers import this module, and none of them draws
+
     drawing = plots.figure(8.0, 4.6)
     ax = plots.total_accumulation(drawing.subplots(), trajectories)
     plots.legend_below(drawing, [ax], columns=6)
@@ -111,19 +111,21 @@ def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -
     drawing, axes = plots.panels(network.regions)
     for region, ax in enumerate(axes):
         plots.region_accumulation(ax, network, region, trajectories)
-    plots.legend_below(drawing, axes, columns=min(3, network.regions))
+    plots.legend_below(drawing, axes, columns=3)
     plots.save(drawing, folder / "region_accumulation.png")
     draw_scenario(folder, scenario)
 
 
 def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
     """Spawn matrix, region map and MFDs of `scenario`, as png files in `folder`."""
+    from nmfd import plots
+
     network = scenario.network
     drawing = plots.figure(11.0, 4.8)
     left, right = drawing.subplots(1, 2)
     plots.spawn_matrix(left, scenario)
     plots.demand(right, scenario)
-    plots.legend_below(drawing, [right], columns=6)
+    plots.legend_below(drawing, [right])
     files = [plots.save(drawing, folder / "spawn_matrix.png")]
     drawing = plots.figure(5.5, 5.0)
     plots.region_map(drawing.subplots(), network)
@@ -135,25 +137,16 @@ def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
     for ax, (mfd, regions) in zip(axes, kinds.items(), strict=True):
         plots.mfd(ax, mfd)
         ax.set_title("region " + ", ".join(map(str, regions)) if len(kinds) > 1 else "every region", fontsize="medium")
-    plots.legend_below(drawing, axes, columns=2 if len(axes) < 3 else 4)
+    plots.legend_below(drawing, axes)
     files.append(plots.save(drawing, folder / "mfd.png"))
     return files
 
 
-def student(degrees: int) -> float:
-    """The two-sided 95 % quantile of Student's t."""
-    if degrees <= len(STUDENT):
-        return STUDENT[degrees - 1]
-    z = 1.959964
-    terms = ((z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384)
-    return z + sum(term / degrees**n for n, term in enumerate(terms, start=1))
-
-
 def interval(values: Sequence[float]) -> float:
-    """Half of the 95 % interval of the mean of `values`; NaN of a single one."""
+    """Half of the 95 % interval of the mean of `values` (Student's t); NaN of a single one."""
     if len(values) < 2:
         return math.nan
-    return student(len(values) - 1) * statistics.stdev(values) / math.sqrt(len(values))
+    return float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
 
 
 def table(rows: Sequence[Mapping]) -> str:

@@ -1,6 +1,6 @@
 """Figures: every function draws into the `ax` it is given and returns it. Nothing is simulated here.
 
-`save` and `figure` make files without pyplot, and so without a display or global state.
+`figure`, `panels` and `save` make files without pyplot, and so without a display or global state.
 """
 
 import zlib
@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator, MultipleLocator, StrMethodFormatter
@@ -43,7 +44,9 @@ def colour(controller: str) -> str:
 
 def figure(width: float, height: float) -> Figure:
     """An empty figure [inch] that keeps its parts from overlapping."""
-    return Figure(figsize=(width, height), layout="constrained")
+    drawing = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(drawing)
+    return drawing
 
 
 def save(drawing: Figure, path: Path) -> Path:
@@ -53,11 +56,11 @@ def save(drawing: Figure, path: Path) -> Path:
     return path
 
 
-def panels(count: int):
+def panels(count: int) -> tuple[Figure, list[Axes]]:
     """A figure with `count` axes, at most four in a row."""
     columns = min(4, count)
     rows = -(-count // columns)
-    drawing = figure(6.0 if count == 1 else 3.3 * columns, 1.0 + (3.6 if count == 1 else 2.7 * rows))
+    drawing = figure(6.8 if count == 1 else 3.3 * columns, 1.0 + (3.6 if count == 1 else 2.7 * rows))
     grid = np.ravel(drawing.subplots(rows, columns))
     for ax in grid[count:]:
         ax.remove()
@@ -65,11 +68,15 @@ def panels(count: int):
 
 
 def legend_below(drawing: Figure, axes: Sequence[Axes], columns: int = 4) -> None:
-    """One legend for all `axes`, below them; every label once, zones last."""
+    """One legend for all `axes`, below them, in as many `columns` as fit; every label once, zones last."""
     entries = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     entries |= {label: entries.pop(label) for label, _, _ in ZONES if label in entries}
-    drawing.legend(
-        entries.values(), entries.keys(), loc="outside lower center", ncols=min(columns, len(entries)), frameon=False)
+    for number in range(min(columns, len(entries)), 0, -1):
+        legend = drawing.legend(
+            entries.values(), entries.keys(), loc="outside lower center", ncols=number, frameon=False)
+        if number == 1 or legend.get_window_extent(drawing.canvas.get_renderer()).width <= drawing.bbox.width:
+            return
+        legend.remove()
 
 
 def optimal_band(mfd: Mfd) -> tuple[float, float]:

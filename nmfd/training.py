@@ -5,7 +5,6 @@ validation on the scenario itself is kept. The same seed gives the same weights.
 """
 
 import math
-import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import torch
 from nmfd import dynamics, toml
 from nmfd.controllers.dpc import ACTIVATIONS, Architecture, Policy, checkpoint
 from nmfd.errors import InputError
+from nmfd.runs import atomic
 from nmfd.scenario import Scenario
 
 VALIDATE_EVERY = 20  # Adam steps
@@ -123,6 +123,7 @@ def train(
     """
     chosen = settings(scenario, controller, steps)
     configuration = {"controller": controller, "scenario": scenario.name, "seed": seed, **asdict(chosen)}
+    torch.set_num_threads(1)  # the matrices are small: more threads only wait for one another
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     architecture = Architecture(
@@ -157,6 +158,8 @@ def train(
                 _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
         if progress:
             progress(step + 1, chosen.steps, f"best {best:.4g} veh s")
+    if not math.isfinite(best):
+        raise RuntimeError(f"{controller}: every validation of {chosen.steps} steps diverged; lower the learning rate")
     state_file.unlink(missing_ok=True)
     return out
 
@@ -194,6 +197,5 @@ def _restore(state_file: Path, configuration, policy, optimizer, generator) -> t
 
 
 def _write(content: dict, path: Path) -> None:
-    temporary = path.with_name(path.name + ".tmp")
-    torch.save(content, temporary)
-    os.replace(temporary, path)
+    with atomic(path) as temporary:
+        torch.save(content, temporary)

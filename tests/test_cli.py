@@ -1,0 +1,226 @@
+"""The command line: benchmark, train and show on a tiny scenario; quick help; one line for Ctrl-C and failures."""
+
+import importlib
+import json
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import tiny
+from click.testing import CliRunner
+
+from nmfd import benchmarks, closed_loop, runs, training
+from nmfd.cli import main
+from nmfd.controllers import registry
+from nmfd.controllers.gating import PiGating
+
+HEAVY = ("torch", "casadi", "libsumo", "numpy", "pandas", "matplotlib")
+TIMES = ("evaluation_time_s", "control_step_ms_median", "control_step_ms_max")
+COLUMNS = (
+    "controller,seed,plant,total_time_spent_veh_s,final_accumulation_veh,max_accumulation_veh,completed_veh,"
+    "evaluation_time_s,control_step_ms_median,control_step_ms_max,solver_failures")
+
+
+def nmfd(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    return tiny.write(tmp_path)
+
+
+@pytest.fixture
+def benchmark_command(scenario, tmp_path):
+    return ["benchmark", scenario, "--controllers", "no-control,pi-gating", "--seeds", 2, "--out", tmp_path / "out"]
+
+
+def timeless(folder):
+    """The rows of summary.csv without what differs from run to run, and the bytes of every trajectory."""
+    rows = [{key: value for key, value in row.items() if key not in TIMES} for row in runs.read_summary(
+        folder / "summary.csv")]
+    return rows, {path.name: path.read_bytes() for path in folder.glob("*.npz")}
+
+
+@pytest.mark.parametrize("package, commands", [
+    ("nmfd", [[], ["benchmark"], ["train"], ["show"]]), ("cosim", [[]])])
+def test_help_is_quick_and_shows_an_example(package, commands):
+    for command in commands:
+        call = [sys.executable, "-c", f"from {package}.cli import main; main()", *command, "--help"]
+        durations = []
+        for _ in range(4):  # the least of them: the machine has other work
+            begin = time.perf_counter()
+            text = subprocess.run(call, capture_output=True, text=True, check=True).stdout
+            durations.append(time.perf_counter() - begin)
+            if durations[-1] < 0.5:
+                break
+        assert min(durations) < 0.5
+        assert "Example" in text and "Usage: " + " ".join([package, *command]) in text
+
+
+@pytest.mark.parametrize("package", ["nmfd", "cosim"])
+def test_importing_the_command_line_imports_nothing_heavy(package):
+    code = f"import sys, {package}.cli; print(*[name for name in {HEAVY} if name in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "\n"
+
+
+@pytest.mark.parametrize("package", ["nmfd", "cosim"])
+def test_every_command_shows_an_example(package):
+    group = importlib.import_module(f"{package}.cli").main
+    for name in ([], *([command] for command in group.commands)):
+        assert "Example" in CliRunner().invoke(group, [*name, "--help"]).stdout
+
+
+def test_without_arguments_the_help_is_shown():
+    result = nmfd()
+    assert result.exit_code == 0 and "benchmark" in result.stdout
+
+
+def test_the_help_names_every_controller():
+    assert ",".join(registry.names()) in "".join(nmfd("benchmark", "--help").stdout.split())
+
+
+def test_registry_agrees_with_training():
+    assert registry._WITH_POLICY == training.NAMES
+
+
+def test_benchmark_writes_a_run_folder(benchmark_command, tmp_path):
+    result = nmfd(*benchmark_command)
+    assert result.exit_code == 0, result.stderr
+    lines = result.stdout.splitlines()
+    assert lines[2].split()[:2] == ["no-control", "2"] and lines[3].split()[:2] == ["pi-gating", "2"]
+    assert "±" in lines[3] and lines[3].count("%") == 1
+    assert lines[-1] == f"Written to {tmp_path / 'out'}"
+    summary = (tmp_path / "out" / "summary.csv").read_text().splitlines()
+    assert summary[0] == COLUMNS
+    assert [line.split(",")[:3] for line in summary[1:]] == [
+        [name, seed, "nmfd"] for name in ("no-control", "pi-gating") for seed in "01"]
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert manifest["configuration"]["plant"] == "nmfd"
+    assert manifest["sessions"][0]["seeds"] == [0, 1] and manifest["sessions"][0]["versions"]["torch"]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "summary.csv", "manifest.json", "total_accumulation.png", "region_accumulation.png", "spawn_matrix.png",
+        "region_map.png", "mfd.png", "no-control-0.npz", "no-control-1.npz", "pi-gating-0.npz", "pi-gating-1.npz"}
+
+
+def test_trajectories_of_the_folder_agree_with_the_summary(benchmark_command, tmp_path):
+    nmfd(*benchmark_command, "--plant", "acyclic")
+    for row in runs.read_summary(tmp_path / "out" / "summary.csv"):
+        trajectory = runs.read_trajectory(tmp_path / "out" / f"{row['controller']}-{row['seed']}.npz")
+        assert trajectory.plant == row["plant"] == "acyclic"
+        assert 30.0 * trajectory.accumulation[:-1].sum() == pytest.approx(row["total_time_spent_veh_s"], rel=1e-12)
+        assert np.all(trajectory.accumulation >= 0)
+
+
+def test_two_workers_give_the_same_rows_as_one(benchmark_command, tmp_path):
+    assert nmfd(*benchmark_command).exit_code == 0
+    result = nmfd(*benchmark_command[:-1], tmp_path / "two", "--workers", 2)
+    assert result.exit_code == 0, result.stderr
+    assert timeless(tmp_path / "out") == timeless(tmp_path / "two")
+
+
+def test_an_interrupted_benchmark_goes_on(benchmark_command, tmp_path, monkeypatch):
+    nmfd(*benchmark_command[:-1], tmp_path / "whole")
+    calls = []
+
+    def run(*args, **kwargs):
+        calls.append(kwargs["seed"])
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return original(*args, **kwargs)
+
+    original = closed_loop.run
+    monkeypatch.setattr(closed_loop, "run", run)
+    result = nmfd(*benchmark_command)
+    assert result.exit_code == 130
+    assert result.stderr.count("\n") == 1 and f"--out {tmp_path / 'out'} goes on" in result.stderr
+    assert len(runs.read_summary(tmp_path / "out" / "summary.csv")) == 2
+    assert nmfd(*benchmark_command).exit_code == 0
+    assert len(calls) == 5  # two, the interrupted one, and the two that were left
+    assert timeless(tmp_path / "out") == timeless(tmp_path / "whole")
+    assert len(json.loads((tmp_path / "out" / "manifest.json").read_text())["sessions"]) == 2
+
+
+def test_interrupted_before_the_first_run_leaves_nothing(benchmark_command, tmp_path, monkeypatch):
+    def run(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(closed_loop, "run", run)
+    result = nmfd(*benchmark_command[:-1], tmp_path / "a" / "b")
+    assert (result.exit_code, result.stderr) == (
+        130, "nmfd: interrupted before a run was finished; nothing is kept\n")
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_failing_controller_names_itself_and_the_others_are_kept(benchmark_command, tmp_path, monkeypatch):
+    monkeypatch.setattr(PiGating, "act", lambda self, measurement: 1 / 0)
+    result = nmfd(*benchmark_command)
+    assert result.exit_code == 1 and result.stderr.count("\n") == 1
+    assert "controller pi-gating, seed 0: ZeroDivisionError: division by zero (test_cli.py:" in result.stderr
+    rows, trajectories = timeless(tmp_path / "out")
+    assert [row["controller"] for row in rows] == ["no-control"] * 2 and len(trajectories) == 2
+
+
+def test_controllers_can_be_added_to_a_folder(scenario, tmp_path):
+    out = ["--out", tmp_path / "out"]
+    assert nmfd("benchmark", scenario, "--controllers", "no-control", *out).exit_code == 0
+    result = nmfd("benchmark", scenario, "--controllers", "pi-gating", *out)
+    assert result.exit_code == 0, result.stderr
+    assert [row["controller"] for row in timeless(tmp_path / "out")[0]] == ["no-control", "pi-gating"]
+
+
+def test_a_folder_of_another_plant_is_refused(benchmark_command, tmp_path):
+    nmfd(*benchmark_command)
+    before = timeless(tmp_path / "out")
+    result = nmfd(*benchmark_command, "--plant", "acyclic")
+    assert result.exit_code == 2 and 'plant: "nmfd" there, "acyclic" asked for' in result.stderr
+    assert timeless(tmp_path / "out") == before
+
+
+def test_training_can_be_interrupted_and_resumed(scenario, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "VALIDATE_EVERY", 1)
+    calls = []
+
+    def random_start(self, *args):
+        calls.append(None)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return original(self, *args)
+
+    original = training.Rollout.random_start
+    monkeypatch.setattr(training.Rollout, "random_start", random_start)
+    command = ["train", scenario, "--controller", "dpc-pc", "--steps", 4]
+    result = nmfd(*command)
+    assert result.exit_code == 130 and result.stderr.count("\n") == 1
+    again = f"nmfd train {scenario} --controller dpc-pc --steps 4 --resume"
+    assert result.stderr.endswith(f"the best policy so far is {scenario / 'dpc-pc.pt'}; go on with: {again}\n")
+    assert nmfd("benchmark", scenario, "--controllers", "dpc-pc", "--out", tmp_path / "early").exit_code == 0
+    result = nmfd(*again.split()[1:])
+    assert result.exit_code == 0 and "best" in result.stdout and len(calls) == 5
+    assert {path.name for path in scenario.iterdir()} == {"scenario.toml", "dpc-pc.pt"}
+    assert nmfd("benchmark", scenario, "--controllers", "dpc-pc", "--out", tmp_path / "late").exit_code == 0
+
+
+def test_training_interrupted_at_once_keeps_nothing(scenario, monkeypatch):
+    def random_start(self, *args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(training.Rollout, "random_start", random_start)
+    result = nmfd("train", scenario, "--controller", "dpc-pc")
+    assert (result.exit_code, result.stderr) == (
+        130, "nmfd: interrupted before the first validation; nothing is kept\n")
+    assert [path.name for path in scenario.iterdir()] == ["scenario.toml"]
+
+
+def test_show_draws_the_scenario(scenario, tmp_path):
+    result = nmfd("show", scenario, "--out", tmp_path / "figures")
+    assert result.exit_code == 0, result.stderr
+    assert "2 regions, 360 trips between 1 pairs" in result.stdout
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"spawn_matrix.png", "region_map.png", "mfd.png"}
+
+
+def test_interval_is_students():
+    assert benchmarks.interval([1.0, 2.0, 3.0]) == pytest.approx(4.3027 / 3**0.5, rel=1e-4)
+    assert np.isnan(benchmarks.interval([1.0]))

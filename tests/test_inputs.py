@@ -1,0 +1,147 @@
+"""Bad input: one clear line that names the file and the key, exit status 2, nothing left behind."""
+
+import pytest
+import tiny
+import torch
+from click.testing import CliRunner
+
+from nmfd.cli import main
+from nmfd.controllers.dpc import Architecture, Policy, checkpoint
+from nmfd.network import load_network
+
+TO_1 = "to = 1"
+BENCHMARK = ["benchmark", "{scenario}", "--out", "{out}", "--controllers"]
+
+
+def nmfd(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def assert_one_line(result, *fragments):
+    assert result.exit_code == 2
+    assert result.stderr.startswith("nmfd: error: ") and result.stderr.count("\n") == 1, result.stderr
+    for fragment in fragments:
+        assert fragment in result.stderr
+    assert result.stdout == ""
+
+
+SCENARIO_ERRORS = {
+    "unknown key": (
+        tiny.SCENARIO.replace("steps =", "stepz = 20\nsteps ="), ["scenario.toml: stepz: unknown key", "steps"]),
+    "wrong type": (tiny.SCENARIO.replace("steps = 20", 'steps = "20"'), ["scenario.toml: steps:", "got '20' instead"]),
+    "missing key": (tiny.SCENARIO.replace("step = 30.0", ""), ["scenario.toml: step: missing"]),
+    "out of range": (tiny.SCENARIO.replace("peak = 2.0", "peak = -2.0"), ["scenario.toml: demand[0].peak:", "-2.0"]),
+    "demand for an unknown region": (
+        tiny.SCENARIO.replace(TO_1, "to = 7"), ["scenario.toml: demand[0].to: region 7 is unknown", "0 to 1"]),
+    "unknown key in a table": (
+        tiny.SCENARIO.replace(TO_1, TO_1 + "\nfrm = 0"), ["scenario.toml: demand[0].frm: unknown key"]),
+    "no TOML": ("name = tiny", ["scenario.toml: is not valid TOML"]),
+    "step too long": (tiny.SCENARIO.replace("step = 30.0", "step = 300.0"), ["scenario.toml: step:", "at most 238 s"]),
+    "network missing": (tiny.SCENARIO.replace("../network", "../none"), ["network.toml: no such file"]),
+}
+NETWORK_ERRORS = {
+    "adjacency not symmetric": (
+        tiny.row_network().replace("[0]", "[]"), ["network.toml: regions[0].adjacent: not symmetric"]),
+    "own neighbour": (tiny.row_network().replace("[0]", "[0, 1]"), ["network.toml: regions[1].adjacent:", "itself"]),
+    "neighbour unknown": (tiny.row_network().replace("[0]", "[5]"), ["network.toml: regions[1].adjacent:", "[5]"]),
+    "no way": (
+        tiny.row_network().replace("adjacent = [0]", "adjacent = []").replace("adjacent = [1]", "adjacent = []"),
+        ["network.toml: regions:", "cannot be reached"]),
+    "unknown key": (tiny.row_network().replace("max =", "mx = 1\nmax ="), ["network.toml: perimeter.mx: unknown key"]),
+    "wrong type": (tiny.row_network().replace("jam = 1000.0", "jam = true"), ["network.toml: mfd.jam:", "got True"]),
+    "no MFD": (tiny.row_network().replace("c = 0.0042", "c = -1"), ["network.toml: mfd.c: c must be positive"]),
+    "bounds": (tiny.row_network().replace("max = 0.9", "max = 0.1"), ["network.toml: perimeter: min must be less"]),
+}
+
+
+@pytest.mark.parametrize("command", ["benchmark", "train", "show"])
+@pytest.mark.parametrize("case", SCENARIO_ERRORS)
+def test_scenario_errors(tmp_path, case, command):
+    text, fragments = SCENARIO_ERRORS[case]
+    check_file_error(tiny.write(tmp_path, scenario=text), command, fragments)
+
+
+@pytest.mark.parametrize("command", ["benchmark", "train", "show"])
+@pytest.mark.parametrize("case", NETWORK_ERRORS)
+def test_network_errors(tmp_path, case, command):
+    text, fragments = NETWORK_ERRORS[case]
+    check_file_error(tiny.write(tmp_path, network=text), command, fragments)
+
+
+@pytest.mark.parametrize("command, controller, key", [
+    ("benchmark", "pi-gating", "kq"), ("train", "dpc-pc", "widht")])
+def test_controller_option_errors(tmp_path, command, controller, key):
+    text = tiny.SCENARIO + f"\n[controllers.{controller}]\n{key} = 1.0\n"
+    check_file_error(
+        tiny.write(tmp_path, scenario=text), command, [f"scenario.toml: controllers.{controller}.{key}: unknown key"])
+
+
+def check_file_error(scenario, command, fragments):
+    options = {"benchmark": ["--controllers", "no-control,pi-gating"], "train": ["--controller", "dpc-pc"], "show": []}
+    out = scenario.parent / "out"
+    assert_one_line(nmfd(command, scenario, *options[command], "--out", out), *fragments)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("arguments, fragment", [
+    (["benchmark", "{tmp}/none", "--controllers", "no-control"], "none/scenario.toml: no such file"),
+    (["show", "{tmp}/none"], "none/scenario.toml: no such file"),
+    ([*BENCHMARK, "none"], "controller 'none' is unknown; choose from no-control, pi-gating, mpc-pc"),
+    ([*BENCHMARK, ""], "controller '' is unknown"),
+    ([*BENCHMARK, "no-control,no-control"], "no-control is there twice"),
+    ([*BENCHMARK, "no-control", "--seeds", "0"], "'--seeds': 0 is not in the range"),
+    ([*BENCHMARK, "no-control", "--seeds", "two"], "'--seeds': 'two' is not a valid integer"),
+    ([*BENCHMARK, "no-control", "--workers", "-1"], "'--workers': -1"),
+    ([*BENCHMARK, "no-control", "--plant", "sumo"], "'sumo' is not one of 'nmfd', 'acyclic'"),
+    ([*BENCHMARK, "no-control", "--policy", "x"], "expected NAME=FILE, such as dpc-pc=mine.pt, got 'x' instead"),
+    ([*BENCHMARK, "no-control", "--policy", "dpc-pc=x"], "'dpc-pc' is not among --controllers no-control"),
+    ([*BENCHMARK, "no-control", "--policy", "no-control=x"], "x: controller no-control reads no policy"),
+    ([*BENCHMARK, "dpc-pc"], "dpc-pc.pt: no such policy for dpc-pc; train one with: nmfd train"),
+    (["benchmark", "{scenario}"], "Missing option '--controllers'"),
+    (["benchmark"], "Missing argument 'SCENARIO'"),
+    (["benchmrk"], "No such command 'benchmrk'"),
+    (["show", "{scenario}", "--colour"], "--colour"),
+    (["train", "{scenario}", "--controller", "pi-gating"], "'pi-gating' cannot be trained; choose one of dpc-pc"),
+    (["train", "{scenario}", "--controller", "dpc-pc", "--out", "{tmp}/no/x.pt"], "no: no such folder for the policy"),
+    (["train", "{scenario}", "--controller", "dpc-pc", "--resume"], "dpc-pc.pt.resume: nothing to resume"),
+    (["train", "{scenario}", "--controller", "dpc-pc", "--steps", "0"], "'--steps': 0 is not in the range"),
+    (["show", "{scenario}", "--out", "/dev/null/x"], "/dev/null/x: Not a directory"),
+    (["benchmark", "{scenario}", "--controllers", "no-control", "--out", "/dev/null/x"], "/dev/null/x"),
+])
+def test_command_line_errors(tmp_path, arguments, fragment):
+    scenario, out = tiny.write(tmp_path), tmp_path / "out"
+    result = nmfd(*[a.format(scenario=scenario, out=out, tmp=tmp_path) for a in arguments])
+    assert_one_line(result, fragment)
+    assert {path.name for path in tmp_path.iterdir()} == {"network", "scenario"}
+
+
+def test_policy_errors(tmp_path):
+    scenario, out = tiny.write(tmp_path / "two"), tmp_path / "out"
+    other = tiny.write(tmp_path / "three", network=tiny.row_network(3)).parent / "network"
+    networks = {"own": load_network(scenario.parent / "network"), "other": load_network(other)}
+    for name, network in networks.items():
+        torch.save(checkpoint(Policy(network, Architecture(width=4)), network, {}), tmp_path / f"{name}.pt")
+    (tmp_path / "text.pt").write_text("no policy")
+    torch.save({"weights": 1}, tmp_path / "damaged.pt")
+    for name, file, fragment in (
+            ("dpc-pc", "other.pt", "was trained for network 'row3'"), ("dpc-pc", "text.pt", "is not a policy file"),
+            ("dpc-pc", "damaged.pt", "is damaged or of another version"), ("dpc-pc", "none.pt", "no such policy"),
+            ("dpc-pcrg", "own.pt", "is a dpc-pc policy, not dpc-pcrg")):
+        result = nmfd("benchmark", scenario, "--controllers", f"no-control,{name}", "--out", out, "--policy",
+                      f"{name}={tmp_path / file}")
+        assert_one_line(result, f"{tmp_path / file}: ", fragment)
+        assert not out.exists()
+
+
+@pytest.mark.parametrize("content, fragment", [
+    ({"notes.txt": "mine"}, "is not empty and holds no manifest.json"),
+    ({"manifest.json": "{"}, "manifest.json: is no manifest of a run"),
+    ({"manifest.json": "[]"}, "manifest.json: is no manifest of a run"),
+])
+def test_a_folder_with_something_else_is_left_alone(tmp_path, content, fragment):
+    scenario, out = tiny.write(tmp_path), tmp_path / "out"
+    out.mkdir()
+    for name, text in content.items():
+        (out / name).write_text(text)
+    assert_one_line(nmfd("benchmark", scenario, "--controllers", "no-control", "--out", out), fragment)
+    assert {path.name: path.read_text() for path in out.iterdir()} == content

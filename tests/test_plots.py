@@ -1,0 +1,125 @@
+"""Figures: fixed colours, units on the axes, the right bands, and data that arrives in them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_runs import trajectory
+
+from nmfd import plots
+from nmfd.controllers import registry
+from nmfd.mfd import Mfd
+from nmfd.scenario import load_scenario
+
+SCENARIO = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return load_scenario(SCENARIO)
+
+
+@pytest.fixture
+def ax():
+    return plots.figure(5, 4).subplots()
+
+
+def runs_of(scenario, *, plants=("nmfd",), controllers=("no-control",), seeds=(0,), hours=2.0):
+    steps, regions = int(hours * 120), scenario.network.regions
+    return [
+        replace(trajectory(controller, seed), plant=plant, accumulation=np.full((steps + 1, regions, regions), 10.0),
+                backlog=np.ones((steps + 1, regions, regions)))
+        for plant in plants for controller in controllers for seed in seeds]
+
+
+def test_every_controller_has_its_own_colour():
+    assert set(plots.CONTROLLER_COLOURS) == set(registry.names())
+    assert len(set(plots.CONTROLLER_COLOURS.values())) == len(registry.names())
+    assert plots.colour("mine") == plots.colour("mine") in plots.OTHER_COLOURS
+
+
+def test_optimal_band_is_within_ten_percent_of_the_maximum(scenario):
+    mfd = scenario.network.mfds[0]
+    low, high = plots.optimal_band(mfd)
+    assert mfd.outflow([low, high]) == pytest.approx(0.9 * mfd.capacity, rel=1e-3)
+    assert low < mfd.critical < high
+
+
+def test_total_accumulation_counts_the_backlog(ax, scenario):
+    plots.total_accumulation(ax, runs_of(scenario))
+    assert ax.lines[0].get_ydata() == pytest.approx(49 * 11.0)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time [min]", "vehicles in the network [veh]")
+    assert ax.get_xlim() == (0.0, 120.0)
+
+
+def test_long_runs_are_in_hours(ax, scenario):
+    plots.total_accumulation(ax, runs_of(scenario, hours=6.0))
+    assert ax.get_xlabel() == "time [h]" and ax.get_xlim() == (0.0, 6.0)
+
+
+def test_seeds_share_one_curve_and_controllers_do_not(ax, scenario):
+    plots.total_accumulation(ax, runs_of(scenario, controllers=("no-control", "dpc-pc"), seeds=(0, 1)))
+    assert [line.get_label() for line in ax.lines] == ["no-control", "dpc-pc"]
+    assert [line.get_color() for line in ax.lines] == [plots.colour("no-control"), plots.colour("dpc-pc")]
+
+
+def test_plants_differ_in_line_style(ax, scenario):
+    plots.region_accumulation(ax, scenario.network, 3, runs_of(scenario, plants=("sumo", "nmfd")))
+    assert [(line.get_label(), line.get_linestyle()) for line in ax.lines] == [("SUMO", "-"), ("regional model", "--")]
+    assert len({line.get_color() for line in ax.lines}) == 1
+    assert ax.lines[0].get_ydata() == pytest.approx(70.0)
+    assert "veh" in ax.get_ylabel()
+
+
+def test_mfd_with_samples(ax, scenario):
+    samples = {"loading": np.array([[1000.0, 3.0], [6000.0, 8.0]]), "unloading": np.empty((0, 2))}
+    plots.mfd(ax, scenario.network.mfds[0], samples)
+    assert ax.get_ylim()[1] > 8.0 and ax.get_xlim()[1] > 6000.0
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("accumulation [veh]", "outflow [veh/s]")
+
+
+def test_mfd_without_a_tail(ax):
+    plots.mfd(ax, Mfd(a=0.0, b=-1e-6, c=0.004, jam=float("inf")))
+    assert np.isfinite(ax.get_xlim()).all()
+
+
+def test_spawn_matrix_shows_the_trips_of_every_pair(ax, scenario):
+    plots.spawn_matrix(ax, scenario)
+    assert [text.get_text() for text in ax.texts] == ["5,280"] * 6
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("destination region", "origin region")
+
+
+def test_scenario_without_demand(scenario):
+    left, right = plots.figure(8, 4).subplots(1, 2)
+    empty = replace(scenario, demand=np.zeros_like(scenario.demand))
+    plots.spawn_matrix(left, empty)
+    plots.demand(right, empty)
+    left.figure.canvas.draw()
+
+
+def test_region_map_names_every_region(ax, scenario):
+    plots.region_map(ax, scenario.network)
+    texts = [text.get_text() for text in ax.texts]
+    assert set(texts) == {*map(str, range(7)), *scenario.network.region_names}
+    assert len(ax.lines) == 12
+
+
+@pytest.mark.parametrize("width", [4, 8, 16])
+def test_the_legend_fits_the_figure(scenario, width):
+    drawing = plots.figure(width, 4)
+    ax = plots.region_accumulation(
+        drawing.subplots(), scenario.network, 3, runs_of(scenario, controllers=registry.names()))
+    plots.legend_below(drawing, [ax], columns=8)
+    assert len(drawing.legends) == 1 and len(drawing.legends[0].get_texts()) == 8
+    assert drawing.legends[0].get_window_extent(drawing.canvas.get_renderer()).width <= drawing.bbox.width
+
+
+def test_plots_leave_pyplot_alone(scenario, tmp_path):
+    import sys
+
+    drawing = plots.figure(4, 3)
+    plots.total_accumulation(drawing.subplots(), runs_of(scenario))
+    plots.save(drawing, tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 1000 and len(list(tmp_path.iterdir())) == 1
+    assert "matplotlib.pyplot" not in sys.modules

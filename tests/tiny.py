@@ -1,0 +1,56 @@
+"""A scenario small enough for tests: two or three regions in a row, 0-1-2, twenty control intervals."""
+
+from pathlib import Path
+
+NETWORK = """
+name = "{name}"
+
+[perimeter]
+min = 0.1
+max = 0.9
+
+[mfd]
+a = 4.133e-9
+b = -8.282e-6
+c = 0.0042
+jam = 1000.0
+"""
+REGION = """
+[[regions]]
+position = [{position}.0, 0.0]
+adjacent = {adjacent}
+"""
+SCENARIO = """
+name = "tiny"
+network = "../network"
+step = 30.0
+steps = 20
+protected = [1]
+
+[noise]
+measurement_std = 0.5
+
+[[demand]]
+from = 0
+to = 1
+start = 0.0
+peak = 2.0
+ramp_up = 60.0
+flat = 120.0
+ramp_down = 60.0
+"""
+
+
+def row_network(regions: int = 2) -> str:
+    """network.toml of `regions` regions in a row."""
+    return NETWORK.format(name=f"row{regions}") + "".join(
+        REGION.format(position=region, adjacent=[h for h in (region - 1, region + 1) if 0 <= h < regions])
+        for region in range(regions))
+
+
+def write(folder: Path, *, scenario: str = SCENARIO, network: str | None = None) -> Path:
+    """The folder of a scenario in `folder`, its network beside it."""
+    for name, text in (("network", row_network() if network is None else network), ("scenario", scenario)):
+        (folder / name).mkdir(parents=True)
+        (folder / name / f"{name}.toml").write_text(text)
+    return folder / "scenario"
