@@ -94,13 +94,10 @@ def train(scenario: Path, controller: str, seed: int, steps: int | None, out: Pa
       nmfd train scenarios/economic_mpc --controller dpc-pcrg
       nmfd train scenarios/economic_mpc --controller dpc-pc --steps 200 --out mine.pt
     """
-    import torch
-
     from nmfd import training
     from nmfd.progress import progress_line
     from nmfd.scenario import load_scenario
 
-    torch.set_num_threads(1)  # the tensors are small: more threads spend their time waiting, tenfold on a busy machine
     loaded = load_scenario(scenario)
     training.settings(loaded, controller, steps)  # complains of the name before a file is named after it
     file = scenario / f"{controller}.pt" if out is None else out

@@ -53,7 +53,7 @@ def check(states, phases, min_green=MIN_GREEN):
         least = min([length for c, length in runs(originals, link)[1:-1] if c == "G"], default=min_green)
         yellow = [length for c, length in runs(originals, link)[1:-1] if c == "y"]
         sequence = runs(states, link)
-        for (before, length), (after, _) in itertools.pairwise(sequence):
+        for (before, _), (after, _) in itertools.pairwise(sequence):
             assert (before, after) != ("G", "r"), f"link {link} goes from green to red without yellow"
         for n, (shown, length) in enumerate(sequence[1:-1], start=1):
             if shown == "G":
@@ -75,7 +75,7 @@ def test_u_max_is_the_original_programme(mode, phases):
 @pytest.mark.parametrize("phases", [PHASES, SINGLE])
 def test_random_commands_are_safe(mode, phases):
     random = np.random.default_rng(3)
-    for trial in range(40):
+    for _ in range(40):
         links = random.permutation(len(phases[0][0]))[: random.integers(1, len(phases[0][0]) + 1)]
         movements = {int(link): (0, int(link) + 1) for link in links}
         commands = random.uniform(-0.2, 1.2, (30, 6, 6)).clip(0, 1)

@@ -23,9 +23,12 @@ FORMAT = 1
 class SoftExponential(nn.Module):
     """Trainable activation between logarithm, identity and exponential (Godfrey and Gashler, 2015), per unit.
 
-    f(a, x) = -ln(1 - a (x + a)) / a for a < 0, x at a = 0, (exp(a x) - 1) / a + a for a > 0. The logarithm is odd-
-    extended below its pole, so that f is defined and increasing for every x.
+    f(a, x) = -ln(1 - a (x + a)) / a for a < 0, x at a = 0, (exp(a x) - 1) / a + a for a > 0. Near its pole and below
+    the logarithm goes on along its tangent, and the exponential stops growing at e^20, so that f and its gradients
+    are finite for every x.
     """
+
+    POLE = 1e-3  # the argument of the logarithm from which on its tangent is taken
 
     def __init__(self, width: int):
         super().__init__()
@@ -35,8 +38,11 @@ class SoftExponential(nn.Module):
         small = self.alpha.abs() < 1e-4
         safe = torch.where(small, torch.full_like(self.alpha, 1e-4), self.alpha)
         rising = torch.expm1((safe * x).clamp(max=20.0)) / safe + safe
-        logarithm = -torch.log((1.0 - safe * (x + safe)).clamp(min=1e-6)) / safe
-        return torch.where(small, x, torch.where(safe > 0, rising, logarithm))
+        argument = 1.0 - safe * (x + safe)
+        logarithm = torch.log(argument.clamp(min=self.POLE)) + (argument - self.POLE).clamp(max=0.0) / self.POLE
+        # Near a = 0 the first-order expansion in a: with x alone, a would have no gradient and stay 0 for ever.
+        identity = x + self.alpha * (1.0 + 0.5 * x * x)
+        return torch.where(small, identity, torch.where(safe > 0, rising, -logarithm / safe))
 
 
 ACTIVATIONS = {

@@ -4,7 +4,9 @@ As in Tumu et al.: perimeter control alone ("mpc-pc") or with route guidance ("m
 nothing assumed beyond the horizon. Multiple shooting on nmfd.dynamics_casadi with exact second derivatives.
 """
 
-from collections.abc import Callable
+import signal
+import threading
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import casadi as ca
@@ -17,7 +19,7 @@ from nmfd.scenario import Scenario
 from nmfd.types import Controls, Measurement
 
 UNIT = 1000.0       # veh: accumulations in the solver, so that its variables are of the order of 1
-ROUNDING = 50.0     # veh: over which the solver sees the kink of the MFD at the jam accumulation rounded off
+ROUNDING = 0.005    # of the smallest jam accumulation: over which the solver sees the kink of the MFD there rounded off
 TOLERANCE = 1e-6    # of the optimality conditions; a tenth changes the benchmark's total time spent by 0.02 %
 # Closing a perimeter, or leaving the drivers' own routes, must save this many vehicles for one interval. Far below the
 # measurement noise; without it whatever has no effect floats between its bounds, and IPOPT needs twice the iterations.
@@ -110,8 +112,8 @@ def layout(network: Network, destinations: np.ndarray, *, guidance: bool) -> Lay
         upper=np.concatenate([np.full(len(edges), network.u_max), np.ones(len(turns))]))
 
 
-def interval(scenario: Scenario, chosen: Layout, *, substeps: int, rounding: float = 0.0) -> ca.Function:
-    """The regional model over `substeps` integration steps: (state, decision, demand) -> state.
+def step_function(scenario: Scenario, chosen: Layout, *, rounding: float = 0.0) -> ca.Function:
+    """One integration step of the regional model, (state, decision, demand) -> state.
 
     state (R*J,) [UNIT veh] and demand (R*J,) [veh/s]: the columns of the destinations in use, one after the other.
     """
@@ -126,9 +128,8 @@ def interval(scenario: Scenario, chosen: Layout, *, substeps: int, rounding: flo
 
     x = model.advance(
         model.parameters(scenario.network, rounding=rounding), UNIT * matrix(state), matrix(demand),
-        *chosen.symbols(decision), scenario.step / scenario.substeps * substeps, integrator=scenario.integrator,
-        substeps=substeps)
-    return ca.Function("interval", [state, decision, demand], [ca.vec(ca.densify(x)[:, columns]) / UNIT])
+        *chosen.symbols(decision), scenario.step / scenario.substeps, integrator=scenario.integrator)
+    return ca.Function("step", [state, decision, demand], [ca.vec(ca.densify(x)[:, columns]) / UNIT])
 
 
 def solver(scenario: Scenario, chosen: Layout, moves: int, limits: Options) -> ca.Function:
@@ -137,7 +138,7 @@ def solver(scenario: Scenario, chosen: Layout, moves: int, limits: Options) -> c
     Parameters: the state now, then the demand of every interval. The states are nodes without bounds: the model keeps
     them non-negative by itself, and a bound that the dynamics pin (an empty region) has no interior.
     """
-    advance = interval(scenario, chosen, substeps=1, rounding=ROUNDING)
+    advance = step_function(scenario, chosen, rounding=ROUNDING * min(mfd.jam for mfd in scenario.network.mfds))
     cells, nodes = advance.size1_in(0), limits.horizon * scenario.substeps
     decisions, states = ca.SX.sym("decisions", len(chosen.lower), moves), ca.SX.sym("states", cells, nodes)
     start, demand = ca.SX.sym("start", cells), ca.SX.sym("demand", cells, limits.horizon)
@@ -148,8 +149,7 @@ def solver(scenario: Scenario, chosen: Layout, moves: int, limits: Options) -> c
         state = states[:, node]
     open_edges, shares = decisions[:len(chosen.edges), :], decisions[len(chosen.edges):, :]
     if len(chosen.turns):
-        sums = ca.DM.ones(len(chosen.turns)).T
-        member = ca.DM.triplet(chosen.group.tolist(), list(range(len(chosen.turns))), sums.T)
+        member = ca.DM.triplet(chosen.group.tolist(), list(range(len(chosen.turns))), [1.0] * len(chosen.turns))
         constraints.append(ca.vec(member @ shares) - 1.0)
     own = chosen.splits[tuple(chosen.turns.T)]
     preference = ca.sum1(ca.vec(1.0 - open_edges)) + ca.sum1(ca.vec(ca.repmat(1.0 - own, 1, moves) * shares))
@@ -160,7 +160,8 @@ def solver(scenario: Scenario, chosen: Layout, moves: int, limits: Options) -> c
     return ca.nlpsol("solver", "ipopt", problem, {
         "print_time": False, "ipopt": {
             "print_level": 0, "sb": "yes", "tol": TOLERANCE, "max_iter": limits.max_iterations,
-            "max_wall_time": limits.time_limit}})
+            "max_wall_time": limits.time_limit,
+            "mumps_pivot_order": 0}})  # AMD: for these matrices 1.5 times as fast as MUMPS's own choice
 
 
 class EconomicMpc:
@@ -169,44 +170,99 @@ class EconomicMpc:
     The last plan, moved on by one interval, is where the solver starts and what its answer is compared with on the
     exact model. Where the solver does not converge, the status gives its reason and what is done instead: its
     unfinished plan if that is better than the last one, else the last one for as long as it reaches, else the
-    perimeter opened and nominal splits. `backlog` counts as demand of the first interval.
+    perimeter opened and nominal splits. The backlog counts as demand of the first interval; negative measurements
+    count as 0.
     """
 
     def __init__(self, scenario: Scenario, *, guidance: bool):
-        """InputError for a wrong option or a scenario without demand (an optimum of nothing)."""
+        """InputError for a wrong option."""
         self.name = "mpc-pcrg" if guidance else "mpc-pc"
-        self._guidance, self._step = guidance, scenario.step
-        self._options = options(scenario, self.name)
-        destinations = np.flatnonzero(scenario.demand.sum(axis=(0, 1)) > 0)
-        self._layout = layout(scenario.network, destinations, guidance=guidance)
-        after = np.zeros((self._options.horizon, *scenario.demand.shape[1:]))
-        self._demand = np.concatenate([scenario.demand, after])
+        self._guidance, self._step, self._substeps = guidance, scenario.step, scenario.substeps
+        chosen = options(scenario, self.name)
+        used = np.flatnonzero(scenario.demand.sum(axis=(0, 1)) > 0)
+        self._used = used if len(used) else np.arange(scenario.network.regions)
+        self._demand = np.concatenate([scenario.demand, np.zeros((chosen.horizon, *scenario.demand.shape[1:]))])
+        self._steps, self._horizon = scenario.steps, chosen.horizon
         # With one Euler step per interval, the last controls move vehicles that the horizon does not see arrive.
         blind = scenario.integrator == "euler" and scenario.substeps == 1
-        self._moves = self._options.horizon - 1 if blind else self._options.horizon
-        self._substeps = scenario.substeps
-        self._advance = interval(scenario, self._layout, substeps=1)
-        self._solver = solver(scenario, self._layout, self._moves, self._options)
+        self._moves = chosen.horizon - 1 if blind else chosen.horizon
+        self._layout = layout(scenario.network, self._used, guidance=guidance)
+        self._advance = step_function(scenario, self._layout)
+        self._solver = solver(scenario, self._layout, self._moves, chosen)
+        states = np.full(self._advance.size1_in(0) * chosen.horizon * scenario.substeps, np.inf)
+        self._lower = np.concatenate([np.tile(self._layout.lower, self._moves), -states])
+        self._upper = np.concatenate([np.tile(self._layout.upper, self._moves), states])
         self._open = np.tile(self._layout.decision(self._layout.perimeter, self._layout.splits), (self._moves, 1))
         self.reset()
 
     def reset(self) -> None:
-        self._plan, self._left = self._open, 0
+        self._plan, self._left = self._open, 0  # left: intervals of the plan that are still to come
 
     def act(self, measurement: Measurement) -> Controls:
-        state, demand = self._forecast(measurement)
-        plan = np.vstack([self._plan[1:], self._plan[-1:]]) if self._left > 0 else self._open
-        self._left = max(self._left - 1, 0)
-        found, reason = self._solve(state, demand, plan)
-        better = self._cost(state, demand, found) < self._cost(state, demand, plan)
-        if better or reason is None:
-            self._left = self._moves
+        start, demand = self._forecast(measurement)
+        last = np.vstack([self._plan[1:], self._plan[-1:]]) if self._left else self._open
+        found, reason = self._solve(start, demand, last)
+        better = self.cost(start, demand, found) < self.cost(start, demand, last)
         if reason is None:
             status = "ok"
         elif better:
             status = f"{reason}: unfinished plan used"
         else:
-            status = f"{reason}: last plan used" if self._left else f"{reason}: perimeter opened, nominal splits"
-        self._plan = found if better else plan
+            status = f"{reason}: " + ("last plan used" if self._left else "perimeter opened, nominal splits")
+        self._plan = found if better else last
+        self._left = self._moves - 1 if better or reason is None else max(self._left - 1, 0)
         perimeter, splits = self._layout.controls(self._plan[0])
         return Controls(perimeter=perimeter, splits=splits if self._guidance else None, status=status)
+
+    def cost(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> float:
+        """Total time spent over the horizon [veh s] by the exact model, under a plan (moves, C)."""
+        states = self._rollout(start, demand, plan)
+        return self._step * UNIT * float(states[self._substeps - 1::self._substeps].sum())
+
+    def _forecast(self, measurement: Measurement) -> tuple[np.ndarray, np.ndarray]:
+        """The state (R*J,) [UNIT veh] and the demand (horizon, R*J) [veh/s], in the order of `step_function`."""
+        k = min(measurement.step, self._steps)
+        demand = self._demand[k:k + self._horizon].copy()
+        demand[0] += measurement.backlog / self._step
+        start = np.maximum(measurement.accumulation, 0.0)[:, self._used].T.ravel() / UNIT
+        return start, demand[:, :, self._used].transpose(0, 2, 1).reshape(self._horizon, -1)
+
+    def _rollout(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> np.ndarray:
+        """The states (horizon * substeps, R*J) [UNIT veh] after every integration step."""
+        states = [start]
+        for node in range(self._horizon * self._substeps):
+            k = node // self._substeps
+            states.append(self._advance(states[-1], plan[min(k, self._moves - 1)], demand[k]).full().ravel())
+        return np.stack(states[1:])
+
+    def _solve(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> tuple[np.ndarray, str | None]:
+        """An admissible plan (moves, C) from the guess `plan`, and why the solver stopped short, or None."""
+        guess = np.concatenate([plan.ravel(), self._rollout(start, demand, plan).ravel()])
+        with _interruptible():
+            answer = self._solver(
+                x0=guess, p=np.concatenate([start, demand.ravel()]), lbx=self._lower, ubx=self._upper, lbg=0.0, ubg=0.0)
+        decisions = answer["x"].full().ravel()[:plan.size].reshape(plan.shape)
+        found = np.array([self._layout.decision(*self._layout.controls(decision)) for decision in decisions])
+        report = self._solver.stats()
+        return found, None if report["success"] else report["return_status"]
+
+
+@contextmanager
+def _interruptible():
+    """CasADi takes a KeyboardInterrupt inside a solve for a failure of the solver; here Ctrl-C still ends the run."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        yield
+        return
+    seen = []
+
+    def interrupt(number, frame):
+        seen.append(number)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if seen:
+        raise KeyboardInterrupt

@@ -1,0 +1,221 @@
+"""DPC: constraints by construction, the activation, policy files, and training that resumes as if uninterrupted."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+import torch
+
+from nmfd import training
+from nmfd.controllers import dpc
+from nmfd.controllers.dpc import Architecture, DpcController, Policy, SoftExponential
+from nmfd.errors import InputError
+from nmfd.network import load_network
+from nmfd.scenario import load_scenario
+from nmfd.types import Measurement
+
+NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
+
+
+def policy(*, guidance, activation="gelu", network=NETWORK, spread=1.0):
+    torch.manual_seed(0)
+    made = Policy(network, Architecture(width=16, guidance=guidance, activation=activation))
+    with torch.no_grad():
+        for weights in made.parameters():
+            weights.add_(spread * torch.randn_like(weights))
+    return made
+
+
+def measurement(accumulation):
+    return Measurement(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros_like(accumulation))
+
+
+@pytest.mark.parametrize("activation", dpc.ACTIVATIONS)
+@pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
+def test_any_weights_and_any_state_give_admissible_controls(guidance, activation):
+    controller, random = DpcController(policy(guidance=guidance, activation=activation)), np.random.default_rng(0)
+    for scale in (0.0, 1.0, 1e3, 1e5, 1e7):
+        controls = controller.act(measurement(scale * random.standard_normal((7, 7))))
+        assert controls.status == "ok"
+        u = controls.perimeter[NETWORK.adjacency]
+        assert NETWORK.u_min - 1e-7 <= u.min() and u.max() <= NETWORK.u_max + 1e-7
+        assert (controls.perimeter[~NETWORK.adjacency] == 0.0).all()
+        assert (controls.splits is not None) == guidance
+        if guidance:
+            assert controls.splits.min() >= 0.0
+            assert (controls.splits[~NETWORK.split_mask] == 0.0).all()
+            np.testing.assert_allclose(controls.splits.sum(axis=1), 1.0 - np.eye(7), rtol=0.0, atol=1e-12)
+
+
+def test_forbidden_regions_have_no_gradient_and_no_nan():
+    made = policy(guidance=True)
+    _, splits = made(torch.full((3, 7, 7), 500.0))
+    (splits ** 2).sum().backward()
+    gradient = made.splits_decoder.weight.grad.unflatten(0, (7, 7, 7))
+    assert torch.isfinite(gradient).all()
+    assert (gradient[torch.tensor(~NETWORK.split_mask)] == 0.0).all() and gradient.abs().max() > 0.0
+
+
+def test_a_policy_that_returns_nan_opens_the_perimeter_and_says_so():
+    controls = DpcController(policy(guidance=True)).act(measurement(np.full((7, 7), np.nan)))
+    assert controls.status == "dpc: policy returned NaN, perimeter opened"
+    np.testing.assert_allclose(controls.perimeter, np.where(NETWORK.adjacency, NETWORK.u_max, 0.0))
+
+
+def test_a_batch_is_the_same_as_one_by_one():
+    made, x = policy(guidance=True), 1000.0 * torch.rand(5, 7, 7)
+    together = made(x)
+    for n in range(5):
+        for batched, single in zip(together, made(x[n]), strict=True):
+            torch.testing.assert_close(batched[n], single, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("alpha", [-0.7, -0.1, 0.0, 0.1, 0.7])
+def test_soft_exponential_is_the_published_function(alpha):
+    """Godfrey and Gashler (2015), equation 1, wherever its logarithm is defined."""
+    activation, x = SoftExponential(1).double(), torch.linspace(-1.0, 3.0, 41, dtype=torch.float64)[:, None]
+    torch.nn.init.constant_(activation.alpha, alpha)
+    if alpha < 0:
+        x = x[1.0 - alpha * (x + alpha) > 0.01][:, None]
+        expected = -torch.log(1.0 - alpha * (x + alpha)) / alpha
+    else:
+        expected = (torch.exp(alpha * x) - 1.0) / alpha + alpha if alpha > 0 else x
+    torch.testing.assert_close(activation(x).detach(), expected)
+
+
+@pytest.mark.parametrize("alpha", [-2.0, -1e-5, 0.0, 1e-5, 2.0])
+def test_soft_exponential_is_finite_everywhere(alpha):
+    activation = SoftExponential(1)
+    torch.nn.init.constant_(activation.alpha, alpha)
+    x = torch.tensor([[-1e4], [-1.0], [0.0], [1.0], [1e4]], requires_grad=True)
+    value = activation(x)
+    value.sum().backward()
+    assert torch.isfinite(value).all() and torch.isfinite(x.grad).all() and torch.isfinite(activation.alpha.grad).all()
+
+
+def test_soft_exponential_can_leave_the_identity():
+    """df/dalpha at alpha = 0 is 1 + x^2 / 2: were it 0, the activation would stay what it starts as."""
+    activation = SoftExponential(1)
+    activation(torch.tensor([[2.0]])).sum().backward()
+    assert activation.alpha.grad.item() == pytest.approx(3.0, rel=0.01)
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    return load_scenario(tiny.write(tmp_path))
+
+
+def saved(path, made, network):
+    torch.save(dpc.checkpoint(made, network, {"seed": 0}), path)
+    return path
+
+
+@pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
+def test_a_policy_file_gives_the_policy_back(tmp_path, guidance):
+    made = policy(guidance=guidance)
+    loaded, content = dpc.load_policy(saved(tmp_path / "p.pt", made, NETWORK), NETWORK)
+    x = 1000.0 * torch.rand(4, 7, 7)
+    for before, after in zip(made(x), loaded(x), strict=True):
+        assert (before is None and after is None) or torch.equal(before, after)
+    assert torch.equal(content["weights"]["scale"], made.scale)
+    assert content["network_hash"] == NETWORK.hash and content["configuration"] == {"seed": 0}
+
+
+def one_line(caught, path):
+    assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
+
+
+def test_a_policy_for_another_network_is_refused(tmp_path, scenario):
+    path = saved(tmp_path / "p.pt", policy(guidance=False), NETWORK)
+    with pytest.raises(InputError, match="trained for network 'hexagon7'") as caught:
+        dpc.load_policy(path, scenario.network)
+    one_line(caught, path)
+    wider = replace(NETWORK, u_max=1.0)
+    with pytest.raises(InputError, match="network_hash"):
+        dpc.load_policy(path, wider)
+
+
+def test_a_policy_of_the_other_kind_is_refused(tmp_path, scenario):
+    path = saved(tmp_path / "p.pt", policy(guidance=False, network=scenario.network), scenario.network)
+    with pytest.raises(InputError, match="dpc-pc policy, not dpc-pcrg") as caught:
+        dpc.load(path, scenario, guidance=True)
+    one_line(caught, path)
+
+
+@pytest.mark.parametrize("damage, problem", [
+    (lambda path: path.unlink(), "no such policy"),
+    (lambda path: path.write_bytes(b"not a policy"), "is not a policy file"),
+    (lambda path: path.write_bytes(path.read_bytes()[:2000]), "is not a policy file"),
+    (lambda path: torch.save({"format": 99}, path), "format: expected"),
+    (lambda path: torch.save({"format": 1}, path), "is damaged"),
+    (lambda path: torch.save([1, 2], path), "is damaged")],
+    ids=["missing", "text", "truncated", "format", "empty", "list"])
+def test_a_damaged_policy_file_is_one_line(tmp_path, damage, problem):
+    path = saved(tmp_path / "p.pt", policy(guidance=False), NETWORK)
+    damage(path)
+    with pytest.raises(InputError, match=problem) as caught:
+        dpc.load_policy(path, NETWORK)
+    one_line(caught, path)
+
+
+def weights(path):
+    return torch.load(path, weights_only=True)["weights"]
+
+
+@pytest.mark.parametrize("controller", training.NAMES)
+def test_a_resumed_training_is_the_uninterrupted_one(tmp_path, scenario, monkeypatch, controller):
+    monkeypatch.setattr(training, "VALIDATE_EVERY", 2)
+
+    def interrupt(done, steps, note):
+        if done == 5:
+            raise KeyboardInterrupt
+
+    straight, broken = tmp_path / "straight.pt", tmp_path / "broken.pt"
+    training.train(scenario, controller, seed=3, out=straight, steps=8)
+    with pytest.raises(KeyboardInterrupt):
+        training.train(scenario, controller, seed=3, out=broken, steps=8, progress=interrupt)
+    training.train(scenario, controller, seed=3, out=broken, steps=8, resume=True)
+    for name, tensor in weights(straight).items():
+        assert torch.equal(tensor, weights(broken)[name]), name
+    assert not list(tmp_path.glob("*.resume"))
+    assert dpc.load(broken, scenario, guidance=training.NAMES[controller]).name == controller
+
+
+def test_another_seed_is_another_policy(tmp_path, scenario):
+    paths = [training.train(scenario, "dpc-pc", seed=seed, out=tmp_path / f"{seed}.pt", steps=1) for seed in (0, 1)]
+    assert not torch.equal(weights(paths[0])["backbone.0.weight"], weights(paths[1])["backbone.0.weight"])
+
+
+def test_training_lowers_the_total_time_spent(tmp_path, scenario):
+    """An untrained policy holds the perimeter half closed, to no purpose."""
+    trained = training.train(scenario, "dpc-pc", seed=0, out=tmp_path / "p.pt", steps=20)
+    rollout = training.Rollout(scenario)
+    torch.manual_seed(0)
+    fresh = Policy(scenario.network, Architecture())
+    after = training.validate(dpc.load_policy(trained, scenario.network)[0], rollout, 0)
+    assert after < training.validate(fresh, rollout, 0)
+
+
+def test_resume_needs_something_to_resume_and_the_same_settings(tmp_path, scenario, monkeypatch):
+    monkeypatch.setattr(training, "VALIDATE_EVERY", 1)
+
+    def interrupt(done, steps, note):
+        raise KeyboardInterrupt
+
+    out = tmp_path / "p.pt"
+    with pytest.raises(InputError, match="nothing to resume"):
+        training.train(scenario, "dpc-pc", seed=0, out=out, steps=4, resume=True)
+    with pytest.raises(KeyboardInterrupt):
+        training.train(scenario, "dpc-pc", seed=0, out=out, steps=4, progress=interrupt)
+    with pytest.raises(InputError, match="seed: was 0, now 1"):
+        training.train(scenario, "dpc-pc", seed=1, out=out, steps=4, resume=True)
+
+
+@pytest.mark.parametrize("options, problem", [
+    ({"widht": 3}, "widht: unknown key"), ({"activation": "sine"}, "activation: expected one of"),
+    ({"steps": 0}, "steps: expected a whole number from 1"), ({"batch": 1.5}, "batch: expected a whole number")])
+def test_wrong_training_settings(scenario, options, problem):
+    with pytest.raises(InputError, match=f"controllers.dpc-pc.{problem}"):
+        training.settings(replace(scenario, controller_options={"dpc-pc": options}), "dpc-pc")

@@ -1,0 +1,160 @@
+"""The physics of the regional model, and its torch and CasADi twins against each other."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+import torch
+
+from nmfd import dynamics, dynamics_casadi
+from nmfd.mfd import Mfd
+from nmfd.network import Network, load_network
+
+STEP = 30.0
+NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
+PARAMETERS = dynamics.parameters(NETWORK)
+
+
+def random_controls(random, network=NETWORK, batch=()):
+    """Admissible perimeter (*batch, R, R) and splits (*batch, R, R, R)."""
+    shape = (*batch, network.regions, network.regions)
+    perimeter = random.uniform(network.u_min, network.u_max, shape) * network.adjacency
+    splits = random.uniform(size=(*shape, network.regions)) ** 3 * network.split_mask
+    sums = splits.sum(axis=-2, keepdims=True)
+    return perimeter, splits / np.where(sums > 0, sums, 1.0)
+
+
+def random_tensors(seed, *, filling, batch=()):
+    """State, demand, perimeter, splits; regions hold up to `filling` [veh]."""
+    random = np.random.default_rng(seed)
+    x = random.uniform(size=(*batch, 7, 7)) * random.uniform(0.0, filling / 3.5, (*batch, 7, 1))
+    demand = random.uniform(0.0, 3.0, (*batch, 7, 7))
+    return tuple(torch.from_numpy(array) for array in (x, demand, *random_controls(random, batch=batch)))
+
+
+def one_region(mfd):
+    return dynamics.parameters(Network(
+        name="one", region_names=("only",), positions=np.zeros((1, 2)), adjacency=np.zeros((1, 1), dtype=bool),
+        mfds=(mfd,), u_min=0.1, u_max=0.9))
+
+
+@pytest.mark.parametrize("integrator", dynamics.INTEGRATORS)
+def test_no_vehicle_is_negative_or_lost_inside(integrator):
+    """Without trips that end, the vehicles only move: their number grows by the demand exactly."""
+    x, demand, perimeter, splits = random_tensors(1, filling=25_000.0, batch=(40,))
+    off = PARAMETERS.off_diagonal
+    x, demand = x * off, demand * off
+    # A split that never delivers: nobody is sent to a region that is their destination.
+    splits = splits * (1.0 - torch.eye(7, dtype=torch.float64))
+    total = x.sum((-2, -1))
+    for _ in range(60):
+        x = dynamics.advance(PARAMETERS, x, demand, perimeter, splits, STEP, integrator=integrator)
+        total = total + STEP * demand.sum((-2, -1))
+        assert x.min() >= 0.0
+        torch.testing.assert_close(x.sum((-2, -1)), total, rtol=0.0, atol=1e-6)
+
+
+def test_vehicles_leave_as_their_trips_end():
+    x, demand, perimeter, splits = random_tensors(2, filling=25_000.0, batch=(40,))
+    completions, _ = dynamics.flows(PARAMETERS, x, perimeter, splits)
+    after = dynamics.euler(PARAMETERS, x, demand, perimeter, splits, STEP)
+    expected = x.sum((-2, -1)) + STEP * (demand.sum((-2, -1)) - completions.sum(-1))
+    torch.testing.assert_close(after.sum((-2, -1)), expected, rtol=0.0, atol=1e-9)
+
+
+def test_one_region_with_a_linear_mfd_decays_exponentially():
+    p = one_region(Mfd(a=0.0, b=0.0, c=0.0042, jam=10_000.0))
+    none = torch.zeros(1, 1, dtype=torch.float64)
+    x = dynamics.advance(p, none + 5000.0, none, none, none[None], 600.0, integrator="rk4", substeps=600)
+    assert x.item() == pytest.approx(5000.0 * np.exp(-0.0042 * 600.0), rel=1e-8)
+
+
+def test_one_region_decays_exponentially_at_small_accumulation():
+    p = one_region(NETWORK.mfds[0])
+    none = torch.zeros(1, 1, dtype=torch.float64)
+    x = dynamics.advance(p, none + 1.0, none, none, none[None], 600.0, integrator="rk4", substeps=20)
+    assert x.item() == pytest.approx(np.exp(-0.0042 * 600.0), rel=1e-3)
+
+
+@pytest.mark.parametrize("order", [[6, 5, 4, 3, 2, 1, 0], [1, 0, 4, 3, 2, 6, 5]], ids=["turned", "mirrored"])
+def test_a_turned_or_mirrored_hexagon_is_the_same_hexagon(order):
+    x, demand, perimeter, splits = random_tensors(3, filling=20_000.0)
+    assert (NETWORK.adjacency[order][:, order] == NETWORK.adjacency).all()
+    plain = dynamics.advance(PARAMETERS, x, demand, perimeter, splits, STEP, substeps=3)
+    turned = dynamics.advance(
+        PARAMETERS, *(matrix[order][:, order] for matrix in (x, demand, perimeter)),
+        splits[order][:, order][:, :, order], STEP, substeps=3)
+    torch.testing.assert_close(turned, plain[order][:, order], rtol=1e-12, atol=0.0)
+
+
+@pytest.mark.parametrize("integrator, order", [("euler", 1), ("rk4", 4)])
+def test_order_of_convergence(integrator, order):
+    """Below the jam: at its kink the right-hand side is not smooth, and no scheme keeps its order."""
+    x, demand, *controls = random_tensors(4, filling=6000.0)
+    state = x, 0.05 * demand, *controls
+    exact = dynamics.advance(PARAMETERS, *state, 1200.0, integrator="rk4", substeps=1000)
+    error = [
+        (dynamics.advance(PARAMETERS, *state, 1200.0, integrator=integrator, substeps=n) - exact).abs().max().item()
+        for n in (10, 20)]
+    assert np.log2(error[0] / error[1]) == pytest.approx(order, abs=0.3)
+
+
+@pytest.mark.parametrize("filling", [3000.0, 30_000.0], ids=["free", "jammed"])
+@pytest.mark.parametrize("integrator", dynamics.INTEGRATORS)
+def test_gradients_against_finite_differences(integrator, filling):
+    """In vehicles by the thousand, so that one step of differences suits states and controls."""
+    x, demand, perimeter, splits = random_tensors(5, filling=filling)
+    inputs = tuple(tensor.clone().requires_grad_() for tensor in (x / 1000.0, demand, perimeter, splits))
+
+    def advanced(x, *others):
+        return dynamics.advance(PARAMETERS, 1000.0 * x, *others, STEP, integrator=integrator) / 1000.0
+
+    assert torch.autograd.gradcheck(advanced, inputs, fast_mode=True)
+
+
+@pytest.mark.parametrize("substeps", [1, 3])
+@pytest.mark.parametrize("integrator", dynamics.INTEGRATORS)
+def test_torch_and_casadi_agree(integrator, substeps):
+    """Over a rollout into the jam and beyond, with new controls in every interval."""
+    random = np.random.default_rng(6)
+    p, x, twin, most = dynamics_casadi.parameters(NETWORK), torch.zeros(7, 7, dtype=torch.float64), ca.DM(7, 7), 0.0
+    for _ in range(120):
+        demand, (perimeter, splits) = random.uniform(0.0, 2.0, (7, 7)), random_controls(random)
+        kwargs = {"integrator": integrator, "substeps": substeps}
+        x = dynamics.advance(
+            PARAMETERS, x, *(torch.from_numpy(array) for array in (demand, perimeter, splits)), STEP, **kwargs)
+        twin = dynamics_casadi.advance(
+            p, twin, ca.DM(demand), ca.DM(perimeter), dynamics_casadi.splits_list(splits), STEP, **kwargs)
+        most = max(most, x.sum(-1).max().item())
+        np.testing.assert_allclose(twin.full(), x.numpy(), rtol=0.0, atol=1e-9)
+    assert most > 1.5 * NETWORK.mfds[0].jam
+
+
+def test_both_rates_are_those_of_the_mfd():
+    accumulation = np.linspace(0.0, 20_000.0, 7)
+    expected = [mfd.rate(n) for mfd, n in zip(NETWORK.mfds, accumulation, strict=True)]
+    torch_rate = dynamics.rate(PARAMETERS, torch.from_numpy(accumulation)).numpy()
+    casadi_rate = dynamics_casadi.rate(dynamics_casadi.parameters(NETWORK), ca.DM(accumulation)).full().ravel()
+    np.testing.assert_allclose(torch_rate, expected, rtol=1e-13)
+    np.testing.assert_allclose(casadi_rate, expected, rtol=1e-13)
+
+
+def test_the_outflow_stays_at_its_jam_value_beyond():
+    jam = NETWORK.mfds[0].jam
+    n = torch.linspace(jam, 3.0 * jam, 7, dtype=torch.float64)
+    outflow = dynamics.rate(PARAMETERS, n) * n
+    torch.testing.assert_close(outflow, outflow[:1].expand(7), rtol=1e-12, atol=0.0)
+
+
+def test_rounding_changes_the_rate_at_the_kink_only():
+    steep = replace(NETWORK, mfds=tuple(replace(mfd, jam=6000.0) for mfd in NETWORK.mfds))
+    exact, rounded = (dynamics_casadi.parameters(steep, rounding=width) for width in (0.0, 50.0))
+
+    def difference(n):
+        n = ca.DM([n] * 7)
+        return abs(dynamics_casadi.rate(rounded, n) / dynamics_casadi.rate(exact, n) - 1.0).full().max()
+
+    assert 1e-4 < difference(6000.0) < 0.02
+    assert max(difference(0.0), difference(4000.0), difference(9000.0)) < 2e-4

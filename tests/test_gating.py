@@ -1,0 +1,101 @@
+"""PI gating of the centre: what it reaches on the benchmark, its anti-windup and its options."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nmfd.closed_loop import run
+from nmfd.controllers.gating import PiGating
+from nmfd.errors import InputError
+from nmfd.metrics import summary
+from nmfd.plant import NmfdPlant
+from nmfd.scenario import load_scenario
+from nmfd.types import Measurement
+
+SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")
+NETWORK, CENTRE = SCENARIO.network, 3
+CRITICAL = NETWORK.mfds[CENTRE].critical
+
+
+def seen(vehicles, step=0):
+    """A measurement with `vehicles` in the centre."""
+    accumulation = np.zeros((7, 7))
+    accumulation[CENTRE, 0] = vehicles
+    return Measurement(step=step, time=30.0 * step, accumulation=accumulation, backlog=np.zeros((7, 7)))
+
+
+def gate(controls):
+    """The one u of all entries of the centre."""
+    entries = controls.perimeter[NETWORK.adjacency[:, CENTRE], CENTRE]
+    assert (entries == entries[0]).all()
+    return entries[0]
+
+
+def with_options(**options):
+    return replace(SCENARIO, controller_options={"pi-gating": options})
+
+
+def test_benchmark_row():
+    trajectory = run(NmfdPlant(SCENARIO), PiGating(SCENARIO), SCENARIO, seed=0)
+    row = summary(trajectory)
+    assert row["total_time_spent_veh_s"] == pytest.approx(8.9e7, rel=0.02)
+    assert row["final_accumulation_veh"] < 500.0
+    assert trajectory.accumulation[:, CENTRE].sum(axis=1).max() < 1.25 * CRITICAL
+
+
+def test_only_the_entries_are_metered_and_within_bounds():
+    controller, random = PiGating(SCENARIO), np.random.default_rng(0)
+    others = NETWORK.adjacency.copy()
+    others[:, CENTRE] = False
+    for step in range(100):
+        controls = controller.act(seen(random.uniform(-10.0, 3.0 * CRITICAL), step))
+        assert NETWORK.u_min <= gate(controls) <= NETWORK.u_max
+        assert (controls.perimeter[others] == NETWORK.u_max).all()
+        assert (controls.perimeter[~NETWORK.adjacency] == 0.0).all()
+        assert controls.splits is None and controls.status == "ok"
+
+
+@pytest.mark.parametrize("long, then, limit", [(0.0, 1.2, "u_max"), (3.0, 0.8, "u_min")])
+def test_the_integral_does_not_wind_up(long, then, limit):
+    """After hours at one bound, the gate leaves it as fast as after ten minutes."""
+    gates = []
+    for intervals in (20, 1000):
+        controller = PiGating(SCENARIO)
+        for step in range(intervals):
+            controls = controller.act(seen(long * CRITICAL, step))
+        assert gate(controls) == getattr(NETWORK, limit)
+        controller.act(seen(then * CRITICAL, intervals))
+        gates.append(gate(controller.act(seen(then * CRITICAL, intervals + 1))))
+    assert gates[0] == gates[1] != getattr(NETWORK, limit)
+
+
+def test_one_step_by_hand():
+    controller = PiGating(with_options(set_point=[3000.0], kp=0.5, ki=0.001))
+    controller.act(seen(3000.0))
+    by_hand = 0.9 + (0.5 * (3000.0 - 3600.0) + 0.001 * 30.0 * (3000.0 - 3600.0)) / CRITICAL
+    assert gate(controller.act(seen(3600.0, 1))) == pytest.approx(by_hand, rel=1e-12)
+
+
+def test_reset_forgets():
+    controller = PiGating(SCENARIO)
+    for step in range(5):
+        controller.act(seen(2.0 * CRITICAL, step))
+    controller.reset()
+    assert gate(controller.act(seen(0.0))) == NETWORK.u_max
+
+
+@pytest.mark.parametrize("options, problem", [
+    ({"kP": 1.0}, "kP: unknown key"), ({"ki": 0.0}, "ki: expected a number above 0"),
+    ({"kp": -1.0}, "kp: expected a number in"), ({"set_point": [1.0, 2.0]}, "set_point: expected a list of 1 numbers"),
+    ({"set_point": [-5.0]}, "set_point: expected numbers above 0")])
+def test_wrong_options(options, problem):
+    with pytest.raises(InputError, match=f"controllers.pi-gating.{problem}") as caught:
+        PiGating(with_options(**options))
+    assert "\n" not in str(caught.value)
+
+
+def test_something_must_be_protected():
+    with pytest.raises(InputError, match="protected: pi-gating needs at least one protected region, got none"):
+        PiGating(replace(SCENARIO, protected=()))

@@ -1,0 +1,191 @@
+"""Economic MPC: optimal and admissible plans, forecasts, declared fallbacks, and the benchmark rows."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from test_dynamics import random_controls
+
+from nmfd import dynamics
+from nmfd.closed_loop import run
+from nmfd.controllers.fixed import NoControl
+from nmfd.controllers.mpc import LEAST_GAIN, EconomicMpc
+from nmfd.errors import InputError
+from nmfd.metrics import summary
+from nmfd.plant import NmfdPlant
+from nmfd.scenario import load_scenario
+from nmfd.types import Measurement
+
+SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")
+NETWORK = SCENARIO.network
+BOTH = pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
+
+
+@pytest.fixture(scope="module")
+def states():
+    """Measurements of a run without control: its first 50 intervals, from empty to gridlock in the centre."""
+    trajectory = run(NmfdPlant(SCENARIO), NoControl(SCENARIO), replace(SCENARIO, steps=50), seed=0)
+    return [
+        Measurement(step=k, time=30.0 * k, accumulation=x, backlog=np.zeros((7, 7)))
+        for k, x in enumerate(trajectory.accumulation)]
+
+
+def with_options(scenario=SCENARIO, **options):
+    return replace(scenario, controller_options={"mpc-pc": options, "mpc-pcrg": options})
+
+
+def assert_admissible(controls, guidance):
+    u = controls.perimeter[NETWORK.adjacency]
+    assert NETWORK.u_min <= u.min() and u.max() <= NETWORK.u_max
+    assert (controls.splits is not None) == guidance
+    if guidance:
+        assert controls.splits.min() >= 0.0
+        assert (controls.splits[~NETWORK.split_mask] == 0.0).all()
+        np.testing.assert_allclose(controls.splits.sum(axis=1), 1.0 - np.eye(7), rtol=0.0, atol=1e-9)
+
+
+@BOTH
+def test_controls_are_admissible_and_solved(states, guidance):
+    controller = EconomicMpc(SCENARIO, guidance=guidance)
+    for k in range(0, 50, 6):
+        controls = controller.act(states[k])
+        assert controls.status == "ok"
+        assert_admissible(controls, guidance)
+
+
+@BOTH
+@pytest.mark.parametrize("k", [10, 30])
+def test_no_random_plan_nearby_or_far_is_better(states, guidance, k):
+    controller, random = EconomicMpc(SCENARIO, guidance=guidance), np.random.default_rng(k)
+    assert controller.act(states[k]).status == "ok"
+    forecast, plan = controller._forecast(states[k]), controller._plan
+    best = controller.cost(*forecast, plan)
+    allowed = SCENARIO.step * LEAST_GAIN * plan.size  # what the preference for open edges and own routes may cost
+    for _ in range(300):
+        other = np.stack([controller._layout.decision(*random_controls(random)) for _ in plan])
+        share = 10.0 ** random.uniform(-3.0, 0.0)
+        assert controller.cost(*forecast, plan + share * (other - plan)) >= best - share * allowed
+    without = controller.cost(*forecast, controller._open)
+    assert best < without if k == 30 else best <= without
+
+
+def test_two_decisions_against_brute_force(tmp_path):
+    """A jammed region behind a gate: the best of all pairs of u on a grid."""
+    network = tiny.row_network(2).replace("jam = 1000.0", "jam = 700.0")
+    scenario = load_scenario(tiny.write(tmp_path, network=network))
+    controller = EconomicMpc(with_options(scenario, horizon=6), guidance=False)
+    accumulation = np.array([[0.0, 900.0], [0.0, 330.0]])
+    measurement = Measurement(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros((2, 2)))
+    assert controller.act(measurement).status == "ok"
+    forecast, plan = controller._forecast(measurement), controller._plan
+    assert plan.shape == (5, 1)
+    best = min(
+        controller.cost(*forecast, np.array([[first]] * 2 + [[second]] * 3))
+        for first in np.linspace(0.1, 0.9, 41) for second in np.linspace(0.1, 0.9, 41))
+    assert controller.cost(*forecast, plan) <= best + 1.0
+
+
+@BOTH
+def test_the_plan_costs_what_the_regional_model_says(states, guidance):
+    for scenario in (SCENARIO, replace(SCENARIO, step=90.0, substeps=3)):
+        controller = EconomicMpc(scenario, guidance=guidance)
+        start, demand = controller._forecast(states[20])
+        random = np.random.default_rng(7)
+        plan = np.stack([
+            controller._layout.decision(*random_controls(random)) for _ in range(controller._moves)])
+        p, x, total = dynamics.parameters(NETWORK), torch.from_numpy(states[20].accumulation), 0.0
+        for k in range(8):
+            controls = controller._layout.controls(plan[min(k, len(plan) - 1)])
+            x = dynamics.advance(
+                p, x, torch.from_numpy(scenario.demand[20 + k]), *(torch.from_numpy(array) for array in controls),
+                scenario.step, substeps=scenario.substeps)
+            total += scenario.step * x.sum().item()
+        # Region 3 holds no destination: the measured columns without demand are empty.
+        assert controller.cost(start, demand, plan) == pytest.approx(total, rel=1e-12)
+
+
+def test_the_backlog_is_demand_and_noise_is_not_negative(states):
+    controller = EconomicMpc(SCENARIO, guidance=False)
+    backlog = np.zeros((7, 7))
+    backlog[0, 6] = 60.0
+    start, demand = controller._forecast(replace(states[0], backlog=backlog, accumulation=np.full((7, 7), -0.5)))
+    plain = controller._forecast(states[0])[1]
+    assert (start == 0.0).all()
+    assert 30.0 * (demand - plain).sum() == pytest.approx(60.0) and (demand[1:] == plain[1:]).all()
+
+
+def test_nothing_is_demanded_after_the_end(states):
+    controller = EconomicMpc(SCENARIO, guidance=False)
+    for step in (SCENARIO.steps - 2, SCENARIO.steps, SCENARIO.steps + 50):
+        controls = controller.act(replace(states[5], step=step))
+        assert controls.status == "ok"
+
+
+@BOTH
+def test_without_a_plan_a_failure_opens_the_perimeter(states, guidance):
+    controls = EconomicMpc(with_options(max_iterations=0), guidance=guidance).act(states[30])
+    assert controls.status == "Maximum_Iterations_Exceeded: perimeter opened, nominal splits"
+    assert (controls.perimeter[NETWORK.adjacency] == NETWORK.u_max).all()
+    if guidance:
+        np.testing.assert_allclose(controls.splits, NETWORK.nominal_splits, atol=1e-6)
+
+
+def test_after_a_failure_the_last_plan_is_used_until_it_ends(states):
+    controller = EconomicMpc(SCENARIO, guidance=False)
+    assert controller.act(states[20]).status == "ok"
+    plan = controller._plan
+    controller._solver = EconomicMpc(with_options(max_iterations=0), guidance=False)._solver
+    for ahead in range(1, len(plan)):
+        controls = controller.act(states[20 + ahead])
+        assert controls.status == "Maximum_Iterations_Exceeded: last plan used"
+        np.testing.assert_allclose(controls.perimeter, controller._layout.controls(plan[ahead])[0])
+    assert controller.act(states[20 + len(plan)]).status.endswith("perimeter opened, nominal splits")
+
+
+def test_an_unfinished_but_better_plan_is_used_and_says_so(states):
+    controller = EconomicMpc(with_options(max_iterations=12), guidance=True)
+    controls = controller.act(states[30])
+    assert controls.status == "Maximum_Iterations_Exceeded: unfinished plan used"
+    assert_admissible(controls, True)
+
+
+def test_a_time_limit_is_a_recorded_failure(states):
+    controls = EconomicMpc(with_options(time_limit=1e-6), guidance=True).act(states[30])
+    assert controls.status.startswith("Maximum_WallTime_Exceeded: ")
+    assert_admissible(controls, True)
+
+
+def test_no_measurement_at_all_is_a_recorded_failure(states):
+    controls = EconomicMpc(SCENARIO, guidance=True).act(replace(states[30], accumulation=np.full((7, 7), np.nan)))
+    assert controls.status.startswith("Invalid_Number_Detected: perimeter opened")
+    assert_admissible(controls, True)
+
+
+def test_reset_forgets_the_plan(states):
+    controller = EconomicMpc(SCENARIO, guidance=False)
+    first = controller.act(states[25]).perimeter
+    controller.act(states[26])
+    controller.reset()
+    assert (controller.act(states[25]).perimeter == first).all()
+
+
+@pytest.mark.parametrize("options, problem", [
+    ({"horizen": 8}, "horizen: unknown key"), ({"horizon": 1}, "horizon: expected a whole number from 2"),
+    ({"max_iterations": -1}, "max_iterations: expected a whole number from 0"),
+    ({"time_limit": 0.0}, "time_limit: expected a number above 0")])
+def test_wrong_options(options, problem):
+    with pytest.raises(InputError, match=f"controllers.mpc-pc.{problem}") as caught:
+        EconomicMpc(with_options(**options), guidance=False)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("guidance, most", [
+    pytest.param(False, 0.80 * 1.773e8, id="pc"),
+    pytest.param(True, 0.55 * 1.773e8, id="pcrg", marks=pytest.mark.slow)])
+def test_benchmark_row(guidance, most):
+    row = summary(run(NmfdPlant(SCENARIO), EconomicMpc(SCENARIO, guidance=guidance), SCENARIO, seed=0))
+    assert row["total_time_spent_veh_s"] < most
+    assert row["solver_failures"] == 0

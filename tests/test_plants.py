@@ -1,0 +1,132 @@
+"""The two regional plants: conservation, what the acyclic one forbids, and their agreement without control."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+from test_dynamics import random_controls
+
+from nmfd import acyclic
+from nmfd.closed_loop import run
+from nmfd.controllers.fixed import NoControl
+from nmfd.metrics import total_time_spent
+from nmfd.plant import AcyclicPlant, NmfdPlant
+from nmfd.scenario import load_scenario
+from nmfd.types import Controls
+
+SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")
+
+
+def busy(seed, **changes):
+    """The benchmark with random demand between all regions, and beyond the jam."""
+    demand = np.random.default_rng(seed).uniform(0.0, 0.8, SCENARIO.demand.shape)
+    demand[160:] = 0.0
+    return replace(SCENARIO, demand=demand, **changes)
+
+
+def nmfd_completions(plant, accumulation):
+    return sum(
+        mfd.rate(row.sum()) * row[i]
+        for i, (mfd, row) in enumerate(zip(SCENARIO.network.mfds, accumulation, strict=True)))
+
+
+def acyclic_completions(plant, accumulation):
+    model = acyclic.build(SCENARIO.network)
+    ends = model.region == model.destination
+    return (acyclic.rate(model, plant.state)[model.region] * plant.state)[ends].sum()
+
+
+@pytest.mark.parametrize(
+    "make, completions", [(NmfdPlant, nmfd_completions), (AcyclicPlant, acyclic_completions)])
+def test_conservation_and_non_negativity_under_random_controls(make, completions):
+    """Trip ends, integrated here from the states, account for every vehicle that is no longer there."""
+    scenario, random = busy(0), np.random.default_rng(1)
+    plant = make(scenario)
+    measured, ended, entered = plant.reset(0), 0.0, 0.0
+    for k in range(scenario.steps):
+        ended += scenario.step * completions(plant, measured.accumulation)
+        entered += scenario.step * scenario.demand[k].sum()
+        perimeter, splits = random_controls(random)
+        measured = plant.step(Controls(perimeter=perimeter, splits=splits))
+        assert measured.accumulation.min() >= 0.0
+        assert abs(entered - ended - measured.accumulation.sum()) <= 1e-6
+        assert abs(plant.completed() - ended) <= 1e-6
+    assert ended > 10_000.0
+
+
+@pytest.mark.parametrize("integrator, substeps", [("euler", 3), ("rk4", 1)])
+@pytest.mark.parametrize("make", [NmfdPlant, AcyclicPlant])
+def test_non_negative_with_other_integrators(make, integrator, substeps):
+    scenario, random = busy(2, integrator=integrator, substeps=substeps), np.random.default_rng(3)
+    plant = make(scenario)
+    plant.reset(0)
+    for _ in range(60):
+        perimeter, splits = random_controls(random)
+        assert plant.step(Controls(perimeter=perimeter, splits=splits)).accumulation.min() >= 0.0
+
+
+def test_without_control_both_plants_are_the_same():
+    """Shortest ways never turn back."""
+    nmfd, anmfd = (run(make(SCENARIO), NoControl(SCENARIO), SCENARIO, seed=0) for make in (NmfdPlant, AcyclicPlant))
+    assert total_time_spent(anmfd) == pytest.approx(total_time_spent(nmfd), rel=1e-3)
+    np.testing.assert_allclose(anmfd.accumulation, nmfd.accumulation, rtol=0.0, atol=1e-6)
+
+
+def test_no_control_forces_no_move():
+    plant = AcyclicPlant(SCENARIO)
+    run(plant, NoControl(SCENARIO), SCENARIO, seed=0)
+    assert plant.forced_moves == 0.0
+
+
+def test_the_acyclic_plant_is_fast():
+    plant, (perimeter, splits) = AcyclicPlant(SCENARIO), random_controls(np.random.default_rng(4))
+    plant.reset(0)
+    begin = time.process_time()
+    for _ in range(SCENARIO.steps):
+        plant.step(Controls(perimeter=perimeter, splits=splits))
+    assert time.process_time() - begin < 2.0
+
+
+def test_no_way_leads_back_to_the_origin_or_the_previous_region():
+    model = acyclic.build(SCENARIO.network)
+    onward, cell = model.move_onward, model.move_from
+    assert (model.move_next != model.origin[cell])[onward].all()
+    assert (model.move_next != model.previous[cell])[onward].all()
+    assert SCENARIO.network.adjacency[model.region[cell], model.move_next].all()
+    assert (model.previous[model.move_to] == model.region[cell]).all()
+    assert (model.origin[model.move_to] == model.origin[cell]).all()
+    assert (model.destination[model.move_to] == model.destination[cell]).all()
+
+
+def test_shares_sum_to_one_and_are_theta_renormalised():
+    model, (_, splits) = acyclic.build(SCENARIO.network), random_controls(np.random.default_rng(5))
+    theta, forced = acyclic.shares(model, splits)
+    sums = np.bincount(model.move_from, theta, minlength=len(model.region))
+    np.testing.assert_allclose(sums, model.region != model.destination, atol=1e-12)
+    # From 0 by way of 3 (o = g = 0, i = 3) to 6: 1, 2, 4, 5 and 6 are left, 0 is not.
+    here = (model.origin == 0) & (model.previous == 0) & (model.region == 3) & (model.destination == 6)
+    moves = here[model.move_from]
+    expected = splits[3, model.move_next[moves], 6]
+    assert sorted(model.move_next[moves]) == [1, 2, 4, 5, 6]
+    np.testing.assert_allclose(theta[moves], expected / expected.sum(), atol=1e-12)
+    assert not forced[here].any()
+
+
+def test_what_theta_leaves_no_way_on_is_forced_and_counted(tmp_path):
+    """In a row of regions 0-1-2, trips from 1 to 0 that are sent into the dead end 2 must turn back there."""
+    scenario = load_scenario(tiny.write(tmp_path, network=tiny.row_network(3), scenario=tiny.SCENARIO.replace(
+        "from = 0\nto = 1", "from = 1\nto = 0")))
+    splits = scenario.network.nominal_splits.copy()
+    splits[1, :, 0] = [0.0, 0.0, 1.0]
+    controls = Controls(perimeter=scenario.network.adjacency * 0.9, splits=splits)
+    plant = AcyclicPlant(scenario)
+    states = [plant.reset(0)] + [plant.step(controls) for _ in range(scenario.steps)]
+    entered = scenario.step * scenario.demand.sum()
+    assert states[-1].accumulation[2, 0] > 0.0
+    assert 0.0 < plant.forced_moves < 2.0 * entered
+    assert plant.completed() + states[-1].accumulation.sum() == pytest.approx(entered, abs=1e-6)
+    plant.reset(0)
+    assert plant.forced_moves == 0.0
