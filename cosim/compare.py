@@ -18,6 +18,8 @@ from nmfd.types import Controls, Measurement, Trajectory
 COLUMNS = (
     "region", "name", "critical_veh", "mean_veh", "rmse_veh", "rmse_share", "bias_veh", "next_interval_rmse_veh",
     "next_interval_rmse_share")
+COLLAPSED = 0.7  # of the largest outflow so far
+HELD_UP = "held up by a neighbour"
 CAPTION = (
     "RMSE, bias: of the accumulation that the regional model predicts for the whole run from its start [veh]; next\n"
     "interval: predicted one control interval ahead from every recorded state; bias > 0: the model holds too many")
@@ -89,26 +91,54 @@ def _row(region, name, critical, simulated, whole, ahead) -> dict:
         next_rmse / critical), strict=True))
 
 
-def outflow_samples(trajectories: Sequence[Trajectory], records: Sequence[dict], u_max: float, region: int) -> dict:
-    """MFD samples of one region: "loading" and "unloading" -> (n, 2) of accumulation [veh] and outflow [veh/s].
+def outflow_samples(
+    trajectories: Sequence[Trajectory], records: Sequence[dict], u_max: float, region: int, adjacency: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """MFD samples of one region: label -> (n, 2) of accumulation [veh] and outflow [veh/s].
+
+    Labels: "loading" and "unloading", and HELD_UP for intervals in which a neighbour's congestion, not the region's
+    own, limited what could leave (`held_up`).
 
     Per control interval, the outflow that the model's g has to give: trips ended in the region and transfers out of
     it as counted, the transfers divided by the u of the interval where it was below the bound that is meant by the
     original programme. In the model x_ii leaves at q x_ii and x_ij at u q x_ij, so q = outflow / (x_ii + u x_i,other).
     """
-    loading, unloading = [], []
+    samples: dict[str, list[np.ndarray]] = {"loading": [], "unloading": [], HELD_UP: []}
     for trajectory, record in zip(trajectories, records, strict=True):
-        x = 0.5 * (trajectory.accumulation[1:, region] + trajectory.accumulation[:-1, region])
-        total, own = x.sum(1), x[:, region]
-        outflow = (record["arrivals"][:, region] + record["crossings"][:, region].sum(axis=(1, 2))) / trajectory.step
+        x = 0.5 * (trajectory.accumulation[1:] + trajectory.accumulation[:-1])
+        total, own = x.sum(2), x[:, range(x.shape[1]), range(x.shape[1])]
+        outflow = (record["arrivals"] + record["crossings"].sum(axis=(2, 3))) / trajectory.step
         share = np.minimum(trajectory.perimeter[:, region].max(axis=1), u_max)
-        weight = own + share * (total - own)
+        weight = own[:, region] + share * (total - own)[:, region]
+        points = np.stack(
+            [total[:, region], outflow[:, region] * total[:, region] / np.maximum(weight, 1e-9)], axis=1)
         rising = np.diff(trajectory.accumulation[:, region].sum(1)) >= 0
-        seen = total >= 5.0
-        points = np.stack([total, outflow * total / np.maximum(weight, 1e-9)], axis=1)
-        loading.append(points[seen & rising])
-        unloading.append(points[seen & ~rising])
-    return {"loading": np.concatenate(loading), "unloading": np.concatenate(unloading)}
+        seen, blocked = total[:, region] >= 5.0, held_up(total, outflow, adjacency)[:, region]
+        samples["loading"].append(points[seen & ~blocked & rising])
+        samples["unloading"].append(points[seen & ~blocked & ~rising])
+        samples[HELD_UP].append(points[seen & blocked])
+    return {label: np.concatenate(clouds) for label, clouds in samples.items()}
+
+
+def held_up(accumulation: np.ndarray, outflow: np.ndarray, adjacency: np.ndarray) -> np.ndarray:
+    """(T, R) bool: a neighbour that collapsed before the region did is collapsed in this interval.
+
+    Collapsed: holding more vehicles (T, R) than when its outflow (T, R) was largest so far, and letting out less than
+    COLLAPSED of that. Queues that spill back over a boundary lower the outflow of the region behind it; its own MFD
+    is not to blame.
+    """
+    steps, regions = outflow.shape
+    collapsed = np.zeros((steps, regions), dtype=bool)
+    for i in range(regions):
+        best = 0
+        for k in range(steps):
+            if outflow[k, i] >= outflow[best, i]:
+                best = k
+            collapsed[k, i] = (
+                accumulation[k, i] > accumulation[best, i] and outflow[k, i] < COLLAPSED * outflow[best, i])
+    onset = np.where(collapsed.any(axis=0), collapsed.argmax(axis=0), steps)
+    earlier = adjacency & (onset[None, :] < onset[:, None])
+    return (collapsed[:, None, :] & earlier[None]).any(axis=2)
 
 
 def table(rows: pd.DataFrame) -> str:
@@ -139,7 +169,8 @@ def write(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
     plots.legend_below(drawing, axes, columns=4)
     plots.save(drawing, folder / f"compare-{name}-accumulation.png")
     samples = [
-        outflow_samples([result.trajectory], [result.record], scenario.network.u_max, region)
+        outflow_samples(
+            [result.trajectory], [result.record], scenario.network.u_max, region, scenario.network.adjacency)
         for region in range(scenario.network.regions)]
     draw_mfds(folder / f"compare-{name}-mfd.png", scenario.network, samples)
     return rows

@@ -1,6 +1,7 @@
 """Closed-loop runs in SUMO, side by side: a run folder with table, records and pictures."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from nmfd import plots, runs
 from nmfd.benchmarks import interval
 from nmfd.controllers import registry
 from nmfd.errors import InputError
+from nmfd.mfd import Mfd
 from nmfd.scenario import Scenario
 from nmfd.workers import Failure, RunFailed, attempt, outcomes
 
@@ -25,9 +27,11 @@ CAPTION = (
 
 def experiment(
     tasks: Sequence[Task], *, out: Path, workers: int = 1, progress: Callable[[int, int, str], None] | None = None,
+    model_free: bool = False,
 ) -> pd.DataFrame:
     """Run the tasks that are not yet in the run folder `out`; returns `overview` of all that is there.
 
+    model_free: the runs do not depend on the regional model (no control), and stay valid when its MFDs change.
     The tasks share scenario, steps and demand. Every finished run is kept, whatever happens to the others.
     progress: called with what is done and to do, and what is running. Raises InputError, before anything is written,
     for a city or controller that cannot be made; RunFailed at the end if runs failed.
@@ -41,9 +45,10 @@ def experiment(
         controllers[task.controller] = {} if policy is None else {"policy_hash": runs.file_hash(policy)}
     files = ensure_built(scenario.network)
     check_adjacency(load_city(files.net_file, files.regions_csv, scenario.network.regions), scenario.network)
+    model = _without_model(scenario) if model_free else scenario
     configuration = {
-        "scenario": scenario.name, "scenario_hash": runs.scenario_hash(scenario), "network": scenario.network.name,
-        "network_hash": scenario.network.hash, "net_file_hash": runs.file_hash(files.net_file), "plant": "sumo",
+        "scenario": scenario.name, "scenario_hash": runs.scenario_hash(model), "network": scenario.network.name,
+        "network_hash": model.network.hash, "net_file_hash": runs.file_hash(files.net_file), "plant": "sumo",
         "step_s": scenario.step, "steps": scenario.steps, "demand_factor": first.demand_factor,
         "sumo": vars(settings(scenario))}
     order = [(task.controller, task.seed) for task in tasks]
@@ -65,6 +70,13 @@ def experiment(
         if failures:
             raise RunFailed("; ".join(failures))
     return overview(out)
+
+
+def _without_model(scenario: Scenario) -> Scenario:
+    """The scenario with an arbitrary regional model and no controller options."""
+    network = scenario.network
+    mfds = (Mfd(a=0.0, b=0.0, c=1e-3, jam=1.0),) * network.regions
+    return replace(scenario, controller_options={}, network=replace(network, mfds=mfds, own_splits={}))
 
 
 def _outcomes(todo: Sequence[Task], workers: int, steps: int, progress) -> Iterator[tuple]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from cosim import experiment
-from cosim.compare import draw_mfds, outflow_samples
+from cosim.compare import HELD_UP, draw_mfds, outflow_samples
 from cosim.simulate import Result, Task
 from nmfd import mfd, runs, toml
 from nmfd.errors import InputError
@@ -37,12 +37,13 @@ def identify(
         folder = out / f"level-{level:g}"
         tasks = [
             Task(scenario=scenario, controller="no-control", seed=seed, demand_factor=level) for seed in seeds]
-        # The network is what is sought here: earlier loading runs stay valid when its MFDs change.
-        experiment.experiment(tasks, out=folder, workers=workers, progress=tell if progress else None)
+        experiment.experiment(
+            tasks, out=folder, workers=workers, progress=tell if progress else None, model_free=True)
         results += [experiment.read_run(folder, "no-control", seed) for seed in seeds]
     network = loaded.network
     samples = [
-        outflow_samples([r.trajectory for r in results], [r.record for r in results], network.u_max, region)
+        outflow_samples(
+            [r.trajectory for r in results], [r.record for r in results], network.u_max, region, network.adjacency)
         for region in range(network.regions)]
     fitted = replace(
         network, mfds=tuple(_fit(cloud, loaded.step / loaded.substeps) for cloud in samples),
@@ -58,11 +59,16 @@ def identify(
 
 
 def _fit(cloud: dict[str, np.ndarray], step: float) -> mfd.Mfd:
-    points = np.concatenate(list(cloud.values()))
+    points = own_points(cloud)
     if len(points) < 10:
         raise InputError(
             "--levels: a region was nearly empty in all loading runs; give higher levels, or a scenario that uses it")
     return mfd.fit(points[:, 0], points[:, 1], max_rate=1.0 / step)
+
+
+def own_points(cloud: dict[str, np.ndarray]) -> np.ndarray:
+    """(n, 2): the samples that the region's own MFD explains."""
+    return np.concatenate([points for label, points in cloud.items() if label != HELD_UP])
 
 
 def own_splits(network: Network, records: Sequence[dict]) -> dict[tuple[int, int], dict[int, float]]:
@@ -80,7 +86,7 @@ def fit_table(network: Network, samples: Sequence[dict]) -> str:
     """Per region: critical and jam accumulation, maximum outflow, samples, and how well the curve explains them."""
     lines = [f"{'region':<16}{'critical':>10}{'jam':>8}{'max outflow':>13}{'samples':>9}{'R2':>7}   [veh, veh/s]"]
     for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
-        points = np.concatenate(list(cloud.values()))
+        points = own_points(cloud)
         residual = points[:, 1] - curve.outflow(points[:, 0])
         explained = 1.0 - residual.var() / points[:, 1].var()
         name = f"{region} {network.region_names[region]}"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from cosim.compare import errors, outflow_samples, predict, predict_next
+from cosim.compare import errors, held_up, outflow_samples, predict, predict_next
 from cosim.identify import network_toml, own_splits
 from cosim.simulate import Result
 from nmfd import dynamics, mfd
@@ -70,7 +70,8 @@ def test_several_intervals_ahead(scenario, result):
 
 def test_outflow_samples_lie_on_the_mfd(scenario, result):
     for region in (0, 3):
-        cloud = outflow_samples([result.trajectory], [result.record], scenario.network.u_max, region)
+        cloud = outflow_samples(
+            [result.trajectory], [result.record], scenario.network.u_max, region, scenario.network.adjacency)
         points = np.concatenate(list(cloud.values()))
         expected = scenario.network.mfds[region].outflow(points[:, 0])
         # The samples are taken at the middle of an interval, the flows at its beginning.
@@ -112,3 +113,12 @@ def test_fit_is_safe_and_close(jam):
     assert (fitted.outflow(grid)[1:] > 0).all() and (np.diff(fitted.rate(grid)) <= 1e-12).all()
     inside = grid[grid <= jam]
     assert np.abs(fitted.outflow(inside) - truth.outflow(inside)).max() < 0.3
+
+
+def test_held_up_is_who_collapsed_later():
+    """Regions 0-1-2 in a row; 1 collapses at k = 2, 0 at k = 3, and 2 never; then 1 recovers."""
+    adjacency = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], dtype=bool)
+    accumulation = np.array([[10, 10, 10], [20, 20, 20], [30, 30, 20], [40, 30, 20], [50, 20, 20]], dtype=float)
+    outflow = np.array([[1, 1, 1], [2, 2, 2], [2, 1, 2], [1, 1, 2], [1, 2, 2]], dtype=float)
+    found = held_up(accumulation, outflow, adjacency)
+    assert found.T.tolist() == [[False, False, True, True, False], [False] * 5, [False, False, True, True, False]]
