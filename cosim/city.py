@@ -65,6 +65,7 @@ class Recipe:
     pocket: float
     cycle: int
     yellow: int
+    all_red: int
     left_green: int
 
 
@@ -148,7 +149,7 @@ def read_recipe(path: Path, regions: int) -> Recipe:
         nodes=nodes, streets=_streets(nodes), centre_speed=centre.number("speed", above=0.0),
         outer_speed=outer.number("speed", above=0.0), pocket=centre.number("pocket", low=10.0),
         cycle=signals.integer("cycle", low=30), yellow=signals.integer("yellow", low=1),
-        left_green=signals.integer("left_green", low=1))
+        all_red=signals.integer("all_red"), left_green=signals.integer("left_green", low=1))
     for table in (centre, outer, signals, root):
         table.close()
     return recipe
@@ -176,7 +177,10 @@ def _streets(nodes: dict[str, Node]) -> list[tuple[str, str]]:
 
 
 def _movements(recipe: Recipe, start: str, end: str) -> dict[str, str]:
-    """{"r", "s" or "l": next node} at the end of a street, without turning back."""
+    """{"r", "s" or "l": next node} at the end of a street, without turning back.
+
+    A radial into the centre is entered straight ahead only: no queue before the centre stands on the ring around it.
+    """
     nodes = recipe.nodes
     heading = _heading(nodes[start], nodes[end])
     turns = {}
@@ -184,7 +188,9 @@ def _movements(recipe: Recipe, start: str, end: str) -> dict[str, str]:
         if a == end and b != start:
             onward = _heading(nodes[a], nodes[b])
             cross = heading[0] * onward[1] - heading[1] * onward[0]
-            turns["s" if cross == 0 else "l" if cross > 0 else "r"] = b
+            turn = "s" if cross == 0 else "l" if cross > 0 else "r"
+            if turn == "s" or nodes[a].centre or not nodes[b].centre:
+                turns[turn] = b
     return {turn: turns[turn] for turn in "rsl" if turn in turns}
 
 
@@ -226,9 +232,8 @@ def _plain_xml(recipe: Recipe) -> tuple[str, str, str, dict[str, int]]:
         own = _leads_in(recipe, a, b) or (nodes[b].centre and not nodes[a].centre)
         for turn, lanes_of_turn in LANES[lanes[source], "".join(turns), own].items():
             target = first[b, turns[turn]]
-            connection_rows += [
-                _link(source, target, lane, into)
-                for lane, into in zip(lanes_of_turn, _into(turn, len(lanes_of_turn), lanes[target]), strict=True)]
+            for lane, into in zip(lanes_of_turn, _into(turn, len(lanes_of_turn), lanes[target]), strict=True):
+                connection_rows += [_link(source, target, lane, number) for number in into]
     parts = (("nodes", node_rows), ("edges", edge_rows), ("connections", connection_rows))
     return *(f"<{tag}>\n{''.join(rows)}</{tag}>\n" for tag, rows in parts), region_of
 
@@ -239,10 +244,16 @@ def _leads_in(recipe: Recipe, a: str, b: str) -> bool:
     return outside and any(recipe.nodes[to].centre for to in _movements(recipe, a, b).values())
 
 
-def _into(turn: str, lanes: int, target_lanes: int) -> list[int]:
-    """The lanes that a movement's lanes lead into: right turns to the right, left turns to the left."""
-    first = {"r": 0, "l": target_lanes - lanes, "s": 1 if target_lanes > lanes + 1 else 0}[turn]
-    return [first + n for n in range(lanes)]
+def _into(turn: str, lanes: int, target_lanes: int) -> list[range]:
+    """For each lane of a movement the lanes that it leads into.
+
+    A vehicle chooses the lane it needs next while it turns: in a queue it could not change lanes any more, and two
+    vehicles that each want the lane of the other would wait for ever.
+    """
+    if turn == "s" or lanes > 1:
+        cuts = [target_lanes * n // lanes for n in range(lanes + 1)]
+        return [range(a, b) for a, b in zip(cuts, cuts[1:], strict=False)]
+    return [range(target_lanes)]
 
 
 def _row(tag: str, **attributes) -> str:
@@ -267,7 +278,8 @@ def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
         command = [
             str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"), *options, "--output-file", "net.xml",
             "--no-turnarounds", "true", "--tls.cycle.time", str(recipe.cycle),
-            "--tls.yellow.time", str(recipe.yellow), "--tls.left-green.time", str(recipe.left_green)]
+            "--tls.yellow.time", str(recipe.yellow),
+            "--tls.allred.time", str(recipe.all_red), "--tls.left-green.time", str(recipe.left_green)]
         result = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, check=False,
             env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME})

@@ -15,7 +15,7 @@ from nmfd.errors import InputError
 
 STREAM = 7101       # keeps the random numbers of trips apart from others of the same seed
 TASTES = 8          # groups of drivers who see different travel times
-TASTE_SPREAD = 0.1  # standard deviation of the logarithm of their travel times
+TASTE_SPREAD = 0.15  # standard deviation of the logarithm of their travel times
 SHORT = 30.0        # m; no trip starts or ends on a shorter edge where its region has longer ones
 
 

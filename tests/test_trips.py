@@ -1,0 +1,89 @@
+"""Trips of grid7: their number, their regions, their routes and their seeds."""
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim.city import ensure_built
+from cosim.regions import load_city
+from cosim.trips import make_trips, write_trips
+from nmfd.errors import InputError
+from nmfd.scenario import load_scenario
+
+SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return load_scenario(SCENARIO)
+
+
+@pytest.fixture(scope="module")
+def city(scenario):
+    files = ensure_built(scenario.network)
+    return load_city(files.net_file, files.regions_csv, 7)
+
+
+@pytest.fixture(scope="module")
+def trips(city, scenario):
+    return make_trips(city, scenario.demand, scenario.step, seed=1)
+
+
+def test_every_pair_gets_its_vehicles(trips, scenario):
+    counts = np.zeros((7, 7))
+    np.add.at(counts, (trips.origin, trips.destination), 1)
+    assert np.abs(counts - scenario.demand.sum(axis=0) * scenario.step).max() < 1.0
+    assert 7000 <= counts.sum() <= 11000
+
+
+def test_vehicles_depart_when_the_demand_says(trips, scenario):
+    per_step = np.histogram(trips.depart, bins=scenario.step * np.arange(scenario.steps + 1))[0]
+    pairs = (scenario.demand.sum(axis=0) > 0).sum()
+    assert np.abs(per_step - scenario.demand.sum(axis=(1, 2)) * scenario.step).max() < pairs
+    assert (np.diff(trips.depart) >= 0).all()
+
+
+def test_routes_lead_from_region_to_region(trips, city):
+    for origin, destination, route, arrival in zip(
+            trips.origin, trips.destination, trips.routes, trips.arrival, strict=True):
+        assert city.region_of[route[0]] == origin
+        assert city.region_of[route[-1]] == destination
+        assert route[0] != route[-1]
+        assert all(b in city.successors[a] for a, b in zip(route, route[1:], strict=False))
+        assert 0 < arrival < city.length[route[-1]]
+
+
+def test_no_trip_starts_or_ends_on_a_radial_or_in_a_pocket(trips, city):
+    into_the_centre = {gateway.from_edge for gateway in city.gateways if gateway.target == 3}
+    out_of_the_centre = {gateway.to_edge for gateway in city.gateways if gateway.source == 3}
+    assert not into_the_centre & {route[0] for route in trips.routes}
+    assert not out_of_the_centre & {route[-1] for route in trips.routes}
+    assert not any(edge.endswith(".p") for route in trips.routes for edge in (route[0], route[-1]))
+
+
+def test_drivers_spread(trips):
+    by_ends: dict = {}
+    for route in trips.routes:
+        by_ends.setdefault((route[0], route[-1]), set()).add(route)
+    assert max(len(routes) for routes in by_ends.values()) > 1
+
+
+def test_seeds(city, scenario, tmp_path):
+    paths = [tmp_path / f"{n}.rou.xml" for n in range(3)]
+    count = [write_trips(city, scenario.demand, scenario.step, seed, path)
+             for seed, path in zip((1, 1, 2), paths, strict=True)]
+    first, again, other = (path.read_bytes() for path in paths)
+    assert first == again != other
+    vehicles = list(ElementTree.fromstring(first).iter("vehicle"))
+    assert [vehicle.get("id") for vehicle in vehicles] == [f"v{n}" for n in range(count[0])]
+
+
+def test_demand_for_other_regions(city):
+    with pytest.raises(InputError, match="demand for 3 regions, but the city has 7"):
+        make_trips(city, np.zeros((2, 3, 3)), 90.0, seed=1)
+
+
+def test_no_demand_no_trips(city, tmp_path):
+    assert write_trips(city, np.zeros((2, 7, 7)), 90.0, 1, tmp_path / "none.rou.xml") == 0
