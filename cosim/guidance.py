@@ -1,7 +1,13 @@
-"""Route guidance to reroutes: the next region of a vehicle is drawn from the split ratios, once per region it enters.
+"""Route guidance to reroutes: every vehicle is given its next region once per region it enters, in shares theta.
+
+Who is sent where is not drawn by lot: a driver at the western edge of a region would be sent round its eastern end as
+often as the others, and trips get so much longer that guidance with the drivers' own split ratios jams a city that
+flows without it (measured on grid7). Instead everybody takes the next region that costs least, with a bonus for the
+regions that are behind their share; the bonus grows until the shares are met, by those who lose least.
 
 A guided vehicle in region i bound for edge d takes the fastest way inside i to a gateway i -> h, and from there to d
-without coming back to i, at the travel times of the last control interval (smoothed). In h it is guided again.
+without coming back to i, at the travel times of the last control interval (smoothed), as its group of drivers sees
+them. In h it is guided again.
 """
 
 import numpy as np
@@ -13,7 +19,11 @@ from cosim.regions import City
 from cosim.sumo import Session
 
 SMOOTHING = 0.5  # weight of the newest travel times
-NONE = -9999  # scipy's "no predecessor"
+TASTES = 4       # groups of drivers who see different travel times: were they all sent one way, it would jam
+SPREAD = 0.15    # standard deviation of the logarithm of their travel times
+SLOWEST = 0.1    # m/s; slower is as good as standing
+BONUS = 30.0     # s per vehicle that a region is behind its share
+MEMORY = 0.9     # of the vehicles assigned before, per control interval
 
 
 class Guide:
@@ -30,20 +40,29 @@ class Guide:
         self._from, self._to = (np.array(column) for column in zip(*pairs, strict=True))
         self._turn = np.array([city.turn_time[pair] for pair in (
             (e, f) for e, after in city.successors.items() for f in after)])
-        self._time = np.array([city.length[edge] / city.speed[edge] for edge in city.edges])
-        self._ways: dict[int, _Ways] = {}
+        self._taste = np.exp(SPREAD * random.standard_normal((TASTES, len(city.edges))))
+        self._length = np.array([city.length[edge] for edge in city.edges])
+        self._free = self._length / np.array([city.speed[edge] for edge in city.edges])
+        self._time = self._free.copy()
+        self._ways: dict[tuple[int, int], _Ways] = {}
         self._splits: np.ndarray | None = None
+        self._assigned = np.zeros((city.regions,) * 3)
         self.realised = np.zeros((city.regions,) * 3, dtype=int)
         self.refused = 0
 
-    def command(self, splits: np.ndarray | None) -> None:
-        """Take over theta (R, R, R) [-] for the next control interval and the travel times of the last; None: no
-        guidance."""
+    def command(self, splits: np.ndarray | None, speed: np.ndarray | None) -> None:
+        """Take over theta (R, R, R) [-] for the next control interval; None: no guidance.
+
+        speed: (E,) [m/s] of the city's edges, the mean over the last interval and NaN on empty ones; None: as before.
+        A mean, because the speed at one instant is that of a red or a green signal, every time the same one.
+        """
         self._splits = splits
         if splits is not None:
-            now = np.array([self._session.travel_time(edge) for edge in self._city.edges])
-            self._time += SMOOTHING * (np.minimum(now, 3600.0) - self._time)
+            if speed is not None:
+                now = np.where(np.isnan(speed), self._free, self._length / np.maximum(speed, SLOWEST))
+                self._time += SMOOTHING * (np.maximum(now, self._free) - self._time)
             self._ways = {}
+            self._assigned *= MEMORY
 
     def apply(self, events: list[Event]) -> None:
         """Guide the vehicles that departed or entered a region in the last step."""
@@ -54,41 +73,47 @@ class Guide:
                 self._guide(event)
 
     def _guide(self, event: Event) -> None:
-        ways, target = self._ways_from(event.region), self._index[event.edge]
+        ways = self._ways_from(event.region, int(self._random.integers(TASTES)))
+        target = self._index[event.edge]
         here = self._index.get(self._session.road(event.vehicle))
         if here is None or self._region[here] != event.region:  # on a junction already: too late to turn
             return
         cost = ways.cost(here, target)
-        reachable = np.isfinite(np.minimum.reduceat(cost, ways.begins))
-        shares = np.cumsum(self._splits[event.region, ways.neighbours, event.destination] * reachable)
-        if shares[-1] <= 0:
+        least = np.minimum.reduceat(cost, ways.begins)
+        cell = event.region, ways.neighbours, event.destination
+        shares = self._splits[cell] * np.isfinite(least)
+        if shares.sum() <= 0:
             return
-        n = int(np.searchsorted(shares, self._random.random() * shares[-1], side="right"))
+        shares /= shares.sum()
+        behind = shares * (self._assigned[cell].sum() + 1.0) - self._assigned[cell]
+        n = int(np.argmin(np.where(shares > 1e-3, least - BONUS * behind, np.inf)))
         following = int(ways.neighbours[n])
         gateway = int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]]))
         route = [self._city.edges[n] for n in ways.route(here, gateway, target)]
         if self._session.set_route(event.vehicle, route):
             self.realised[event.region, following, event.destination] += 1
+            self._assigned[event.region, following, event.destination] += 1.0
         else:
             self.refused += 1
 
-    def _ways_from(self, region: int) -> "_Ways":
-        if region not in self._ways:
+    def _ways_from(self, region: int, taste: int) -> "_Ways":
+        if (region, taste) not in self._ways:
+            time = self._time * self._taste[taste]
             gateways = [g for g in self._city.gateways if g.source == region]
-            self._ways[region] = _Ways(
+            self._ways[region, taste] = _Ways(
                 first=np.array([self._index[g.from_edge] for g in gateways]),
                 second=np.array([self._index[g.to_edge] for g in gateways]),
                 next_region=np.array([g.target for g in gateways]),  # sorted, as the gateways are
-                inside=self._graph(self._region == region, reverse=True),
-                outside=self._graph(self._region != region, reverse=False), time=self._time)
-        return self._ways[region]
+                inside=self._graph(time, self._region == region, reverse=True),
+                outside=self._graph(time, self._region != region, reverse=False), time=time)
+        return self._ways[region, taste]
 
-    def _graph(self, allowed: np.ndarray, *, reverse: bool) -> csr_array:
+    def _graph(self, time: np.ndarray, allowed: np.ndarray, *, reverse: bool) -> csr_array:
         """Moves between allowed edges; a move costs the time of the turn and of the edge that it leads to."""
         keep = allowed[self._from] & allowed[self._to]
         rows, columns = self._from[keep], self._to[keep]
-        cost = np.maximum(self._time[columns] + self._turn[keep], 1e-3)
-        size = len(self._time)
+        cost = np.maximum(time[columns] + self._turn[keep], 1e-3)
+        size = len(time)
         return csr_array((cost, (columns, rows) if reverse else (rows, columns)), shape=(size, size))
 
 
@@ -99,23 +124,24 @@ class _Ways:
     """
 
     def __init__(self, *, first, second, next_region, inside, outside, time):
-        self._first, self._second = first, second
+        self._first, self._second, self._enter = first, second, time[second]
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))
-        self._to_gateway, self._after = dijkstra(inside, indices=first, return_predecessors=True)
-        self._from_gateway, self._before = dijkstra(outside, indices=second, return_predecessors=True)
-        self._enter = time[second]
+        firsts, self._in = np.unique(first, return_inverse=True)  # several gateways share an edge
+        seconds, self._out = np.unique(second, return_inverse=True)
+        self._to_gateway, self._after = dijkstra(inside, indices=firsts, return_predecessors=True)
+        self._from_gateway, self._before = dijkstra(outside, indices=seconds, return_predecessors=True)
 
     def cost(self, here: int, target: int) -> np.ndarray:
         """(G,) [s] from the end of edge `here` to the end of edge `target`; infinite where there is no way."""
-        return self._to_gateway[:, here] + self._enter + self._from_gateway[:, target]
+        return self._to_gateway[self._in, here] + self._enter + self._from_gateway[self._out, target]
 
     def route(self, here: int, gateway: int, target: int) -> list[int]:
         """The edges from `here` to `target` through `gateway`."""
         to_gateway = [here]
         while to_gateway[-1] != self._first[gateway]:
-            to_gateway.append(int(self._after[gateway, to_gateway[-1]]))
+            to_gateway.append(int(self._after[self._in[gateway], to_gateway[-1]]))
         back = [target]
         while back[-1] != self._second[gateway]:
-            back.append(int(self._before[gateway, back[-1]]))
+            back.append(int(self._before[self._out[gateway], back[-1]]))
         return to_gateway + back[::-1]

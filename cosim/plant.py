@@ -103,6 +103,7 @@ class SumoPlant:
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
         check_adjacency(self.city, scenario.network)
+        self._edge_region = np.array([self.city.region_of[edge] for edge in self.city.edges])
         self._net_file = files.net_file
         self._folder = tempfile.TemporaryDirectory(prefix="cosim-")
         self._session: Session | None = None
@@ -125,30 +126,34 @@ class SumoPlant:
             random=np.random.default_rng([seed, 0x67756964]))
         self._signals = self._gateway_signals()
         self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
-        self._k, self._rows = 0, []
+        self._k, self._rows, self._speed = 0, [], None
         return self._measurement()
 
     def step(self, controls: Controls) -> Measurement:
         network, session, meter = self._scenario.network, self._session, self._meter
         before = self._totals()
         self._actuator.command(controls.perimeter, network.u_min, network.u_max)
-        self._guide.command(controls.splits)
+        self._guide.command(controls.splits, self._speed)
         begin, steps = session.time, round(self._scenario.step / session.step_length)
         every = max(1, round(PRODUCTION_EVERY / session.step_length))
-        samples = []
+        vehicles, metres = np.zeros((2, len(self.city.edges)))  # sums over the samples, by edge: n and n v
+        samples = 0
         for n in range(steps):
             self._actuator.play(session.time)
             session.step()
             self._guide.apply(meter.observe())
             if n % every == every - 1:
-                samples.append(self._sample())
+                counts, speeds = self._sample()
+                vehicles, metres, samples = vehicles + counts, metres + counts * speeds, samples + 1
         self._k += 1
         assert abs(session.time - begin - self._scenario.step) < 1e-6
         measurement = self._measurement()
         after = self._totals()
         row = {key: after[key] - before[key] for key in after}
-        row["production"], row["mean_accumulation"] = np.mean(samples, axis=0) if samples else np.full(
-            (2, network.regions), np.nan)
+        with np.errstate(invalid="ignore"):
+            self._speed = metres / vehicles
+        row["production"], row["mean_accumulation"] = (
+            np.bincount(self._edge_region, amount, network.regions) / max(samples, 1) for amount in (metres, vehicles))
         row["gateway_queue"] = np.array([session.halting(g.from_edge) for g in self.city.gateways])
         self._rows.append(row)
         return measurement
@@ -203,14 +208,13 @@ class SumoPlant:
             backlog=self._meter.backlog())
 
     def _sample(self) -> tuple[np.ndarray, np.ndarray]:
-        production, accumulation = np.zeros((2, self.city.regions))
-        for edge in self.city.edges:
-            vehicles = self._session.vehicle_count(edge)
-            if vehicles:
-                region = self.city.region_of[edge]
-                accumulation[region] += vehicles
-                production[region] += vehicles * self._session.mean_speed(edge)
-        return production, accumulation
+        """Vehicles (E,) [veh] and mean speed (E,) [m/s] by edge, now."""
+        count, mean_speed = self._session.vehicle_count, self._session.mean_speed
+        counts = np.array([count(edge) for edge in self.city.edges], dtype=float)
+        speeds = np.zeros(len(counts))
+        for n in np.flatnonzero(counts):
+            speeds[n] = mean_speed(self.city.edges[n])
+        return counts, speeds
 
     def _totals(self) -> dict[str, np.ndarray]:
         # Several movements may lead from one region to one edge: they share its flow.

@@ -115,13 +115,11 @@ class Session:
             return False
         return True
 
-    # Edges: the vehicles on one and their number, mean speed [m/s] (the limit if empty), vehicles slower than 0.1 m/s,
-    # and travel time at the present mean speed [s].
+    # Edges: the vehicles on one and their number, mean speed [m/s] (the limit if empty), vehicles under 0.1 m/s.
     vehicles_on = staticmethod(libsumo.edge.getLastStepVehicleIDs)
     vehicle_count = staticmethod(libsumo.edge.getLastStepVehicleNumber)
     mean_speed = staticmethod(libsumo.edge.getLastStepMeanSpeed)
     halting = staticmethod(libsumo.edge.getLastStepHaltingNumber)
-    travel_time = staticmethod(libsumo.edge.getTraveltime)
 
     # Signals.
 

@@ -21,6 +21,7 @@ REFERENCE = "no-control"
 CAPTION = (
     "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against no-control; control: time of all\n"
     "decisions of a run; step: median / longest decision; failures: decisions that were a fallback, all seeds")
+BOUND_CAPTION = "above bound: TTS against the bound with the same controls, perimeter alone (PC) or with routes (PCRG)"
 
 
 def run_one(
@@ -50,17 +51,17 @@ def benchmark(
     policies = policies or {}
     for name in controllers:
         registry.make(name, scenario, policy=policies.get(name))
-    configuration, settings = _configuration(scenario, controllers, plant, policies)
+    common, settings = configuration(scenario, controllers, plant, policies)
     wanted = [(name, seed) for name in controllers for seed in seeds]
     session = {"scenario_folder": str(scenario.folder), "workers": workers}
     with runs.open_folder(
-            out, configuration=configuration, controllers=settings, order=wanted, session=session) as folder:
+            out, configuration=common, controllers=settings, order=wanted, session=session) as folder:
         todo = [run for run in wanted if run not in folder.finished]
         failures = []
         work = partial(run_one, scenario=scenario, plant=plant, policies=policies)
-        for run, outcome in _results(work, todo, workers, scenario.steps, progress):
+        for run, outcome in results(work, todo, workers, scenario.steps, progress, label=_label):
             if isinstance(outcome, Failure):
-                failures.append(f"controller {run[0]}, seed {run[1]}: {outcome.reason}")
+                failures.append(f"controller {_label(run)}: {outcome.reason}")
             else:
                 folder.add(outcome)
         if folder.finished:
@@ -70,7 +71,7 @@ def benchmark(
         return folder.rows()
 
 
-def _configuration(scenario: Scenario, controllers, plant: str, policies) -> tuple[dict, dict]:
+def configuration(scenario: Scenario, controllers, plant: str, policies) -> tuple[dict, dict]:
     """What all runs have in common, and what each controller depends on besides."""
     settings = {}
     for name in controllers:
@@ -83,18 +84,28 @@ def _configuration(scenario: Scenario, controllers, plant: str, policies) -> tup
     return common, settings
 
 
-def _results(work, todo: Sequence[tuple[str, int]], workers: int, steps: int, progress) -> Iterator[tuple]:
-    """(run, trajectory or Failure) of every run, in this process if there is one worker."""
+def _label(run: tuple[str, int]) -> str:
+    return f"{run[0]}, seed {run[1]}"
+
+
+def results(
+    work: Callable, todo: Sequence[tuple], workers: int, steps: int, progress, *, label: Callable[[tuple], str],
+) -> Iterator[tuple]:
+    """(run, result or Failure) of every run, in this process if there is one worker.
+
+    work(run), or work(run, progress=...) in this process, is one closed loop of `steps` control intervals; progress
+    as in `benchmark`, with the `label` of the run.
+    """
     report = progress or (lambda done, total, note: None)
     total = steps * len(todo)
     if workers > 1:
         for done, (run, outcome) in enumerate(outcomes(work, todo, min(workers, len(todo))), start=1):
-            report(done * steps, total, f"{done}/{len(todo)} runs, last {run[0]} {run[1]}")
+            report(done * steps, total, f"{done}/{len(todo)} runs, last {label(run)}")
             yield run, outcome
         return
     for done, run in enumerate(todo):
-        def tick(k, _, before=done * steps, note=f"{run[0]}, seed {run[1]}"):
-            report(before + k, total, note)
+        def tick(k, _, before=done * steps, run=run):
+            report(before + k, total, label(run))
 
         yield run, attempt(partial(work, progress=tick), run)
 
@@ -155,8 +166,9 @@ def table(rows: Sequence[Mapping]) -> str:
     for row in rows:
         groups.setdefault(row["controller"], []).append(row)
     tts = {name: [row["total_time_spent_veh_s"] for row in group] for name, group in groups.items()}
-    lines = [["controller", "seeds", "TTS [veh s]", "change", "final [veh]", "max [veh]", "completed [veh]",
-              "control [s]", "step [ms]", "failures"]]
+    with_bound = any(name in tts for name in ("bound-pc", "bound-pcrg"))
+    lines = [["controller", "seeds", "TTS [veh s]", "change", *["above bound"] * with_bound, "final [veh]",
+              "max [veh]", "completed [veh]", "control [s]", "step [ms]", "failures"]]
     for name, group in groups.items():
         def mean(column, group=group):
             return statistics.fmean(row[column] for row in group)
@@ -164,11 +176,14 @@ def table(rows: Sequence[Mapping]) -> str:
         spread = interval(tts[name])
         change = ""
         if REFERENCE in tts and name != REFERENCE:
-            change = f"{100 * (statistics.fmean(tts[name]) / statistics.fmean(tts[REFERENCE]) - 1):+.1f} %"
+            change = _percent(tts[name], tts[REFERENCE])
+        bound = "bound-pcrg" if "-pcrg" in name else "bound-pc"
+        above = _percent(tts[name], tts[bound]) if bound in tts and name != bound else ""
         lines.append([
             name, str(len(group)), _scientific(statistics.fmean(tts[name])) + (
                 "" if math.isnan(spread) else f" ± {_scientific(spread, 1)}"),
-            change, f"{mean('final_accumulation_veh'):,.0f}", f"{mean('max_accumulation_veh'):,.0f}",
+            change, *[above] * with_bound, f"{mean('final_accumulation_veh'):,.0f}",
+            f"{mean('max_accumulation_veh'):,.0f}",
             f"{mean('completed_veh'):,.0f}", f"{mean('evaluation_time_s'):.3g}",
             f"{mean('control_step_ms_median'):.3g} / {max(row['control_step_ms_max'] for row in group):.3g}",
             str(sum(row["solver_failures"] for row in group))])
@@ -176,7 +191,12 @@ def table(rows: Sequence[Mapping]) -> str:
     text = [
         "  ".join([line[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(line[1:], widths[1:], strict=True))])
         for line in lines]
-    return "\n".join([*text, CAPTION])
+    return "\n".join([*text, CAPTION, *[BOUND_CAPTION] * with_bound])
+
+
+def _percent(values: Sequence[float], reference: Sequence[float]) -> str:
+    """How far the mean of `values` is above that of `reference`, like +1.7 %."""
+    return f"{100 * (statistics.fmean(values) / statistics.fmean(reference) - 1):+.1f} %"
 
 
 def _scientific(value: float, digits: int = 4) -> str:

@@ -1,15 +1,13 @@
 """The command line `nmfd`. Heavy modules are imported inside the commands, so that the help answers at once."""
 
-import shlex
 from pathlib import Path
 
 import click
 
 from nmfd.command_line import Commands, Interrupted
 from nmfd.errors import InputError
-
-FOLDER = click.Path(path_type=Path, file_okay=False)
-FILE = click.Path(path_type=Path, dir_okay=False)
+from nmfd.experiments import ablation, bound, robustness, scaling
+from nmfd.options import FILE, FOLDER, controller_names, policy_files, quoted
 
 
 @click.group(name="nmfd", cls=Commands)
@@ -26,7 +24,8 @@ def main() -> None:
 @main.command()
 @click.argument("scenario", type=FOLDER)
 @click.option("--controllers", required=True, metavar="A,B,...",
-              help="Which to run: no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc, dpc-pcrg.")
+              help="Which to run: no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, "
+                   "dpc-pcrg-robust, dpc-pc-guarded, dpc-pcrg-guarded, bound-pc, bound-pcrg.")
 @click.option("--seeds", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
               help="Run seeds 0 to N-1 of the measurement noise.")
 @click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", show_default=True,
@@ -34,7 +33,7 @@ def main() -> None:
 @click.option("--workers", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
               help="Runs at a time, each on one core. Timings are cleanest with 1.")
 @click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
-              help="The policy file of a DPC controller, if not SCENARIO/NAME.pt. May be repeated.")
+              help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.")
 @click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
 def benchmark(
     scenario: Path, controllers: str, seeds: int, plant: str, workers: int, policies: tuple[str, ...],
@@ -52,8 +51,8 @@ def benchmark(
       nmfd benchmark scenarios/economic_mpc --controllers no-control,dpc-pc \\
           --seeds 5 --plant acyclic --workers 2 --policy dpc-pc=mine.pt --out runs/mine
     """
-    names = _names(controllers)
-    files = _policies(policies, names)
+    names = controller_names(controllers)
+    files = policy_files(policies, names)
 
     from nmfd import benchmarks, runs
     from nmfd.progress import progress_line
@@ -69,7 +68,7 @@ def benchmark(
         if not (out / "summary.csv").exists():
             raise Interrupted("interrupted before a run was finished; nothing is kept") from None
         raise Interrupted(
-            f"interrupted; finished runs are in {out}: the same command with --out {_quoted(out)} goes on") from None
+            f"interrupted; finished runs are in {out}: the same command with --out {quoted(out)} goes on") from None
     click.echo(f"{loaded.name}, {plant} plant, {loaded.steps} control intervals of {loaded.step:g} s")
     click.echo(benchmarks.table(rows))
     click.echo(f"Written to {out}")
@@ -77,15 +76,24 @@ def benchmark(
 
 @main.command()
 @click.argument("scenario", type=FOLDER)
-@click.option("--controller", required=True, metavar="NAME", help="dpc-pc or dpc-pcrg.")
+@click.option("--controller", required=True, metavar="NAME",
+              help="dpc-pc, dpc-pcrg, dpc-pc-robust or dpc-pcrg-robust.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True,
               help="Of the initial weights and the training scenarios.")
 @click.option("--steps", type=click.IntRange(min=1), metavar="N",
               help="Adam steps. [default: what scenario.toml says, else 400]")
 @click.option("--out", type=FILE, metavar="FILE", help="The policy file. [default: SCENARIO/NAME.pt]")
 @click.option("--resume", is_flag=True, help="Go on with an interrupted training.")
-def train(scenario: Path, controller: str, seed: int, steps: int | None, out: Path | None, resume: bool) -> None:
-    """Train a DPC policy on a scenario.
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True,
+              help="auto: a GPU where there is one. The CPU gives the same weights every time.")
+@click.option("--compile/--no-compile", "compiled", default=None,
+              help="Compile the rollout: a minute or two first, then several times as fast. [default: from 200 Adam "
+                   "steps up, where there is a C++ compiler]")
+def train(
+    scenario: Path, controller: str, seed: int, steps: int | None, out: Path | None, resume: bool, device: str,
+    compiled: bool | None,
+) -> None:
+    """Train a DPC policy on a scenario. The -robust ones are trained with noise on the demand.
 
     The policy that does best in validation is in the policy file at any time; Ctrl-C keeps it, and --resume goes on.
 
@@ -94,12 +102,18 @@ def train(scenario: Path, controller: str, seed: int, steps: int | None, out: Pa
       nmfd train scenarios/economic_mpc --controller dpc-pcrg
       nmfd train scenarios/economic_mpc --controller dpc-pc --steps 200 --out mine.pt
     """
-    from nmfd import training
+    from nmfd import rollout, training
     from nmfd.progress import progress_line
     from nmfd.scenario import load_scenario
 
     loaded = load_scenario(scenario)
-    training.settings(loaded, controller, steps)  # complains of the name before a file is named after it
+    device = training.available(device)
+    chosen = training.settings(loaded, controller, steps)  # complains of the name before a file is named after it
+    default = compiled is None
+    if default:
+        compiled = chosen.steps >= training.WORTH_COMPILING and rollout.can_compile()
+    elif compiled and not rollout.can_compile():
+        raise InputError("--compile: needs a C++ compiler, and none was found; install g++ or leave it out")
     file = scenario / f"{controller}.pt" if out is None else out
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the policy; make it or choose another --out")
@@ -113,14 +127,18 @@ def train(scenario: Path, controller: str, seed: int, steps: int | None, out: Pa
                 if line:
                     line(done, total, note)
 
-            training.train(loaded, controller, seed=seed, out=file, steps=steps, resume=resume, progress=progress)
+            training.train(
+                loaded, controller, seed=seed, out=file, steps=steps, resume=resume, device=device, compiled=compiled,
+                progress=progress)
     except KeyboardInterrupt:
         if not resume and _stamp(state) == before:
             raise Interrupted("interrupted before the first validation; nothing is kept") from None
-        again = f"nmfd train {_quoted(scenario)} --controller {controller}"
+        again = f"nmfd train {quoted(scenario)} --controller {controller}"
         again += f" --seed {seed}" if seed else ""
         again += f" --steps {steps}" if steps else ""
-        again += f" --out {_quoted(out)}" if out else ""
+        again += f" --out {quoted(out)}" if out else ""
+        again += f" --device {device}" if device != "cpu" else ""
+        again += "" if default else f" --{'' if compiled else 'no-'}compile"
         raise Interrupted(f"interrupted; the best policy so far is {file}; go on with: {again} --resume") from None
     click.echo(f"{controller}: {notes[-1]} in validation")
     click.echo(f"Written to {file}")
@@ -152,40 +170,13 @@ def show(scenario: Path, out: Path | None) -> None:
         click.echo(f"Written to {file}")
 
 
-def _names(controllers: str) -> list[str]:
-    """The controllers in a list separated by commas. InputError for an unknown, repeated or empty name."""
-    from nmfd.controllers import registry
-
-    names = [name.strip() for name in controllers.split(",")]
-    for name in names:
-        registry.check(name)
-    if repeated := [name for n, name in enumerate(names) if name in names[:n]]:
-        raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
-    return names
-
-
-def _policies(options: tuple[str, ...], names: list[str]) -> dict[str, Path]:
-    """NAME=FILE options as a table. InputError for another form, or a controller that is not run."""
-    files: dict[str, Path] = {}
-    for option in options:
-        name, equals, file = option.partition("=")
-        if not equals or not file:
-            raise InputError(f"--policy: expected NAME=FILE, such as dpc-pc=mine.pt, got {option!r} instead")
-        if name not in names:
-            raise InputError(f"--policy: {name!r} is not among --controllers {','.join(names)}; add it there")
-        if name in files:
-            raise InputError(f"--policy: {name} is there twice; give one file for each controller")
-        files[name] = Path(file)
-    return files
-
-
-def _quoted(path: Path) -> str:
-    return shlex.quote(str(path))
-
-
 def _stamp(path: Path) -> int | None:
     """When `path` was written last [ns]; None without it."""
     return path.stat().st_mtime_ns if path.exists() else None
+
+
+for command in (bound, robustness, ablation, scaling):
+    main.add_command(command)
 
 
 if __name__ == "__main__":

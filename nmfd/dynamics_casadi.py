@@ -16,27 +16,22 @@ from nmfd.network import Network
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
-    """The network as CasADi constants. a, b, c, jam: (R, 1) of the MFDs; adjacency: (R, R), 1 or structural zero.
-
-    rounding: width [veh] over which the kink of the MFD at the jam accumulation is rounded off, for solvers that want
-        second derivatives; 0 for the exact model
-    """
+    """The network as CasADi constants. a, b, c, jam: (R, 1) of the MFDs; adjacency: (R, R), 1 or structural zero."""
 
     a: ca.DM
     b: ca.DM
     c: ca.DM
     jam: ca.DM
     adjacency: ca.DM
-    rounding: float
 
 
-def parameters(network: Network, *, rounding: float = 0.0) -> Parameters:
+def parameters(network: Network) -> Parameters:
     def column(name):
         return ca.DM([getattr(m, name) for m in network.mfds])
 
     return Parameters(
         a=column("a"), b=column("b"), c=column("c"), jam=column("jam"),
-        adjacency=ca.sparsify(ca.DM(network.adjacency.astype(float))), rounding=rounding)
+        adjacency=ca.sparsify(ca.DM(network.adjacency.astype(float))))
 
 
 def splits_list(splits: np.ndarray) -> list[ca.DM]:
@@ -45,15 +40,8 @@ def splits_list(splits: np.ndarray) -> list[ca.DM]:
 
 
 def rate(p: Parameters, accumulation):
-    """q_i = g_i(min(x_i, jam_i)) / x_i [1/s], of accumulation (R, 1) [veh]; no division by zero at x = 0.
-
-    With rounding r, min(x, jam) is (x + jam - sqrt((x - jam)^2 + r^2)) / 2: off by r/2 at the jam accumulation, and by
-    less than r^2 / (4 |x - jam|) elsewhere.
-    """
-    if p.rounding:
-        body = 0.5 * (accumulation + p.jam - ca.sqrt((accumulation - p.jam) ** 2 + p.rounding**2))
-    else:
-        body = ca.fmin(accumulation, p.jam)
+    """q_i = g_i(min(x_i, jam_i)) / x_i [1/s], of accumulation (R, 1) [veh]; no division by zero at x = 0."""
+    body = ca.fmin(accumulation, p.jam)
     return ((p.a * body + p.b) * body + p.c) * p.jam / (accumulation + p.jam - body)
 
 

@@ -55,7 +55,7 @@ class Mfd:
 
 
 def fit(accumulation, outflow, *, max_rate: float = np.inf, bins: int = 24) -> Mfd:
-    """The curve closest to samples (n,) [veh], (n,) [veh/s] that is safe to use: least squares over bin means.
+    """The curve closest to samples (n,) [veh], (n,) [veh/s] that is safe to use: least squares over bin medians.
 
     The rate q(x) = a x^2 + b x + c is kept positive and falling up to the jam accumulation and at most `max_rate`
     [1/s] (the inverse of the integration step). The jam accumulation is that of the best fit, at most the largest
@@ -69,10 +69,11 @@ def fit(accumulation, outflow, *, max_rate: float = np.inf, bins: int = 24) -> M
     x, g = x[good], g[good]
     number = np.minimum((bins * x / x.max()).astype(int), bins - 1)
     used = np.unique(number)
-    mean_x = np.array([x[number == n].mean() for n in used])
-    mean_g = np.array([g[number == n].mean() for n in used])
-    candidates = [_fit_cubic(mean_x, mean_g, float(share * x.max()), max_rate) for share in np.linspace(0.2, 1.0, 17)]
-    return min(candidates, key=lambda curve: ((curve.outflow(mean_x) - mean_g) ** 2).sum())
+    middle_x = np.array([np.median(x[number == n]) for n in used])
+    middle_g = np.array([np.median(g[number == n]) for n in used])
+    candidates = [
+        _fit_cubic(middle_x, middle_g, float(share * x.max()), max_rate) for share in np.linspace(0.2, 1.0, 17)]
+    return min(candidates, key=lambda curve: ((curve.outflow(middle_x) - middle_g) ** 2).sum())
 
 
 def _fit_cubic(x: np.ndarray, g: np.ndarray, jam: float, max_rate: float) -> Mfd:

@@ -2,13 +2,13 @@
 
 import hashlib
 import json
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from scipy.sparse import csgraph
 
 from nmfd import toml
 from nmfd.errors import InputError
@@ -48,7 +48,8 @@ class Network:
     @cached_property
     def hops(self) -> np.ndarray:
         """(R, R) int: boundaries to cross on a shortest way; -1 where there is none."""
-        return _hops(self.adjacency)
+        hops = csgraph.shortest_path(self.adjacency, unweighted=True)
+        return np.where(np.isfinite(hops), hops, -1).astype(int)
 
     @cached_property
     def split_mask(self) -> np.ndarray:
@@ -60,7 +61,8 @@ class Network:
         for i in range(self.regions):
             without_i = self.adjacency.copy()
             without_i[i, :] = without_i[:, i] = False
-            mask[i] = self.adjacency[i][:, None] & (_hops(without_i) >= 0)
+            part = csgraph.connected_components(without_i, directed=False)[1]
+            mask[i] = self.adjacency[i][:, None] & (part[:, None] == part)
             mask[i, :, i] = False
         return mask
 
@@ -83,21 +85,6 @@ class Network:
             self.adjacency.astype(int).tolist(), [[m.a, m.b, m.c, m.jam] for m in self.mfds], self.u_min, self.u_max,
             self.nominal_splits.round(12).tolist()]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
-
-
-def _hops(adjacency: np.ndarray) -> np.ndarray:
-    regions = len(adjacency)
-    hops = np.full((regions, regions), -1)
-    for origin in range(regions):
-        hops[origin, origin] = 0
-        queue = deque([origin])
-        while queue:
-            here = queue.popleft()
-            for there in np.flatnonzero(adjacency[here]):
-                if hops[origin, there] < 0:
-                    hops[origin, there] = hops[origin, here] + 1
-                    queue.append(there)
-    return hops
 
 
 def load_network(folder: Path | str) -> Network:

@@ -24,7 +24,8 @@ from nmfd.types import Trajectory
 # Colours that stay apart for colour-blind readers and on the green band and the red zone.
 CONTROLLER_COLOURS = {
     "no-control": "#333333", "pi-gating": "#e69f00", "mpc-pc": "#56b4e9", "mpc-pcrg": "#0059a8",
-    "dpc-pc": "#e377c2", "dpc-pcrg": "#882255",
+    "dpc-pc": "#e377c2", "dpc-pcrg": "#882255", "dpc-pc-robust": "#b07aa1", "dpc-pcrg-robust": "#d62d20",
+    "dpc-pc-guarded": "#c9a0dc", "dpc-pcrg-guarded": "#6a3d9a", "bound-pc": "#9aa33c", "bound-pcrg": "#4d6600",
 }
 OTHER_COLOURS = ("#8c6d31", "#17becf", "#7f7f7f", "#5254a3", "#843c39", "#b5a642")
 PLANT_LABELS = {"nmfd": "regional model", "acyclic": "acyclic model", "sumo": "SUMO"}

@@ -83,24 +83,34 @@ def read_trajectory(path: Path) -> Trajectory:
         raise InputError(f"{path}: is no trajectory ({error}); delete it and run it again") from None
 
 
-def write_summary(path: Path, rows: list[dict]) -> None:
-    """`rows` of metrics.summary as summary.csv, atomically."""
+def write_rows(path: Path, columns: Mapping[str, type], rows: Sequence[Mapping]) -> None:
+    """`rows` as a csv file with `columns`, atomically."""
     with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(COLUMNS), lineterminator="\n")
+        writer = csv.DictWriter(file, fieldnames=list(columns), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
 
 
-def read_summary(path: Path) -> list[dict]:
-    """The rows of summary.csv with the types of metrics.summary. Raises InputError."""
+def read_rows(path: Path, columns: Mapping[str, type]) -> list[dict]:
+    """The rows of a csv file with `columns`: name -> type. Raises InputError."""
     with Path(path).open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
-        if reader.fieldnames != list(COLUMNS):
-            raise InputError(f"{path}: expected the columns {', '.join(COLUMNS)}; delete the folder and run again")
+        if reader.fieldnames != list(columns):
+            raise InputError(f"{path}: expected the columns {', '.join(columns)}; delete the folder and run again")
         try:
-            return [{name: convert(row[name]) for name, convert in COLUMNS.items()} for row in reader]
+            return [{name: convert(row[name]) for name, convert in columns.items()} for row in reader]
         except (TypeError, ValueError) as error:
             raise InputError(f"{path}: {error}; delete the folder and run again") from None
+
+
+def write_summary(path: Path, rows: list[dict]) -> None:
+    """`rows` of metrics.summary as summary.csv, atomically."""
+    write_rows(path, COLUMNS, rows)
+
+
+def read_summary(path: Path) -> list[dict]:
+    """The rows of summary.csv with the types of metrics.summary. Raises InputError."""
+    return read_rows(path, COLUMNS)
 
 
 def scenario_hash(scenario: Scenario) -> str:
@@ -200,30 +210,50 @@ def open_folder(
     Finished runs are kept. Raises InputError if the folder holds another configuration or is no run folder. When
     the body fails before any run is finished, everything made here is removed again.
     """
+    summary_path = Path(path) / "summary.csv"
+    session = {"seeds": sorted({seed for _, seed in order}), **(session or {})}
+    with manifest(path, configuration=configuration, controllers=controllers, session=session, results=summary_path):
+        folder = RunFolder(Path(path), order, read_summary(summary_path) if summary_path.is_file() else [])
+        try:
+            yield folder
+        except BaseException:
+            if not summary_path.exists():
+                for run in order:
+                    with suppress(OSError):
+                        folder.trajectory_path(*run).unlink()
+            raise
+
+
+@contextmanager
+def manifest(
+    path: Path, *, configuration: Mapping, results: Path, controllers: Mapping[str, Mapping] | None = None,
+    session: Mapping | None = None,
+) -> Iterator[None]:
+    """manifest.json in the folder `path`, which is made if it is not there; arguments as in `open_folder`.
+
+    results: the file in `path` that holds what is finished. If the body fails at the first opening before this file
+    is there, everything made here is removed again. Raises InputError as `open_folder`.
+    """
     path = Path(path)
     configuration, controllers = json.loads(json.dumps([configuration, controllers or {}]))
-    manifest_path, summary_path = path / "manifest.json", path / "summary.csv"
-    sessions, rows = [], []
-    if manifest_path.is_file():
-        sessions, controllers = _continued(manifest_path, configuration, controllers)
-        rows = read_summary(summary_path) if summary_path.is_file() else []
+    file, sessions = path / "manifest.json", []
+    if file.is_file():
+        sessions, controllers = _continued(file, configuration, controllers)
     elif path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; choose another folder with --out")
     elif path.is_dir() and any(path.iterdir()):
         raise InputError(f"{path}: is not empty and holds no manifest.json; choose another folder with --out")
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
-    sessions.append({**provenance(), "seeds": sorted({seed for _, seed in order}), **(session or {})})
-    manifest = {"configuration": configuration, "controllers": controllers, "sessions": sessions}
-    folder = RunFolder(path, order, rows)
+    sessions.append({**provenance(), **(session or {})})
+    content = {"configuration": configuration, "controllers": controllers, "sessions": sessions}
     try:
         path.mkdir(parents=True, exist_ok=True)
-        write_text(manifest_path, json.dumps(manifest, indent=2) + "\n")
-        yield folder
+        write_text(file, json.dumps(content, indent=2) + "\n")
+        yield
     except BaseException:
-        if not summary_path.exists() and len(sessions) == 1:
-            for file in (manifest_path, *(folder.trajectory_path(*run) for run in order)):
-                with suppress(OSError):
-                    file.unlink()
+        if not results.exists() and len(sessions) == 1:
+            with suppress(OSError):
+                file.unlink()
             for parent in made:
                 with suppress(OSError):
                     parent.rmdir()

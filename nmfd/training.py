@@ -9,29 +9,38 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 
-from nmfd import dynamics, toml
+from nmfd import toml
+from nmfd.controllers import guarded
 from nmfd.controllers.dpc import ACTIVATIONS, Architecture, Policy, checkpoint
 from nmfd.errors import InputError
+from nmfd.rollout import Rollout, compiled_step
 from nmfd.runs import atomic
 from nmfd.scenario import Scenario
 
 VALIDATE_EVERY = 20  # Adam steps
-NAMES = {"dpc-pc": False, "dpc-pcrg": True}
+ROBUST_NOISE = 3.0     # veh/s, of the policies whose name ends in -robust
+WORTH_COMPILING = 200  # Adam steps
+VALIDATIONS = 16       # perturbed scenarios in a validation, if training perturbs the demand
+NAMES = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Training:
-    """Settings of one training, from [controllers.dpc-pc] or [controllers.dpc-pcrg] of scenario.toml.
+    """Settings of one training, from the table [controllers.<name>] of scenario.toml, name one of NAMES.
 
     width, layers, activation: of the policy
     steps: Adam steps
     batch: rollouts per step
     learning_rate: of Adam at the start; falls to a tenth along a cosine
-    alternating: for dpc-pcrg, train the two decoders in turn (the backbone always)
+    alternating: with route guidance, train the two decoders in turn (the backbone always)
     demand_spread: every flow is scaled by a factor drawn from 1 +- demand_spread, per rollout
     initial_share: share of the rollouts that start from a random state, at a random time of the scenario
+    noise: largest sigma [veh/s] of the Gaussian noise on the demand of the pairs that have any, at every step; every
+        rollout has its own sigma, evenly between 0 and `noise` (demand_noise.WHERE, "pairs")
+    noise_all: the same of the noise on every pair of regions ("all"), in every other rollout, instead of `noise`
     """
 
     width: int = 128
@@ -43,13 +52,15 @@ class Training:
     alternating: bool = True
     demand_spread: float = 0.2
     initial_share: float = 0.5
+    noise: float = 0.0
+    noise_all: float = 0.0
 
 
 def settings(scenario: Scenario, controller: str, steps: int | None = None) -> Training:
     """The training settings of `controller` in `scenario`, checked; `steps` overrides."""
     if controller not in NAMES:
         raise InputError(f"--controller: {controller!r} cannot be trained; choose one of {', '.join(NAMES)}")
-    default = Training()
+    default = Training(noise=ROBUST_NOISE if controller.endswith("-robust") else 0.0)
     table = toml.Table(
         scenario.controller_options.get(controller, {}), scenario.folder / "scenario.toml" if scenario.folder else
         Path("scenario"), f"controllers.{controller}.")
@@ -60,75 +71,42 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         learning_rate=table.number("learning_rate", default.learning_rate, above=0.0),
         alternating=table.flag("alternating", default.alternating),
         demand_spread=table.number("demand_spread", default.demand_spread, low=0.0, high=1.0),
-        initial_share=table.number("initial_share", default.initial_share, low=0.0, high=1.0))
+        initial_share=table.number("initial_share", default.initial_share, low=0.0, high=1.0),
+        noise=table.number("noise", default.noise, low=0.0),
+        noise_all=table.number("noise_all", default.noise_all, low=0.0))
     table.close()
     return chosen if steps is None else Training(**{**asdict(chosen), "steps": steps})
 
 
-class Rollout:
-    """The scenario's regional model as tensors, for many rollouts at once."""
-
-    def __init__(self, scenario: Scenario, dtype=torch.float32):
-        network = scenario.network
-        self.scenario, self.dtype = scenario, dtype
-        self.parameters = dynamics.parameters(network, dtype=dtype)
-        self.demand = torch.tensor(scenario.demand, dtype=dtype)
-        self.nominal_splits = torch.tensor(network.nominal_splits, dtype=dtype)
-        self.critical = torch.tensor([m.critical for m in network.mfds], dtype=dtype)
-        self.jam = torch.tensor([m.jam for m in network.mfds], dtype=dtype)
-        self.bound = (self.demand.sum((0, 1)) > 0).to(dtype)
-
-    def random_start(self, batch: int, spread: float, share: float, generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """Initial states (B, R, R) [veh] and demands (T, B, R, R) [veh/s].
-
-        A share of the rollouts starts at a random time of the scenario from a random state, which fills the regions
-        up to between nothing and 80 % of their jam accumulation with vehicles for the destinations in use.
-        """
-        def uniform(*shape):
-            return torch.rand(*shape, generator=generator, dtype=self.dtype)
-
-        steps, regions = self.demand.shape[:2]
-        factor = 1.0 + spread * (2.0 * uniform(batch, regions, regions) - 1.0)
-        shift = (uniform(batch) * steps * 0.5).long() * (torch.arange(batch) < share * batch)
-        index = torch.arange(steps)[:, None] + shift
-        padded = torch.cat([self.demand, torch.zeros_like(self.demand)])
-        demand = padded[index] * factor
-        weight = uniform(batch, regions, regions) ** 2 * self.bound
-        total = uniform(batch, regions) * uniform(batch, 1) * 0.8 * self.jam
-        x = total.unsqueeze(-1) * weight / weight.sum(-1, keepdim=True).clamp(min=1e-6)
-        return x * (torch.arange(batch) < share * batch)[:, None, None], demand
-
-    def total_time_spent(self, policy: Policy, x, demand, generator) -> torch.Tensor:
-        """TTS (B,) [veh s] of rollouts from x (B, R, R) under `policy`, with the scenario's measurement noise."""
-        total = torch.zeros(x.shape[0], dtype=self.dtype)
-        scenario = self.scenario
-        for k in range(demand.shape[0]):
-            total = total + x.sum((-2, -1))
-            noise = scenario.measurement_std * torch.randn(x.shape, generator=generator, dtype=self.dtype)
-            perimeter, splits = policy(x + noise)
-            x = dynamics.advance(
-                self.parameters, x, demand[k], perimeter, self.nominal_splits if splits is None else splits,
-                scenario.step, integrator=scenario.integrator, substeps=scenario.substeps)
-        return total * scenario.step
+def available(device: str) -> str:
+    """"cpu" or "cuda", with "auto" the GPU where there is one. InputError for a GPU that is not there."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device: cuda asked for, but PyTorch finds no GPU here; choose cpu or auto")
+    return "cuda" if device == "auto" and torch.cuda.is_available() else device.replace("auto", "cpu")
 
 
 def train(
     scenario: Scenario, controller: str, *, seed: int, out: Path, steps: int | None = None, resume: bool = False,
-    progress: Callable[[int, int, str], None] | None = None,
+    device: str = "cpu", compiled: bool = False, progress: Callable[[int, int, str], None] | None = None,
+    log: Callable[[int, float], None] | None = None,
 ) -> Path:
-    """Train `controller` ("dpc-pc" or "dpc-pcrg") on the regional model and write the policy to `out`.
+    """Train `controller`, one of NAMES, on the regional model and write the policy to `out`.
 
     `out` holds the best policy so far after every validation; `out`.resume beside it holds what `resume` needs and
-    goes when the training is complete. `progress(done, steps, note)` is called after every step.
+    goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done, TTS)` after
+    every validation. `compiled` makes a step several times as fast, after up to a minute or two of compilation; the
+    weights differ by rounding.
     """
     chosen = settings(scenario, controller, steps)
-    configuration = {"controller": controller, "scenario": scenario.name, "seed": seed, **asdict(chosen)}
+    configuration = {
+        "controller": controller, "scenario": scenario.name, "seed": seed, "compiled": compiled, **asdict(chosen)}
     torch.set_num_threads(1)  # the matrices are small: more threads only wait for one another
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     architecture = Architecture(
         width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=NAMES[controller])
-    policy, rollout = Policy(scenario.network, architecture), Rollout(scenario)
+    policy, rollout = Policy(scenario.network, architecture).to(device), Rollout(scenario, device=device)
+    advance = compiled_step(rollout.step) if compiled else rollout.step
     optimizer = torch.optim.Adam(policy.parameters(), lr=chosen.learning_rate)
     first, best, history = 0, float("inf"), []
     state_file = out.with_name(out.name + ".resume")
@@ -138,22 +116,30 @@ def train(
         for group in optimizer.param_groups:
             cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
             group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
-        if architecture.guidance and chosen.alternating:
-            policy.perimeter_decoder.requires_grad_(step % 2 == 0)
-            policy.splits_decoder.requires_grad_(step % 2 == 1)
         x, demand = rollout.random_start(chosen.batch, chosen.demand_spread, chosen.initial_share, generator)
-        loss = rollout.total_time_spent(policy, x, demand, generator).mean()
+        demand = rollout.perturb(
+            demand, torch.rand(chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
+        # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
+        loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
         optimizer.zero_grad()
-        (loss / loss.detach()).backward()
+        loss.backward()
+        if architecture.guidance and chosen.alternating:
+            # Not by requires_grad, which would compile the step once for each decoder.
+            for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
+                weights.grad = None
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
         optimizer.step()
         last = step + 1 == chosen.steps
         if (step + 1) % VALIDATE_EVERY == 0 or last:
-            score = validate(policy, rollout, seed)
-            history.append([step + 1, loss.item(), score])
+            score = validate(policy, rollout, seed, chosen)
+            history.append([step + 1, math.exp(loss.item()), score])
+            if log:
+                log(step + 1, score)
             if score < best:
                 best = score
-                _write(checkpoint(policy, scenario.network, {**configuration, "validation_veh_s": best}), out)
+                states = guarded.statistics(visited(policy, rollout, chosen, seed))
+                _write(checkpoint(
+                    policy, scenario.network, {**configuration, "validation_veh_s": best}, states), out)
             if not last:
                 _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
         if progress:
@@ -164,12 +150,30 @@ def train(
     return out
 
 
-def validate(policy: Policy, rollout: Rollout, seed: int) -> float:
-    """TTS of the scenario itself from its own start, the mean of two noise draws [veh s]."""
+def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> float:
+    """TTS of the scenario itself from its own start, the geometric mean of two noise draws [veh s].
+
+    If training perturbs the demand: also of VALIDATIONS perturbed scenarios, whose sigma rises to that of `chosen`.
+    """
     generator = torch.Generator().manual_seed(seed)
-    demand = rollout.demand.unsqueeze(1).expand(-1, 2, -1, -1)
+    count = 2 + (VALIDATIONS if chosen.noise or chosen.noise_all else 0)
+    level = torch.linspace(0.0, 1.0, count // 2).repeat_interleave(2)  # in twos: one of each kind of noise
+    nominal = rollout.demand.unsqueeze(1).expand(-1, count, -1, -1)
+    demand = rollout.perturb(nominal, level, chosen.noise, chosen.noise_all, generator)
     with torch.no_grad():
-        return rollout.total_time_spent(policy, torch.zeros_like(demand[0]), demand, generator).mean().item()
+        total = rollout.total_time_spent(policy, torch.zeros_like(demand[0]), demand, generator)
+    return torch.log(total).mean().exp().item()
+
+
+def visited(policy: Policy, rollout: Rollout, chosen: Training, seed: int) -> np.ndarray:
+    """States (N, R*R) [-], as a share of the policy's scale, that `policy` sees in rollouts like those in training."""
+    generator = torch.Generator().manual_seed(seed)
+    x, demand = rollout.random_start(4 * chosen.batch, chosen.demand_spread, chosen.initial_share, generator)
+    demand = rollout.perturb(
+        demand, torch.rand(4 * chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
+    with torch.no_grad():
+        _, seen = rollout.states(policy, x, demand, generator)
+        return (seen / policy.scale).flatten(0, 1).flatten(-2).double().cpu().numpy()
 
 
 def _state(configuration, step, best, history, policy, optimizer, generator) -> dict:
@@ -180,7 +184,7 @@ def _state(configuration, step, best, history, policy, optimizer, generator) -> 
 
 def _restore(state_file: Path, configuration, policy, optimizer, generator) -> tuple[int, float, list]:
     try:
-        state = torch.load(state_file, weights_only=True)
+        state = torch.load(state_file, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise InputError(f"{state_file}: nothing to resume; train without --resume") from None
     except Exception:

@@ -1,8 +1,10 @@
 """Many independent runs in several processes; every outcome is handed over as soon as it is there."""
 
+import math
 import multiprocessing
 import signal
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -31,22 +33,35 @@ def attempt(function: Callable, task):
         return Failure(f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})")
 
 
-def outcomes(function: Callable, tasks: Sequence, workers: int) -> Iterator[tuple]:
+def outcomes(
+    function: Callable, tasks: Sequence, workers: int, *, fresh: bool = False, seconds: float | None = None,
+) -> Iterator[tuple]:
     """(task, `attempt(function, task)`) for every task, as they finish, from `workers` processes.
+
+    fresh: every task in a process of its own
+    seconds: wall time after which a task is ended; it needs `fresh`
 
     The processes are spawned, so `function` and the tasks must be picklable. A process that dies (out of memory, a
     crash in a library) is the Failure of the task it was at. Closing the iterator ends the processes at once.
     """
-    todo, busy = list(tasks)[::-1], {}
+    todo, busy, deadlines = list(tasks)[::-1], {}, {}
     try:
         while todo or busy:
             while todo and len(busy) < workers:
                 connection, process = _spawn(function)
                 busy[connection] = process, _hand_over(connection, todo.pop())
-            for connection in wait(list(busy)):
+                deadlines[connection] = time.monotonic() + (math.inf if seconds is None else seconds)
+            first = min(deadlines[connection] for connection in busy) - time.monotonic()
+            ready = wait(list(busy), None if math.isinf(first) else max(first, 0.0))
+            late = [connection for connection in busy if deadlines[connection] <= time.monotonic()]
+            for connection in {*ready, *late}:
                 process, task = busy[connection]
-                outcome = _receive(connection, process)
-                if todo and process.is_alive():
+                if connection in ready:
+                    outcome = _receive(connection, process)
+                else:
+                    outcome = Failure(f"not finished after {seconds:g} s")
+                    process.kill()
+                if todo and process.is_alive() and not fresh:
                     busy[connection] = process, _hand_over(connection, todo.pop())
                 else:
                     del busy[connection]

@@ -9,6 +9,7 @@ import time
 import numpy as np
 import pytest
 import tiny
+import torch
 from click.testing import CliRunner
 
 from nmfd import benchmarks, closed_loop, runs, training
@@ -183,14 +184,14 @@ def test_training_can_be_interrupted_and_resumed(scenario, tmp_path, monkeypatch
     monkeypatch.setattr(training, "VALIDATE_EVERY", 1)
     calls = []
 
-    def random_start(self, *args):
+    def once_per_step(*args):
         calls.append(None)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return original(self, *args)
+        return original(*args)
 
-    original = training.Rollout.random_start
-    monkeypatch.setattr(training.Rollout, "random_start", random_start)
+    original = torch.nn.utils.clip_grad_norm_
+    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", once_per_step)
     command = ["train", scenario, "--controller", "dpc-pc", "--steps", 4]
     result = nmfd(*command)
     assert result.exit_code == 130 and result.stderr.count("\n") == 1

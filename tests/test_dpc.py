@@ -180,7 +180,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(tmp_path, scenario, monkeyp
     for name, tensor in weights(straight).items():
         assert torch.equal(tensor, weights(broken)[name]), name
     assert not list(tmp_path.glob("*.resume"))
-    assert dpc.load(broken, scenario, guidance=training.NAMES[controller]).name == controller
+    assert dpc.load(broken, scenario, guidance=training.NAMES[controller]).name == controller.removesuffix("-robust")
 
 
 def test_another_seed_is_another_policy(tmp_path, scenario):
@@ -194,8 +194,8 @@ def test_training_lowers_the_total_time_spent(tmp_path, scenario):
     rollout = training.Rollout(scenario)
     torch.manual_seed(0)
     fresh = Policy(scenario.network, Architecture())
-    after = training.validate(dpc.load_policy(trained, scenario.network)[0], rollout, 0)
-    assert after < training.validate(fresh, rollout, 0)
+    after = training.validate(dpc.load_policy(trained, scenario.network)[0], rollout, 0, training.Training())
+    assert after < training.validate(fresh, rollout, 0, training.Training())
 
 
 def test_resume_needs_something_to_resume_and_the_same_settings(tmp_path, scenario, monkeypatch):
@@ -219,3 +219,26 @@ def test_resume_needs_something_to_resume_and_the_same_settings(tmp_path, scenar
 def test_wrong_training_settings(scenario, options, problem):
     with pytest.raises(InputError, match=f"controllers.dpc-pc.{problem}"):
         training.settings(replace(scenario, controller_options={"dpc-pc": options}), "dpc-pc")
+
+
+@pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
+def test_a_sparse_policy_is_the_dense_one_with_the_same_weights(guidance):
+    """Of the dense decoders it holds the rows of adjacent regions; hexagon7 has regions with 3 and with 6 of them."""
+    dense = policy(guidance=guidance)
+    sparse = Policy(NETWORK, Architecture(width=16, guidance=guidance, sparse=True))
+    here, onward = np.arange(7)[:, None], sparse.onward.numpy()
+    rows = {"perimeter_decoder": (here * 7 + onward).ravel()}
+    rows["splits_decoder"] = ((here * 7 + onward)[..., None] * 7 + np.arange(7)).ravel()
+    weights = dense.state_dict()
+    sparse.load_state_dict({
+        key: value[rows[key.split(".")[0]]] if key.split(".")[0] in rows else value for key, value in weights.items()})
+    x = 1000.0 * torch.rand(5, 7, 7)
+    for a, b in zip(dense(x), sparse(x), strict=True):
+        if a is not None:
+            torch.testing.assert_close(a, b)
+    both = [DpcController(made).act(measurement(x[0].numpy().astype(float))) for made in (dense, sparse)]
+    np.testing.assert_allclose(both[0].perimeter, both[1].perimeter, rtol=1e-6)
+    if guidance:
+        np.testing.assert_allclose(both[0].splits, both[1].splits, atol=1e-7)
+    stuck = DpcController(sparse).act(measurement(np.full((7, 7), np.nan)))
+    np.testing.assert_allclose(stuck.perimeter, np.where(NETWORK.adjacency, NETWORK.u_max, 0.0))

@@ -1,6 +1,5 @@
 """The physics of the regional model, and its torch and CasADi twins against each other."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -146,15 +145,3 @@ def test_the_outflow_stays_at_its_jam_value_beyond():
     n = torch.linspace(jam, 3.0 * jam, 7, dtype=torch.float64)
     outflow = dynamics.rate(PARAMETERS, n) * n
     torch.testing.assert_close(outflow, outflow[:1].expand(7), rtol=1e-12, atol=0.0)
-
-
-def test_rounding_changes_the_rate_at_the_kink_only():
-    steep = replace(NETWORK, mfds=tuple(replace(mfd, jam=6000.0) for mfd in NETWORK.mfds))
-    exact, rounded = (dynamics_casadi.parameters(steep, rounding=width) for width in (0.0, 50.0))
-
-    def difference(n):
-        n = ca.DM([n] * 7)
-        return abs(dynamics_casadi.rate(rounded, n) / dynamics_casadi.rate(exact, n) - 1.0).full().max()
-
-    assert 1e-4 < difference(6000.0) < 0.02
-    assert max(difference(0.0), difference(4000.0), difference(9000.0)) < 2e-4

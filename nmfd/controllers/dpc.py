@@ -4,6 +4,7 @@ As in Tumu et al.: an MLP backbone with one decoder for the perimeter (scaled si
 (masked softmax), so that every output satisfies the constraints by construction. Trained by nmfd.training.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -53,12 +54,14 @@ ACTIVATIONS = {
 @dataclass(frozen=True, kw_only=True)
 class Architecture:
     """width: units per hidden layer; layers: hidden layers of the backbone; activation: a key of ACTIVATIONS;
-    guidance: with a decoder for the split ratios."""
+    guidance: with a decoder for the split ratios; sparse: decoders with outputs for adjacent regions only, which a
+    city of many regions needs (their number grows with R^2 instead of R^3)."""
 
     width: int = 128
     layers: int = 2
     activation: str = "gelu"
     guidance: bool = False
+    sparse: bool = False
 
 
 class Policy(nn.Module):
@@ -73,16 +76,20 @@ class Policy(nn.Module):
         self.architecture, self.regions = architecture, regions
         self.u_min, self.u_max = network.u_min, network.u_max
         self.register_buffer("scale", torch.tensor([[m.critical] for m in network.mfds], dtype=torch.float32))
-        self.register_buffer("adjacency", torch.tensor(network.adjacency, dtype=torch.float32), persistent=False)
+        onward = _neighbours(network.adjacency) if architecture.sparse else np.tile(np.arange(regions), (regions, 1))
+        here = np.arange(regions)[:, None]
+        allowed = torch.tensor(network.adjacency[here, onward] & (np.diff(onward, prepend=-1) != 0))
+        self.register_buffer("adjacency", allowed.float(), persistent=False)
+        self.register_buffer("onward", torch.tensor(onward), persistent=False)
         layers: list[nn.Module] = []
         for layer in range(architecture.layers):
             layers += [nn.Linear(regions**2 if layer == 0 else width, width),
                        ACTIVATIONS[architecture.activation](width)]
         self.backbone = nn.Sequential(*layers)
-        self.perimeter_decoder = nn.Linear(width, regions**2)
+        self.perimeter_decoder = nn.Linear(width, onward.size)
         if architecture.guidance:
-            self.splits_decoder = nn.Linear(width, regions**3)
-            mask = torch.tensor(network.split_mask)
+            self.splits_decoder = nn.Linear(width, onward.size * regions)
+            mask = torch.tensor(network.split_mask[here, onward]) & allowed.unsqueeze(-1)
             # A softmax over nothing but -inf is NaN: rows with no way out (j = i) get finite logits and are zeroed.
             blocked = ~mask & mask.any(dim=1, keepdim=True)
             bias = torch.zeros(mask.shape).masked_fill(blocked, -torch.inf)
@@ -90,14 +97,33 @@ class Policy(nn.Module):
             self.register_buffer("split_bias", bias, persistent=False)
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        perimeter, splits = self.listed(x)
+        if not self.architecture.sparse:
+            return perimeter, splits
+        onward, shape = self.onward, (self.regions,) * 2
+        perimeter = perimeter.new_zeros(*x.shape[:-2], *shape).scatter_add(-1, onward.expand_as(perimeter), perimeter)
+        if splits is not None:
+            splits = splits.new_zeros(*x.shape[:-2], self.regions, *shape).scatter_add(
+                -2, onward.unsqueeze(-1).expand_as(splits), splits)
+        return perimeter, splits
+
+    def listed(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Perimeter (..., R, D) and splits (..., R, D, R) towards the regions `onward` (R, D); all D = R if dense."""
         hidden = self.backbone((x / self.scale).flatten(-2))
-        shape = (self.regions,) * 2
+        shape = self.onward.shape
         open_share = torch.sigmoid(self.perimeter_decoder(hidden)).unflatten(-1, shape)
         perimeter = (self.u_min + (self.u_max - self.u_min) * open_share) * self.adjacency
         if not self.architecture.guidance:
             return perimeter, None
-        logits = self.splits_decoder(hidden).unflatten(-1, (self.regions, *shape)) + self.split_bias
+        logits = self.splits_decoder(hidden).unflatten(-1, (*shape, self.regions)) + self.split_bias
         return perimeter, torch.softmax(logits, dim=-2) * self.split_mask
+
+
+def _neighbours(adjacency: np.ndarray) -> np.ndarray:
+    """(R, D) int: the regions adjacent to each, D the most that any has; shorter rows repeat their last."""
+    rows = [np.flatnonzero(row) for row in adjacency]
+    most = max(map(len, rows))
+    return np.stack([np.pad(row, (0, most - len(row)), "edge") for row in rows])
 
 
 class DpcController:
@@ -106,7 +132,8 @@ class DpcController:
     def __init__(self, policy: Policy):
         self._policy = policy.eval()
         self.name = "dpc-pcrg" if policy.architecture.guidance else "dpc-pc"
-        self._u_max = policy.u_max * policy.adjacency.numpy().astype(float)
+        self._onward = policy.onward.numpy() if policy.architecture.sparse else None
+        self._u_max = self._full(policy.u_max * policy.adjacency.numpy())
 
     def reset(self) -> None:
         pass
@@ -114,22 +141,41 @@ class DpcController:
     def act(self, measurement: Measurement) -> Controls:
         with torch.inference_mode():
             x = torch.from_numpy(measurement.accumulation.astype(np.float32))
-            perimeter, splits = self._policy(x)
-        perimeter = perimeter.numpy().astype(float)
-        splits = None if splits is None else splits.numpy().astype(float)
-        if not np.isfinite(perimeter).all() or (splits is not None and not np.isfinite(splits).all()):
+            perimeter, splits = self._policy.listed(x)
+        perimeter = perimeter.numpy()
+        if splits is not None:
+            splits = splits.numpy().astype(float)
+            sums = splits.sum(axis=1, keepdims=True)
+        # The sum is finite if every number is: they are bounded unless they are NaN.
+        if not math.isfinite(perimeter.sum()) or (splits is not None and not math.isfinite(sums.sum())):
             return Controls(perimeter=self._u_max, splits=None, status="dpc: policy returned NaN, perimeter opened")
-        if splits is not None:  # float32 sums miss 1 by 1e-7
-            splits /= np.where(splits.sum(axis=1, keepdims=True) > 0, splits.sum(axis=1, keepdims=True), 1.0)
-        return Controls(perimeter=perimeter, splits=splits)
+        if splits is not None:
+            splits /= np.maximum(sums, 1e-9)  # float32 sums miss 1 by 1e-7; those of j = i are 0
+        return Controls(perimeter=self._full(perimeter), splits=None if splits is None else self._full(splits))
+
+    def _full(self, listed: np.ndarray) -> np.ndarray:
+        """(R, R) or (R, R, R) of (R, D) or (R, D, R): the second axis, over the policy's neighbours, over all regions.
+
+        The zeros are never written, so that many regions cost no time.
+        """
+        if self._onward is None:
+            return listed.astype(float, copy=False)
+        full = np.zeros((len(listed), len(listed), *listed.shape[2:]))
+        here, way = np.nonzero(np.diff(self._onward, prepend=-1))
+        full[here, self._onward[here, way]] = listed[here, way]
+        return full
 
 
-def checkpoint(policy: Policy, network: Network, configuration: Mapping) -> dict:
-    """What a policy file holds: weights with the normalisation, architecture, network hash, configuration."""
+def checkpoint(policy: Policy, network: Network, configuration: Mapping, states: Mapping | None = None) -> dict:
+    """What a policy file holds: weights with the normalisation, architecture, network hash, configuration.
+
+    states: of nmfd.controllers.guarded.statistics, where the policy is to be guarded
+    """
     return {
+        **({} if states is None else {"states": dict(states)}),
         "format": FORMAT, "architecture": asdict(policy.architecture), "network": network.name,
         "network_hash": network.hash, "configuration": dict(configuration),
-        "weights": {key: value.detach().clone() for key, value in policy.state_dict().items()}}
+        "weights": {key: value.detach().cpu().clone() for key, value in policy.state_dict().items()}}
 
 
 def load_policy(path: Path, network: Network) -> tuple[Policy, dict]:
@@ -157,10 +203,15 @@ def load_policy(path: Path, network: Network) -> tuple[Policy, dict]:
     return policy, content
 
 
-def load(path: Path, scenario: Scenario, *, guidance: bool) -> DpcController:
-    """The controller in the policy file `path`; InputError if it does not fit the scenario's network or the name."""
-    policy, _ = load_policy(path, scenario.network)
+def check_guidance(policy: Policy, path: Path, guidance: bool) -> None:
+    """InputError if the policy in `path` is of the other kind."""
     if policy.architecture.guidance != guidance:
         has, wanted = ("dpc-pc", "dpc-pcrg") if guidance else ("dpc-pcrg", "dpc-pc")
         raise InputError(f"{path}: is a {has} policy, not {wanted}; choose --controller {has} or another file")
+
+
+def load(path: Path, scenario: Scenario, *, guidance: bool) -> DpcController:
+    """The controller in the policy file `path`; InputError if it does not fit the scenario's network or the name."""
+    policy, _ = load_policy(path, scenario.network)
+    check_guidance(policy, path, guidance)
     return DpcController(policy)

@@ -1,29 +1,30 @@
-"""Economic model predictive control: the least total time spent over a horizon of the regional model, by IPOPT.
+"""Economic model predictive control: the least total time spent over a horizon of the regional model.
 
 As in Tumu et al.: perimeter control alone ("mpc-pc") or with route guidance ("mpc-pcrg"), the demand known ahead,
-nothing assumed beyond the horizon. Multiple shooting on nmfd.dynamics_casadi with exact second derivatives.
+nothing assumed beyond the horizon. Not as there: single shooting, so that only the controls are unknown, with exact
+gradients by the adjoint method (nmfd.turns), and projected gradients (nmfd.descent). Every control is bounded or in a
+simplex and acts linearly on the model, so that nearly all of them end at a bound; finding out which takes a few
+gradients, while an interior-point method factorises the whole horizon some twenty times.
 """
 
-import signal
-import threading
-from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
-import casadi as ca
 import numpy as np
 
-from nmfd import dynamics_casadi as model
 from nmfd import toml
+from nmfd.descent import Minimum, minimise
 from nmfd.network import Network
 from nmfd.scenario import Scenario
+from nmfd.turns import Turns, build, vehicle_steps, vehicles_at_stake
 from nmfd.types import Controls, Measurement
 
-UNIT = 1000.0       # veh: accumulations in the solver, so that its variables are of the order of 1
 ROUNDING = 0.005    # of the smallest jam accumulation: over which the solver sees the kink of the MFD there rounded off
-TOLERANCE = 1e-6    # of the optimality conditions; a tenth changes the benchmark's total time spent by 0.02 %
-# Closing a perimeter, or leaving the drivers' own routes, must save this many vehicles for one interval. Far below the
-# measurement noise; without it whatever has no effect floats between its bounds, and IPOPT needs twice the iterations.
-LEAST_GAIN = 0.1    # veh
+# The solver stops when, to first order, no admissible plan can save more than this share of the total time spent. A
+# tenth changes the benchmark's total time spent by less than 1 %, either way. At its limits it may stop at ACCEPTABLE.
+TOLERANCE = 1e-6
+ACCEPTABLE = 1e-5
+FEW = 5.0           # veh: added to the vehicles that a control decides on, where these scale the solver's steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,224 +46,149 @@ def options(scenario: Scenario, name: str) -> Options:
     where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
     table = toml.Table(scenario.controller_options.get(name, {}), where, f"controllers.{name}.")
     chosen = Options(
-        horizon=table.integer("horizon", 8, low=2), max_iterations=table.integer("max_iterations", 200),
+        horizon=table.integer("horizon", 8, low=2), max_iterations=table.integer("max_iterations", 1000),
         time_limit=table.number("time_limit", scenario.step, above=0.0))
     table.close()
     return chosen
 
 
-@dataclass(frozen=True, kw_only=True)
-class Layout:
-    """What the solver decides in one interval: a vector (C,) [-] of the u_ih of all edges, then theta_ihj of all turns.
+class Admissible:
+    """The plans (K, E + V) of nmfd.turns that a controller may choose: u in its bounds, theta in simplices.
 
-    destinations: (J,) int, the j with any demand in the scenario; no vehicle is ever bound elsewhere
-    edges: (E, 2) int, the (i, h) with a choice of u_ih
-    turns: (V, 3) int, the (i, h, j) with a choice of theta_ihj; none without guidance
-    group: (V,) int, the pair (i, j) of every turn, numbered from 0: its shares sum to 1
-    perimeter: (R, R) [-], open; splits: (R, R, R) [-], nominal: the values of all that is not decided
-    lower, upper: (C,) [-], bounds
+    Without guidance theta is the nominal one.
     """
 
-    destinations: np.ndarray
-    edges: np.ndarray
-    turns: np.ndarray
-    group: np.ndarray
-    perimeter: np.ndarray
-    splits: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
+    def __init__(self, network: Network, model: Turns, *, guidance: bool):
+        self._network, self._model, self._guidance = network, model, guidance
+        self._edges = len(model.edges)
+        unused = np.setdiff1d(np.arange(network.regions), model.destinations)
+        self._unused = (slice(None), slice(None), unused)
+
+    def open(self, moves: int) -> np.ndarray:
+        """The plan without control: perimeters open, nominal splits."""
+        return np.tile(np.concatenate([np.full(self._edges, self._network.u_max), self._model.own]), (moves, 1))
+
+    def project(self, plan: np.ndarray) -> np.ndarray:
+        """The nearest admissible plan."""
+        perimeter = np.clip(plan[:, :self._edges], self._network.u_min, self._network.u_max)
+        if not self._guidance:
+            return np.concatenate([perimeter, np.broadcast_to(self._model.own, plan[:, self._edges:].shape)], axis=1)
+        return np.concatenate([perimeter, self._simplices(plan[:, self._edges:])], axis=1)
+
+    def _simplices(self, splits: np.ndarray) -> np.ndarray:
+        """The nearest shares (K, V) >= 0 whose sum is 1 over the turns of every cell (Michelot, 1986)."""
+        groups, value = self._groups(len(splits)), splits.ravel()
+        count = groups.max(initial=-1) + 1
+        positive = np.ones(len(value), dtype=bool)
+        while True:
+            surplus = np.bincount(groups, np.where(positive, value, 0.0), count) - 1.0
+            level = (surplus / np.maximum(np.bincount(groups, positive, count), 1.0))[groups]
+            still = positive & (value > level)
+            if still.sum() == positive.sum():
+                return np.where(positive, value - level, 0.0).reshape(splits.shape)
+            positive = still
+
+    def gap(self, plan: np.ndarray, gradient: np.ndarray) -> float:
+        """What the best admissible plan would save if the objective were linear [its unit]."""
+        u, of_u = plan[:, :self._edges], gradient[:, :self._edges]
+        saved = float((of_u * (u - np.where(of_u > 0, self._network.u_min, self._network.u_max))).sum())
+        if not self._guidance or not len(self._model.turns):
+            return saved
+        splits, of_splits = plan[:, self._edges:], gradient[:, self._edges:]
+        groups = self._groups(len(plan))
+        least = np.full(groups.max() + 1, np.inf)
+        np.minimum.at(least, groups, of_splits.ravel())
+        return saved + float((splits.ravel() * (of_splits.ravel() - least[groups])).sum())
+
+    def _groups(self, moves: int) -> np.ndarray:
+        """(K * V,) int: the simplex, one per interval and cell, of every share."""
+        cells = len(self._model.region)
+        return (cells * np.arange(moves)[:, None] + self._model.source).ravel()
+
+    def controls(self, decision: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """Perimeter (R, R) and splits (R, R, R), or None without guidance, of one interval (E + V,) of a plan."""
+        perimeter = np.where(self._network.adjacency, self._network.u_max, 0.0)
+        perimeter[tuple(self._model.edges.T)] = decision[:self._edges]
+        if not self._guidance:
+            return perimeter, None
+        splits = np.zeros((self._network.regions,) * 3)
+        splits[self._unused] = self._network.nominal_splits[self._unused]
+        splits[tuple(self._model.turns.T)] = decision[self._edges:]
+        return perimeter, splits
 
     def decision(self, perimeter: np.ndarray, splits: np.ndarray) -> np.ndarray:
-        """The vector of a perimeter (R, R) and splits (R, R, R)."""
-        return np.concatenate([perimeter[tuple(self.edges.T)], splits[tuple(self.turns.T)]])
-
-    def controls(self, decision: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Perimeter (R, R) and splits (R, R, R) of a vector, admissible also where the vector is so only nearly."""
-        perimeter, splits = self.perimeter.copy(), self.splits.copy()
-        decision = np.clip(decision, self.lower, self.upper)
-        perimeter[tuple(self.edges.T)] = decision[:len(self.edges)]
-        if len(self.turns):
-            share = np.maximum(decision[len(self.edges):], 1e-9)  # a pair of nothing but zeros is shared equally
-            splits[tuple(self.turns.T)] = share / np.bincount(self.group, share)[self.group]
-        return perimeter, splits
-
-    def symbols(self, decision: ca.SX) -> tuple[ca.SX, list[ca.SX]]:
-        """Perimeter and splits of nmfd.dynamics_casadi; destinations out of use are left out of their sparsity."""
-        perimeter = ca.SX(ca.sparsify(ca.DM(self.perimeter)))
-        for n, (i, h) in enumerate(self.edges.tolist()):
-            perimeter[i, h] = decision[n]
-        in_use = np.isin(np.arange(len(self.perimeter)), self.destinations)
-        splits = [ca.SX(rows) for rows in model.splits_list(self.splits * in_use)]
-        for n, (i, h, j) in enumerate(self.turns.tolist()):
-            splits[i][h, j] = decision[len(self.edges) + n]
-        return perimeter, splits
-
-
-def layout(network: Network, destinations: np.ndarray, *, guidance: bool) -> Layout:
-    """The decisions that can matter for vehicles bound for `destinations` (J,), with theta among them or nominal."""
-    in_use = np.isin(np.arange(network.regions), destinations)
-    useful = (network.split_mask if guidance else network.nominal_splits > 0) & in_use
-    choice = useful & (useful.sum(axis=1, keepdims=True) > 1) & guidance
-    edges, turns = np.argwhere(useful.any(axis=2)), np.argwhere(choice)
-    pairs = turns[:, 0] * network.regions + turns[:, 2]
-    return Layout(
-        destinations=destinations, edges=edges, turns=turns, group=np.unique(pairs, return_inverse=True)[1],
-        perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=network.nominal_splits,
-        lower=np.concatenate([np.full(len(edges), network.u_min), np.zeros(len(turns))]),
-        upper=np.concatenate([np.full(len(edges), network.u_max), np.ones(len(turns))]))
-
-
-def step_function(scenario: Scenario, chosen: Layout, *, rounding: float = 0.0) -> ca.Function:
-    """One integration step of the regional model, (state, decision, demand) -> state.
-
-    state (R*J,) [UNIT veh] and demand (R*J,) [veh/s]: the columns of the destinations in use, one after the other.
-    """
-    regions, columns = scenario.network.regions, chosen.destinations.tolist()
-    state, demand = (ca.SX.sym(name, regions * len(columns)) for name in ("state", "demand"))
-    decision = ca.SX.sym("decision", len(chosen.lower))
-
-    def matrix(vector):
-        full = ca.SX(regions, regions)
-        full[:, columns] = ca.reshape(vector, regions, len(columns))
-        return full
-
-    x = model.advance(
-        model.parameters(scenario.network, rounding=rounding), UNIT * matrix(state), matrix(demand),
-        *chosen.symbols(decision), scenario.step / scenario.substeps, integrator=scenario.integrator)
-    return ca.Function("step", [state, decision, demand], [ca.vec(ca.densify(x)[:, columns]) / UNIT])
-
-
-def solver(scenario: Scenario, chosen: Layout, moves: int, limits: Options) -> ca.Function:
-    """IPOPT on the horizon: variables are the decisions (C, moves) and the state after every integration step.
-
-    Parameters: the state now, then the demand of every interval. The states are nodes without bounds: the model keeps
-    them non-negative by itself, and a bound that the dynamics pin (an empty region) has no interior.
-    """
-    advance = step_function(scenario, chosen, rounding=ROUNDING * min(mfd.jam for mfd in scenario.network.mfds))
-    cells, nodes = advance.size1_in(0), limits.horizon * scenario.substeps
-    decisions, states = ca.SX.sym("decisions", len(chosen.lower), moves), ca.SX.sym("states", cells, nodes)
-    start, demand = ca.SX.sym("start", cells), ca.SX.sym("demand", cells, limits.horizon)
-    constraints, state = [], start
-    for node in range(nodes):
-        k = node // scenario.substeps
-        constraints.append(advance(state, decisions[:, min(k, moves - 1)], demand[:, k]) - states[:, node])
-        state = states[:, node]
-    open_edges, shares = decisions[:len(chosen.edges), :], decisions[len(chosen.edges):, :]
-    if len(chosen.turns):
-        member = ca.DM.triplet(chosen.group.tolist(), list(range(len(chosen.turns))), [1.0] * len(chosen.turns))
-        constraints.append(ca.vec(member @ shares) - 1.0)
-    own = chosen.splits[tuple(chosen.turns.T)]
-    preference = ca.sum1(ca.vec(1.0 - open_edges)) + ca.sum1(ca.vec(ca.repmat(1.0 - own, 1, moves) * shares))
-    time_spent = ca.sum1(ca.vec(states[:, scenario.substeps - 1::scenario.substeps]))
-    problem = {
-        "x": ca.vertcat(ca.vec(decisions), ca.vec(states)), "p": ca.vertcat(start, ca.vec(demand)),
-        "f": time_spent + LEAST_GAIN / UNIT * preference, "g": ca.vertcat(*constraints)}
-    return ca.nlpsol("solver", "ipopt", problem, {
-        "print_time": False, "ipopt": {
-            "print_level": 0, "sb": "yes", "tol": TOLERANCE, "max_iter": limits.max_iterations,
-            "max_wall_time": limits.time_limit,
-            "mumps_pivot_order": 0}})  # AMD: for these matrices 1.5 times as fast as MUMPS's own choice
+        """One interval (E + V,) of a plan, of perimeter (R, R) and splits (R, R, R)."""
+        return np.concatenate([perimeter[tuple(self._model.edges.T)], splits[tuple(self._model.turns.T)]])
 
 
 class EconomicMpc:
     """Economic MPC on the scenario's own regional model and demand (nmfd.types.Controller).
 
-    The last plan, moved on by one interval, is where the solver starts and what its answer is compared with on the
-    exact model. Where the solver does not converge, the status gives its reason and what is done instead: its
-    unfinished plan if that is better than the last one, else the last one for as long as it reaches, else the
-    perimeter opened and nominal splits. The backlog counts as demand of the first interval; negative measurements
-    count as 0.
+    The solver starts from its last plan, moved on by one interval, or from no control where that is better. Where it
+    stops short of its tolerance, the status says why; the best plan that it has found, which is never worse than the
+    one that it started from, is used. Where the measurement is not a number, the last plan is used for as long as it
+    reaches, and then the perimeter opened with nominal splits. The backlog counts as demand of the first interval;
+    negative measurements count as 0.
     """
 
     def __init__(self, scenario: Scenario, *, guidance: bool):
         """InputError for a wrong option."""
         self.name = "mpc-pcrg" if guidance else "mpc-pc"
-        self._guidance, self._step, self._substeps = guidance, scenario.step, scenario.substeps
-        chosen = options(scenario, self.name)
+        self.options = options(scenario, self.name)
+        network, horizon = scenario.network, self.options.horizon
         used = np.flatnonzero(scenario.demand.sum(axis=(0, 1)) > 0)
-        self._used = used if len(used) else np.arange(scenario.network.regions)
-        self._demand = np.concatenate([scenario.demand, np.zeros((chosen.horizon, *scenario.demand.shape[1:]))])
-        self._steps, self._horizon = scenario.steps, chosen.horizon
+        self._used = used if len(used) else np.arange(network.regions)
+        self._demand, self._step, self._steps = scenario.demand, scenario.step, scenario.steps
         # With one Euler step per interval, the last controls move vehicles that the horizon does not see arrive.
         blind = scenario.integrator == "euler" and scenario.substeps == 1
-        self._moves = chosen.horizon - 1 if blind else chosen.horizon
-        self._layout = layout(scenario.network, self._used, guidance=guidance)
-        self._advance = step_function(scenario, self._layout)
-        self._solver = solver(scenario, self._layout, self._moves, chosen)
-        states = np.full(self._advance.size1_in(0) * chosen.horizon * scenario.substeps, np.inf)
-        self._lower = np.concatenate([np.tile(self._layout.lower, self._moves), -states])
-        self._upper = np.concatenate([np.tile(self._layout.upper, self._moves), states])
-        self._open = np.tile(self._layout.decision(self._layout.perimeter, self._layout.splits), (self._moves, 1))
+        self._moves = horizon - 1 if blind else horizon
+        self._model = build(network, self._used, guidance=guidance)
+        rounded = replace(self._model, rounding=ROUNDING * min(mfd.jam for mfd in network.mfds))
+        scheme = {"step": scenario.step, "substeps": scenario.substeps, "integrator": scenario.integrator}
+        self._exact = partial(vehicle_steps, self._model, **scheme)
+        self._rounded = partial(vehicle_steps, rounded, gradient=True, **scheme)
+        self._at_stake = partial(vehicles_at_stake, self._model, **scheme)
+        self.admissible = Admissible(network, self._model, guidance=guidance)
+        self._open = self.admissible.open(self._moves)
         self.reset()
 
     def reset(self) -> None:
         self._plan, self._left = self._open, 0  # left: intervals of the plan that are still to come
 
     def act(self, measurement: Measurement) -> Controls:
-        start, demand = self._forecast(measurement)
-        last = np.vstack([self._plan[1:], self._plan[-1:]]) if self._left else self._open
-        found, reason = self._solve(start, demand, last)
-        better = self.cost(start, demand, found) < self.cost(start, demand, last)
-        if reason is None:
-            status = "ok"
-        elif better:
-            status = f"{reason}: unfinished plan used"
+        start, demand = self.forecast(measurement)
+        last = np.concatenate([self._plan[1:], self._plan[-1:]]) if self._left else self._open
+        if self._left and self._exact(start, demand, self._open)[0] < self._exact(start, demand, last)[0]:
+            last = self._open
+        found = self._solve(start, demand, last)
+        self._plan = found.point
+        if found.reason is None or found.gap <= ACCEPTABLE * found.value:
+            self._left, status = self._moves - 1, "ok"
+        elif np.isfinite(found.gap):
+            self._left, status = self._moves - 1, f"{found.reason}: best plan so far used"
         else:
-            status = f"{reason}: " + ("last plan used" if self._left else "perimeter opened, nominal splits")
-        self._plan = found if better else last
-        self._left = self._moves - 1 if better or reason is None else max(self._left - 1, 0)
-        perimeter, splits = self._layout.controls(self._plan[0])
-        return Controls(perimeter=perimeter, splits=splits if self._guidance else None, status=status)
+            status = f"{found.reason}: " + ("last plan used" if self._left else "perimeter opened, nominal splits")
+            self._left = max(self._left - 1, 0)
+        perimeter, splits = self.admissible.controls(self._plan[0])
+        return Controls(perimeter=perimeter, splits=splits, status=status)
 
     def cost(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> float:
-        """Total time spent over the horizon [veh s] by the exact model, under a plan (moves, C)."""
-        states = self._rollout(start, demand, plan)
-        return self._step * UNIT * float(states[self._substeps - 1::self._substeps].sum())
+        """Total time spent over the horizon [veh s] by the exact model, under a plan (moves, E + V)."""
+        return self._step * self._exact(start, demand, plan)[0]
 
-    def _forecast(self, measurement: Measurement) -> tuple[np.ndarray, np.ndarray]:
-        """The state (R*J,) [UNIT veh] and the demand (horizon, R*J) [veh/s], in the order of `step_function`."""
-        k = min(measurement.step, self._steps)
-        demand = self._demand[k:k + self._horizon].copy()
+    def forecast(self, measurement: Measurement) -> tuple[np.ndarray, np.ndarray]:
+        """The cells (C,) [veh] now and the demand (horizon, C) [veh/s] of them, as nmfd.turns numbers them."""
+        first, horizon = min(measurement.step, self._steps), self.options.horizon
+        known = self._demand[first:first + horizon]
+        demand = np.zeros((horizon, *known.shape[1:]))
+        demand[:len(known)] = known
         demand[0] += measurement.backlog / self._step
-        start = np.maximum(measurement.accumulation, 0.0)[:, self._used].T.ravel() / UNIT
-        return start, demand[:, :, self._used].transpose(0, 2, 1).reshape(self._horizon, -1)
+        start = np.maximum(measurement.accumulation, 0.0)[:, self._used].ravel()
+        return start, demand[:, :, self._used].reshape(horizon, -1)
 
-    def _rollout(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> np.ndarray:
-        """The states (horizon * substeps, R*J) [UNIT veh] after every integration step."""
-        states = [start]
-        for node in range(self._horizon * self._substeps):
-            k = node // self._substeps
-            states.append(self._advance(states[-1], plan[min(k, self._moves - 1)], demand[k]).full().ravel())
-        return np.stack(states[1:])
-
-    def _solve(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> tuple[np.ndarray, str | None]:
-        """An admissible plan (moves, C) from the guess `plan`, and why the solver stopped short, or None."""
-        guess = np.concatenate([plan.ravel(), self._rollout(start, demand, plan).ravel()])
-        with _interruptible():
-            answer = self._solver(
-                x0=guess, p=np.concatenate([start, demand.ravel()]), lbx=self._lower, ubx=self._upper, lbg=0.0, ubg=0.0)
-        decisions = answer["x"].full().ravel()[:plan.size].reshape(plan.shape)
-        found = np.array([self._layout.decision(*self._layout.controls(decision)) for decision in decisions])
-        report = self._solver.stats()
-        return found, None if report["success"] else report["return_status"]
-
-
-@contextmanager
-def _interruptible():
-    """CasADi takes a KeyboardInterrupt inside a solve for a failure of the solver; here Ctrl-C still ends the run."""
-    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        yield
-        return
-    seen = []
-
-    def interrupt(number, frame):
-        seen.append(number)
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if seen:
-        raise KeyboardInterrupt
+    def _solve(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> Minimum:
+        """The best plan found from `plan` (moves, E + V); its value, in vehicles, is that of the rounded model."""
+        return minimise(
+            partial(self._rounded, start, demand), self.admissible.project, self.admissible.gap, plan,
+            metric=(self._at_stake(start, demand, plan) + FEW) ** 2, tolerance=TOLERANCE,
+            iterations=self.options.max_iterations, seconds=self.options.time_limit)

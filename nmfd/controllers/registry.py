@@ -44,17 +44,21 @@ _WITHOUT_POLICY: dict[str, Callable[[Scenario], Controller]] = {
     "mpc-pcrg": _mpc_pcrg,
 }
 # Whether the policy guides routes too. The same as training.NAMES, which cannot be read without importing torch.
-_WITH_POLICY = {"dpc-pc": False, "dpc-pcrg": True}
+_WITH_POLICY = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
+# The policy that is watched.
+_GUARDED = {"dpc-pc-guarded": "dpc-pc", "dpc-pcrg-guarded": "dpc-pcrg"}
+# Whether the plan guides routes too. The same as bound.NAMES.
+_WITH_PLAN = {"bound-pc": False, "bound-pcrg": True}
 
 
 def names() -> tuple[str, ...]:
     """Every controller."""
-    return (*_WITHOUT_POLICY, *_WITH_POLICY)
+    return (*_WITHOUT_POLICY, *_WITH_POLICY, *_GUARDED, *_WITH_PLAN)
 
 
 def policy_names() -> tuple[str, ...]:
     """The controllers that need a trained policy."""
-    return tuple(_WITH_POLICY)
+    return (*_WITH_POLICY, *_GUARDED)
 
 
 def check(name: str) -> None:
@@ -64,35 +68,46 @@ def check(name: str) -> None:
 
 
 def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Path | None:
-    """The policy file that `make` would read: `policy`, or the scenario's own; None for a controller without one.
+    """The policy or plan file that `make` would read: `policy`, or the scenario's own; None for a controller without.
 
     InputError for an unknown name, for a `policy` that the controller has no use for, and for a missing file.
     """
     check(name)
-    if name not in _WITH_POLICY:
+    if name in _WITHOUT_POLICY:
         if policy is not None:
             raise InputError(
-                f"{policy}: controller {name} reads no policy; only {' and '.join(policy_names())} do: leave it out")
+                f"{policy}: controller {name} reads no policy; only {', '.join((*policy_names(), *_WITH_PLAN))} do: "
+                "leave it out")
         return None
     if policy is None and scenario.folder is None:
         raise InputError(f"controller {name}: scenario {scenario.name} has no folder with policies; give a file")
-    path = scenario.folder / f"{name}.pt" if policy is None else Path(policy)
+    kind, verb, suffix = ("plan", "compute", "npz") if name in _WITH_PLAN else ("policy", "train", "pt")
+    owner = _GUARDED.get(name, name)
+    path = scenario.folder / f"{owner}.{suffix}" if policy is None else Path(policy)
     if not path.is_file():
         scenario_text = "SCENARIO" if scenario.folder is None else scenario.folder
         out = "" if policy is None else f" --out {path}"
-        raise InputError(
-            f"{path}: no such policy for {name}; train one with: nmfd train {scenario_text} --controller {name}{out}")
+        command = f"nmfd {'bound' if kind == 'plan' else 'train'} {scenario_text} --controller {owner}{out}"
+        raise InputError(f"{path}: no such {kind} for {name}; {verb} one with: {command}")
     return path
 
 
 def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Controller:
-    """The controller `name` for `scenario`; `policy` is the file of a DPC policy instead of the scenario's own.
+    """The controller `name` for `scenario`; `policy` is the file of a policy or plan instead of the scenario's own.
 
     Raises InputError as `policy_path` does, and what the controller itself finds wrong with its options or policy.
     """
     path = policy_path(name, scenario, policy)
     if path is None:
         return _WITHOUT_POLICY[name](scenario)
+    if name in _WITH_PLAN:
+        from nmfd import bound
+
+        return bound.load(path, scenario, guidance=_WITH_PLAN[name])
+    if name in _GUARDED:
+        from nmfd.controllers import guarded
+
+        return guarded.load(path, scenario, guidance=_WITH_POLICY[_GUARDED[name]])
     from nmfd.controllers import dpc
 
     return dpc.load(path, scenario, guidance=_WITH_POLICY[name])

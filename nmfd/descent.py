@@ -1,0 +1,83 @@
+"""Minimising a smooth function over a simple convex set: spectral projected gradients with a certificate.
+
+Birgin, Martinez and Raydan, "Nonmonotone spectral projected gradient methods on convex sets", SIAM J. Optim. 10 (2000).
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+MEMORY = 20             # values that a step is compared with: some may rise
+SUFFICIENT = 1e-4       # of the decrease that the slope promises
+SHORTEST = 1e-10        # of a step, below which the line search gives up
+LONGEST = 1e10          # spectral step length
+
+
+@dataclass(frozen=True, kw_only=True)
+class Minimum:
+    """point: the best one found; value: there
+    gap: value is at most so much above the least one, if the function is convex; else to first order, at a point that
+        is no better
+    reason: why the search stopped short of its tolerance, or None
+    evaluations: of the function and its gradient
+    """
+
+    point: np.ndarray
+    value: float
+    gap: float
+    evaluations: int
+    reason: str | None
+
+
+def minimise(
+    function: Callable[[np.ndarray], tuple[float, np.ndarray]], project: Callable[[np.ndarray], np.ndarray],
+    gap: Callable[[np.ndarray, np.ndarray], float], start: np.ndarray, *, metric: np.ndarray | float = 1.0,
+    tolerance: float, iterations: int, seconds: float,
+) -> Minimum:
+    """Descend from the admissible `start` until gap <= tolerance * |value|.
+
+    function: point -> value and gradient
+    project: the nearest admissible point
+    gap: (point, gradient) -> the most by which any admissible point is lower on the linear model (Frank-Wolfe)
+    metric: weights of the squared length of a step, about in proportion to the second derivatives; the nearest point
+        in this metric must be that of `project`, as it is for bounds, and for simplices of one weight each
+    """
+    deadline = time.perf_counter() + seconds
+    point = start
+    value, gradient = function(point)
+    if not (np.isfinite(value) and np.isfinite(gradient).all()):
+        return Minimum(point=start, value=value, gap=np.inf, evaluations=1, reason="not a number")
+    recent, evaluations = deque([value], MEMORY), 1
+    length = 1.0 / max(np.abs(gradient / metric).max(initial=0.0), 1.0 / LONGEST)
+    best, least = (point, np.inf), np.inf
+    for iteration in range(iterations + 1):
+        if (now := gap(point, gradient)) <= tolerance * abs(value):
+            return Minimum(point=point, value=value, gap=now, evaluations=evaluations, reason=None)
+        least = min(least, now)
+        if value < best[1]:
+            best = point, value
+        reason = "iteration limit" if iteration == iterations else "time limit"
+        if iteration == iterations or time.perf_counter() > deadline:
+            break
+        direction = project(point - length * gradient / metric) - point
+        slope, share, limit = float((gradient * direction).sum()), 1.0, max(recent)
+        while True:
+            other = point + share * direction
+            other_value, other_gradient = function(other)
+            evaluations += 1
+            if other_value <= limit + SUFFICIENT * share * slope:
+                break
+            if share < SHORTEST:
+                return Minimum(
+                    point=best[0], value=best[1], gap=least, evaluations=evaluations, reason="no further descent")
+            lowest = -0.5 * share**2 * slope / (other_value - value - share * slope)  # of the parabola through both
+            share = lowest if 0.1 * share <= lowest <= 0.5 * share else 0.5 * share
+        moved, turned = other - point, other_gradient - gradient
+        curvature = float((moved * turned).sum())
+        length = min(float((metric * moved**2).sum()) / curvature if curvature > 0 else 4.0 * length, LONGEST)
+        point, value, gradient = other, other_value, other_gradient
+        recent.append(value)
+    return Minimum(point=best[0], value=best[1], gap=least, evaluations=evaluations, reason=reason)

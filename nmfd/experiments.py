@@ -1,0 +1,242 @@
+"""The commands robustness, bound, ablation and scaling of `nmfd`. Heavy modules are imported inside them."""
+
+from pathlib import Path
+
+import click
+
+from nmfd.command_line import Interrupted
+from nmfd.errors import InputError
+from nmfd.options import FILE, FOLDER, controller_names, policy_files, quoted
+
+
+@click.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--controllers", required=True, metavar="A,B,...",
+              help="Which to run besides no-control; the names as in nmfd benchmark.")
+@click.option("--sigmas", default="0,0.25,0.5,0.75,1,1.5,2,3,5", show_default=True, metavar="S,...",
+              help="Standard deviations of the noise [veh/s].")
+@click.option("--scenarios", type=click.IntRange(min=1), default=20, show_default=True, metavar="N",
+              help="Draws of the noise for every sigma.")
+@click.option("--where", type=click.Choice(["planned", "pairs", "all"]), default="pairs", show_default=True,
+              help="What is perturbed: planned demand while it lasts, its pairs of regions all the time, or all pairs. "
+                   "Clipping at zero makes the last two add many trips.")
+@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="acyclic", show_default=True,
+              help="The model that the controllers act on.")
+@click.option("--workers", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+              help="Runs at a time, each on one core.")
+@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
+              help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.")
+@click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
+def robustness(
+    scenario: Path, controllers: str, sigmas: str, scenarios: int, where: str, plant: str, workers: int,
+    policies: tuple[str, ...], out: Path | None,
+) -> None:
+    """Run controllers against perturbed demand; print a table and draw the improvement over no control.
+
+    Controllers know the demand of the scenario; what comes is max(0, demand + noise) with Gaussian noise of standard
+    deviation sigma, drawn for every pair of regions and control interval. The run folder holds robustness.csv,
+    robustness.png and manifest.json; the same command with the same --out goes on where it was interrupted, and
+    controllers, sigmas or scenarios can be added.
+
+    \b
+    Example:
+      nmfd robustness scenarios/economic_mpc --controllers pi-gating,dpc-pcrg,dpc-pcrg-robust --out runs/robust
+    """
+    names = controller_names(controllers)
+    files = policy_files(policies, names)
+    levels = _sigmas(sigmas)
+
+    from nmfd import robustness as method
+    from nmfd import runs
+    from nmfd.progress import progress_line
+    from nmfd.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    out = runs.default_folder(loaded) if out is None else out
+    try:
+        with progress_line("robustness") as progress:
+            rows = method.robustness(
+                loaded, names, levels, scenarios, where=where, plant=plant, out=out, policies=files, workers=workers,
+                progress=progress)
+    except KeyboardInterrupt:
+        if not (out / "robustness.csv").exists():
+            raise Interrupted("interrupted before a run was finished; nothing is kept") from None
+        raise Interrupted(
+            f"interrupted; finished runs are in {out}: the same command with --out {quoted(out)} goes on") from None
+    click.echo(method.table(rows))
+    click.echo(f"Written to {out}")
+
+
+@click.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--controller", required=True, metavar="NAME", help="bound-pc or bound-pcrg.")
+@click.option("--from", "starts", metavar="A,B,...",
+              help="Controllers whose closed loops it starts from, besides open and half-closed perimeters. "
+                   "[default: pi-gating and the DPC policies there are]")
+@click.option("--iterations", type=click.IntRange(min=1), metavar="N", help="Adam steps. [default: 1500]")
+@click.option("--out", type=FILE, metavar="FILE", help="The plan file. [default: SCENARIO/NAME.npz]")
+def bound(scenario: Path, controller: str, starts: str | None, iterations: int | None, out: Path | None) -> None:
+    """Compute the bound: the best control of the regional model that knows all demand.
+
+    The plan is written to a file that `nmfd benchmark --controllers bound-pc,bound-pcrg` replays. Ctrl-C ends the
+    search early and keeps the best plan so far.
+
+    \b
+    Examples:
+      nmfd bound scenarios/economic_mpc --controller bound-pcrg
+      nmfd bound scenarios/economic_mpc --controller bound-pc --from mpc-pc,dpc-pc
+    """
+    from nmfd import bound as method
+    from nmfd.progress import progress_line
+    from nmfd.scenario import load_scenario
+
+    method.check(controller)
+    names = None if starts is None else controller_names(starts)
+    loaded = load_scenario(scenario)
+    file = scenario / f"{controller}.npz" if out is None else out
+    if not file.parent.is_dir():
+        raise InputError(f"{file.parent}: no such folder for the plan; make it or choose another --out")
+    steps = iterations or method.ITERATIONS
+    with progress_line(controller) as progress:
+        plan = method.compute(loaded, controller, starts=names, iterations=steps, progress=progress)
+    method.write(plan, loaded, file)
+    for name, total in sorted(plan.totals.items(), key=lambda item: item[1]):
+        click.echo(f"from {name}: {total:.5g} veh s" + (" (kept)" if name == plan.start else ""))
+    click.echo(f"{plan.iterations} Adam steps" + ("" if plan.iterations == steps else ", interrupted"))
+    click.echo(f"Written to {file}")
+
+
+def _sigmas(text: str) -> list[float]:
+    """Standard deviations in a list separated by commas. InputError for anything but numbers from 0 up."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = [-1.0]
+    if not all(0.0 <= value < float("inf") for value in values) or len(set(values)) < len(values):
+        raise InputError(f"--sigmas: expected different numbers from 0 up, such as 0,0.5,1, got {text!r} instead")
+    return values
+
+
+@click.command()
+@click.argument("what", type=click.Choice(["training", "horizon"]))
+@click.argument("scenario", type=FOLDER)
+@click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, metavar="N",
+              help="training: seeds 0 to N-1 with each method.")
+@click.option("--controller", default="dpc-pcrg", show_default=True, metavar="NAME", help="training: what is trained.")
+@click.option("--steps", type=click.IntRange(min=1), metavar="N", help="training: Adam steps. [default: scenario.toml]")
+@click.option("--horizons", default="2,3,4,6,8,10,12,16,20,25,30", show_default=True, metavar="H,...",
+              help="horizon: control intervals that MPC looks ahead.")
+@click.option("--controllers", default="mpc-pc,mpc-pcrg", show_default=True, metavar="A,B", help="horizon: which MPC.")
+@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="acyclic", show_default=True,
+              help="horizon: the model that MPC acts on.")
+@click.option("--workers", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+              help="Runs at a time, each on one core. Timings are cleanest with 1.")
+@click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
+def ablation(
+    what: str, scenario: Path, seeds: int, controller: str, steps: int | None, horizons: str, controllers: str,
+    plant: str, workers: int, out: Path | None,
+) -> None:
+    """Vary one thing and draw its effect: the training of DPC with route guidance, or the horizon of MPC.
+
+    training: the two decoders in turn (alternating) against both at once (joint), the same Adam steps.
+    horizon: total time spent and time of a decision over the horizon. Finished runs are kept: the same command with
+    the same --out goes on where it was interrupted.
+
+    \b
+    Examples:
+      nmfd ablation training scenarios/economic_mpc --seeds 3 --out runs/alternating
+      nmfd ablation horizon scenarios/economic_mpc --controllers mpc-pc --out runs/horizon
+    """
+    names, lengths = controller_names(controllers), _lengths(horizons)
+
+    from nmfd import ablation as method
+    from nmfd import runs
+    from nmfd.progress import progress_line
+    from nmfd.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    out = runs.default_folder(loaded) if out is None else out
+    try:
+        with progress_line(f"ablation {what}") as progress:
+            if what == "training":
+                rows = method.alternating_or_joint(
+                    loaded, range(seeds), out=out, controller=controller, steps=steps, workers=workers,
+                    progress=progress)
+            else:
+                rows = method.horizons(
+                    loaded, names, lengths, plant=plant, out=out, workers=workers, progress=progress)
+    except KeyboardInterrupt:
+        if not (out / f"{what}.csv").exists():
+            raise Interrupted("interrupted before a run was finished; nothing is kept") from None
+        raise Interrupted(
+            f"interrupted; finished runs are in {out}: the same command with --out {quoted(out)} goes on") from None
+    click.echo(method.table(what, rows))
+    click.echo(f"Written to {out}")
+
+
+def _lengths(text: str) -> list[int]:
+    """Horizons in a list separated by commas. InputError for anything but whole numbers from 2 up."""
+    parts = [part.strip() for part in text.split(",")]
+    values = [int(part) if part.isdecimal() else 0 for part in parts]
+    if min(values) < 2 or len(set(values)) < len(values):
+        raise InputError(f"--horizons: expected different whole numbers from 2 up, such as 2,8, got {text!r} instead")
+    return values
+
+
+@click.command()
+@click.option("--regions", metavar="N,...", help="Numbers of regions. [default: 2,4,8,... to 64, hexagonal to 256]")
+@click.option("--controllers", default="dpc-pc,dpc-pcrg,mpc-pc,mpc-pcrg", show_default=True, metavar="A,B,...",
+              help="Which to measure, out of these four.")
+@click.option("--family", type=click.Choice(["complete", "hexagonal"]), default="complete", show_default=True,
+              help="Every region adjacent to every other, as published, or a plane city.")
+@click.option("--load", type=click.Choice(["published", "congested"]), default="published", show_default=True,
+              help="Initial states: 0 to 100 vehicles bound for every region, or regions up to beyond their jam.")
+@click.option("--workers", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+              help="Cases at a time, each in a process on one core. Timings are cleanest with 1.")
+@click.option("--memory", type=click.FloatRange(min=0.0, min_open=True), default=16.0, show_default=True,
+              metavar="GIB", help="That a case may take.")
+@click.option("--time-limit", type=click.FloatRange(min=0.0, min_open=True), default=600.0, show_default=True,
+              metavar="S", help="That a case may take.")
+@click.option("--out", type=FOLDER, default=Path("runs/scaling"), show_default=True, metavar="DIR",
+              help="The run folder.")
+def scaling(
+    regions: str | None, controllers: str, family: str, load: str, workers: int, memory: float, time_limit: float,
+    out: Path,
+) -> None:
+    """Measure the time of a decision and its memory against the number of regions; print a table and draw it.
+
+    Random MFDs and initial states, ten control intervals, the median of all decisions but the first. The policies
+    are untrained. The run folder holds scaling.csv, scaling.png and manifest.json; what is there is not run again, and
+    other families, loads, regions and controllers are added to it.
+
+    \b
+    Examples:
+      nmfd scaling
+      nmfd scaling --family hexagonal --load congested --controllers dpc-pcrg,mpc-pcrg --regions 7,19,37
+    """
+    names = controller_names(controllers)
+    counts = () if regions is None else _counts(regions)
+
+    from nmfd import scaling as method
+    from nmfd.progress import progress_line
+
+    try:
+        with progress_line("scaling") as progress:
+            rows = method.scaling(
+                names, out=out, family=family, load=load, regions=counts, workers=workers, memory_gib=memory,
+                time_limit=time_limit, progress=progress)
+    except KeyboardInterrupt:
+        if not (out / "scaling.csv").exists():
+            raise Interrupted("interrupted before a case was finished; nothing is kept") from None
+        raise Interrupted(f"interrupted; finished cases are in {out}: the same command goes on") from None
+    click.echo(method.table(rows))
+    click.echo(f"Written to {out}")
+
+
+def _counts(text: str) -> list[int]:
+    """Numbers of regions in a list separated by commas. InputError for anything but whole numbers from 2 up."""
+    parts = [part.strip() for part in text.split(",")]
+    values = [int(part) if part.isdecimal() else 0 for part in parts]
+    if min(values) < 2 or len(set(values)) < len(values):
+        raise InputError(f"--regions: expected different whole numbers from 2 up, such as 2,4,8, got {text!r} instead")
+    return values

@@ -1,0 +1,169 @@
+"""Speed against plain versions of the same: pytest tests/benchmarks --benchmark-only
+
+What is compared must agree; that part runs with the other tests.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import plain
+import pytest
+import torch
+
+from nmfd import scaling
+from nmfd.closed_loop import run
+from nmfd.controllers import registry
+from nmfd.controllers.dpc import load_policy
+from nmfd.controllers.fixed import NoControl
+from nmfd.controllers.mpc import EconomicMpc
+from nmfd.plant import NmfdPlant
+from nmfd.scenario import Scenario, load_scenario
+from nmfd.types import Measurement
+
+SCENARIO = load_scenario(Path(__file__).parents[2] / "scenarios" / "economic_mpc")
+KINDS = pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
+WHEN = (10, 20, 30, 40)  # control intervals: from free flow to gridlock in the centre
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Measurements of a run without control."""
+    trajectory = run(NmfdPlant(SCENARIO), NoControl(SCENARIO), replace(SCENARIO, steps=WHEN[-1] + 1), seed=0)
+    return [measurement(trajectory.accumulation[k], k) for k in WHEN]
+
+
+def measurement(x, k=0):
+    return Measurement(step=k, time=30.0 * k, accumulation=x, backlog=np.zeros_like(x))
+
+
+def forecast(scenario, k):
+    """(8, R, R) [veh/s]."""
+    ahead = np.zeros((8, *scenario.demand.shape[1:]))
+    known = scenario.demand[k:k + 8]
+    ahead[:len(known)] = known
+    return ahead
+
+
+def random_city(family, regions):
+    city = scaling.network(family, regions)
+    scenario = Scenario(name="city", network=city, step=30.0, steps=10, demand=np.zeros((10, regions, regions)))
+    return scenario, measurement(scaling.initial_state(city, "congested"))
+
+
+def compare(scenario, measured, guidance):
+    """Total time spent over the horizon [veh s] by nmfd.controllers.mpc, by plain IPOPT, and whether that converged."""
+    controller, k = EconomicMpc(scenario, guidance=guidance), measured.step
+    assert controller.act(measured).status == "ok"
+    perimeter, splits, solved = plain.mpc(scenario, guidance=guidance)(
+        np.maximum(measured.accumulation, 0.0), forecast(scenario, k))
+    rows = [controller.admissible.decision(u, theta) for u, theta in zip(perimeter, splits, strict=True)]
+    other = controller.admissible.project(np.stack(rows))
+    start, demand = controller.forecast(measured)
+    return controller.cost(start, demand, controller._plan), controller.cost(start, demand, other), solved
+
+
+@KINDS
+def test_mpc_has_the_optimum_of_plain_ipopt(seen, guidance):
+    ours, plain_ipopt, solved = compare(SCENARIO, seen[2], guidance)
+    assert ours <= plain_ipopt * (1.0 + 1e-5) and (not solved or ours == pytest.approx(plain_ipopt, rel=1e-4))
+
+
+@pytest.mark.parametrize("family, regions, guidance", [
+    ("complete", 5, True), ("complete", 8, False), ("hexagonal", 9, False),
+    pytest.param("hexagonal", 7, True, marks=pytest.mark.slow)])
+def test_mpc_has_the_optimum_of_plain_ipopt_in_random_cities(family, regions, guidance):
+    ours, plain_ipopt, solved = compare(*random_city(family, regions), guidance)
+    assert ours <= plain_ipopt * (1.0 + 1e-5) and (not solved or ours == pytest.approx(plain_ipopt, rel=1e-4))
+
+
+def test_the_plain_model_is_the_model():
+    trajectory = run(NmfdPlant(SCENARIO), NoControl(SCENARIO), replace(SCENARIO, steps=30), seed=0)
+    x = trajectory.accumulation[0]
+    for k in range(30):
+        x = plain.euler(SCENARIO.network, x, SCENARIO.demand[k], trajectory.perimeter[k], trajectory.splits[k], 30.0)
+        np.testing.assert_allclose(x, trajectory.accumulation[k + 1], atol=1e-9)
+
+
+@KINDS
+def test_plain_dpc_decides_the_same(seen, guidance):
+    name = "dpc-pcrg" if guidance else "dpc-pc"
+    policy, _ = load_policy(SCENARIO.folder / f"{name}.pt", SCENARIO.network)
+    controls = registry.make(name, SCENARIO).act(seen[2])
+    perimeter, splits = plain.dpc(policy)(seen[2].accumulation)
+    np.testing.assert_allclose(controls.perimeter, perimeter, atol=1e-6)
+    if guidance:
+        np.testing.assert_allclose(controls.splits, splits, atol=1e-6)
+
+
+@KINDS
+@pytest.mark.benchmark(group="MPC, four decisions from nothing, 7 regions")
+class TestMpc:
+    def test_plain(self, benchmark, seen, guidance):
+        decide = plain.mpc(SCENARIO, guidance=guidance)
+        benchmark(lambda: [decide(m.accumulation, forecast(SCENARIO, m.step)) for m in seen])
+
+    def test_ours(self, benchmark, seen, guidance):
+        controller = EconomicMpc(SCENARIO, guidance=guidance)
+
+        def decide():
+            for measured in seen:
+                controller.reset()
+                controller.act(measured)
+
+        benchmark(decide)
+
+
+@pytest.mark.parametrize("guidance, regions", [(False, 16), (True, 8)], ids=["pc-16", "pcrg-8"])
+@pytest.mark.benchmark(group="MPC, one decision from nothing, complete network, congested")
+class TestMpcOfManyRegions:
+    def test_plain(self, benchmark, guidance, regions):
+        scenario, measured = random_city("complete", regions)
+        decide = plain.mpc(scenario, guidance=guidance)
+        benchmark.pedantic(lambda: decide(measured.accumulation, forecast(scenario, 0)), rounds=1)
+
+    def test_ours(self, benchmark, guidance, regions):
+        scenario, measured = random_city("complete", regions)
+        controller = EconomicMpc(scenario, guidance=guidance)
+
+        def decide():
+            controller.reset()
+            controller.act(measured)
+
+        benchmark(decide)
+
+
+@KINDS
+@pytest.mark.benchmark(group="DPC, one decision, 7 regions")
+class TestDpc:
+    def test_plain(self, benchmark, seen, guidance):
+        policy, _ = load_policy(SCENARIO.folder / f"dpc-pc{'rg' * guidance}.pt", SCENARIO.network)
+        benchmark(plain.dpc(policy), seen[2].accumulation)
+
+    def test_ours(self, benchmark, seen, guidance):
+        benchmark(registry.make(f"dpc-pc{'rg' * guidance}", SCENARIO).act, seen[2])
+
+
+@pytest.mark.benchmark(group="closed loop without control, 240 intervals of 7 regions")
+class TestClosedLoop:
+    def test_plain(self, benchmark):
+        controls = NoControl(SCENARIO).act(measurement(np.zeros((7, 7))))
+        theta = SCENARIO.network.nominal_splits
+
+        def loop():
+            x = np.zeros((7, 7))
+            for k in range(SCENARIO.steps):
+                x = plain.euler(SCENARIO.network, x, SCENARIO.demand[k], controls.perimeter, theta, SCENARIO.step)
+
+        benchmark(loop)
+
+    def test_ours(self, benchmark):
+        benchmark(lambda: run(NmfdPlant(SCENARIO), NoControl(SCENARIO), SCENARIO, seed=0))

@@ -1,0 +1,124 @@
+"""The bound: admissible plans below every closed loop and an exact optimum, plan files, and the command."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+from click.testing import CliRunner
+
+from nmfd import bound, closed_loop
+from nmfd.cli import main
+from nmfd.controllers import registry
+from nmfd.controllers.fixed import NoControl
+from nmfd.controllers.gating import PiGating
+from nmfd.errors import InputError
+from nmfd.metrics import total_time_spent
+from nmfd.plant import NmfdPlant
+from nmfd.scenario import load_scenario
+
+ECONOMIC = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tiny.write(tmp_path)
+
+
+@pytest.fixture
+def scenario(folder):
+    return load_scenario(folder)
+
+
+def nmfd(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def closed(scenario, controller):
+    return total_time_spent(closed_loop.run(NmfdPlant(scenario), controller, scenario, seed=0))
+
+
+def test_names_are_those_of_the_registry():
+    assert registry._WITH_PLAN == bound.NAMES
+
+
+def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
+    free = replace(scenario, demand=0.01 * scenario.demand)
+    plan = bound.compute(free, "bound-pc", starts=[], iterations=100)
+    assert plan.perimeter[:8, 0, 1].min() > 0.85  # later intervals move vehicles that the horizon does not count
+    assert closed(free, bound.OpenLoop(plan)) == pytest.approx(closed(free, NoControl(free)), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", bound.NAMES)
+def test_plans_are_admissible_and_replayed_exactly(name):
+    scenario = replace(load_scenario(ECONOMIC), steps=40)
+    scenario = replace(scenario, demand=scenario.demand[:40])
+    plan = bound.compute(scenario, name, starts=["pi-gating"], iterations=20)
+    network = scenario.network
+    u = plan.perimeter[:, network.adjacency]
+    assert u.min() >= network.u_min and u.max() <= network.u_max and (plan.perimeter[:, ~network.adjacency] == 0).all()
+    if plan.splits is not None:
+        assert (plan.splits[:, ~network.split_mask] == 0.0).all()
+        np.testing.assert_allclose(
+            plan.splits.sum(axis=2), np.broadcast_to(1.0 - np.eye(7), (40, 7, 7)), rtol=0.0, atol=1e-12)
+    assert closed(scenario, bound.OpenLoop(plan)) == pytest.approx(plan.totals[plan.start], rel=1e-12)
+    assert plan.totals[plan.start] == min(plan.totals.values())
+    assert set(plan.totals) == {"open", "middle", "pi-gating"}
+
+
+def test_the_bound_is_not_above_the_closed_loop_it_started_from(scenario):
+    crowded = replace(scenario, demand=3.0 * scenario.demand)
+    plan = bound.compute(crowded, "bound-pc", starts=["pi-gating"], iterations=200)
+    # A sigmoid never quite reaches the bounds of u.
+    assert plan.totals[plan.start] <= (1.0 + 1e-4) * closed(crowded, PiGating(crowded))
+
+
+def test_an_interrupted_descent_keeps_the_best_so_far(scenario):
+    def interrupt(done, total, note):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    start = bound.neutral_starts(scenario.network, scenario.steps, guidance=False)
+    short = bound.solve(scenario, start, guidance=False, iterations=50, progress=interrupt)
+    first = bound.solve(scenario, start, guidance=False, iterations=1)
+    assert short.iterations == 2
+    assert all(short.totals[name] < first.totals[name] for name in start)
+
+
+def test_command_writes_a_plan_that_benchmark_replays(folder, tmp_path):
+    result = nmfd("bound", folder, "--controller", "bound-pcrg", "--iterations", 20)
+    assert result.exit_code == 0, result.stderr
+    *lines, steps, _ = result.stdout.splitlines()
+    assert steps == "20 Adam steps"
+    assert lines[0].endswith("(kept)") and {line.split()[1] for line in lines} == {"open:", "middle:", "pi-gating:"}
+    command = ["benchmark", folder, "--controllers", "no-control,bound-pcrg", "--out", tmp_path / "out"]
+    result = nmfd(*command)
+    assert result.exit_code == 0, result.stderr
+    lines = result.stdout.splitlines()
+    assert "above bound" in lines[1] and lines[-2].startswith("above bound: ")
+    assert any(line.startswith("bound-pcrg ") for line in lines)
+
+
+def test_wrong_names_and_missing_plans(folder, tmp_path):
+    for arguments, fragment in (
+            (["bound", folder, "--controller", "dpc-pc"], "'dpc-pc' is no bound; choose one of bound-pc, bound-pcrg"),
+            (["bound", folder, "--controller", "bound-pc", "--from", "nobody"], "controller 'nobody' is unknown"),
+            (["bound", folder, "--controller", "bound-pc", "--out", tmp_path / "a" / "b.npz"], "no such folder"),
+            (["benchmark", folder, "--controllers", "bound-pc", "--out", tmp_path / "out"],
+             f"compute one with: nmfd bound {folder} --controller bound-pc")):
+        result = nmfd(*arguments)
+        assert result.exit_code == 2 and result.stderr.count("\n") == 1 and fragment in result.stderr, result.stderr
+
+
+def test_files_that_do_not_fit(scenario, tmp_path):
+    path, start = tmp_path / "p.npz", bound.neutral_starts(scenario.network, scenario.steps, guidance=False)
+    bound.write(bound.solve(scenario, start, guidance=False, iterations=1), scenario, path)
+    assert bound.read(path, replace(scenario, measurement_std=9.0), guidance=False).start in start
+    with pytest.raises(InputError, match="another demand or network"):
+        bound.read(path, replace(scenario, demand=2.0 * scenario.demand), guidance=False)
+    with pytest.raises(InputError, match="without route guidance, expected one with"):
+        bound.read(path, scenario, guidance=True)
+    path.write_bytes(b"nothing")
+    with pytest.raises(InputError, match="is no plan"):
+        bound.read(path, scenario, guidance=False)

@@ -1,0 +1,189 @@
+"""Perturbed demand, the comparison over it, and the guard that falls back to PI gating."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from click.testing import CliRunner
+
+from nmfd import closed_loop, robustness, training
+from nmfd.cli import main
+from nmfd.controllers import guarded, registry
+from nmfd.controllers.dpc import Architecture, Policy, checkpoint
+from nmfd.controllers.gating import PiGating
+from nmfd.demand_noise import WHERE, entries, perturbed
+from nmfd.scenario import load_scenario
+from nmfd.types import Measurement
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tiny.write(tmp_path)
+
+
+@pytest.fixture
+def scenario(folder):
+    return load_scenario(folder)
+
+
+def nmfd(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_noise_has_the_declared_size_and_place(scenario, where):
+    long = replace(scenario, demand=np.tile(10.0 * np.sign(scenario.demand), (200, 1, 1)))
+    noisy = perturbed(long, 1.0, 0, where=where)
+    change, touched = noisy.demand - long.demand, entries(long.demand, where)
+    assert (change[~touched] == 0.0).all() and noisy.demand.min() >= 0.0
+    assert change[long.demand > 0].std() == pytest.approx(1.0, rel=0.05)
+    added = noisy.demand[touched & (long.demand == 0)]
+    if where == "planned":
+        assert added.size == 0
+    else:  # half of a normal distribution
+        assert added.mean() == pytest.approx(1.0 / np.sqrt(2.0 * np.pi), rel=0.05)
+
+
+def test_noise_is_common_to_all_sigmas_and_follows_its_seed(scenario):
+    high = replace(scenario, demand=scenario.demand + 100.0)
+    one, two = (perturbed(high, sigma, 3, where="all").demand - high.demand for sigma in (1.0, 2.0))
+    np.testing.assert_allclose(two, 2.0 * one, atol=1e-10)
+    np.testing.assert_array_equal(perturbed(high, 0.0, 3, where="all").demand, high.demand)
+    assert not np.array_equal(perturbed(high, 1.0, 4, where="all").demand - high.demand, one)
+
+
+def test_training_noise_is_that_of_the_evaluation(scenario):
+    """Even rollouts: on the pairs in use; odd ones: everywhere; sigma the level times the setting."""
+    rollout = training.Rollout(scenario)
+    nominal = 50.0 + rollout.demand.unsqueeze(1).repeat(50, 400, 1, 1)
+    level = torch.full((400,), 0.5)
+    change = rollout.perturb(nominal, level, 2.0, 0.5, torch.Generator().manual_seed(0)) - nominal
+    assert change[:, 0::2, 0, 1].std().item() == pytest.approx(1.0, rel=0.02)
+    assert change[:, 0::2, 1, 0].abs().max().item() == 0.0
+    assert change[:, 1::2, 0, 1].std().item() == pytest.approx(0.25, rel=0.02)
+    assert change[:, 1::2, 1, 0].std().item() == pytest.approx(0.25, rel=0.02)
+    assert rollout.perturb(nominal, level, 0.0, 0.0, None) is nominal
+
+
+def command(folder, out, *more):
+    return [
+        "robustness", folder, "--controllers", "pi-gating", "--sigmas", "0,1", "--scenarios", 2, "--out", out, *more]
+
+
+def test_command_writes_rows_figure_and_manifest(folder, tmp_path):
+    result = nmfd(*command(folder, tmp_path / "out"))
+    assert result.exit_code == 0, result.stderr
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "robustness.csv", "robustness.png", "manifest.json"}
+    rows = robustness.read(tmp_path / "out" / "robustness.csv")
+    assert [tuple(row.values())[:3] for row in rows] == [
+        (sigma, number, name) for sigma in (0.0, 1.0) for number in (0, 1) for name in ("no-control", "pi-gating")]
+    assert rows[0]["trips_veh"] == pytest.approx(360.0) and rows[-1]["trips_veh"] > 400.0
+    assert "pi-gating" in result.stdout and "±" in result.stdout
+
+
+def test_improvement_is_over_no_control_in_the_same_scenario():
+    rows = [
+        {"sigma_veh_per_s": 1.0, "scenario": number, "controller": name, "trips_veh": 1.0,
+         "total_time_spent_veh_s": total}
+        for number, name, total in (
+            (0, "no-control", 100.0), (0, "pi-gating", 50.0), (1, "no-control", 1000.0), (1, "pi-gating", 700.0),
+            (2, "pi-gating", 1.0))]
+    mean, half = robustness.improvements(rows, "pi-gating")[1.0]
+    assert mean == pytest.approx(40.0) and half == pytest.approx(12.706 * 10.0, rel=1e-3)
+
+
+def test_an_interrupted_comparison_goes_on_and_workers_change_nothing(folder, tmp_path, monkeypatch):
+    assert nmfd(*command(folder, tmp_path / "whole")).exit_code == 0
+    assert nmfd(*command(folder, tmp_path / "two", "--workers", 2)).exit_code == 0
+    original, calls = closed_loop.run, []
+
+    def run(*arguments, **options):
+        calls.append(None)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(closed_loop, "run", run)
+    result = nmfd(*command(folder, tmp_path / "out"))
+    assert result.exit_code == 130 and result.stderr.count("\n") == 1 and "goes on" in result.stderr
+    assert len(robustness.read(tmp_path / "out" / "robustness.csv")) == 3
+    assert nmfd(*command(folder, tmp_path / "out")).exit_code == 0
+    assert len(calls) == 9  # three, the interrupted one, and the five that were left
+    files = [(tmp_path / name / "robustness.csv").read_bytes() for name in ("whole", "two", "out")]
+    assert files[0] == files[1] == files[2]
+
+
+def test_interrupted_before_the_first_run_leaves_nothing(folder, tmp_path, monkeypatch):
+    def run(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(closed_loop, "run", run)
+    result = nmfd(*command(folder, tmp_path / "a" / "b"))
+    assert result.exit_code == 130 and "nothing is kept" in result.stderr and not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("sigmas", ["", "1,x", "-1", "1,1", "inf"])
+def test_wrong_sigmas(folder, tmp_path, sigmas):
+    result = nmfd("robustness", folder, "--controllers", "pi-gating", f"--sigmas={sigmas}", "--out", tmp_path / "out")
+    assert result.exit_code == 2 and result.stderr.startswith("nmfd: error: --sigmas: expected different numbers")
+
+
+def test_a_folder_of_another_noise_is_refused(folder, tmp_path):
+    assert nmfd(*command(folder, tmp_path / "out")).exit_code == 0
+    result = nmfd(*command(folder, tmp_path / "out", "--where", "all"))
+    assert result.exit_code == 2 and 'where: "pairs" there, "all" asked for' in result.stderr
+
+
+def guard(scenario, spread=0.1):
+    torch.manual_seed(0)
+    policy = Policy(scenario.network, Architecture(width=4))
+    states = 0.5 + spread * np.random.default_rng(0).standard_normal((5000, 4))
+    return guarded.Guarded(policy, guarded.statistics(states), scenario)
+
+
+def at(scenario, value, step=0):
+    critical = scenario.network.mfds[0].critical
+    return Measurement(
+        step=step, time=30.0 * step, accumulation=np.full((2, 2), value * critical), backlog=np.zeros((2, 2)))
+
+
+def test_the_guard_takes_over_outside_and_hands_back_inside(scenario):
+    watched, gating = guard(scenario), PiGating(scenario)
+    assert watched.act(at(scenario, 0.5)).status == "ok"
+    gating.reset()
+    for step in (1, 2):
+        controls = watched.act(at(scenario, 2.0, step))
+        assert controls.status.startswith("guard: ")
+        np.testing.assert_array_equal(controls.perimeter, gating.act(at(scenario, 2.0, step)).perimeter)
+    statuses = [watched.act(at(scenario, 0.5, step)).status for step in range(3, 3 + guarded.PATIENCE)]
+    assert all(status != "ok" for status in statuses[:-1]) and statuses[-1] == "ok"
+
+
+def test_the_limit_lets_the_training_states_pass(scenario):
+    watched, critical = guard(scenario), scenario.network.mfds[0].critical
+    states = critical * (0.5 + 0.1 * np.random.default_rng(1).standard_normal((4000, 2, 2)))
+    outside = np.mean([watched.distance(state) > 1.0 for state in states])
+    assert outside == pytest.approx(1.0 - guarded.QUANTILE, abs=2e-3)
+
+
+def test_the_guard_reads_the_statistics_of_a_trained_policy(folder, scenario, tmp_path):
+    file = training.train(scenario, "dpc-pc", seed=0, out=tmp_path / "p.pt", steps=1)
+    controller = registry.make("dpc-pc-guarded", scenario, policy=file)
+    assert controller.name == "dpc-pc-guarded" and controller.act(at(scenario, 0.0)).status == "ok"
+    torch.save(checkpoint(Policy(scenario.network, Architecture(width=4)), scenario.network, {}), tmp_path / "old.pt")
+    result = nmfd("benchmark", folder, "--controllers", "dpc-pc-guarded", "--policy",
+                  f"dpc-pc-guarded={tmp_path / 'old.pt'}", "--out", tmp_path / "out")
+    assert result.exit_code == 2 and "holds no statistics of its training states" in result.stderr
+
+
+def test_a_damaged_csv_is_one_line(folder, tmp_path):
+    assert nmfd(*command(folder, tmp_path / "out")).exit_code == 0
+    file = tmp_path / "out" / "robustness.csv"
+    with file.open("a", newline="") as text:
+        csv.writer(text).writerow(["x", "y"])
+    result = nmfd(*command(folder, tmp_path / "out"))
+    assert result.exit_code == 2 and result.stderr.count("\n") == 1 and str(file) in result.stderr
