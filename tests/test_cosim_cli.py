@@ -1,6 +1,7 @@
 """The command line `cosim`: run, compare and identify on a few control intervals, and its error lines."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -31,11 +32,12 @@ def good(result):
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """A copy of grid7_peak and its network, so that tests may change them; six intervals, earlier peak."""
+    """A copy of grid7_peak and its network, so that tests may change them, with the peak at the beginning."""
     folder = tmp_path_factory.mktemp("small")
     shutil.copytree(GRID, folder / "networks" / "grid7")
     source = ROOT / "scenarios" / "grid7_peak" / "scenario.toml"
-    text = source.read_text().replace("ramp_up = 900.0", "ramp_up = 90.0")
+    text = re.sub(r"ramp_up = [\d.]+", "ramp_up = 90.0", source.read_text())
+    text = text.replace("steps = 64", "steps = 80")
     (folder / "scenarios" / "small").mkdir(parents=True)
     (folder / "scenarios" / "small" / "scenario.toml").write_text(text)
     scenario = load_scenario(folder / "scenarios" / "small")
