@@ -11,15 +11,14 @@ from cosim.city import ensure_built
 from cosim.plant import settings
 from cosim.regions import check_adjacency, load_city
 from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
-from nmfd import plots, runs
-from nmfd.benchmarks import interval
+from nmfd import runs
+from nmfd.benchmarks import REFERENCE, draw_accumulations, interval
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.mfd import Mfd
 from nmfd.scenario import Scenario
 from nmfd.workers import Failure, RunFailed, attempt, outcomes
 
-REFERENCE = "no-control"
 CAPTION = (
     "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; backlog: not\n"
     "inserted at the end; step: median / longest decision; outside SUMO: share of the wall time not in its own step")
@@ -66,7 +65,7 @@ def experiment(
                 folder.add(outcome.trajectory)
                 _write_facts(folder, outcome)
         if folder.finished:
-            draw(folder.path, scenario, folder.trajectories())
+            draw_accumulations(folder.path, scenario, folder.trajectories())
         if failures:
             raise RunFailed("; ".join(failures))
     return overview(out)
@@ -151,17 +150,3 @@ def table(rows: pd.DataFrame) -> str:
             "wall [s]": f"{group['wall_time_s'].mean():.0f}",
             "outside SUMO": f"{100 * group['overhead_share'].mean():.1f} %"})
     return pd.DataFrame(lines).to_string(index=False) + "\n" + CAPTION
-
-
-def draw(folder: Path, scenario: Scenario, trajectories: Sequence) -> None:
-    """Total and regional accumulation over time, as png files in `folder`."""
-    drawing = plots.figure(8.0, 4.6)
-    ax = plots.total_accumulation(drawing.subplots(), trajectories)
-    plots.legend_below(drawing, [ax], columns=6)
-    plots.save(drawing, folder / "total_accumulation.png")
-    drawing, axes = plots.panels(scenario.network.regions)
-    for region, ax in enumerate(axes):
-        plots.region_accumulation(ax, scenario.network, region, trajectories)
-    plots.legend_below(drawing, axes, columns=3)
-    plots.save(drawing, folder / "region_accumulation.png")
-

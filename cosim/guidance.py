@@ -36,10 +36,9 @@ class Guide:
         self._session, self._city, self._compliance, self._random = session, city, compliance, random
         self._index = {edge: n for n, edge in enumerate(city.edges)}
         self._region = np.array([city.region_of[edge] for edge in city.edges])
-        pairs = [(self._index[e], self._index[f]) for e, after in city.successors.items() for f in after]
-        self._from, self._to = (np.array(column) for column in zip(*pairs, strict=True))
-        self._turn = np.array([city.turn_time[pair] for pair in (
-            (e, f) for e, after in city.successors.items() for f in after)])
+        moves = [(e, f) for e, after in city.successors.items() for f in after]
+        self._from, self._to = np.array([(self._index[e], self._index[f]) for e, f in moves]).T
+        self._turn = np.array([city.turn_time[move] for move in moves])
         self._taste = np.exp(SPREAD * random.standard_normal((TASTES, len(city.edges))))
         self._length = np.array([city.length[edge] for edge in city.edges])
         self._free = self._length / np.array([city.speed[edge] for edge in city.edges])

@@ -106,8 +106,7 @@ class Meter:
         for vehicle in on_road:
             known = self._vehicles[vehicle]
             region = self._city.region_of[self._session.road(vehicle)]
-            if region != known.region:
-                self._cross(known, region)
+            self._cross(known, region)
             counted[region, known.destination] += 1
         for vehicle in self._teleporting.difference(on_road):
             known = self._vehicles[vehicle]

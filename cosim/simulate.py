@@ -50,7 +50,7 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
     import torch
 
     from cosim.plant import SumoPlant
-    from nmfd import closed_loop
+    from nmfd import closed_loop, runs
     from nmfd.controllers import registry
 
     torch.set_num_threads(1)  # runs stand side by side, one core each
@@ -59,8 +59,9 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
     controller = registry.make(task.controller, scenario, policy=task.policy)
     plant = SumoPlant(scenario)
     try:
-        trajectory = replace(
-            closed_loop.run(plant, controller, scenario, seed=task.seed, progress=progress), plant="sumo")
+        trajectory = runs.labelled(
+            closed_loop.run(plant, controller, scenario, seed=task.seed, progress=progress),
+            controller=task.controller, plant="sumo")
         record = plant.record()
         departed = int(record.departures.sum())
         backlog = trajectory.backlog.sum(axis=(1, 2))

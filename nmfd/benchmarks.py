@@ -112,6 +112,12 @@ def results(
 
 def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -> None:
     """The paper's figures of `trajectories` and of their scenario, as png files in `folder`."""
+    draw_accumulations(folder, scenario, trajectories)
+    draw_scenario(folder, scenario)
+
+
+def draw_accumulations(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -> None:
+    """Total and regional accumulation over time, as png files in `folder`."""
     from nmfd import plots  # workers import this module, and none of them draws
 
     drawing = plots.figure(8.0, 4.6)
@@ -124,7 +130,6 @@ def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -
         plots.region_accumulation(ax, network, region, trajectories)
     plots.legend_below(drawing, axes, columns=3)
     plots.save(drawing, folder / "region_accumulation.png")
-    draw_scenario(folder, scenario)
 
 
 def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
