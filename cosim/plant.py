@@ -16,7 +16,7 @@ from cosim.sumo import Session
 from cosim.trips import write_trips
 from nmfd import toml
 from nmfd.errors import InputError
-from nmfd.scenario import Scenario
+from nmfd.scenario import Scenario, read_tables
 from nmfd.types import Controls, Measurement
 
 PRODUCTION_EVERY = 10.0  # s, between two samples of the production
@@ -46,7 +46,7 @@ def settings(scenario: Scenario) -> Settings:
     if scenario.folder is None:
         return Settings()
     path, default = scenario.folder / "scenario.toml", Settings()
-    table = toml.Table(toml.read(path).raw_table("sumo"), path, "sumo.")
+    table = toml.Table(read_tables(scenario.folder).raw_table("sumo"), path, "sumo.")
     chosen = Settings(
         step_length=table.number("step_length", default.step_length, above=0.0, high=1.0),
         time_to_teleport=table.number("time_to_teleport", default.time_to_teleport, low=-1.0),

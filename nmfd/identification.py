@@ -1,8 +1,8 @@
 """The regional model from observed runs: all its parameters at once, by prediction error.
 
 MFDs fitted to outflow samples explain one interval at a time, and take the blame for what happens at the boundaries: a
-region that cannot send its vehicles on looks as if it had collapsed. Here the parameters of `nmfd.dynamics` - MFDs, exit
-rates, boundary capacities and storage - are those whose rollouts over some control intervals, started from every
+region that cannot send its vehicles on looks as if it had collapsed. Here the parameters of `nmfd.dynamics` - MFDs,
+exit rates, boundary capacities and storage - are those whose rollouts over some control intervals, started from every
 observed state under the observed demand and controls, come closest to what was observed (Ljung, System
 Identification, 1999, ch. 7; output error over a finite horizon).
 """

@@ -111,7 +111,10 @@ def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Contro
 
     Raises InputError as `policy_path` does, and what the controller itself finds wrong with its options or policy.
     """
+    from nmfd.scenario import as_modelled
+
     path = policy_path(name, scenario, policy)
+    scenario = as_modelled(scenario, _GUARDED.get(name, name))
     if path is None:
         return _WITHOUT_POLICY[name](scenario)
     if name in _WITH_PLAN:
