@@ -9,7 +9,9 @@ from nmfd.errors import InputError
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 FILE = click.Path(path_type=Path, dir_okay=False)
-CONTROLLER_HELP = "no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc or dpc-pcrg."
+CONTROLLER_HELP = (
+    "no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc or dpc-pcrg; what else the city does is joined by +: webster, "
+    "actuated or max-pressure signals, rerouting-N (percent of the drivers), hold-back or redistribute, compliance-N.")
 
 
 @click.group(name="cosim", cls=Commands)
@@ -25,7 +27,7 @@ def main() -> None:
 
 @main.command()
 @click.argument("scenario", type=FOLDER)
-@click.option("--controller", required=True, metavar="NAME", help=CONTROLLER_HELP)
+@click.option("--controller", required=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
 @click.option("--against", metavar="NAME", help="Run this controller too, on the same trips, in a second process.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True,
               help="Of the trips, the drivers and the guidance.")
@@ -45,12 +47,13 @@ def run(
     Examples:
       cosim run scenarios/grid7_peak --controller dpc-pcrg --against no-control
       cosim run scenarios/grid7_peak --controller pi-gating --seed 3 --out runs/gating
+      cosim run scenarios/grid7_peak --controller dpc-pc+rerouting-30 --against rerouting-30
     """
-    from nmfd.controllers import registry
+    from cosim import strategy
 
     names = [controller] + ([against] if against and against != controller else [])
     for name in names:
-        registry.check(name)
+        strategy.parse(name)
 
     from cosim import experiment
     from cosim.simulate import Task
@@ -65,7 +68,7 @@ def run(
 
 @main.command()
 @click.argument("target", type=FOLDER, metavar="SCENARIO|RUN")
-@click.option("--controller", default="no-control", show_default=True, metavar="NAME", help=CONTROLLER_HELP)
+@click.option("--controller", default="no-control", show_default=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
 @click.option("--out", type=FOLDER, metavar="DIR", help="Run folder of a SCENARIO. [default: runs/<scenario>-<time>]")

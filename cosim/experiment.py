@@ -11,6 +11,7 @@ from cosim.city import ensure_built
 from cosim.plant import settings
 from cosim.regions import check_adjacency, load_city
 from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
+from cosim.strategy import parse
 from nmfd import runs
 from nmfd.benchmarks import REFERENCE, draw_accumulations, interval
 from nmfd.controllers import registry
@@ -39,8 +40,9 @@ def experiment(
     scenario = scenario_of(first)
     controllers = {}
     for task in tasks:
-        registry.make(task.controller, scenario, policy=task.policy)
-        policy = registry.policy_path(task.controller, scenario, task.policy)
+        controller = parse(task.controller).controller
+        registry.make(controller, scenario, policy=task.policy)
+        policy = registry.policy_path(controller, scenario, task.policy)
         controllers[task.controller] = {} if policy is None else {"policy_hash": runs.file_hash(policy)}
     files = ensure_built(scenario.network)
     check_adjacency(load_city(files.net_file, files.regions_csv, scenario.network.regions), scenario.network)

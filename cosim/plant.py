@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.actuate import HOLD_BACK, MODES, Actuator, GatewaySignal
+from cosim.actuate import Actuator, GatewaySignal
 from cosim.city import ensure_built
 from cosim.guidance import Guide
 from cosim.measure import Meter
 from cosim.regions import City, Gateway, check_adjacency, load_city
+from cosim.strategy import FIXED, HOLD_BACK, MODES, SIGNALS
 from cosim.sumo import Session
 from cosim.trips import write_trips
 from nmfd import toml
@@ -30,6 +31,8 @@ class Settings:
     actuation: "hold-back" or "redistribute"; min_green: of a gateway movement [s]
     compliance: share of the decisions in which a driver follows the route guidance [-]
     rerouting: share of the drivers with SUMO's own rerouting device [-]
+    signals: one of cosim.strategy.SIGNALS; gateways_fixed (of the strategy, no key of the table): whether signals with
+        a gateway movement stay fixed-time, for perimeter control, where the others are actuated or max-pressure
     """
 
     step_length: float = 1.0
@@ -39,6 +42,8 @@ class Settings:
     min_green: float = 5.0
     compliance: float = 1.0
     rerouting: float = 0.0
+    signals: str = FIXED
+    gateways_fixed: bool = True
 
 
 def settings(scenario: Scenario) -> Settings:
@@ -55,7 +60,8 @@ def settings(scenario: Scenario) -> Settings:
         actuation=table.text("actuation", default.actuation, MODES),
         min_green=table.number("min_green", default.min_green, low=1.0),
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
-        rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0))
+        rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0),
+        signals=table.text("signals", default.signals, SIGNALS))
     table.close()
     if abs(scenario.step / chosen.step_length - round(scenario.step / chosen.step_length)) > 1e-9:
         raise InputError(

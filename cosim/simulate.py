@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cosim.strategy import parse
 from nmfd.scenario import Scenario, load_scenario
 from nmfd.types import Trajectory
 
@@ -18,8 +19,8 @@ FACTS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """scenario: its folder; policy: of a DPC controller, instead of the scenario's own; steps: control intervals, all
-    if None; demand_factor: all flows of the scenario are multiplied by it."""
+    """scenario: its folder; controller: a strategy (cosim.strategy); policy: of a DPC controller, instead of the
+    scenario's own; steps: control intervals, all if None; demand_factor: multiplies all flows."""
 
     scenario: Path
     controller: str
@@ -49,15 +50,15 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
     """Run `task` in this process, which must hold no other SUMO session. Raises InputError."""
     import torch
 
-    from cosim.plant import SumoPlant
+    from cosim.plant import SumoPlant, settings
     from nmfd import closed_loop, runs
     from nmfd.controllers import registry
 
     torch.set_num_threads(1)  # runs stand side by side, one core each
     begin = time.perf_counter()
-    scenario = scenario_of(task)
-    controller = registry.make(task.controller, scenario, policy=task.policy)
-    plant = SumoPlant(scenario)
+    scenario, strategy = scenario_of(task), parse(task.controller)
+    controller = registry.make(strategy.controller, scenario, policy=task.policy)
+    plant = SumoPlant(scenario, overrides=replace(settings(scenario), **strategy.overrides))
     try:
         trajectory = runs.labelled(
             closed_loop.run(plant, controller, scenario, seed=task.seed, progress=progress),
