@@ -143,6 +143,10 @@ def identify(scenario: Path, levels: str, seeds: int, workers: int, out: Path | 
     click.echo(f"Written to {loaded.network.folder / 'network.toml'}; samples and pictures to {out}")
 
 
+def _tell(line: str) -> None:
+    click.echo(f"cosim: {line}", err=True)
+
+
 def _experiment(tasks: list, out: Path | None) -> tuple:
     """The run folder of the tasks, and its overview."""
     from cosim import experiment
@@ -153,7 +157,7 @@ def _experiment(tasks: list, out: Path | None) -> tuple:
     out = runs.default_folder(load_scenario(tasks[0].scenario)) if out is None else out
     try:
         with progress_line("cosim") as progress:
-            return out, experiment.experiment(tasks, out=out, workers=2, progress=progress)
+            return out, experiment.experiment(tasks, out=out, workers=2, progress=progress, tell=_tell)
     except KeyboardInterrupt:
         if not (out / "summary.csv").exists():
             raise Interrupted("interrupted before a run was finished; nothing is kept") from None
