@@ -37,8 +37,7 @@ def identify(
         folder = out / f"level-{level:g}"
         tasks = [
             Task(scenario=scenario, controller="no-control", seed=seed, demand_factor=level) for seed in seeds]
-        experiment.experiment(
-            tasks, out=folder, workers=workers, progress=tell if progress else None, model_free=True)
+        experiment.experiment(tasks, out=folder, workers=workers, progress=tell if progress else None)
         results += [experiment.read_run(folder, "no-control", seed) for seed in seeds]
     network = loaded.network
     samples = [

@@ -7,20 +7,21 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.actuate import Actuator, GatewaySignal
+from cosim.actuate import GREEN, Actuator, GatewaySignal
 from cosim.city import ensure_built
 from cosim.guidance import Guide
 from cosim.measure import Meter
 from cosim.regions import City, Gateway, check_adjacency, load_city
 from cosim.strategy import FIXED, HOLD_BACK, MODES, SIGNALS
 from cosim.sumo import Session
+from cosim.trip_facts import TripFacts, read_trip_facts, trip_options
 from cosim.trips import write_trips
 from nmfd import toml
 from nmfd.errors import InputError
 from nmfd.scenario import Scenario, read_tables
 from nmfd.types import Controls, Measurement
 
-PRODUCTION_EVERY = 10.0  # s, between two samples of the production
+SAMPLE_EVERY = 10.0  # s, between two samples of the production and of the queues
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,9 +78,12 @@ class Record:
     departures: (T, R, R) [veh]; arrivals: (T, R) [veh], by the region of the destination
     crossings: (T, R, R, R) [veh], [i, h, j] = from i to h, bound for j
     production: (T, R) [veh m/s], mean of samples; mean_accumulation: (T, R) [veh], of the same samples
+    edge_vehicles: (T, E) [veh], mean of the same samples, by the city's edges
     gateway_green: (T, G) [s], green shown per gateway, its links' mean; NaN without a signal
+    gateway_original_green: (T, G) [s], the same in the original programme
     gateway_flow: (T, G) [veh] over the boundary there
-    gateway_queue: (T, G) [veh] halting before it at the end of the interval
+    gateway_queue, gateway_queue_max: (T, G) [veh] halting on the edge before it, mean and largest of samples; gateways
+        that share this edge share its queue
     teleports: (T,); guided: (T, R, R, R) [veh], reroutes by route guidance
     """
 
@@ -88,9 +92,12 @@ class Record:
     crossings: np.ndarray
     production: np.ndarray
     mean_accumulation: np.ndarray
+    edge_vehicles: np.ndarray
     gateway_green: np.ndarray
+    gateway_original_green: np.ndarray
     gateway_flow: np.ndarray
     gateway_queue: np.ndarray
+    gateway_queue_max: np.ndarray
     teleports: np.ndarray
     guided: np.ndarray
 
@@ -110,6 +117,8 @@ class SumoPlant:
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
         check_adjacency(self.city, scenario.network)
         self._edge_region = np.array([self.city.region_of[edge] for edge in self.city.edges])
+        self._upstream = sorted({g.from_edge for g in self.city.gateways})
+        self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in self.city.gateways], dtype=int)
         self._net_file = files.net_file
         self._folder = tempfile.TemporaryDirectory(prefix="cosim-")
         self._session: Session | None = None
@@ -120,9 +129,10 @@ class SumoPlant:
         scenario, chosen = self._scenario, self._settings
         routes = Path(self._folder.name) / "trips.rou.xml"
         self.trips = write_trips(self.city, scenario.demand, scenario.step, seed, routes)
-        options = ()
+        self._trip_file = routes.with_name("tripinfo.xml")
+        options = trip_options(self._trip_file)
         if chosen.rerouting > 0:
-            options = ("--device.rerouting.probability", str(chosen.rerouting), "--device.rerouting.period", "60")
+            options += ("--device.rerouting.probability", str(chosen.rerouting), "--device.rerouting.period", "60")
         self._session = Session(
             self._net_file, routes, seed=seed, step_length=chosen.step_length,
             time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action, options=options)
@@ -131,6 +141,7 @@ class SumoPlant:
             self._session, self.city, compliance=chosen.compliance,
             random=np.random.default_rng([seed, 0x67756964]))
         self._signals = self._gateway_signals()
+        self._original_green = self._programmed_green()
         self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
         self._k, self._rows, self._speed = 0, [], None
         return self._measurement()
@@ -141,16 +152,17 @@ class SumoPlant:
         self._actuator.command(controls.perimeter, network.u_min, network.u_max)
         self._guide.command(controls.splits, self._speed)
         begin, steps = session.time, round(self._scenario.step / session.step_length)
-        every = max(1, round(PRODUCTION_EVERY / session.step_length))
+        every = max(1, round(SAMPLE_EVERY / session.step_length))
         vehicles, metres = np.zeros((2, len(self.city.edges)))  # sums over the samples, by edge: n and n v
-        samples = 0
+        queues = []
         for n in range(steps):
             self._actuator.play(session.time)
             session.step()
             self._guide.apply(meter.observe())
             if n % every == every - 1:
                 counts, speeds = self._sample()
-                vehicles, metres, samples = vehicles + counts, metres + counts * speeds, samples + 1
+                vehicles, metres = vehicles + counts, metres + counts * speeds
+                queues.append([session.halting(edge) for edge in self._upstream])
         self._k += 1
         assert abs(session.time - begin - self._scenario.step) < 1e-6
         measurement = self._measurement()
@@ -159,8 +171,12 @@ class SumoPlant:
         with np.errstate(invalid="ignore"):
             self._speed = metres / vehicles
         row["production"], row["mean_accumulation"] = (
-            np.bincount(self._edge_region, amount, network.regions) / max(samples, 1) for amount in (metres, vehicles))
-        row["gateway_queue"] = np.array([session.halting(g.from_edge) for g in self.city.gateways])
+            np.bincount(self._edge_region, amount, network.regions) / len(queues) for amount in (metres, vehicles))
+        row["edge_vehicles"] = (vehicles / len(queues)).astype(np.float16)  # to 0.1 % and as small as an integer
+        queues = np.array(queues).reshape(len(queues), len(self._upstream))
+        row["gateway_queue"], row["gateway_queue_max"] = (
+            queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))
+        row["gateway_original_green"] = self._original_green
         self._rows.append(row)
         return measurement
 
@@ -174,6 +190,12 @@ class SumoPlant:
     def record(self) -> Record:
         """Of all control intervals since the reset."""
         return Record(**{key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]})
+
+    def trip_facts(self) -> TripFacts:
+        """Ends the simulation, for only then does SUMO tell of the trips under way."""
+        end = self._session.time
+        self._end_session()
+        return read_trip_facts(self._trip_file, end)
 
     @property
     def sumo_time(self) -> float:
@@ -207,6 +229,17 @@ class SumoPlant:
                     programme, movements[signal], min_green=self._settings.min_green,
                     mode=self._settings.actuation, start=self._session.time)
         return signals
+
+    def _programmed_green(self) -> np.ndarray:
+        """(G,) [s] per control interval, as Record.gateway_original_green."""
+        green = np.full(len(self.city.gateways), np.nan)
+        for n, gateway in enumerate(self.city.gateways):
+            if gateway.signal in self._signals:
+                programme = self._session.programme(gateway.signal)
+                lasting = [phase.duration * (phase.state[link] in GREEN)
+                           for phase in programme.phases for link in gateway.links]
+                green[n] = sum(lasting) / len(gateway.links) * self._scenario.step / programme.cycle
+        return green
 
     def _measurement(self) -> Measurement:
         return Measurement(

@@ -14,7 +14,9 @@ from nmfd.types import Trajectory
 # Columns of sumo.csv, beside those of summary.csv.
 FACTS = (
     "controller", "seed", "trips", "departed_veh", "final_backlog_veh", "total_backlog_veh_s", "teleports",
-    "leaking_share", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s")
+    "mean_trip_time_s", "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh",
+    "gateway_queue_max_veh", "gateway_full_share", "late_decisions", "fallbacks", "leaking_share", "wall_time_s",
+    "sumo_time_s", "overhead_share", "setup_time_s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +52,7 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
     """Run `task` in this process, which must hold no other SUMO session. Raises InputError."""
     import torch
 
+    from cosim import facts
     from cosim.plant import SumoPlant, settings
     from nmfd import closed_loop, runs
     from nmfd.controllers import registry
@@ -66,16 +69,16 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
         record = plant.record()
         departed = int(record.departures.sum())
         backlog = trajectory.backlog.sum(axis=(1, 2))
-        leaks, flow = set(plant.leaks()), record.gateway_flow.sum(axis=0)
-        leaking = sum(passed for gateway, passed in zip(plant.city.gateways, flow, strict=True) if gateway in leaks)
-        facts = {
+        sumo_time, leaks = plant.sumo_time, set(plant.leaks())
+        row = {
             "controller": task.controller, "seed": task.seed, "trips": plant.trips, "departed_veh": departed,
             "final_backlog_veh": int(backlog[-1]), "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
-            "teleports": int(record.teleports.sum()),
-            "leaking_share": float(leaking / max(flow.sum(), 1)),
-            "wall_time_s": trajectory.wall_time, "sumo_time_s": plant.sumo_time,
-            "overhead_share": 1.0 - plant.sumo_time / trajectory.wall_time,
+            "teleports": int(record.teleports.sum()), **facts.trip_facts(plant.trip_facts()),
+            **facts.queue_facts(record, plant.city), **facts.decision_facts(trajectory),
+            "leaking_share": facts.leaking_share(record, plant.city, leaks),
+            "wall_time_s": trajectory.wall_time, "sumo_time_s": sumo_time,
+            "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time}
     finally:
         plant.close()
-    return Result(trajectory=trajectory, record=asdict(record), facts=facts)
+    return Result(trajectory=trajectory, record=asdict(record), facts=row)
