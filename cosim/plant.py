@@ -31,6 +31,7 @@ class Settings:
     step_length: of SUMO [s]; time_to_teleport: [s], -1 for never; collision_action: SUMO's
     actuation: "hold-back" or "redistribute"; min_green: of a gateway movement [s]
     compliance: share of the decisions in which a driver follows the route guidance [-]
+    most_detour: a driver does not follow route guidance into a next region that costs him more than this [s]
     rerouting: share of the drivers with SUMO's own rerouting device [-]
     signals: one of cosim.strategy.SIGNALS; gateways_fixed (of the strategy, no key of the table): whether signals with
         a gateway movement stay fixed-time, for perimeter control, where the others are actuated or max-pressure
@@ -42,6 +43,7 @@ class Settings:
     actuation: str = HOLD_BACK
     min_green: float = 5.0
     compliance: float = 1.0
+    most_detour: float = 60.0
     rerouting: float = 0.0
     signals: str = FIXED
     gateways_fixed: bool = True
@@ -61,6 +63,7 @@ def settings(scenario: Scenario) -> Settings:
         actuation=table.text("actuation", default.actuation, MODES),
         min_green=table.number("min_green", default.min_green, low=1.0),
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
+        most_detour=table.number("most_detour", default.most_detour, low=0.0),
         rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0),
         signals=table.text("signals", default.signals, SIGNALS))
     table.close()
@@ -138,7 +141,7 @@ class SumoPlant:
             time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action, options=options)
         self._meter = Meter(self._session, self.city)
         self._guide = Guide(
-            self._session, self.city, compliance=chosen.compliance,
+            self._session, self.city, compliance=chosen.compliance, most_detour=chosen.most_detour,
             random=np.random.default_rng([seed, 0x67756964]))
         self._signals = self._gateway_signals()
         self._original_green = self._programmed_green()

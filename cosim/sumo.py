@@ -107,6 +107,10 @@ class Session:
     road = staticmethod(libsumo.vehicle.getRoadID)
     route = staticmethod(libsumo.vehicle.getRoute)
 
+    def route_index(self, vehicle: str) -> int:
+        """Where on its route a vehicle is."""
+        return libsumo.vehicle.getRouteIndex(vehicle)
+
     def set_route(self, vehicle: str, edges: list[str]) -> bool:
         """Give a vehicle on edges[0] a new route; False where SUMO refuses it (the old route then stays)."""
         try:

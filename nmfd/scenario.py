@@ -51,7 +51,7 @@ def trapezoid(time: np.ndarray, *, start: float, peak: float, ramp_up: float, fl
 def read_tables(folder: Path) -> toml.Table:
     """`folder`/scenario.toml; what it does not say is that of the scenario in the folder `base`, if it names one.
 
-    The tables [controllers] and [sumo] are completed key by key, everything else is taken whole. Raises InputError.
+    Tables are completed key by key, everything else is taken whole. Raises InputError.
     """
     path, folders, content = folder / "scenario.toml", [], {}
     while True:
@@ -62,14 +62,19 @@ def read_tables(folder: Path) -> toml.Table:
         folders.append(folder.resolve())
         if isinstance(own.get("network"), str):  # relative to the file that says it
             own["network"] = os.path.relpath(folder / own["network"], path.parent)
-        merged = {key: {**own[key], **content[key]} for key in ("controllers", "sumo")
-                  if isinstance(own.get(key), dict) and isinstance(content.get(key), dict)}
-        content = {**own, **content, **merged}
+        content = _completed(content, own)
         base = table.text("base", None)
         if base is None:
             content.pop("base", None)
             return toml.Table(content, path)
         folder = folder / base
+
+
+def _completed(content: dict, base: dict) -> dict:
+    """`content` with what only `base` has, in the tables of both too."""
+    both = {key: _completed(content[key], base[key]) for key in content
+            if isinstance(content[key], dict) and isinstance(base.get(key), dict)}
+    return {**base, **content, **both}
 
 
 def load_scenario(folder: Path | str) -> Scenario:
