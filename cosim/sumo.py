@@ -119,11 +119,19 @@ class Session:
             return False
         return True
 
+    def reroutes(self, vehicle: str) -> bool:
+        """Whether it has SUMO's rerouting device."""
+        return libsumo.vehicle.getParameter(vehicle, "has.rerouting.device") == "true"
+
     # Edges: the vehicles on one and their number, mean speed [m/s] (the limit if empty), vehicles under 0.1 m/s.
     vehicles_on = staticmethod(libsumo.edge.getLastStepVehicleIDs)
     vehicle_count = staticmethod(libsumo.edge.getLastStepVehicleNumber)
     mean_speed = staticmethod(libsumo.edge.getLastStepMeanSpeed)
     halting = staticmethod(libsumo.edge.getLastStepHaltingNumber)
+
+    # Lanes: the same, for max-pressure control, which asks for a thousand of them every few seconds.
+    lane_vehicles = staticmethod(libsumo.lane.getLastStepVehicleNumber)
+    lane_halting = staticmethod(libsumo.lane.getLastStepHaltingNumber)
 
     # Signals.
 
