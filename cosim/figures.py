@@ -7,12 +7,14 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 
 from nmfd import plots
 
 JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
-DENSITIES = ScalarMappable(Normalize(0.0, JAM_DENSITY), colormaps["YlOrRd"])
+DENSITIES = ScalarMappable(Normalize(0.0, JAM_DENSITY), LinearSegmentedColormap.from_list(
+    "density", ["#d9d9d9", "#fecc5c", "#e31a1c", "#4d0010"]))
+ASIDE = 0.007  # of the map's width: how far the lines of the two directions of a street are drawn apart
 QUEUES = colormaps["YlOrRd"]
 SATURATION = 0.5  # veh/s and lane
 COMMANDED, GREEN_SHOWN, FLOWED = "#333333", "#009e73", "#0059a8"
@@ -25,19 +27,26 @@ def link_densities(
 
     shapes: E lines (n, 2) [m]; density: (E,) [veh/km and lane]; lanes, region: (E,)
     """
-    for r in np.unique(region):
-        middle = np.mean([shapes[n].mean(axis=0) for n in np.flatnonzero(region == r)], axis=0)
-        ax.text(*middle, str(r), color="#9ab4cc", fontsize=22, fontweight="bold", ha="center", va="center", zorder=0)
+    points = np.concatenate(shapes)
+    apart = ASIDE * np.ptp(points[:, 0])
     order = np.argsort(density, kind="stable")  # the full ones on top
     ax.add_collection(LineCollection(
-        [shapes[n] for n in order], colors="#c8c8c8", linewidths=1.0 + 0.9 * lanes[order], capstyle="butt"))
-    ax.add_collection(LineCollection(
-        [shapes[n] for n in order], colors=DENSITIES.to_rgba(density[order]), linewidths=0.5 + 0.9 * lanes[order],
-        capstyle="butt"))
+        [_to_the_right(shapes[n], apart) for n in order], colors=DENSITIES.to_rgba(density[order]),
+        linewidths=0.5 + 0.4 * lanes[order], capstyle="butt"))
+    for r in np.unique(region):
+        middle = np.mean([shapes[n].mean(axis=0) for n in np.flatnonzero(region == r)], axis=0)
+        ax.text(*middle, str(r), fontsize=8, fontweight="bold", ha="center", va="center",
+                bbox={"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": "#30506f", "linewidth": 0.8})
     ax.autoscale_view()
     ax.set_aspect("equal")
     ax.set_axis_off()
     return ax
+
+
+def _to_the_right(shape: np.ndarray, distance: float) -> np.ndarray:
+    """The line moved sideways, as seen in its direction."""
+    along = shape[-1] - shape[0]
+    return shape + distance * np.array([along[1], -along[0]]) / max(np.hypot(*along), 1e-9)
 
 
 def perimeter(ax: Axes, step: float, commanded: np.ndarray, green: np.ndarray, flow: np.ndarray) -> Axes:
@@ -121,6 +130,7 @@ def time_full(ax: Axes, hours: Mapping[str, np.ndarray]) -> Axes:
         ax.barh(rows, values, height=1.0 / len(hours), color=tones[controller], label=controller)
     ax.set_yticks([])
     ax.set_ylim(max(map(len, hours.values())), 0)
+    ax.set_xlim(0.0, max(1.0, 1.05 * max(values.max() for values in hours.values())))
     ax.set_xlabel("time full [min]")
     ax.spines[["top", "right"]].set_visible(False)
     return ax

@@ -33,8 +33,7 @@ def draw(folder: Path, scenario: Scenario, city: City, rows: pd.DataFrame) -> No
     pair = {name: results[name] for name in (REFERENCE, best) if name in results}
     link_maps(folder / "link_densities.png", city, pair)
     gateway_queues(folder / "gateway_queues.png", city, pair)
-    u_max = scenario.network.u_max
-    gating = next((name for name in names if name in results and acts(results[name], scenario.network, u_max)), None)
+    gating = next((name for name in names if name in results and acts(results[name], scenario.network)), None)
     if gating:
         perimeter(folder / "perimeter.png", city, scenario.network, results[gating])
     guiding = next((name for name in names if name in results and results[name].record["guided"].sum() > 0), None)
@@ -42,9 +41,9 @@ def draw(folder: Path, scenario: Scenario, city: City, rows: pd.DataFrame) -> No
         splits(folder / "splits.png", scenario.network, results[guiding])
 
 
-def acts(result: Result, network: Network, u_max: float) -> bool:
+def acts(result: Result, network: Network) -> bool:
     """Whether a gateway was ever commanded to less than its original programme."""
-    return bool((result.trajectory.perimeter[:, network.adjacency] < u_max - 1e-9).any())
+    return bool((result.trajectory.perimeter[:, network.adjacency] < network.u_max - 1e-9).any())
 
 
 def ranked(rows: pd.DataFrame) -> list[str]:
@@ -70,15 +69,16 @@ def link_maps(path: Path, city: City, results: dict[str, Result]) -> None:
     shapes, lanes = edge_shapes(city), np.array([city.lanes[edge] for edge in city.edges])
     km = np.array([city.length[edge] for edge in city.edges]) / 1000.0
     region = np.array([city.region_of[edge] for edge in city.edges])
-    drawing = plots.figure(3.4 * MAPS, 0.7 + 3.4 * len(results))
+    width, height = np.ptp(np.concatenate(shapes), axis=0)
+    drawing = plots.figure(3.6 * MAPS + 1.0, 0.3 + (0.3 + 3.6 * height / width) * len(results))
     grid = drawing.subplots(len(results), MAPS, squeeze=False)
     for line, (name, result) in zip(grid, results.items(), strict=True):
         loads = result.record["edge_vehicles"].astype(float)
         for ax, k in zip(line, np.linspace(0, len(loads) - 1, MAPS + 1).round().astype(int)[1:], strict=True):
             figures.link_densities(ax, shapes, loads[k] / km / lanes, lanes, region)
             ax.set_title(f"{name}, {(k + 1) * result.trajectory.step / 60:.0f} min", fontsize="medium")
-    bar = drawing.colorbar(figures.DENSITIES, ax=grid, shrink=0.7, aspect=30)
-    bar.set_label("vehicles per km and lane, mean of the control interval")
+    bar = drawing.colorbar(figures.DENSITIES, ax=grid, shrink=0.8, aspect=30)
+    bar.set_label("vehicles per km and lane,\nmean of the control interval")
     plots.save(drawing, path)
 
 
@@ -107,7 +107,7 @@ def gateway_queues(path: Path, city: City, results: dict[str, Result]) -> None:
 
 
 def perimeter(path: Path, city: City, network: Network, result: Result) -> None:
-    """Commanded u against green and flow: the boundaries with the lowest commands over time, and all in one cloud."""
+    """Commanded u against green and flow: the boundaries that were closed most over time, and all in one cloud."""
     trajectory, record = result.trajectory, result.record
     pairs = {}
     for pair in map(tuple, np.argwhere(network.adjacency)):
@@ -118,7 +118,8 @@ def perimeter(path: Path, city: City, network: Network, result: Result) -> None:
         if members and original.sum() > 0:
             flow = record["gateway_flow"][:, members].sum(axis=1) / (figures.SATURATION * original.sum(axis=1))
             pairs[pair] = trajectory.perimeter[:, *pair], shown.sum(axis=1) / original.sum(axis=1), flow
-    chosen = sorted(sorted(pairs, key=lambda pair: pairs[pair][0].mean())[:PANELS])
+    closed = [pair for pair in pairs if pairs[pair][0].min() < network.u_max - 1e-9]
+    chosen = sorted(sorted(closed, key=lambda pair: pairs[pair][0].mean())[:PANELS])
     drawing, axes = plots.panels(len(chosen) + 1)
     for ax, pair in zip(axes, chosen, strict=False):
         figures.perimeter(ax, trajectory.step, *pairs[pair])
