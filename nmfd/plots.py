@@ -26,6 +26,8 @@ CONTROLLER_COLOURS = {
     "no-control": "#333333", "pi-gating": "#e69f00", "mpc-pc": "#56b4e9", "mpc-pcrg": "#0059a8",
     "dpc-pc": "#e377c2", "dpc-pcrg": "#882255", "dpc-pc-robust": "#b07aa1", "dpc-pcrg-robust": "#d62d20",
     "dpc-pc-guarded": "#c9a0dc", "dpc-pcrg-guarded": "#6a3d9a", "bound-pc": "#9aa33c", "bound-pcrg": "#4d6600",
+}
+CITY_COLOURS = {  # what a city may do without a regional controller
     "webster": "#8c6d31", "actuated": "#a6761d", "max-pressure": "#009e73", "rerouting-30": "#7f7f7f",
     "rerouting-100": "#b5a642",
 }
@@ -42,14 +44,16 @@ ZONES = (  # of a region's accumulation: label, colour, opacity
 
 def colour(controller: str) -> str:
     """The colour of a controller, the same in every figure; unknown names get one of OTHER_COLOURS by their hash."""
-    return CONTROLLER_COLOURS.get(controller, OTHER_COLOURS[zlib.crc32(controller.encode()) % len(OTHER_COLOURS)])
+    other = OTHER_COLOURS[zlib.crc32(controller.encode()) % len(OTHER_COLOURS)]
+    return (CONTROLLER_COLOURS | CITY_COLOURS).get(controller, other)
 
 
 def colours(controllers: Sequence[str]) -> dict[str, str]:
     """The colour of each of `controllers`; unknown names get different ones of OTHER_COLOURS while there are any."""
-    unknown = [name for name in dict.fromkeys(controllers) if name not in CONTROLLER_COLOURS]
+    known = CONTROLLER_COLOURS | CITY_COLOURS
+    unknown = [name for name in dict.fromkeys(controllers) if name not in known]
     others = OTHER_COLOURS * (1 + len(unknown) // len(OTHER_COLOURS))
-    return {**CONTROLLER_COLOURS, **dict(zip(unknown, others, strict=False))}
+    return {**known, **dict(zip(unknown, others, strict=False))}
 
 
 def figure(width: float, height: float) -> Figure:
