@@ -107,6 +107,9 @@ class Session:
     road = staticmethod(libsumo.vehicle.getRoadID)
     route = staticmethod(libsumo.vehicle.getRoute)
 
+    def emission_class(self, vehicle_type: str) -> str:
+        return libsumo.vehicletype.getEmissionClass(vehicle_type)
+
     def set_route(self, vehicle: str, edges: list[str]) -> bool:
         """Give a vehicle on edges[0] a new route; False where SUMO refuses it (the old route then stays)."""
         try:

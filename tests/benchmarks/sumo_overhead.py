@@ -3,8 +3,8 @@
     python tests/benchmarks/sumo_overhead.py [--controllers no-control,pi-gating] [--intervals 20] [--repeats 3]
 
 The binary shows the signals that the closed loop showed, as fixed programmes that last for the whole run, and both
-must write the same trip file. Compared is all from the start of SUMO to its end; the making of the trips and the imports
-of Python are outside. CPU times are compared besides wall times: on a busy machine only they mean something.
+must write the same trip file. Compared is all from the start of SUMO to its end; the making of the trips and the
+imports of Python are outside. CPU times are compared besides wall times: on a busy machine only they mean something.
 """
 
 import argparse
