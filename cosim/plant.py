@@ -222,9 +222,8 @@ class SumoPlant:
 
     def trip_facts(self) -> TripFacts:
         """Ends the simulation, for only then does SUMO tell of the trips under way."""
-        end = self._session.time
         self._end_session()
-        return read_trip_facts(self._trip_file, end)
+        return read_trip_facts(self._trip_file)
 
     @property
     def sumo_time(self) -> float:
