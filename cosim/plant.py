@@ -160,8 +160,8 @@ class SumoPlant:
             time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action, options=options)
         self._meter = Meter(self._session, self.city)
         self._guide = Guide(
-            self._session, self.city, compliance=chosen.compliance, most_detour=chosen.most_detour,
-            random=np.random.default_rng([seed, 0x67756964]))
+            self._session, self.city, scenario.network.nominal_splits, compliance=chosen.compliance,
+            most_detour=chosen.most_detour, random=np.random.default_rng([seed, 0x67756964]))
         self._max_pressure, steered_ids = None, set()
         if chosen.signals == MAX_PRESSURE:
             flows = turning_flows(self.city, scenario.demand, scenario.step)

@@ -25,6 +25,7 @@ from nmfd.types import Trajectory
 CONTROLLER_COLOURS = {
     "no-control": "#333333", "pi-gating": "#e69f00", "mpc-pc": "#56b4e9", "mpc-pcrg": "#0059a8",
     "dpc-pc": "#e377c2", "dpc-pcrg": "#882255", "dpc-pc-robust": "#b07aa1", "dpc-pcrg-robust": "#d62d20",
+    "route-guidance": "#8c6d31", "probing-pc": "#bcbd22", "probing-pcrg": "#637939",
     "dpc-pc-guarded": "#c9a0dc", "dpc-pcrg-guarded": "#6a3d9a", "bound-pc": "#9aa33c", "bound-pcrg": "#4d6600",
 }
 CITY_COLOURS = {  # what a city may do without a regional controller
