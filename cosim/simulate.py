@@ -14,7 +14,8 @@ from nmfd.types import Trajectory
 # Columns of sumo.csv, beside those of summary.csv.
 FACTS = (
     "controller", "seed", "trips", "departed_veh", "final_backlog_veh", "total_backlog_veh_s", "teleports",
-    "leaking_share", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s")
+    "leaking_share", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s",
+    "signals_left_alone")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +76,8 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
             "leaking_share": float(leaking / max(flow.sum(), 1)),
             "wall_time_s": trajectory.wall_time, "sumo_time_s": plant.sumo_time,
             "overhead_share": 1.0 - plant.sumo_time / trajectory.wall_time,
-            "setup_time_s": time.perf_counter() - begin - trajectory.wall_time}
+            "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
+            "signals_left_alone": len(plant.other_signals)}
     finally:
         plant.close()
     return Result(trajectory=trajectory, record=asdict(record), facts=facts)
