@@ -165,7 +165,8 @@ class SumoPlant:
         self._max_pressure, steered_ids = None, set()
         if chosen.signals == MAX_PRESSURE:
             flows = turning_flows(self.city, scenario.demand, scenario.step)
-            self._max_pressure = MaxPressure(self._session, self.city, steered, flows)
+            others = [signal for signal in self.simple_signals if signal not in steered]
+            self._max_pressure = MaxPressure(self._session, self.city, steered, flows, others=others)
             steered_ids = {signal.id for signal in steered}
         self._signals = self._gateway_signals(without=steered_ids)
         self._original_green = self._programmed_green()

@@ -16,7 +16,7 @@ FACTS = (
     "controller", "seed", "trips", "departed_veh", "final_backlog_veh", "total_backlog_veh_s", "teleports",
     "mean_trip_time_s", "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh",
     "gateway_queue_max_veh", "gateway_full_share", "late_decisions", "fallbacks", "leaking_share", "wall_time_s",
-    "sumo_time_s", "overhead_share", "setup_time_s")
+    "sumo_time_s", "overhead_share", "setup_time_s", "signals_left_alone")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +85,8 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
             "leaking_share": facts.leaking_share(record, plant.city, leaks),
             "wall_time_s": trajectory.wall_time, "sumo_time_s": sumo_time,
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
-            "setup_time_s": time.perf_counter() - begin - trajectory.wall_time}
+            "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
+            "signals_left_alone": len(plant.other_signals)}
     finally:
         plant.close()
     return Result(trajectory=trajectory, record=asdict(record), facts=row)

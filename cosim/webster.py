@@ -23,6 +23,7 @@ from cosim.green_wave import offsets
 from cosim.regions import City
 from cosim.signals import Signal, programme_row, write_programmes
 from cosim.sumo import Phase
+from nmfd.errors import InputError
 
 CYCLES = (40, 50, 60, 70, 80, 90, 100, 110, 120)  # s
 MIN_GREEN = 5.0           # s
@@ -67,7 +68,7 @@ def plan(
 ) -> Path:
     """The additional file for SUMO with `signals` optimised for the busiest hour of `demand` (T, R, R) [veh/s].
 
-    Kept in `folder` under a name that changes with all that it depends on.
+    Kept in `folder` under a name that changes with all that it depends on. InputError if it cannot be written there.
     """
     content = hashlib.sha256(metadata.version("numpy").encode())
     for source in (cosim.flows, cosim.green_wave, cosim.signals, cosim.trips, sys.modules[__name__]):
@@ -77,9 +78,13 @@ def plan(
     content.update(np.ascontiguousarray(demand).tobytes())
     path = folder / f"webster-{content.hexdigest()[:16]}.add.xml"
     if not path.is_file():
-        folder.mkdir(exist_ok=True)
         flows = cosim.flows.turning_flows(city, demand, step)
-        write_programmes(path, [programme_row(signal, "static") for signal in optimised(city, signals, flows)])
+        rows = [programme_row(signal, "static") for signal in optimised(city, signals, flows)]
+        try:
+            folder.mkdir(exist_ok=True)
+            write_programmes(path, rows)
+        except OSError as error:
+            raise InputError(f"{path}: the signal plan cannot be kept ({error.strerror}); make it writable") from None
     return path
 
 

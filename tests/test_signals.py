@@ -16,6 +16,7 @@ from cosim.plant import Settings, SumoPlant
 from cosim.regions import load_city
 from cosim.signals import Link, Signal, read_signals
 from cosim.sumo import Phase
+from cosim.trips import make_trips
 from cosim.webster import LOST, SATURATION, optimised, plan
 from nmfd.errors import InputError
 from nmfd.scenario import load_scenario
@@ -249,17 +250,21 @@ def test_the_same_drivers_reroute(scenario, plant_of):
     for share, signals in ((0.3, "fixed"), (0.3, "max-pressure"), (0.6, "fixed")):
         plant = plant_of(rerouting=share, signals=signals)
         plant.reset(5)
+        planned = make_trips(plant.city, scenario.demand, scenario.step, 5).routes
         seen = {}
         step = plant.session.step
 
-        def watch(plant=plant, step=step, seen=seen):
+        def watch(plant=plant, step=step, seen=seen, planned=planned):
             step()
             for vehicle in plant.session.departed():
-                seen[vehicle] = plant.session.reroutes(vehicle)
+                own = plant.session.route(vehicle) == planned[int(vehicle[1:])]
+                seen[vehicle] = plant.session.reroutes(vehicle), own
 
         plant.session.step = watch
         plant.step(Controls(perimeter=np.full((7, 7), 0.9), splits=None))
-        equipped[share, signals] = {v for v, reroutes in seen.items() if reroutes}
+        equipped[share, signals] = {v for v, (reroutes, _) in seen.items() if reroutes}
+        assert all(own for reroutes, own in seen.values() if not reroutes)
+        assert sum(not own for reroutes, own in seen.values() if reroutes) > 10  # on the fastest way from the start
         assert abs(len(equipped[share, signals]) / len(seen) - share) < 0.15
         plant.close()
     assert equipped[0.3, "fixed"] == equipped[0.3, "max-pressure"] < equipped[0.6, "fixed"]
