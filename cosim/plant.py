@@ -180,7 +180,7 @@ class SumoPlant:
         self._actuator.command(controls.perimeter, network.u_min, network.u_max)
         self._guide.command(controls.splits, self._speed)
         begin, steps = session.time, round(self._scenario.step / session.step_length)
-        every = max(1, round(SAMPLE_EVERY / session.step_length))
+        every = min(max(1, round(SAMPLE_EVERY / session.step_length)), steps)
         vehicles, metres = np.zeros((2, len(self.city.edges)))  # sums over the samples, by edge: n and n v
         queues = []
         for n in range(steps):
