@@ -2,7 +2,7 @@
 
 import tempfile
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +10,18 @@ import numpy as np
 from cosim.actuate import HOLD_BACK, MODES, Actuator, GatewaySignal
 from cosim.city import ensure_built
 from cosim.guidance import Guide
+from cosim.detectors import EVERY, Detectors, instruments, lay_out, probes, write_loops
 from cosim.measure import Meter
 from cosim.regions import City, Gateway, check_adjacency, load_city
 from cosim.sumo import Session
 from cosim.trips import write_trips
 from nmfd import toml
 from nmfd.errors import InputError
+from nmfd.estimation import Estimator
 from nmfd.scenario import Scenario
 from nmfd.types import Controls, Measurement
 
+EXACT, ESTIMATE = "exact", "estimate"
 PRODUCTION_EVERY = 10.0  # s, between two samples of the production
 
 
@@ -30,6 +33,8 @@ class Settings:
     actuation: "hold-back" or "redistribute"; min_green: of a gateway movement [s]
     compliance: share of the decisions in which a driver follows the route guidance [-]
     rerouting: share of the drivers with SUMO's own rerouting device [-]
+    measurement: "exact", or "estimate": controllers see what detectors and probes tell (cosim/detectors.py)
+    detector_share: of the links, with loop detectors [-]; probe_share: of the vehicles [-]
     """
 
     step_length: float = 1.0
@@ -39,6 +44,9 @@ class Settings:
     min_green: float = 5.0
     compliance: float = 1.0
     rerouting: float = 0.0
+    measurement: str = EXACT
+    detector_share: float = 0.3
+    probe_share: float = 0.1
 
 
 def settings(scenario: Scenario) -> Settings:
@@ -55,8 +63,15 @@ def settings(scenario: Scenario) -> Settings:
         actuation=table.text("actuation", default.actuation, MODES),
         min_green=table.number("min_green", default.min_green, low=1.0),
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
-        rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0))
+        rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0),
+        measurement=table.text("measurement", default.measurement, (EXACT, ESTIMATE)),
+        detector_share=table.number("detector_share", default.detector_share, low=0.0, high=1.0),
+        probe_share=table.number("probe_share", default.probe_share, low=0.0, high=1.0))
     table.close()
+    if chosen.measurement == ESTIMATE and chosen.detector_share == chosen.probe_share == 0:
+        raise InputError(
+            f"{path}: sumo.measurement: \"estimate\" needs detectors or probes, but sumo.detector_share and "
+            "sumo.probe_share are both 0; raise one of them")
     if abs(scenario.step / chosen.step_length - round(scenario.step / chosen.step_length)) > 1e-9:
         raise InputError(
             f"{path}: sumo.step_length: expected a divisor of the control interval {scenario.step:g} s, got "
@@ -105,6 +120,8 @@ class SumoPlant:
         check_adjacency(self.city, scenario.network)
         self._edge_region = np.array([self.city.region_of[edge] for edge in self.city.edges])
         self._net_file = files.net_file
+        self._layout = lay_out(self.city, self._settings.detector_share)
+        self._instruments = instruments(self.city, self._layout, self._settings.probe_share)
         self._folder = tempfile.TemporaryDirectory(prefix="cosim-")
         self._session: Session | None = None
 
@@ -117,17 +134,27 @@ class SumoPlant:
         options = ()
         if chosen.rerouting > 0:
             options = ("--device.rerouting.probability", str(chosen.rerouting), "--device.rerouting.period", "60")
+        estimating = chosen.measurement == ESTIMATE
+        if estimating:
+            loops = Path(self._folder.name) / "loops.add.xml"
+            write_loops(self.city, self._layout, scenario.step, loops)
+            options += ("--additional-files", str(loops))
         self._session = Session(
             self._net_file, routes, seed=seed, step_length=chosen.step_length,
             time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action, options=options)
-        self._meter = Meter(self._session, self.city)
+        self._meter = Meter(
+            self._session, self.city, probes(self.trips, chosen.probe_share, seed) if estimating else frozenset())
+        self._detectors, self._estimator = None, None
+        if estimating:
+            self._detectors = Detectors(self._session, self.city, self._layout, self._meter, self._instruments)
+            self._estimator = Estimator(scenario, self._instruments)
         self._guide = Guide(
             self._session, self.city, compliance=chosen.compliance,
             random=np.random.default_rng([seed, 0x67756964]))
         self._signals = self._gateway_signals()
         self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
         self._k, self._rows, self._speed = 0, [], None
-        return self._measurement()
+        return self._estimated(self._measurement()) if estimating else self._measurement()
 
     def step(self, controls: Controls) -> Measurement:
         network, session, meter = self._scenario.network, self._session, self._meter
@@ -135,13 +162,15 @@ class SumoPlant:
         self._actuator.command(controls.perimeter, network.u_min, network.u_max)
         self._guide.command(controls.splits, self._speed)
         begin, steps = session.time, round(self._scenario.step / session.step_length)
-        every = max(1, round(PRODUCTION_EVERY / session.step_length))
+        every, often = (max(1, round(time / session.step_length)) for time in (PRODUCTION_EVERY, EVERY))
         vehicles, metres = np.zeros((2, len(self.city.edges)))  # sums over the samples, by edge: n and n v
         samples = 0
         for n in range(steps):
             self._actuator.play(session.time)
             session.step()
             self._guide.apply(meter.observe())
+            if self._detectors and n % often == often - 1:
+                self._detectors.sample()
             if n % every == every - 1:
                 counts, speeds = self._sample()
                 vehicles, metres, samples = vehicles + counts, metres + counts * speeds, samples + 1
@@ -149,6 +178,10 @@ class SumoPlant:
         assert abs(session.time - begin - self._scenario.step) < 1e-6
         measurement = self._measurement()
         after = self._totals()
+        if self._estimator:
+            self._estimator.step(
+                controls, self._detectors.observation(after["gateway_flow"] - before["gateway_flow"]))
+            measurement = self._estimated(measurement)
         row = {key: after[key] - before[key] for key in after}
         with np.errstate(invalid="ignore"):
             self._speed = metres / vehicles
@@ -206,6 +239,10 @@ class SumoPlant:
         return Measurement(
             step=self._k, time=self._k * self._scenario.step, accumulation=self._meter.accumulation(),
             backlog=self._meter.backlog())
+
+    def _estimated(self, measurement: Measurement) -> Measurement:
+        return replace(
+            measurement, estimate=self._estimator.accumulation, estimated_backlog=self._detectors.backlog())
 
     def _sample(self) -> tuple[np.ndarray, np.ndarray]:
         """Vehicles (E,) [veh] and mean speed (E,) [m/s] by edge, now."""

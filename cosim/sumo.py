@@ -121,6 +121,9 @@ class Session:
     mean_speed = staticmethod(libsumo.edge.getLastStepMeanSpeed)
     halting = staticmethod(libsumo.edge.getLastStepHaltingNumber)
 
+    # Loop detectors: the share of the last step in which a vehicle was on one [%].
+    loop_occupancy = staticmethod(libsumo.inductionloop.getLastStepOccupancy)
+
     # Signals.
 
     def programme(self, signal: str) -> Programme:
