@@ -81,8 +81,9 @@ def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
 def write_loops(city: City, layout: Layout, period: float, path: Path) -> None:
     """The loops as an additional file for SUMO."""
     rows = [
-        f'  <inductionLoop id="{loop}" lane="{loop}" pos="{position:.2f}" period="{period:g}" file="NUL"/>\n'
-        for edge, position in zip(layout.edges, layout.position, strict=True) for loop in city.lane_ids[city.edges[edge]]]
+        f'  <inductionLoop id="{lane}" lane="{lane}" pos="{position:.2f}" period="{period:g}" file="NUL"/>\n'
+        for edge, position in zip(layout.edges, layout.position, strict=True)
+        for lane in city.lane_ids[city.edges[edge]]]
     path.write_text(f"<additional>\n{''.join(rows)}</additional>\n")
 
 

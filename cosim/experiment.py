@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from cosim import estimates
 from cosim.city import ensure_built
 from cosim.plant import settings
 from cosim.regions import check_adjacency, load_city
@@ -65,7 +66,9 @@ def experiment(
                 folder.add(outcome.trajectory)
                 _write_facts(folder, outcome)
         if folder.finished:
-            draw_accumulations(folder.path, scenario, folder.trajectories())
+            trajectories = folder.trajectories()
+            draw_accumulations(folder.path, scenario, trajectories)
+            estimates.write(folder.path, scenario.network, trajectories)
         if failures:
             raise RunFailed("; ".join(failures))
     return overview(out)

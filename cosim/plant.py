@@ -9,8 +9,8 @@ import numpy as np
 
 from cosim.actuate import HOLD_BACK, MODES, Actuator, GatewaySignal
 from cosim.city import ensure_built
-from cosim.guidance import Guide
 from cosim.detectors import EVERY, Detectors, instruments, lay_out, probes, write_loops
+from cosim.guidance import Guide
 from cosim.measure import Meter
 from cosim.regions import City, Gateway, check_adjacency, load_city
 from cosim.sumo import Session

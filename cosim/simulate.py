@@ -1,5 +1,6 @@
 """One closed-loop run in SUMO: a task that can be handed to another process, and all that came of it."""
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -13,7 +14,7 @@ from nmfd.types import Trajectory
 # Columns of sumo.csv, beside those of summary.csv.
 FACTS = (
     "controller", "seed", "trips", "departed_veh", "final_backlog_veh", "total_backlog_veh_s", "teleports",
-    "leaking_share", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s")
+    "leaking_share", "estimate_rmse_share", "estimate_cell_rmse_veh", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,10 +72,20 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
             "controller": task.controller, "seed": task.seed, "trips": plant.trips, "departed_veh": departed,
             "final_backlog_veh": int(backlog[-1]), "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
             "teleports": int(record.teleports.sum()),
-            "leaking_share": float(leaking / max(flow.sum(), 1)),
+            "leaking_share": float(leaking / max(flow.sum(), 1)), **_estimation(scenario, trajectory),
             "wall_time_s": trajectory.wall_time, "sumo_time_s": plant.sumo_time,
             "overhead_share": 1.0 - plant.sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time}
     finally:
         plant.close()
     return Result(trajectory=trajectory, record=asdict(record), facts=facts)
+
+
+def _estimation(scenario: Scenario, trajectory: Trajectory) -> dict[str, float]:
+    """Errors of the estimate, over all regions; NaN where the controller saw the exact state."""
+    if trajectory.estimate is None:
+        return {"estimate_rmse_share": math.nan, "estimate_cell_rmse_veh": math.nan}
+    from cosim import estimates
+
+    whole = estimates.errors(scenario.network, trajectory)[-1]
+    return {"estimate_rmse_share": whole["rmse_share"], "estimate_cell_rmse_veh": whole["cell_rmse_veh"]}

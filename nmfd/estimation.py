@@ -80,8 +80,8 @@ class Observation:
 class Belief:
     """mean: (3 R + R^2,), the relative errors of outflow, demand and expansion, and x by rows; covariance of it
     probes: (R, R) [veh], where they were last seen
-    surprise: normalised squared innovation of the last update over its degrees of freedom, 1 on average if the
-        covariances are right; NaN without a reading
+    surprise: normalised squared innovation of the last update, over the number of readings that were uncertain: 1 on
+        average if the covariances are right; NaN without a reading
     """
 
     mean: np.ndarray
@@ -187,7 +187,7 @@ class _Model:
             solved = torch.cholesky_solve(torch.cat([towards, innovation], dim=1), root)
             mean = mean + (solved[:, :-1].T @ innovation).ravel().numpy()
             posterior = posterior - solved[:, :-1].T @ towards
-            surprise = float(innovation.ravel() @ solved[:, -1]) / len(there)
+            surprise = float(innovation.ravel() @ solved[:, -1]) / max(int((spread.diagonal() > 0.1).sum()), 1)
         posterior = (0.5 * (posterior + posterior.T)).numpy()
         known = np.isfinite(observation.probes)
         probes = np.where(known, observation.probes, np.maximum(z[self._probes].reshape(known.shape), 0.0))
@@ -264,6 +264,9 @@ class _Model:
                 (self._of_vehicle, self._of_vehicle, moves + error**2),
                 (self._of_vehicle, self._of_probe, seen + share * error**2),
                 (self._of_probe, self._of_probe, seen + share**2 * error**2))]
+        # When in the interval an event was also moves the mean: evenly distributed, a variance of 1/12 of its effect.
+        half = self._of_vehicle[self._cells : self._cells + self._regions]
+        parts[0].diagonal()[self._cells : self._cells + self._regions] += half**2 @ moves / 3.0
         return torch.cat([torch.cat(parts[:2], dim=1), torch.cat([parts[1].T, parts[2]], dim=1)])
 
     def _readings(self, z: np.ndarray, observation: Observation, loops: np.ndarray) -> tuple:

@@ -5,6 +5,7 @@
 
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ CONTROLLER_COLOURS = {
     "dpc-pc-guarded": "#c9a0dc", "dpc-pcrg-guarded": "#6a3d9a", "bound-pc": "#9aa33c", "bound-pcrg": "#4d6600",
 }
 OTHER_COLOURS = ("#8c6d31", "#17becf", "#7f7f7f", "#5254a3", "#843c39", "#b5a642")
-PLANT_LABELS = {"nmfd": "regional model", "acyclic": "acyclic model", "sumo": "SUMO"}
+PLANT_LABELS = {"nmfd": "regional model", "acyclic": "acyclic model", "sumo": "SUMO", "estimate": "estimate"}
 LINE_STYLES = ("-", "--", ":", "-.")
 GREEN, RED = "#2ca02c", "#d62728"
 ZONES = (  # of a region's accumulation: label, colour, opacity
@@ -111,6 +112,12 @@ def region_accumulation(ax: Axes, network: Network, region: int, trajectories: S
     ax.set_ylim(0.0, top)
     ax.set_title(_region_title(network, region), fontsize="medium")
     return ax
+
+
+def region_estimate(ax: Axes, network: Network, region: int, trajectory: Trajectory) -> Axes:
+    """Accumulation of one region over time, and the estimate of it that the controller saw."""
+    estimate = replace(trajectory, accumulation=trajectory.estimate, plant="estimate")
+    return region_accumulation(ax, network, region, [trajectory, estimate])
 
 
 def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> Axes:
