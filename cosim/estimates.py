@@ -14,8 +14,8 @@ COLUMNS = (
     "controller", "seed", "region", "name", "critical_veh", "mean_veh", "rmse_veh", "rmse_share", "bias_veh",
     "cell_rmse_veh")
 CAPTION = (
-    "estimate against exact accumulation of a region: RMSE, and as a share of the critical accumulation; bias > 0: too\n"
-    "many; x_ij RMSE: of the single cells (region, destination) in which there were vehicles; mean over runs")
+    "estimate against exact accumulation of a region: RMSE, also as a share of the critical accumulation; bias > 0:\n"
+    "too many; x_ij RMSE: of the single cells (region, destination) in which there were vehicles; mean over runs")
 
 
 def errors(network: Network, trajectory: Trajectory) -> list[dict]:

@@ -14,7 +14,8 @@ from nmfd.types import Trajectory
 # Columns of sumo.csv, beside those of summary.csv.
 FACTS = (
     "controller", "seed", "trips", "departed_veh", "final_backlog_veh", "total_backlog_veh_s", "teleports",
-    "leaking_share", "estimate_rmse_share", "estimate_cell_rmse_veh", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s")
+    "leaking_share", "estimate_rmse_share", "estimate_cell_rmse_veh", "wall_time_s", "sumo_time_s", "overhead_share",
+    "setup_time_s")
 
 
 @dataclass(frozen=True, kw_only=True)
