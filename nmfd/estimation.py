@@ -145,7 +145,9 @@ class _Model:
         memory = torch.tensor([OUTFLOW_MEMORY, DEMAND_MEMORY, EXPANSION_MEMORY], dtype=torch.float64)
         self._kept = torch.exp(-self._step / memory).repeat_interleave(regions)
         self._turns = np.argwhere(network.split_mask)
-        self._of_vehicle, self._of_probe = (torch.from_numpy(part) for part in self._effects())
+        vehicle, probe = (torch.from_numpy(part) for part in self._effects())
+        self._pairs = [_pairs(vehicle, vehicle), _pairs(vehicle, probe), _pairs(probe, probe)]
+        self._half = vehicle[cells : cells + regions]
 
     def _effects(self) -> tuple[np.ndarray, np.ndarray]:
         """(first part, events), (second part, events): what one vehicle changes in (x | mean accumulations, crossings),
@@ -259,14 +261,12 @@ class _Model:
         share = seen / moves.clamp(min=1e-9)
         in_cell = torch.from_numpy(belief.probes.ravel()) / x.clamp(min=1e-9)
         share[:turns] = torch.where(moves[:turns] > 1e-9, share[:turns], in_cell[cell].clamp(max=1.0))
+        weights = moves + error**2, seen + share * error**2, seen + share**2 * error**2
         parts = [
-            (left * weight) @ right.T for left, right, weight in (
-                (self._of_vehicle, self._of_vehicle, moves + error**2),
-                (self._of_vehicle, self._of_probe, seen + share * error**2),
-                (self._of_probe, self._of_probe, seen + share**2 * error**2))]
+            torch.zeros(shape, dtype=x.dtype).index_put_(index[:2], value * weight[index[2]], accumulate=True)
+            for (shape, index, value), weight in zip(self._pairs, weights, strict=True)]
         # When in the interval an event was also moves the mean: evenly distributed, a variance of 1/12 of its effect.
-        half = self._of_vehicle[self._cells : self._cells + self._regions]
-        parts[0].diagonal()[self._cells : self._cells + self._regions] += half**2 @ moves / 3.0
+        parts[0].diagonal()[self._cells : self._cells + self._regions] += self._half**2 @ moves / 3.0
         return torch.cat([torch.cat(parts[:2], dim=1), torch.cat([parts[1].T, parts[2]], dim=1)])
 
     def _readings(self, z: np.ndarray, observation: Observation, loops: np.ndarray) -> tuple:
@@ -291,6 +291,14 @@ class _Model:
         expansion, mean = (torch.from_numpy(z[part])[:, None] for part in (self._expansion, self._mean))
         loops = (1.0 + expansion) * matrix[self._mean] + mean * matrix[self._expansion]
         return torch.cat([loops, matrix[self._crossings.start :]])
+
+
+def _pairs(left: torch.Tensor, right: torch.Tensor) -> tuple:
+    """What of left (m, events) meets what of right (n, events) in one event, for the sums left diag(w) right' (m, n):
+    their shape, (row, column, event), product."""
+    product = left[:, None] * right[None]
+    index = product.nonzero(as_tuple=True)
+    return product.shape[:2], index, product[index]
 
 
 def _moved(share, completions, transfers):
