@@ -134,6 +134,10 @@ class _Model:
         self._parameters = dynamics.parameters(network)
         regions = self._regions = network.regions
         cells = self._cells = regions**2
+        self._fastest = torch.tensor(
+            [m.rate(np.linspace(0.0, m.jam, 501)).max() for m in network.mfds])
+        if network.exit_rates is not None:
+            self._fastest *= torch.from_numpy(network.exit_rates.max(axis=1))
         self._boundaries = np.argwhere(network.adjacency)
         sizes = (2 * regions, regions, cells, regions, len(self._boundaries), cells, cells)
         ends = np.cumsum(sizes)
@@ -214,14 +218,15 @@ class _Model:
         covariance[errors:, errors:] += self._flow_noise(belief, moves, seen)
         return torch.cat([self._kept * mean[:errors], outputs[0]]).numpy(), covariance
 
-    def _rollout(self, points, probes, demand, perimeter, splits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _rollout(self, points, probes, demand, perimeter, splits) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """All of Z but the relative errors at `points` (B, 2 R + R^2); and the events of the first one, (events,)
         [veh], of all vehicles and of probes."""
         regions, batch = self._regions, len(points)
         duration = self._step / self._substeps
-        perimeter, splits = torch.from_numpy(perimeter), torch.from_numpy(splits)
+        perimeter, splits = (torch.tensor(given, dtype=torch.float64) for given in (perimeter, splits))
         x = points[:, 2 * regions :].reshape(batch, regions, regions)
         outflow, wish = (1.0 + points[:, : 2 * regions].reshape(batch, 2, regions)).clamp(min=0.0).unbind(1)
+        outflow = outflow.minimum(1.0 / (duration * self._fastest))  # no more leave than there are
         entering = duration * torch.from_numpy(demand) * wish[:, :, None]
         n = torch.from_numpy(probes).expand(batch, -1, -1)
         mean, crossings = torch.zeros_like(outflow), torch.zeros_like(x)
