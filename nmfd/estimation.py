@@ -10,7 +10,7 @@ model is wrong), of the forecast demand (it is not that day's, or vehicles canno
 loop detectors (those links are not the average link). What is measured during a control interval is predicted together
 with the state at its end: the mean accumulations, the vehicles over the boundaries, and what the probes do. The
 covariance follows from counting vehicles: every flow is Poisson, and a probe that moves is one of the vehicles that
-move. So a probe that was seen before is no news; that it left, or that another one set out, is.
+move. So a probe that was seen before is little news; that it left, or that another one set out, is.
 
 Bounds: no cell can hold fewer vehicles than the probes seen in it. An estimate below is projected on the bounds in the
 metric of its covariance (Simon, "Kalman filtering with state constraints", IET Control Theory and Applications 4,
@@ -32,11 +32,11 @@ from nmfd.types import Controls
 
 # The three relative errors: standard deviation [-] (of the expansion it is `Instruments.detector_error`), and the time
 # after which they are forgotten [s]: queues come and go in a quarter of an hour, which links are busy changes slowly.
-OUTFLOW_ERROR, OUTFLOW_MEMORY = 0.3, 900.0
-DEMAND_ERROR, DEMAND_MEMORY = 0.3, 900.0
-EXPANSION_MEMORY = 3600.0
-FLOW_ERROR = 0.2      # [-], of every single flow, anew in every interval: splits, and trips that are not exponential
-STRAY = 0.02          # [-], of what leaves a cell, as an error of every way it could leave by
+MEMORY, EXPANSION_MEMORY = 900.0, 3600.0
+OUTFLOW_ERROR, DEMAND_ERROR = 0.3, 0.3
+# Of every single flow, and of every way out of a cell as a share of what leaves it: drivers take other ways, and trips
+# are not exponential. As long as MEMORY too, but not worth a state each: white noise that sums up to the same.
+FLOW_ERROR, STRAY = 0.2, 0.02
 COUNT_ERROR = 0.3     # [-], of vehicles over a boundary, expanded from one counted gateway to all alike
 FLOOR = 0.01          # [veh^2], variance of a reading that would be exact
 DIFFERENCE = 1e-5     # of the Jacobian [veh], [-]
@@ -131,7 +131,7 @@ class _Model:
     def __init__(self, scenario: Scenario, instruments: Instruments):
         network, self._instruments = scenario.network, instruments
         self._step, self._substeps = scenario.step, scenario.substeps
-        self._parameters = dynamics.parameters(network)
+        self._parameters, self._probe_share = dynamics.parameters(network), instruments.probe_share
         regions = self._regions = network.regions
         cells = self._cells = regions**2
         self._fastest = torch.tensor(
@@ -146,8 +146,10 @@ class _Model:
         self._states, self._size = int(ends[2]), int(ends[-1])
         self._spread = torch.from_numpy(np.concatenate([
             np.full(regions, OUTFLOW_ERROR), np.full(regions, DEMAND_ERROR), instruments.detector_error]))
-        memory = torch.tensor([OUTFLOW_MEMORY, DEMAND_MEMORY, EXPANSION_MEMORY], dtype=torch.float64)
+        memory = torch.tensor([MEMORY, MEMORY, EXPANSION_MEMORY], dtype=torch.float64)
         self._kept = torch.exp(-self._step / memory).repeat_interleave(regions)
+        kept = np.exp(-self._step / MEMORY)
+        self._lasting = float((1.0 + kept) / (1.0 - kept))  # variance of white noise over that of what lasts
         self._turns = np.argwhere(network.split_mask)
         vehicle, probe = (torch.from_numpy(part) for part in self._effects())
         self._pairs = [_pairs(vehicle, vehicle), _pairs(vehicle, probe), _pairs(probe, probe)]
@@ -190,10 +192,13 @@ class _Model:
             towards = ahead[:, : self._states]
             root = torch.linalg.cholesky(spread)
             innovation = torch.from_numpy((reading - expected)[there])[:, None]
-            solved = torch.cholesky_solve(torch.cat([towards, innovation], dim=1), root)
-            mean = mean + (solved[:, :-1].T @ innovation).ravel().numpy()
-            posterior = posterior - solved[:, :-1].T @ towards
-            surprise = float(innovation.ravel() @ solved[:, -1]) / max(int((spread.diagonal() > 0.1).sum()), 1)
+            # With S = L L' the spread of the readings: L^-1 of what they say, and of what the state has to do with it.
+            whitened = torch.linalg.solve_triangular(root, torch.cat([towards, innovation], dim=1), upper=False)
+            mean = mean + (whitened[:, :-1].T @ whitened[:, -1]).numpy()
+            posterior = posterior - whitened[:, :-1].T @ whitened[:, :-1]
+            measured = there < len(reading) - self._cells  # the last ones are not: see `_readings`
+            uncertain = (spread.diagonal().numpy() > 10.0 * FLOOR)[measured].sum()
+            surprise = float((whitened[measured, -1] ** 2).sum()) / max(int(uncertain), 1)
         posterior = (0.5 * (posterior + posterior.T)).numpy()
         known = np.isfinite(observation.probes)
         probes = np.where(known, observation.probes, np.maximum(z[self._probes].reshape(known.shape), 0.0))
@@ -241,15 +246,15 @@ class _Model:
                 moves[level] += (transfers * part.unsqueeze(2))[0]
                 ends[level] += (completions * torch.diagonal(part, dim1=1, dim2=2))[0]
             crossings = crossings + transfers.sum(3)
-            before, arrived = x.sum(2), self._instruments.probe_share * entering
+            before, arrived = x.sum(2), self._probe_share * entering
             x = x + entering - torch.diag_embed(completions) - transfers.sum(2) + transfers.sum(1)
             n = n + arrived + _moved(share, completions, transfers)
             mean = mean + 0.5 * (before + x.sum(2)) / self._substeps
-        departed = self._substeps * self._instruments.probe_share * entering
+        departed = self._substeps * self._probe_share * entering
         crossings = crossings[:, *self._boundaries.T]
         outputs = torch.cat([part.reshape(batch, -1) for part in (x, mean, crossings, n, departed)], dim=1)
         entered = (self._substeps * entering)[0].reshape(-1)
-        share = (1.0, self._instruments.probe_share)
+        share = (1.0, self._probe_share)
         here, onward, bound = self._turns.T
         events = [torch.cat([moves[k][here, onward, bound], ends[k], share[k] * entered]) for k in (0, 1)]
         every = events[0].clamp(min=0.0)
@@ -266,7 +271,8 @@ class _Model:
         share = seen / moves.clamp(min=1e-9)
         in_cell = torch.from_numpy(belief.probes.ravel()) / x.clamp(min=1e-9)
         share[:turns] = torch.where(moves[:turns] > 1e-9, share[:turns], in_cell[cell].clamp(max=1.0))
-        weights = moves + error**2, seen + share * error**2, seen + share**2 * error**2
+        wrong = self._lasting * error**2
+        weights = moves + wrong, seen + share * wrong, seen + share**2 * wrong
         parts = [
             torch.zeros(shape, dtype=x.dtype).index_put_(index[:2], value * weight[index[2]], accumulate=True)
             for (shape, index, value), weight in zip(self._pairs, weights, strict=True)]
@@ -275,27 +281,34 @@ class _Model:
         return torch.cat([torch.cat(parts[:2], dim=1), torch.cat([parts[1].T, parts[2]], dim=1)])
 
     def _readings(self, z: np.ndarray, observation: Observation, loops: np.ndarray) -> tuple:
-        """All readings (m,), NaN where there is none, their expectation and the variance of their own noise (m,)."""
+        """All readings (m,), NaN where there is none, their expectation and the variance of their own noise (m,).
+
+        The last R^2 are no measurements, but keep a wrong model from going astray: that the probes are a share of the
+        vehicles. A draw of probes lasts as long as they are on the way, so each time it is told, it counts little.
+        """
         known, here, to = self._instruments, *self._boundaries.T
         mean, expansion, counts = z[self._mean], z[self._expansion], z[self._crossings]
         share = np.maximum(known.detector_share, 1e-6)
         boundary, gateways = (
             np.maximum(part[here, to], low) for part, low in ((known.counted_share, 1e-6), (known.counted_gateways, 1)))
-        cells = np.full(self._cells, FLOOR)
+        cells, p = np.full(self._cells, FLOOR), self._probe_share
+        thinning = p * (1.0 - p) * np.maximum(z[self._x], 1.0) * self._lasting + FLOOR
         parts = (
             # a share of the links sees a share of the vehicles; the lasting part of the error is a state
             (loops, (1.0 + expansion) * mean, np.maximum(mean, 1.0) * (1.0 - share) / share + FLOOR),
             (observation.crossings[here, to], counts,
              (1.0 - boundary) * (np.maximum(counts, 1.0) / boundary + COUNT_ERROR**2 * counts**2 / gateways) + FLOOR),
             (observation.probes.ravel(), z[self._probes], cells),
-            (observation.probe_departures.ravel(), z[self._departures], cells))
+            (observation.probe_departures.ravel(), z[self._departures], cells),
+            (0.0 * observation.probes.ravel(), z[self._probes] - self._probe_share * z[self._x], thinning))
         return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
     def _rows(self, z: np.ndarray, matrix: torch.Tensor) -> torch.Tensor:
         """(m, n): how the readings change with Z, times a matrix (size, n)."""
         expansion, mean = (torch.from_numpy(z[part])[:, None] for part in (self._expansion, self._mean))
         loops = (1.0 + expansion) * matrix[self._mean] + mean * matrix[self._expansion]
-        return torch.cat([loops, matrix[self._crossings.start :]])
+        share = matrix[self._probes] - self._probe_share * matrix[self._x]
+        return torch.cat([loops, matrix[self._crossings.start :], share])
 
 
 def _pairs(left: torch.Tensor, right: torch.Tensor) -> tuple:

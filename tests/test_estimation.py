@@ -49,9 +49,11 @@ class Crowd:
 
     def step(self, k, controls=OPEN):
         random, step = self._random, SCENARIO.step / SCENARIO.substeps
-        keep = np.exp(-SCENARIO.step / estimation.OUTFLOW_MEMORY)
+        keep = np.exp(-SCENARIO.step / estimation.MEMORY)
         outflow, wish = np.clip(1.0 + 0.3 * self._wrong * self._factors, 0.0, 2.0)
-        each = np.clip(1.0 + self._wrong * estimation.FLOW_ERROR * random.normal(size=(REGIONS,) * 3), 0.0, 2.0)
+        lasting = np.sqrt((1.0 + keep) / (1.0 - keep))
+        each = 1.0 + self._wrong * estimation.FLOW_ERROR * lasting * random.normal(size=(REGIONS,) * 3)
+        each = np.clip(each, 0.0, 3.0)
         mean, crossings, departures = np.zeros(REGIONS), np.zeros((REGIONS, REGIONS)), np.zeros((REGIONS, REGIONS))
         shares = np.array([self._known.probe_share, 1.0 - self._known.probe_share])
         for _ in range(SCENARIO.substeps):
