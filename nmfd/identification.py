@@ -1,8 +1,8 @@
 """The regional model from observed runs: all its parameters at once, by prediction error.
 
 MFDs fitted to outflow samples explain one interval at a time, and take the blame for what happens at the boundaries: a
-region that cannot send its vehicles on looks as if it had collapsed. Here the parameters of `nmfd.dynamics` - MFDs, exit
-rates, boundary capacities and storage - are those whose rollouts over some control intervals, started from every
+region that cannot send its vehicles on looks as if it had collapsed. Here the parameters of `nmfd.dynamics` - MFDs,
+exit rates, boundary capacities and storage - are those whose rollouts over some control intervals, started from every
 observed state under the observed demand and controls, come closest to what was observed (Ljung, System
 Identification, 1999, ch. 7; output error over a finite horizon).
 """
@@ -97,7 +97,8 @@ def fit(
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     model = _Model(network, runs, step, substeps / step)
-    data, scheme = windows(runs, HORIZON), {"step": step, "substeps": substeps, "integrator": integrator}
+    horizon = min(HORIZON, max(len(run.demand) for run in runs))
+    data, scheme = windows(runs, horizon), {"step": step, "substeps": substeps, "integrator": integrator}
     scale = torch.tensor([mfd.critical for mfd in network.mfds], dtype=torch.float32)
     off_diagonal = 1.0 - torch.eye(network.regions)
     optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
