@@ -2,24 +2,37 @@
 
 import tempfile
 from collections import Counter
+from collections.abc import Set
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from cosim.actuate import HOLD_BACK, MODES, Actuator, GatewaySignal
+from cosim import webster
+from cosim.actuate import GREEN, Actuator, GatewaySignal
+from cosim.actuated import actuated_row
 from cosim.city import ensure_built
+from cosim.flows import turning_flows
 from cosim.guidance import Guide
+from cosim.max_pressure import MaxPressure
 from cosim.measure import Meter
 from cosim.regions import City, Gateway, check_adjacency, load_city
+from cosim.signals import Signal, read_signals, write_programmes
+from cosim.strategy import ACTUATED, FIXED, HOLD_BACK, MAX_PRESSURE, MODES, SIGNALS, WEBSTER
 from cosim.sumo import Session
+from cosim.trip_facts import TripFacts, read_trip_facts, trip_options
 from cosim.trips import write_trips
 from nmfd import toml
 from nmfd.errors import InputError
-from nmfd.scenario import Scenario
+from nmfd.scenario import Scenario, read_tables
 from nmfd.types import Controls, Measurement
 
-PRODUCTION_EVERY = 10.0  # s, between two samples of the production
+SAMPLE_EVERY = 10.0  # s, between two samples of the production and of the queues
+# Equipped drivers take the fastest route by the mean speeds of the last 180 s (SUMO's default): when they depart, which
+# needs their route to be read no earlier, and every minute from then on, as drivers with navigation do.
+REROUTING = (
+    "--route-steps", "1", "--device.rerouting.pre-period", "60", "--device.rerouting.period", "60",
+    "--device.rerouting.adaptation-interval", "1", "--device.rerouting.adaptation-steps", "180")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +42,10 @@ class Settings:
     step_length: of SUMO [s]; time_to_teleport: [s], -1 for never; collision_action: SUMO's
     actuation: "hold-back" or "redistribute"; min_green: of a gateway movement [s]
     compliance: share of the decisions in which a driver follows the route guidance [-]
+    most_detour: a driver does not follow route guidance into a next region that costs him more than this [s]
     rerouting: share of the drivers with SUMO's own rerouting device [-]
+    signals: one of cosim.strategy.SIGNALS; gateways_fixed (of the strategy, no key of the table): whether signals with
+        a gateway movement stay fixed-time, for perimeter control, where the others are actuated or max-pressure
     """
 
     step_length: float = 1.0
@@ -38,7 +54,10 @@ class Settings:
     actuation: str = HOLD_BACK
     min_green: float = 5.0
     compliance: float = 1.0
+    most_detour: float = 60.0
     rerouting: float = 0.0
+    signals: str = FIXED
+    gateways_fixed: bool = True
 
 
 def settings(scenario: Scenario) -> Settings:
@@ -46,7 +65,7 @@ def settings(scenario: Scenario) -> Settings:
     if scenario.folder is None:
         return Settings()
     path, default = scenario.folder / "scenario.toml", Settings()
-    table = toml.Table(toml.read(path).raw_table("sumo"), path, "sumo.")
+    table = toml.Table(read_tables(scenario.folder).raw_table("sumo"), path, "sumo.")
     chosen = Settings(
         step_length=table.number("step_length", default.step_length, above=0.0, high=1.0),
         time_to_teleport=table.number("time_to_teleport", default.time_to_teleport, low=-1.0),
@@ -55,7 +74,9 @@ def settings(scenario: Scenario) -> Settings:
         actuation=table.text("actuation", default.actuation, MODES),
         min_green=table.number("min_green", default.min_green, low=1.0),
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
-        rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0))
+        most_detour=table.number("most_detour", default.most_detour, low=0.0),
+        rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0),
+        signals=table.text("signals", default.signals, SIGNALS))
     table.close()
     if abs(scenario.step / chosen.step_length - round(scenario.step / chosen.step_length)) > 1e-9:
         raise InputError(
@@ -71,9 +92,12 @@ class Record:
     departures: (T, R, R) [veh]; arrivals: (T, R) [veh], by the region of the destination
     crossings: (T, R, R, R) [veh], [i, h, j] = from i to h, bound for j
     production: (T, R) [veh m/s], mean of samples; mean_accumulation: (T, R) [veh], of the same samples
+    edge_vehicles: (T, E) [veh], mean of the same samples, by the city's edges
     gateway_green: (T, G) [s], green shown per gateway, its links' mean; NaN without a signal
+    gateway_original_green: (T, G) [s], the same in the original programme
     gateway_flow: (T, G) [veh] over the boundary there
-    gateway_queue: (T, G) [veh] halting before it at the end of the interval
+    gateway_queue, gateway_queue_max: (T, G) [veh] halting on the edge before it, mean and largest of samples; gateways
+        that share this edge share its queue
     teleports: (T,); guided: (T, R, R, R) [veh], reroutes by route guidance
     """
 
@@ -82,9 +106,12 @@ class Record:
     crossings: np.ndarray
     production: np.ndarray
     mean_accumulation: np.ndarray
+    edge_vehicles: np.ndarray
     gateway_green: np.ndarray
+    gateway_original_green: np.ndarray
     gateway_flow: np.ndarray
     gateway_queue: np.ndarray
+    gateway_queue_max: np.ndarray
     teleports: np.ndarray
     guided: np.ndarray
 
@@ -92,6 +119,7 @@ class Record:
 class SumoPlant:
     """A SUMO simulation of the scenario's city (nmfd.types.Plant).
 
+    `simple_signals` may get another programme, `other_signals` are left alone (cosim.signals).
     `record()` tells what happened; `trips` is their number; `sumo_time` [s] is the wall time inside SUMO's own step
     since the reset.
     """
@@ -104,7 +132,15 @@ class SumoPlant:
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
         check_adjacency(self.city, scenario.network)
         self._edge_region = np.array([self.city.region_of[edge] for edge in self.city.edges])
+        self._upstream = sorted({g.from_edge for g in self.city.gateways})
+        self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in self.city.gateways], dtype=int)
         self._net_file = files.net_file
+        self.simple_signals, self.other_signals = read_signals(self.city)
+        if self._settings.signals != FIXED and not self.simple_signals:
+            raise InputError(
+                f"{files.net_file}: sumo.signals: {self._settings.signals} needs fixed-time signals with several green "
+                f"phases, but none of the {len(self.other_signals)} signals here is one; choose fixed")
+        self._gateway_ids = {gateway.signal for gateway in self.city.gateways if gateway.signal is not None}
         self._folder = tempfile.TemporaryDirectory(prefix="cosim-")
         self._session: Session | None = None
 
@@ -114,17 +150,25 @@ class SumoPlant:
         scenario, chosen = self._scenario, self._settings
         routes = Path(self._folder.name) / "trips.rou.xml"
         self.trips = write_trips(self.city, scenario.demand, scenario.step, seed, routes)
-        options = ()
+        self._trip_file = routes.with_name("tripinfo.xml")
+        steered = [s for s in self.simple_signals if not (chosen.gateways_fixed and s.id in self._gateway_ids)]
+        options = (*trip_options(self._trip_file), *self._signal_plan(steered))
         if chosen.rerouting > 0:
-            options = ("--device.rerouting.probability", str(chosen.rerouting), "--device.rerouting.period", "60")
+            options += (*REROUTING, "--device.rerouting.probability", str(chosen.rerouting))
         self._session = Session(
             self._net_file, routes, seed=seed, step_length=chosen.step_length,
             time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action, options=options)
         self._meter = Meter(self._session, self.city)
         self._guide = Guide(
-            self._session, self.city, compliance=chosen.compliance,
+            self._session, self.city, compliance=chosen.compliance, most_detour=chosen.most_detour,
             random=np.random.default_rng([seed, 0x67756964]))
-        self._signals = self._gateway_signals()
+        self._max_pressure, steered_ids = None, set()
+        if chosen.signals == MAX_PRESSURE:
+            flows = turning_flows(self.city, scenario.demand, scenario.step)
+            self._max_pressure = MaxPressure(self._session, self.city, steered, flows)
+            steered_ids = {signal.id for signal in steered}
+        self._signals = self._gateway_signals(without=steered_ids)
+        self._original_green = self._programmed_green()
         self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
         self._k, self._rows, self._speed = 0, [], None
         return self._measurement()
@@ -135,16 +179,19 @@ class SumoPlant:
         self._actuator.command(controls.perimeter, network.u_min, network.u_max)
         self._guide.command(controls.splits, self._speed)
         begin, steps = session.time, round(self._scenario.step / session.step_length)
-        every = max(1, round(PRODUCTION_EVERY / session.step_length))
+        every = max(1, round(SAMPLE_EVERY / session.step_length))
         vehicles, metres = np.zeros((2, len(self.city.edges)))  # sums over the samples, by edge: n and n v
-        samples = 0
+        queues = []
         for n in range(steps):
             self._actuator.play(session.time)
+            if self._max_pressure is not None:
+                self._max_pressure.play(session.time)
             session.step()
             self._guide.apply(meter.observe())
             if n % every == every - 1:
                 counts, speeds = self._sample()
-                vehicles, metres, samples = vehicles + counts, metres + counts * speeds, samples + 1
+                vehicles, metres = vehicles + counts, metres + counts * speeds
+                queues.append([session.halting(edge) for edge in self._upstream])
         self._k += 1
         assert abs(session.time - begin - self._scenario.step) < 1e-6
         measurement = self._measurement()
@@ -153,8 +200,12 @@ class SumoPlant:
         with np.errstate(invalid="ignore"):
             self._speed = metres / vehicles
         row["production"], row["mean_accumulation"] = (
-            np.bincount(self._edge_region, amount, network.regions) / max(samples, 1) for amount in (metres, vehicles))
-        row["gateway_queue"] = np.array([session.halting(g.from_edge) for g in self.city.gateways])
+            np.bincount(self._edge_region, amount, network.regions) / len(queues) for amount in (metres, vehicles))
+        row["edge_vehicles"] = (vehicles / len(queues)).astype(np.float16)  # to 0.1 % and as small as an integer
+        queues = np.array(queues).reshape(len(queues), len(self._upstream))
+        row["gateway_queue"], row["gateway_queue_max"] = (
+            queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))
+        row["gateway_original_green"] = self._original_green
         self._rows.append(row)
         return measurement
 
@@ -168,6 +219,11 @@ class SumoPlant:
     def record(self) -> Record:
         """Of all control intervals since the reset."""
         return Record(**{key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]})
+
+    def trip_facts(self) -> TripFacts:
+        """Ends the simulation, for only then does SUMO tell of the trips under way."""
+        self._end_session()
+        return read_trip_facts(self._trip_file)
 
     @property
     def sumo_time(self) -> float:
@@ -187,10 +243,23 @@ class SumoPlant:
             self._session.close()
             self._session = None
 
-    def _gateway_signals(self) -> dict[str, GatewaySignal]:
+    def _signal_plan(self, signals: list[Signal]) -> tuple[str, ...]:
+        """Options of SUMO with which it runs other programmes than those of the network file."""
+        if self._settings.signals == WEBSTER:
+            path = webster.plan(
+                self.city, self.simple_signals, self._scenario.demand, self._scenario.step,
+                folder=self._scenario.network.folder / "build")
+        elif self._settings.signals == ACTUATED:
+            path = Path(self._folder.name) / "actuated.add.xml"
+            write_programmes(path, [actuated_row(signal) for signal in signals])
+        else:
+            return ()
+        return ("--additional-files", str(path))
+
+    def _gateway_signals(self, *, without: Set[str]) -> dict[str, GatewaySignal]:
         movements: dict[str, dict[int, tuple[int, int]]] = {}
         for gateway in self.city.gateways:
-            if gateway.signal is not None:
+            if gateway.signal is not None and gateway.signal not in without:
                 for link in gateway.links:
                     movements.setdefault(gateway.signal, {})[link] = (gateway.source, gateway.target)
         signals = {}
@@ -201,6 +270,17 @@ class SumoPlant:
                     programme, movements[signal], min_green=self._settings.min_green,
                     mode=self._settings.actuation, start=self._session.time)
         return signals
+
+    def _programmed_green(self) -> np.ndarray:
+        """(G,) [s] per control interval, as Record.gateway_original_green."""
+        green = np.full(len(self.city.gateways), np.nan)
+        for n, gateway in enumerate(self.city.gateways):
+            if gateway.signal in self._signals:
+                programme = self._session.programme(gateway.signal)
+                lasting = [phase.duration * (phase.state[link] in GREEN)
+                           for phase in programme.phases for link in gateway.links]
+                green[n] = sum(lasting) / len(gateway.links) * self._scenario.step / programme.cycle
+        return green
 
     def _measurement(self) -> Measurement:
         return Measurement(

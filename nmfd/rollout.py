@@ -4,6 +4,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 
@@ -19,13 +20,15 @@ class Rollout:
     Random numbers are drawn on the CPU, so that they are the same on every device.
     """
 
-    def __init__(self, scenario: Scenario, dtype=torch.float32, device="cpu"):
+    def __init__(self, scenario: Scenario, dtype=torch.float32, device="cpu", detour_cost: float = 0.0):
+        """detour_cost: what a vehicle loses that is guided off the drivers' own split ratios [s]"""
         def tensor(values):
             return torch.tensor(values, dtype=dtype, device=device)
 
         network = scenario.network
+        self.detour_cost = detour_cost
         self.scenario, self.dtype, self.device = scenario, dtype, torch.device(device)
-        self.parameters = dynamics.parameters(network, dtype=dtype, device=device)
+        self.parameters = self._nominal = dynamics.parameters(network, dtype=dtype, device=device)
         self.demand = tensor(scenario.demand)
         self.nominal_splits = tensor(network.nominal_splits)
         self.jam = tensor([m.jam for m in network.mfds])
@@ -51,6 +54,32 @@ class Rollout:
         total = uniform(batch, regions) * uniform(batch, 1) * 0.8 * self.jam
         x = total.unsqueeze(-1) * weight / weight.sum(-1, keepdim=True).clamp(min=1e-6)
         return x * (rollout < share * batch)[:, None, None], demand
+
+    def draw_model(self, batch: int, spread: float, generator) -> None:
+        """From now on every one of `batch` rollouts has a regional model of its own, around the nominal one.
+
+        spread: standard deviation of the logarithm of every region's accumulation axis (jam and critical accumulation,
+        storage), and half of it of its outflow and of the capacities [-]; 0 for the nominal model
+        """
+        p, regions = self._nominal, len(self.jam)
+        if spread:
+            def factor(*shape, share=1.0):
+                normal = torch.randn(batch, *shape, generator=generator, dtype=self.dtype).to(self.device)
+                return torch.exp(share * spread * normal.clamp(-2.0, 2.0))
+
+            wide, high = factor(regions), factor(regions, share=0.5)
+            # The integration step stays short enough: no rate rises above the largest that the network was checked for.
+            high = high.clamp(max=1.0 / (self._fastest() * self.scenario.step / self.scenario.substeps))
+            p = replace(
+                p, a=high * p.a / wide**2, b=high * p.b / wide, c=high * p.c, jam=wide * p.jam,
+                capacity=None if p.capacity is None else p.capacity * factor(regions, regions, share=0.5),
+                storage=None if p.storage is None else p.storage * wide)
+        self.parameters = p
+
+    def _fastest(self) -> torch.Tensor:
+        """The largest rate at which vehicles leave each region (R,) [1/s]."""
+        p = self._nominal
+        return p.c if p.exit_rates is None else p.c * p.exit_rates.amax(-1)
 
     def perturb(self, demand: torch.Tensor, level, noise: float, noise_all: float, generator) -> torch.Tensor:
         """`demand` (T, B, R, R) [veh/s] with Gaussian noise, clipped at zero.
@@ -88,9 +117,20 @@ class Rollout:
         return exact, exact + noise
 
     def total_time_spent(self, policy: Policy, x, demand, generator, step=None) -> torch.Tensor:
-        """TTS (B,) [veh s] of rollouts from x (B, R, R) under `policy`; arguments as in `states`."""
-        exact, _ = self.states(policy, x, demand, generator, step)
-        return self.scenario.step * exact.sum((0, -2, -1))
+        """TTS (B,) [veh s] of rollouts from x (B, R, R) under `policy`, with detours; arguments as `states`."""
+        exact, seen = self.states(policy, x, demand, generator, step)
+        vehicles = exact.sum((0, -2, -1))
+        if self.detour_cost and policy.architecture.guidance:
+            vehicles = vehicles + self.detour_cost * self._diverted(exact, policy(seen)[1]).sum((0, -2, -1))
+        return self.scenario.step * vehicles
+
+    def _diverted(self, x: torch.Tensor, splits: torch.Tensor) -> torch.Tensor:
+        """Vehicles (..., R, R) [veh/s] that leave a region another way than by the drivers' own split ratios."""
+        p = self.parameters
+        leaving = dynamics.rate(p, x.sum(-1)).unsqueeze(-1) * x
+        if p.exit_rates is not None:
+            leaving = leaving * p.exit_rates
+        return 0.5 * (splits - self.nominal_splits).abs().sum(-2) * leaving
 
 
 def can_compile(device: str = "cpu") -> bool:

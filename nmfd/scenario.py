@@ -1,7 +1,8 @@
 """Demand, noise, horizon: loaded from scenario.toml and checked."""
 
+import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -47,10 +48,39 @@ def trapezoid(time: np.ndarray, *, start: float, peak: float, ramp_up: float, fl
     return peak * np.clip(np.minimum(rising, falling), 0.0, 1.0)
 
 
+def read_tables(folder: Path) -> toml.Table:
+    """`folder`/scenario.toml; what it does not say is that of the scenario in the folder `base`, if it names one.
+
+    Tables are completed key by key, everything else is taken whole. Raises InputError.
+    """
+    path, folders, content = folder / "scenario.toml", [], {}
+    while True:
+        table = toml.read(folder / "scenario.toml")
+        own = table.raw()
+        if folder.resolve() in folders:
+            raise table.error("base", "the scenarios are each other's base; remove one of the keys")
+        folders.append(folder.resolve())
+        if isinstance(own.get("network"), str):  # relative to the file that says it
+            own["network"] = os.path.relpath(folder / own["network"], path.parent)
+        content = _completed(content, own)
+        base = table.text("base", None)
+        if base is None:
+            content.pop("base", None)
+            return toml.Table(content, path)
+        folder = folder / base
+
+
+def _completed(content: dict, base: dict) -> dict:
+    """`content` with what only `base` has, in the tables of both too."""
+    both = {key: _completed(content[key], base[key]) for key in content
+            if isinstance(content[key], dict) and isinstance(base.get(key), dict)}
+    return {**base, **content, **both}
+
+
 def load_scenario(folder: Path | str) -> Scenario:
     """Read `folder`/scenario.toml and its network. Raises InputError; the table [sumo] is left to cosim."""
     folder = Path(folder)
-    root = toml.read(folder / "scenario.toml")
+    root = read_tables(folder)
     name = root.text("name")
     network = load_network(folder / root.text("network"))
     step = root.number("step", above=0.0)
@@ -61,6 +91,7 @@ def load_scenario(folder: Path | str) -> Scenario:
     noise = root.table("noise", None)
     measurement_std = noise.number("measurement_std", 0.0, low=0.0)
     noise.close()
+    factor = root.number("demand_factor", 1.0, low=0.0)
     demand = np.zeros((steps, network.regions, network.regions))
     time = step * np.arange(steps)
     for row in root.tables("demand"):
@@ -78,9 +109,28 @@ def load_scenario(folder: Path | str) -> Scenario:
     root.close()
     check_step(network, step / substeps, str(folder / "scenario.toml"))
     return Scenario(
-        name=name, network=network, step=step, steps=steps, demand=demand, measurement_std=measurement_std,
+        name=name, network=network, step=step, steps=steps, demand=factor * demand, measurement_std=measurement_std,
         integrator=integrator, substeps=substeps, protected=protected, controller_options=controller_options,
         folder=folder)
+
+
+def as_modelled(scenario: Scenario, controller: str) -> Scenario:
+    """`scenario` with the regional model that `controller` plans with: the network that its option `model` names.
+
+    Drivers who are guided, or who reroute by themselves, make another model of the same city. Raises InputError.
+    """
+    options = dict(scenario.controller_options.get(controller, {}))
+    if "model" not in options or scenario.folder is None:
+        return scenario
+    table = toml.Table(options, scenario.folder / "scenario.toml", f"controllers.{controller}.")
+    model = load_network(scenario.folder / table.text("model"))
+    if not np.array_equal(model.adjacency, scenario.network.adjacency):
+        raise table.error("model", f"network {model.name} has other regions or boundaries than {scenario.network.name}"
+                          "; identify one for the same city with 'cosim identify'")
+    del options["model"]
+    check_step(model, scenario.step / scenario.substeps, f"{model.folder}")
+    return replace(
+        scenario, network=model, controller_options={**scenario.controller_options, controller: options})
 
 
 def _region(row: toml.Table, key: str, network: Network) -> int:
