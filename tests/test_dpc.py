@@ -218,7 +218,8 @@ def test_every_tensor_of_a_training_step_is_on_the_device(scenario, controller):
     """On the device "meta", which like a GPU refuses tensors of another."""
     guidance = training.NAMES[controller]
     made = Policy(scenario.network, Architecture(width=8, guidance=guidance)).to("meta")
-    rollout, generator = training.Rollout(scenario, device="meta"), torch.Generator().manual_seed(0)
+    rollout, generator = training.Rollout(scenario, device="meta", detour_cost=1.0), torch.Generator().manual_seed(0)
+    rollout.draw_model(4, 0.1, generator)
     x, demand = rollout.random_start(4, 0.2, 0.5, generator)
     demand = rollout.perturb(demand, torch.rand(4, generator=generator), 1.0, 1.0, generator)
     total = rollout.total_time_spent(made, x, demand, generator)
