@@ -88,7 +88,7 @@ def benchmark(
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True,
               help="auto: a GPU where there is one. The CPU gives the same weights every time.")
 @click.option("--compile/--no-compile", "compiled", default=None,
-              help="Compile the rollout: a minute or two first, then several times as fast. [default: from 200 Adam "
+              help="Compile the rollout: a minute or two first, then about twice as fast. [default: from 200 Adam "
                    "steps up, where there is a C++ compiler]")
 def train(
     scenario: Path, controller: str, seed: int, steps: int | None, out: Path | None, resume: bool, device: str,
@@ -122,7 +122,7 @@ def train(
                              "leave it out")
         compiled = False
         click.echo("nmfd: cannot compile here, most likely for want of a C++ compiler; training goes on uncompiled, "
-                   "several times slower", err=True)
+                   "about half as fast", err=True)
     state = file.with_name(file.name + ".resume")
     before = _stamp(state)
     notes = ["no validation yet"]
