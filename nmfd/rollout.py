@@ -138,9 +138,19 @@ class Rollout:
         return 0.5 * (splits - self.nominal_splits).abs().sum(-2) * leaving
 
 
-def can_compile() -> bool:
-    """Whether there is a C++ compiler, which torch.compile needs."""
-    return shutil.which(os.environ.get("CXX", "g++")) is not None
+def can_compile(device: str = "cpu") -> bool:
+    """Whether torch.compile works on `device`, found out with one small function.
+
+    It needs a C++ compiler, but also Python's headers and OpenMP, and on a GPU Triton.
+    """
+    if shutil.which(os.environ.get("CXX", "g++")) is None:
+        return False
+    try:
+        with warnings.catch_warnings():
+            compiled_step(torch.neg)(torch.ones(1, device=device))
+    except Exception:  # of the compiler, its tools, or a cache that cannot be written: all the same here
+        return False
+    return True
 
 
 def compiled_step(step: Callable) -> Callable:

@@ -109,7 +109,7 @@ def train(
 
     `out` holds the best policy so far after every validation; `out`.resume beside it holds what `resume` needs and
     goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done, TTS)` after
-    every validation. `compiled` makes a step several times as fast, after up to a minute or two of compilation; the
+    every validation. `compiled` makes a step about twice as fast, after up to a minute or two of compilation; the
     weights differ by rounding.
     """
     scenario = as_modelled(scenario, controller)
