@@ -66,6 +66,7 @@ class Crowd:
             for i, j in np.argwhere(x > 0):
                 ways = step * outflow[i] * each[i, :, j] * transfers[i, :, j] / x[i, j]
                 ways[i] = step * outflow[i] * each[i, i, j] * ends[i] / x[i, j] if i == j else 0.0
+                ways /= max(1.0, ways.sum())
                 for group in (0, 1):
                     moved = random.multinomial(self.groups[group, i, j], [*ways, max(0.0, 1.0 - ways.sum())])[:-1]
                     change[group, i, j] -= moved.sum()
@@ -114,22 +115,26 @@ def runs():
 
 
 def test_beats_the_detectors_and_the_open_loop(runs):
+    off = []
     for truth, estimate, detectors, _, open_loop in runs:
         total = truth.sum(axis=2)
-        off = rmse(estimate.sum(axis=2) - total)
-        assert off < 0.7 * rmse(detectors - total)
-        assert off < 0.7 * rmse(open_loop.sum(axis=2) - total)
+        off.append([rmse(guess - total) for guess in (estimate.sum(axis=2), detectors, open_loop.sum(axis=2))])
+        assert off[-1][0] < off[-1][1] and off[-1][0] < 0.5 * off[-1][2]
         assert rmse(estimate - truth) < 0.5 * rmse(open_loop - truth)
+    pooled = np.sqrt((np.array(off) ** 2).mean(axis=0))
+    assert pooled[0] < 0.5 * pooled[1] and pooled[0] < 0.1 * pooled[2]
 
 
 def test_unbiased_and_consistent(runs):
-    """Over cities, the errors of the totals cancel, and the innovations are as large as the covariances say."""
+    """Over cities, the errors of the totals cancel, and the innovations are about as large as the covariances say: a
+    little smaller, since vehicles that leave by lot vary less than the Poisson flows that the estimator reckons with.
+    """
     bias = [float((estimate - truth).sum(axis=(1, 2)).mean()) for truth, estimate, *_ in runs]
     scale = np.mean([rmse((estimate - truth).sum(axis=(1, 2))) for truth, estimate, *_ in runs])
     assert abs(np.mean(bias)) < 0.6 * scale
     assert abs(np.mean(bias)) < 0.02 * np.mean([truth.sum(axis=(1, 2)).mean() for truth, *_ in runs])
     surprise = [float(surprise[3:].mean()) for *_, surprise, _ in runs]
-    assert all(0.6 < value < 1.3 for value in surprise), surprise
+    assert all(0.5 < value < 1.2 for value in surprise), surprise
 
 
 def test_never_negative_nor_fewer_than_the_probes(runs):
@@ -171,7 +176,7 @@ def test_detectors_tell_the_total_and_probes_the_destinations():
             ("detectors", equipped(), lambda o: replace(nothing(), accumulation=o.accumulation)),
             ("probes", equipped(), lambda o: replace(o, accumulation=nothing().accumulation)),
             ("nothing", equipped(), lambda o: nothing())):
-        truth, estimate, *_ = watch(4, known, changed=changed)
+        truth, estimate, *_ = watch(2, known, changed=changed)
         off[name] = rmse((estimate - truth).sum(axis=2)), rmse(estimate - truth)
     assert max(off["detectors"][0], off["probes"][0]) < 0.5 * off["nothing"][0]
     assert off["probes"][1] < off["detectors"][1] < off["nothing"][1]
