@@ -71,6 +71,7 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
     """The training settings of `controller` in `scenario`, checked; `steps` overrides."""
     if controller not in NAMES:
         raise InputError(f"--controller: {controller!r} cannot be trained; choose one of {', '.join(NAMES)}")
+    scenario = as_modelled(scenario, controller)
     default = Training(noise=ROBUST_NOISE if controller.endswith("-robust") else 0.0)
     table = toml.Table(
         scenario.controller_options.get(controller, {}), scenario.folder / "scenario.toml" if scenario.folder else
