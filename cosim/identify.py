@@ -105,11 +105,14 @@ def network_toml(network: Network, path: Path, comment: str) -> str:
         out.write("\n[sumo]\n" + "".join(f'{key} = "{value}"\n' for key, value in sumo.items()))
     for region in range(network.regions):
         x, y = network.positions[region]
-        neighbours = ", ".join(str(h) for h in np.flatnonzero(network.adjacency[region]))
+        either = network.adjacency | network.adjacency.T
+        neighbours = ", ".join(str(h) for h in np.flatnonzero(either[region]))
+        one_way = ", ".join(str(h) for h in np.flatnonzero((either & ~network.adjacency)[region]))
+        barred = f"no_way_to = [{one_way}]\n" if one_way else ""
         curve = network.mfds[region]
         out.write(
             f'\n[[regions]]\nname = "{network.region_names[region]}"\nposition = [{x:.6g}, {y:.6g}]\n'
-            f"adjacent = [{neighbours}]\n\n[regions.mfd]\na = {curve.a:.6g}\nb = {curve.b:.6g}\nc = {curve.c:.6g}\n"
+            f"adjacent = [{neighbours}]\n{barred}\n[regions.mfd]\na = {curve.a:.6g}\nb = {curve.b:.6g}\nc = {curve.c:.6g}\n"
             f"jam = {curve.jam:.6g}\n")
     for (i, j), shares in sorted(network.own_splits.items()):
         via = ", ".join(str(h) for h in shares)
