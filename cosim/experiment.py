@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from cosim.city import ensure_built
-from cosim.plant import settings
+from cosim.plant import Settings, settings
 from cosim.regions import check_adjacency, load_city
 from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
 from nmfd import runs
@@ -49,7 +49,7 @@ def experiment(
         "scenario": scenario.name, "scenario_hash": runs.scenario_hash(model), "network": scenario.network.name,
         "network_hash": model.network.hash, "net_file_hash": runs.file_hash(files.net_file), "plant": "sumo",
         "step_s": scenario.step, "steps": scenario.steps, "demand_factor": first.demand_factor,
-        "sumo": vars(settings(scenario))}
+        "sumo": _plain(settings(scenario), scenario.folder)}
     order = [(task.controller, task.seed) for task in tasks]
     session = {"scenario_folder": str(first.scenario), "workers": workers}
     with runs.open_folder(
@@ -69,6 +69,16 @@ def experiment(
         if failures:
             raise RunFailed("; ".join(failures))
     return overview(out)
+
+
+def _plain(chosen: Settings, folder: Path | None) -> dict:
+    """The settings, of the files they name fingerprints; without those of a city's own vehicles where it has none."""
+    if not chosen.routes:
+        return {key: value for key, value in vars(chosen).items() if key not in ("begin", "departure_jitter") and (
+            value != ())}
+    return vars(chosen) | {
+        key: [runs.file_hash(folder / name) for name in getattr(chosen, key)]
+        for key in ("routes", "background", "additional")}
 
 
 def _without_model(scenario: Scenario) -> Scenario:

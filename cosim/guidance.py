@@ -68,7 +68,7 @@ class Guide:
         if self._splits is None:
             return
         for event in events:
-            if event.region != event.destination and self._random.random() < self._compliance:
+            if event.free and event.region != event.destination and self._random.random() < self._compliance:
                 self._guide(event)
 
     def _guide(self, event: Event) -> None:

@@ -11,6 +11,7 @@ from cosim.actuate import HOLD_BACK, MODES, Actuator, GatewaySignal
 from cosim.city import ensure_built
 from cosim.guidance import Guide
 from cosim.measure import Meter
+from cosim.originals import Originals, read_originals, write_originals
 from cosim.regions import City, Gateway, check_adjacency, load_city
 from cosim.sumo import Session
 from cosim.trips import write_trips
@@ -30,6 +31,14 @@ class Settings:
     actuation: "hold-back" or "redistribute"; min_green: of a gateway movement [s]
     compliance: share of the decisions in which a driver follows the route guidance [-]
     rerouting: share of the drivers with SUMO's own rerouting device [-]
+
+    Of a city with vehicles of its own (cosim import), files relative to the scenario's folder:
+    routes: their route files; without any, trips are drawn from the scenario's demand
+    background: route files of what is no demand and is left alone: public transport, persons
+    additional: SUMO's additional files: vehicle types, stops, signal programmes
+    begin: simulation time at which interval 0 begins [s]
+    departure_jitter: departures are moved by up to this, either way, by the seed [s]
+    leave_signals: signals that perimeter control leaves alone
     """
 
     step_length: float = 1.0
@@ -39,6 +48,12 @@ class Settings:
     min_green: float = 5.0
     compliance: float = 1.0
     rerouting: float = 0.0
+    routes: tuple[str, ...] = ()
+    background: tuple[str, ...] = ()
+    additional: tuple[str, ...] = ()
+    begin: float = 0.0
+    departure_jitter: float = 10.0
+    leave_signals: tuple[str, ...] = ()
 
 
 def settings(scenario: Scenario) -> Settings:
@@ -55,7 +70,15 @@ def settings(scenario: Scenario) -> Settings:
         actuation=table.text("actuation", default.actuation, MODES),
         min_green=table.number("min_green", default.min_green, low=1.0),
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
-        rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0))
+        rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0),
+        routes=table.texts("routes", ()), background=table.texts("background", ()),
+        additional=table.texts("additional", ()), begin=table.number("begin", 0.0, low=0.0),
+        departure_jitter=table.number("departure_jitter", default.departure_jitter, low=0.0),
+        leave_signals=table.texts("leave_signals", ()))
+    for key in ("routes", "background", "additional"):
+        for name in getattr(chosen, key):
+            if not (scenario.folder / name).is_file():
+                raise table.error(key, f"no such file: {scenario.folder / name}; give the path of an existing one")
     table.close()
     if abs(scenario.step / chosen.step_length - round(scenario.step / chosen.step_length)) > 1e-9:
         raise InputError(
@@ -96,9 +119,12 @@ class SumoPlant:
     since the reset.
     """
 
-    def __init__(self, scenario: Scenario, *, overrides: Settings | None = None):
-        """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network."""
-        self._scenario = scenario
+    def __init__(self, scenario: Scenario, *, overrides: Settings | None = None, demand_factor: float = 1.0):
+        """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network.
+
+        demand_factor: of the city's own vehicles, where the scenario names their files; its demand has it already.
+        """
+        self._scenario, self._factor, self._originals = scenario, demand_factor, None
         self._settings = overrides or settings(scenario)
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
@@ -113,13 +139,18 @@ class SumoPlant:
         self._end_session()
         scenario, chosen = self._scenario, self._settings
         routes = Path(self._folder.name) / "trips.rou.xml"
-        self.trips = write_trips(self.city, scenario.demand, scenario.step, seed, routes)
-        options = ()
+        self._drawn, files = self._write_vehicles(routes, seed), [routes]
+        options = ["--begin", str(chosen.begin), "--ignore-route-errors", str(bool(chosen.routes)).lower()]
         if chosen.rerouting > 0:
-            options = ("--device.rerouting.probability", str(chosen.rerouting), "--device.rerouting.period", "60")
+            options += ["--device.rerouting.probability", str(chosen.rerouting), "--device.rerouting.period", "60"]
+        if scenario.folder is not None:
+            files += [scenario.folder / name for name in chosen.background]
+            if chosen.additional:
+                options += ["--additional-files", ",".join(str(scenario.folder / name) for name in chosen.additional)]
         self._session = Session(
-            self._net_file, routes, seed=seed, step_length=chosen.step_length,
-            time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action, options=options)
+            self._net_file, files, seed=seed, step_length=chosen.step_length,
+            time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action,
+            options=tuple(options))
         self._meter = Meter(self._session, self.city)
         self._guide = Guide(
             self._session, self.city, compliance=chosen.compliance,
@@ -182,6 +213,22 @@ class SumoPlant:
         """Gateways that no fixed-time signal controls: perimeter control does not reach them."""
         return [g for g in self.city.gateways if g.signal not in self._signals]
 
+    @property
+    def trips(self) -> int:
+        """Vehicles of the run: those drawn from the demand, or of a city's own those that were due so far."""
+        if not self._settings.routes:
+            return self._drawn
+        return int(self._meter.departures.sum() + self._meter.backlog().sum())
+
+    def _write_vehicles(self, path: Path, seed: int) -> int:
+        scenario, chosen = self._scenario, self._settings
+        if not chosen.routes:
+            return write_trips(self.city, scenario.demand, scenario.step, seed, path)
+        if self._originals is None:
+            self._originals: Originals | None = read_originals([scenario.folder / name for name in chosen.routes])
+        return write_originals(
+            self._originals, path, seed=seed, factor=self._factor, jitter=chosen.departure_jitter, begin=chosen.begin)
+
     def _end_session(self) -> None:
         if self._session is not None:
             self._session.close()
@@ -195,6 +242,8 @@ class SumoPlant:
                     movements.setdefault(gateway.signal, {})[link] = (gateway.source, gateway.target)
         signals = {}
         for signal in sorted(movements):
+            if signal in self._settings.leave_signals:
+                continue
             programme = self._session.programme(signal)
             if programme.static:
                 signals[signal] = GatewaySignal(

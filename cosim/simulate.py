@@ -57,7 +57,7 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
     begin = time.perf_counter()
     scenario = scenario_of(task)
     controller = registry.make(task.controller, scenario, policy=task.policy)
-    plant = SumoPlant(scenario)
+    plant = SumoPlant(scenario, demand_factor=task.demand_factor)
     try:
         trajectory = runs.labelled(
             closed_loop.run(plant, controller, scenario, seed=task.seed, progress=progress),
