@@ -12,6 +12,10 @@ from nmfd import runs
 from nmfd.errors import InputError
 
 STREAM = 7102  # keeps these random numbers apart from others of the same seed
+# Vehicle classes that keep to their lines, or do not use the road as cars do.
+BOUND = frozenset({
+    "bus", "coach", "tram", "rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car", "ship",
+    "aircraft", "bicycle", "pedestrian", "scooter", "wheelchair", "container", "drone"})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,12 +7,8 @@ from pathlib import Path
 
 import libsumo
 
+from cosim.originals import BOUND
 from nmfd.errors import InputError
-
-# Vehicle classes that keep to their lines, or do not use the road as cars do.
-BOUND = frozenset({
-    "bus", "coach", "tram", "rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car", "ship",
-    "aircraft", "bicycle", "pedestrian", "scooter", "wheelchair", "container", "drone"})
 
 
 @dataclass(frozen=True, kw_only=True)

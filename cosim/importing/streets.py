@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from cosim.importing.case import opened, read_xml, seconds
 from cosim.regions import for_cars
@@ -33,7 +33,7 @@ class Streets:
     drivable: (E,) bool, at least one lane for cars
     length [m], lanes (those for cars), speed [m/s]: (E,)
     shapes: E arrays (n, 2) [m]; centre: (E, 2) [m], half way along
-    junctions: (E, 2), numbers of the junctions where the edge begins and ends
+    junctions: (E, 2), numbers of the junctions where the edge begins and ends; places: junction -> its number
     links: (L, 2) edges that a connection joins, both drivable, by lanes for cars; all_links: for any vehicle
     roundabouts: lists of edges
     logics: signal -> its programmes, the one that runs last
@@ -49,6 +49,7 @@ class Streets:
     shapes: tuple[np.ndarray, ...]
     centre: np.ndarray
     junctions: np.ndarray
+    places: Mapping[str, int]
     links: np.ndarray
     all_links: np.ndarray
     roundabouts: tuple[tuple[int, ...], ...]
@@ -74,6 +75,19 @@ class Streets:
     def core(self) -> np.ndarray:
         """(E,) bool: the largest set of edges of which each can be reached from each."""
         return self._largest("strong")
+
+    def connected(self, pairs: Iterable[tuple[int, int]]) -> dict[tuple[int, int], bool]:
+        """Whether a way leads from the first edge of each pair to its second, for a vehicle that may use every lane."""
+        onward = graph(self.all_links, len(self.edges))
+        wanted: dict[int, list[int]] = {}
+        for first, last in sorted(set(pairs)):
+            wanted.setdefault(first, []).append(last)
+        found = {}
+        for first, ends in wanted.items():
+            reached = np.zeros(len(self.edges), dtype=bool)
+            reached[breadth_first_order(onward, first, return_predecessors=False)] = True
+            found |= {(first, last): bool(reached[last]) for last in ends}
+        return found
 
     def _largest(self, kind: str) -> np.ndarray:
         count, part = connected_components(graph(self.links, len(self.edges)), directed=True, connection=kind)
@@ -168,7 +182,7 @@ def _streets(net, rows, junctions, links, roundabouts, logics, left_hand) -> Str
         path=net, edges=edges, drivable=np.array([bool(rows[edge][0]) for edge in edges]),
         length=np.array([rows[edge][1] for edge in edges]), lanes=np.array([len(rows[edge][0]) for edge in edges]),
         speed=np.array([rows[edge][2] for edge in edges]), shapes=shapes,
-        centre=np.array([_middle(shape) for shape in shapes]), junctions=ends,
+        centre=np.array([_middle(shape) for shape in shapes]), junctions=ends, places=places,
         links=np.array(cars, dtype=int).reshape(-1, 2), all_links=np.array(every, dtype=int).reshape(-1, 2),
         roundabouts=tuple(tuple(number[e] for e in ring if e in number) for ring in roundabouts),
         logics={signal: tuple(found) for signal, found in sorted(logics.items())}, left_hand=left_hand)
