@@ -143,6 +143,40 @@ def identify(scenario: Path, levels: str, seeds: int, workers: int, out: Path | 
     click.echo(f"Written to {loaded.network.folder / 'network.toml'}; samples and pictures to {out}")
 
 
+@main.command(name="import")
+@click.argument("source", type=FILE, metavar="SUMOCFG|NET")
+@click.option("--regions", type=click.IntRange(min=2), metavar="N", help="How many regions to cut the city into.")
+@click.option("--out", type=FOLDER, required=True, metavar="DIR", help="The network's folder, such as networks/mycity.")
+@click.option("--scenario", type=FOLDER, metavar="DIR", help="[default: scenarios/<name>, beside the networks]")
+@click.option("--method", type=click.Choice(["density", "geometric"]), default="density", show_default=True)
+@click.option("--begin", metavar="TIME", help="Instead of the sumocfg's, in seconds or as hours:minutes:seconds.")
+@click.option("--end", metavar="TIME", help="Later departures are left out.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--no-run", is_flag=True, help="Do not simulate the city first: no densities, no measured boundary flows.")
+@click.option("--force", is_flag=True, help="Replace a network and scenario that are there.")
+def import_(
+    source: Path, regions: int | None, out: Path, scenario: Path | None, method: str, begin: str | None,
+    end: str | None, seed: int, no_run: bool, force: bool,
+) -> None:
+    """Turn any SUMO city into a network and a scenario: regions, gateways, demand by pair of regions, map.
+
+    \b
+    Example:
+      cosim import city.sumocfg --regions 5 --out networks/mycity
+    """
+    from cosim.importing.importer import Order, import_city, parse_time
+    from nmfd.progress import progress_line
+
+    order = Order(
+        source=source, regions=regions, out=out, method=method, seed=seed, run=not no_run, force=force,
+        scenario=scenario or out.parent.parent / "scenarios" / out.name, begin=parse_time(begin, "--begin"),
+        end=parse_time(end, "--end"))
+    with progress_line("import") as progress:
+        report = import_city(order, (lambda stage: progress(0, 1, stage)) if progress else lambda stage: None)
+    click.echo(report)
+    click.echo(f"Written to {order.out} (see map.png, quality.csv, gateways.csv) and {order.scenario}")
+
+
 def _experiment(tasks: list, out: Path | None) -> tuple:
     """The run folder of the tasks, and its overview."""
     from cosim import experiment

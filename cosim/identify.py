@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,10 +98,15 @@ def fit_table(network: Network, samples: Sequence[dict]) -> str:
 
 def network_toml(network: Network, path: Path, comment: str) -> str:
     """network.toml of `network`, with the table [sumo] of the one at `path`."""
+    return render_network(network, toml.read(path).raw_table("sumo"), comment)
+
+
+def render_network(network: Network, sumo: Mapping[str, str], comment: str) -> str:
+    """network.toml of `network`, with the table [sumo] given."""
     out = io.StringIO()
     out.write(f"# {comment}\nname = \"{network.name}\"\n\n")
     out.write(f"[perimeter]\nmin = {network.u_min:g}\nmax = {network.u_max:g}\n")
-    if sumo := toml.read(path).raw_table("sumo"):
+    if sumo:
         out.write("\n[sumo]\n" + "".join(f'{key} = "{value}"\n' for key, value in sumo.items()))
     for region in range(network.regions):
         x, y = network.positions[region]

@@ -44,6 +44,7 @@ class City:
     successors: normal edge -> the edges that follow, sorted
     turn_time: (from_edge, to_edge) -> free-flow time on the junction between them [s]
     gateways: sorted by source, target, from_edge, to_edge
+    signals: edge -> the signal at its end, as far as it has links for cars
     """
 
     net_file: Path
@@ -56,6 +57,7 @@ class City:
     successors: Mapping[str, tuple[str, ...]]
     turn_time: Mapping[tuple[str, str], float]
     gateways: tuple[Gateway, ...]
+    signals: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,8 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
         region_of=region_of | _internal_regions(connections, region_of, internal), edges=edges,
         length={e: lanes_of[e][0][0] for e in edges}, lanes={e: len(lanes_of[e]) for e in edges},
         speed={e: max(speed for _, speed in lanes_of[e]) for e in edges},
-        successors={edge: tuple(after) for edge, after in successors.items()}, turn_time=times, gateways=gateways)
+        successors={edge: tuple(after) for edge, after in successors.items()}, turn_time=times, gateways=gateways,
+        signals={c.source: c.signal for c in links if c.signal})
 
 
 def check_adjacency(city: City, network: Network) -> None:
