@@ -8,8 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
+from cosim.importing.layers import sampled
 from cosim.importing.streets import Streets
+
+ASIDE = 30.0      # m between the carriageways of one street, at most
+OPPOSED = -0.9    # cosine of the angle between their directions, at most
+LARGEST = 0.02    # of the network: no block grows beyond by joining carriageways
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +50,7 @@ def make_blocks(streets: Streets) -> Blocks:
     pairs = pairs[inside[pairs].all(axis=1)]
     same = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
     _, label = connected_components(same, directed=False)
+    label = _carriageways(streets, label)
     _, number = np.unique(label[inside], return_inverse=True)
     of = np.full(size, -1)
     of[inside] = number
@@ -61,6 +68,34 @@ def make_blocks(streets: Streets) -> Blocks:
     apart = np.hypot(*(position[near.row] - position[near.col]).T)
     near = csr_array((np.maximum(apart, 1.0), (near.row, near.col)), shape=(count, count))
     return Blocks(of=of, weight=weight, position=position, near=near, joins=joins)
+
+
+def _carriageways(streets: Streets, label: np.ndarray) -> np.ndarray:
+    """Join the two sides of divided roads: an edge and the one that runs the other way beside most of it."""
+    points, of = sampled(streets, streets.main_part)
+    first = np.searchsorted(of, of, side="left")
+    last = np.searchsorted(of, of, side="right") - 1
+    place = np.arange(len(of))
+    heading = points[np.minimum(place + 1, last)] - points[np.maximum(place - 1, first)]
+    heading /= np.maximum(np.hypot(*heading.T), 1e-9)[:, None]
+    pairs = cKDTree(points).query_pairs(ASIDE, output_type="ndarray")
+    pairs = pairs[(heading[pairs[:, 0]] * heading[pairs[:, 1]]).sum(axis=1) < OPPOSED]
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    beside = np.unique(np.column_stack([pairs[:, 0], of[pairs[:, 1]]]), axis=0)  # every point once per other edge
+    edges, votes = np.unique(np.column_stack([of[beside[:, 0]], beside[:, 1]]), axis=0, return_counts=True)
+    count = np.bincount(of, minlength=len(label))
+    edges = edges[votes > 0.5 * count[edges[:, 0]]]
+    size, limit = np.bincount(label, streets.lane_metres), LARGEST * streets.lane_metres.sum()
+    label, group = label.copy(), {}
+    for n, name in enumerate(label):
+        group.setdefault(int(name), []).append(n)
+    for a, b in edges:
+        one, other = int(label[a]), int(label[b])
+        if one != other and size[one] + size[other] <= limit:
+            group[one] += group.pop(other)
+            label[group[one]] = one
+            size[one] += size[other]
+    return label
 
 
 def _opposite(streets: Streets) -> np.ndarray:

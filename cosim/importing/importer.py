@@ -8,7 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -66,15 +66,16 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
         if order.run:
             tell("simulating without control")
             baseline = _baseline(streets, case, clock, folder, files)
+        left = left_alone(streets, traffic)
         tell("partition")
         regions = partition(
-            streets, baseline, regions=order.regions, method=order.method, given=order.given, seed=order.seed)
+            streets, baseline, regions=order.regions, method=order.method, given=order.given, seed=order.seed,
+            left_alone=left)
         name = order.out.name
         network = model.network_of(streets, regions, name, baseline)
         _write_net(case.net, net_folder / NET)
         _write_csv(net_folder / "regions.csv", ("edge", "region"), zip(streets.edges, regions, strict=True))
         city = load_city(net_folder / NET, net_folder / "regions.csv", network.regions)
-        left = left_alone(streets, traffic)
         found = quality.tables(streets, regions, network.region_names, city, baseline, left)
         tell("writing")
         _write_network(net_folder, streets, regions, network, found, baseline, order)
@@ -108,8 +109,6 @@ def _check_free(order: Order) -> None:
 
 def _windowed(case: Case, order: Order) -> Case:
     """The case from --begin to --end, where these are given."""
-    from dataclasses import replace
-
     begin = case.begin if order.begin is None else order.begin
     end = case.end if order.end is None else order.end
     if end is not None and end <= begin:

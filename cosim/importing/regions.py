@@ -9,12 +9,12 @@ from cosim.importing.streets import Streets, graph
 DIRECTIONS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
 
 
-def finish(streets: Streets, labels: np.ndarray) -> np.ndarray:
+def finish(streets: Streets, labels: np.ndarray, *, renumber: bool = True) -> np.ndarray:
     """(E,) region of every edge, from `labels` (E,) of the edges for cars, -1 where none is known yet.
 
     Every region is made connected by the connections between its edges, and all regions can be reached from each
     other: pieces and regions that fail go to a neighbour, so that fewer regions may be left than were asked for.
-    Numbered from north to south. Edges closed to cars, and parts of the network that nothing joins to the rest, belong
+    Numbered from north to south, or with renumber = False in the order of the labels. Edges closed to cars, and parts of the network that nothing joins to the rest, belong
     to a region that they adjoin, or the nearest.
     """
     regions = labels.copy()
@@ -27,7 +27,7 @@ def finish(streets: Streets, labels: np.ndarray) -> np.ndarray:
         regions = _merged(streets, regions, victim)
     everywhere = np.ones(len(streets.edges), dtype=bool)
     regions = _spread(streets, regions, streets.all_links, everywhere)
-    return _numbered(streets, regions)
+    return _numbered(streets, regions) if renumber else np.unique(regions, return_inverse=True)[1]
 
 
 def connect(streets: Streets, regions: np.ndarray) -> np.ndarray:

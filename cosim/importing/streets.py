@@ -35,6 +35,7 @@ class Streets:
     shapes: E arrays (n, 2) [m]; centre: (E, 2) [m], half way along
     junctions: (E, 2), numbers of the junctions where the edge begins and ends; places: junction -> its number
     links: (L, 2) edges that a connection joins, both drivable, by lanes for cars; all_links: for any vehicle
+    link_signals: L signals, of each of the links, None without one
     roundabouts: lists of edges
     logics: signal -> its programmes, the one that runs last
     left_hand: the traffic keeps left
@@ -52,6 +53,7 @@ class Streets:
     places: Mapping[str, int]
     links: np.ndarray
     all_links: np.ndarray
+    link_signals: tuple[str | None, ...]
     roundabouts: tuple[tuple[int, ...], ...]
     logics: Mapping[str, tuple[Logic, ...]]
     left_hand: bool
@@ -107,7 +109,7 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
     """
     rows: dict[str, tuple] = {}
     junctions: dict[str, tuple[float, float]] = {}
-    links: list[tuple[str, str, int, int]] = []
+    links: list[tuple] = []
     roundabouts: list[list[str]] = []
     logics: dict[str, list[Logic]] = {}
     left_hand = False
@@ -130,7 +132,7 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
                     rows[element.get("id")] = _edge(element)
                 elif element.tag == "connection" and not element.get("from").startswith(":"):
                     links.append((element.get("from"), element.get("to"), int(element.get("fromLane")),
-                                  int(element.get("toLane"))))
+                                  int(element.get("toLane")), element.get("tl")))
                 elif element.tag == "junction" and element.get("type") != "internal":
                     junctions[element.get("id")] = float(element.get("x")), float(element.get("y"))
                 elif element.tag == "roundabout":
@@ -174,9 +176,10 @@ def _streets(net, rows, junctions, links, roundabouts, logics, left_hand) -> Str
     number = {edge: n for n, edge in enumerate(edges)}
     places: dict[str, int] = {}
     ends = np.array([[places.setdefault(name, len(places)) for name in rows[edge][4:6]] for edge in edges])
-    known = [(a, b, m, n) for a, b, m, n in links if a in number and b in number]
-    every = sorted({(number[a], number[b]) for a, b, _, _ in known})
-    cars = sorted({(number[a], number[b]) for a, b, m, n in known if m in rows[a][0] and n in rows[b][0]})
+    known = [link for link in links if link[0] in number and link[1] in number]
+    every = sorted({(number[a], number[b]) for a, b, *_ in known})
+    signal_of = {(number[a], number[b]): tl for a, b, m, n, tl in known if m in rows[a][0] and n in rows[b][0]}
+    cars = sorted(signal_of)
     shapes = tuple(rows[edge][3] for edge in edges)
     return Streets(
         path=net, edges=edges, drivable=np.array([bool(rows[edge][0]) for edge in edges]),
@@ -184,6 +187,7 @@ def _streets(net, rows, junctions, links, roundabouts, logics, left_hand) -> Str
         speed=np.array([rows[edge][2] for edge in edges]), shapes=shapes,
         centre=np.array([_middle(shape) for shape in shapes]), junctions=ends, places=places,
         links=np.array(cars, dtype=int).reshape(-1, 2), all_links=np.array(every, dtype=int).reshape(-1, 2),
+        link_signals=tuple(signal_of[pair] for pair in cars),
         roundabouts=tuple(tuple(number[e] for e in ring if e in number) for ring in roundabouts),
         logics={signal: tuple(found) for signal, found in sorted(logics.items())}, left_hand=left_hand)
 
