@@ -16,10 +16,9 @@ from itertools import accumulate
 
 import numpy as np
 
+from cosim.strategy import HOLD_BACK
 from cosim.sumo import Programme
 
-HOLD_BACK, REDISTRIBUTE = "hold-back", "redistribute"
-MODES = (HOLD_BACK, REDISTRIBUTE)
 YELLOW = 3.0  # s, where the original programme has none after a green
 GREEN = frozenset("Gg")
 

@@ -6,16 +6,19 @@ import click
 
 from nmfd.command_line import Commands, Interrupted
 from nmfd.errors import InputError
+from nmfd.workers import RunFailed
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 FILE = click.Path(path_type=Path, dir_okay=False)
-CONTROLLER_HELP = "no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc or dpc-pcrg."
+CONTROLLER_HELP = (
+    "no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc or dpc-pcrg; what else the city does is joined by +: webster, "
+    "actuated or max-pressure signals, rerouting-N (percent of the drivers), hold-back or redistribute, compliance-N.")
 
 
 @click.group(name="cosim", cls=Commands)
 @click.version_option(package_name="perimeter-cosim", prog_name="cosim")
 def main() -> None:
-    """Regional controllers in a SUMO city: run it, compare it with the regional model, identify the model.
+    """Regional controllers in a SUMO city: run, evaluate, compare with the regional model, identify it.
 
     \b
     Example:
@@ -25,7 +28,7 @@ def main() -> None:
 
 @main.command()
 @click.argument("scenario", type=FOLDER)
-@click.option("--controller", required=True, metavar="NAME", help=CONTROLLER_HELP)
+@click.option("--controller", required=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
 @click.option("--against", metavar="NAME", help="Run this controller too, on the same trips, in a second process.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True,
               help="Of the trips, the drivers and the guidance.")
@@ -45,12 +48,13 @@ def run(
     Examples:
       cosim run scenarios/grid7_peak --controller dpc-pcrg --against no-control
       cosim run scenarios/grid7_peak --controller pi-gating --seed 3 --out runs/gating
+      cosim run scenarios/grid7_peak --controller dpc-pc+rerouting-30 --against rerouting-30
     """
-    from nmfd.controllers import registry
+    from cosim import strategy
 
     names = [controller] + ([against] if against and against != controller else [])
     for name in names:
-        registry.check(name)
+        strategy.parse(name)
 
     from cosim import experiment
     from cosim.simulate import Task
@@ -64,8 +68,74 @@ def run(
 
 
 @main.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--controllers", required=True, metavar="A,B,...", help="Separated by commas. " + CONTROLLER_HELP)
+@click.option("--seeds", type=click.IntRange(min=1), default=10, show_default=True, metavar="N",
+              help="Runs per controller and demand level, on the same trips for all controllers.")
+@click.option("--first-seed", type=click.IntRange(min=0), default=2000, show_default=True, metavar="S",
+              help="The seeds are S to S + N - 1. From 2000 on they were never used in development.")
+@click.option("--demand", default="1.0", show_default=True, metavar="A,B,...",
+              help="Demand levels: multiples of the scenario's demand.")
+@click.option("--reference", metavar="NAME", help="Pair all controllers with this one too, besides no-control.")
+@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
+              help="Policy of a DPC controller, if not SCENARIO/NAME.pt. May be repeated.")
+@click.option("--workers", type=click.IntRange(min=1), metavar="N",
+              help="Runs at a time, each in a process of its own. [default: one per core]")
+@click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
+@click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-evaluate]")
+def evaluate(
+    scenario: Path, controllers: str, seeds: int, first_seed: int, demand: str, reference: str | None,
+    policies: tuple[str, ...], workers: int | None, steps: int | None, out: Path | None,
+) -> None:
+    """Compare controllers in the microsimulation over seeds and demand levels; print and write tables, draw figures.
+
+    Every run is kept as soon as it is finished. The same command goes on where it was interrupted, and more seeds,
+    controllers or demand levels are added to what is there; only the runs of a controller whose own options, policy
+    or model changed are done again.
+
+    \b
+    Examples:
+      cosim evaluate scenarios/grid7_peak --controllers no-control,pi-gating,dpc-pc --seeds 10
+      cosim evaluate scenarios/grid7_peak --controllers no-control,dpc-pc --demand 0.8,1.0,1.3 --out runs/levels
+    """
+    from cosim.strategy import parse
+    from nmfd.options import policy_files
+
+    names = [name.strip() for name in controllers.split(",")]
+    for name in names:
+        parse(name)
+    if repeated := [name for n, name in enumerate(names) if name in names[:n]]:
+        raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
+    files = policy_files(policies, names)
+
+    import os
+
+    from cosim import evaluate, tables
+    from nmfd import runs
+    from nmfd.progress import progress_line
+    from nmfd.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    chosen = evaluate.Evaluation(
+        scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
+        levels=tuple(_levels("--demand", demand)), steps=steps, policies=files, reference=reference,
+        out=Path("runs") / f"{runs.file_name(loaded.name)}-evaluate" if out is None else out)
+    workers = len(os.sched_getaffinity(0)) if workers is None else workers
+    try:
+        with progress_line("evaluate") as progress:
+            table, failures = evaluate.evaluate(chosen, workers=workers, progress=progress, tell=_tell)
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; finished runs are in {chosen.out}: the same command goes on") from None
+    if len(table):
+        click.echo(tables.text(table, reference))
+        click.echo(f"Written to {chosen.out}: see evaluate.md, pairs.csv and the pictures")
+    if failures:
+        raise RunFailed(f"{len(failures)} runs failed, and the same command tries them again: {'; '.join(failures)}")
+
+
+@main.command()
 @click.argument("target", type=FOLDER, metavar="SCENARIO|RUN")
-@click.option("--controller", default="no-control", show_default=True, metavar="NAME", help=CONTROLLER_HELP)
+@click.option("--controller", default="no-control", show_default=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
 @click.option("--out", type=FOLDER, metavar="DIR", help="Run folder of a SCENARIO. [default: runs/<scenario>-<time>]")
@@ -125,12 +195,7 @@ def identify(scenario: Path, levels: str, seeds: int, workers: int, out: Path | 
     from nmfd.progress import progress_line
     from nmfd.scenario import load_scenario
 
-    try:
-        factors = [float(level) for level in levels.split(",")]
-    except ValueError:
-        factors = [0.0]
-    if not all(0.0 < factor <= 10.0 for factor in factors):
-        raise InputError(f"--levels: expected numbers above 0 up to 10, such as 0.6,0.8,1.0, got {levels!r} instead")
+    factors = _levels("--levels", levels)
     loaded = load_scenario(scenario)
     out = Path("runs") / f"{runs.file_name(loaded.name)}-identify" if out is None else out
     try:
@@ -156,7 +221,7 @@ def identify(scenario: Path, levels: str, seeds: int, workers: int, out: Path | 
 @click.option("--begin", metavar="TIME", help="Instead of the sumocfg's, in seconds or as hours:minutes:seconds.")
 @click.option("--end", metavar="TIME", help="Later departures are left out.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-@click.option("--no-run", is_flag=True, help="Do not simulate the city first: no densities, no measured boundary flows.")
+@click.option("--no-run", is_flag=True, help="Do not simulate the city first: no densities and no flows.")
 @click.option("--force", is_flag=True, help="Replace a network and scenario that are there.")
 def import_(
     source: Path, regions: int | None, out: Path, scenario: Path | None, method: str, edges: Path | None,
@@ -190,6 +255,23 @@ def import_(
     click.echo(f"Written to {order.out} (see map.png, quality.csv, gateways.csv) and {order.scenario}")
 
 
+def _levels(option: str, text: str) -> list[float]:
+    """Demand levels separated by commas. InputError for anything else."""
+    try:
+        levels = [float(level) for level in text.split(",")]
+    except ValueError:
+        levels = [0.0]
+    if not all(0.0 < level <= 10.0 for level in levels):
+        raise InputError(f"{option}: expected numbers above 0 up to 10, such as 0.6,0.8,1.0, got {text!r} instead")
+    if len(set(levels)) < len(levels):
+        raise InputError(f"{option}: {text!r} names a level twice; name every level once")
+    return levels
+
+
+def _tell(line: str) -> None:
+    click.echo(f"cosim: {line}", err=True)
+
+
 def _experiment(tasks: list, out: Path | None) -> tuple:
     """The run folder of the tasks, and its overview."""
     from cosim import experiment
@@ -200,7 +282,7 @@ def _experiment(tasks: list, out: Path | None) -> tuple:
     out = runs.default_folder(load_scenario(tasks[0].scenario)) if out is None else out
     try:
         with progress_line("cosim") as progress:
-            return out, experiment.experiment(tasks, out=out, workers=2, progress=progress)
+            return out, experiment.experiment(tasks, out=out, workers=2, progress=progress, tell=_tell)
     except KeyboardInterrupt:
         if not (out / "summary.csv").exists():
             raise Interrupted("interrupted before a run was finished; nothing is kept") from None

@@ -31,7 +31,7 @@ class Replay:
     def __init__(self, trajectory: Trajectory):
         self.name, self._trajectory = trajectory.controller, trajectory
 
-    def reset(self) -> None:
+    def reset(self, seed: int = 0) -> None:
         pass
 
     def act(self, measurement: Measurement) -> Controls:

@@ -1,7 +1,10 @@
 """Closed-loop runs in SUMO, side by side: a run folder with table, records and pictures."""
 
+import hashlib
+import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from contextlib import ExitStack
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +14,13 @@ from cosim.city import ensure_built
 from cosim.plant import Settings, settings
 from cosim.regions import check_adjacency, load_city
 from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
+from cosim.strategy import parse
 from nmfd import runs
 from nmfd.benchmarks import REFERENCE, draw_accumulations, interval
 from nmfd.controllers import registry
 from nmfd.errors import InputError
-from nmfd.mfd import Mfd
-from nmfd.scenario import Scenario
+from nmfd.scenario import Scenario, as_modelled
+from nmfd.types import Trajectory
 from nmfd.workers import Failure, RunFailed, attempt, outcomes
 
 CAPTION = (
@@ -26,80 +30,130 @@ CAPTION = (
 
 def experiment(
     tasks: Sequence[Task], *, out: Path, workers: int = 1, progress: Callable[[int, int, str], None] | None = None,
-    model_free: bool = False,
+    tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Run the tasks that are not yet in the run folder `out`; returns `overview` of all that is there.
 
-    model_free: the runs do not depend on the regional model (no control), and stay valid when its MFDs change.
-    The tasks share scenario, steps and demand. Every finished run is kept, whatever happens to the others.
-    progress: called with what is done and to do, and what is running. Raises InputError, before anything is written,
-    for a city or controller that cannot be made; RunFailed at the end if runs failed.
+    As `perform` does it; RunFailed at the end if runs failed.
     """
-    first = tasks[0]
-    scenario = scenario_of(first)
-    controllers = {}
-    for task in tasks:
-        registry.make(task.controller, scenario, policy=task.policy)
-        policy = registry.policy_path(task.controller, scenario, task.policy)
-        controllers[task.controller] = {} if policy is None else {"policy_hash": runs.file_hash(policy)}
-    files = ensure_built(scenario.network)
-    check_adjacency(load_city(files.net_file, files.regions_csv, scenario.network.regions), scenario.network)
-    model = _without_model(scenario) if model_free else scenario
-    configuration = {
-        "scenario": scenario.name, "scenario_hash": runs.scenario_hash(model), "network": scenario.network.name,
-        "network_hash": model.network.hash, "net_file_hash": runs.file_hash(files.net_file), "plant": "sumo",
-        "step_s": scenario.step, "steps": scenario.steps, "demand_factor": first.demand_factor,
-        "sumo": _plain(settings(scenario), scenario.folder)}
-    order = [(task.controller, task.seed) for task in tasks]
-    session = {"scenario_folder": str(first.scenario), "workers": workers}
-    with runs.open_folder(
-            out, configuration=configuration, controllers=controllers, order=order, session=session) as folder:
-        finished = {run for run in folder.finished if record_path(folder.path, *run).is_file()}
-        todo = [task for task in tasks if (task.controller, task.seed) not in finished]
-        failures = []
-        for task, outcome in _outcomes(todo, workers, scenario.steps, progress):
-            if isinstance(outcome, Failure):
-                failures.append(f"controller {task.controller}, seed {task.seed}: {outcome.reason}")
-            else:
-                write_record(record_path(folder.path, task.controller, task.seed), outcome)
-                folder.add(outcome.trajectory)
-                _write_facts(folder, outcome)
-        if folder.finished:
-            draw_accumulations(folder.path, scenario, folder.trajectories())
-        if failures:
-            raise RunFailed("; ".join(failures))
+    failures = perform([(out, task) for task in tasks], workers=workers, progress=progress, tell=tell)
+    if (out / "summary.csv").is_file() and (kept := trajectories(out)):
+        draw_accumulations(out, scenario_of(tasks[0]), kept)
+    if failures:
+        raise RunFailed("; ".join(f"{label(task)}: {reason}" for task, reason in failures))
     return overview(out)
 
 
+def perform(
+    plan: Sequence[tuple[Path, Task]], *, workers: int = 1, fresh: bool = False,
+    progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
+    kept: Callable[[], None] | None = None,
+) -> list[tuple[Task, str]]:
+    """Run every task, in this order, that is not yet in its run folder; returns those that failed, and why.
+
+    The tasks of one folder share scenario, steps and demand. Every finished run is kept at once, whatever happens to
+    the others. A kept run stays valid as long as the city, its demand and what its own controller depends on
+    (`dependencies`) stay as they are.
+
+    fresh: every run in a process of its own
+    progress: called with what is done and to do, and what is running
+    tell: takes one line where the runs of a controller do not count any more because it changed; None: an InputError
+    kept: called after every run that was kept
+
+    Raises InputError, before anything is written, for a city or controller that cannot be made, and for a folder that
+    holds runs of another city or demand.
+    """
+    where = {task: path for path, task in plan}
+    settings_of = {path: _settings([t for t in where if where[t] == path]) for path in dict.fromkeys(where.values())}
+    failures = []
+    with ExitStack() as stack:
+        folders = {}
+        for path, (configuration, controllers) in settings_of.items():
+            tasks = [task for task in where if where[task] == path]
+            folders[path] = stack.enter_context(runs.open_folder(
+                path, configuration=configuration, controllers=controllers,
+                order=[(task.controller, task.seed) for task in tasks], renew=tell,
+                session={"scenario_folder": str(tasks[0].scenario), "workers": workers}))
+        there = {path: _finished(folder) for path, folder in folders.items()}
+        todo = [task for task in where if (task.controller, task.seed) not in there[where[task]]]
+        for task, outcome in _outcomes(todo, workers, fresh, progress):
+            if isinstance(outcome, Failure):
+                failures.append((task, outcome.reason))
+                continue
+            folder = folders[where[task]]
+            write_record(record_path(folder.path, task.controller, task.seed), outcome)
+            _write_facts(folder, outcome)
+            folder.add(outcome.trajectory)
+            if kept:
+                kept()
+    return failures
+
+
+def label(task: Task) -> str:
+    demand = "" if task.demand_factor == 1.0 else f", demand times {task.demand_factor:g}"
+    return f"controller {task.controller}, seed {task.seed}{demand}"
+
+
+def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> dict:
+    """What the runs of a controller depend on, besides the city and its demand, which all runs share.
+
+    Its own options, its policy or plan, the regional model and the library that computes with it. No control depends
+    on none of these. Raises InputError for a controller that cannot be made.
+    """
+    controller = parse(name).controller
+    registry.make(controller, scenario, policy=policy)
+    if controller == REFERENCE:
+        return {}
+    path = registry.policy_path(controller, scenario, policy)
+    network = as_modelled(scenario, controller).network
+    model = json.dumps([network.hash, scenario.integrator, scenario.substeps, scenario.protected])
+    return {
+        "options": scenario.controller_options.get(controller, {}),
+        "policy_hash": None if path is None else runs.file_hash(path),
+        "model_hash": hashlib.sha256(model.encode()).hexdigest()[:16], "torch": metadata.version("torch")}
+
+
+def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
+    """The configuration that the tasks of one folder share, and what each of their controllers depends on."""
+    first = tasks[0]
+    scenario = scenario_of(first)
+    policies = {task.controller: task.policy for task in tasks}
+    controllers = {name: dependencies(name, scenario, policy) for name, policy in policies.items()}
+    files = ensure_built(scenario.network)
+    check_adjacency(load_city(files.net_file, files.regions_csv, scenario.network.regions), scenario.network)
+    configuration = {
+        "scenario": scenario.name, "network": scenario.network.name, "plant": "sumo", "step_s": scenario.step,
+        "steps": scenario.steps, "demand_factor": first.demand_factor,
+        "demand_hash": hashlib.sha256(np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16],
+        "net_file_hash": runs.file_hash(files.net_file), "regions_hash": runs.file_hash(files.regions_csv),
+        "measurement_std_veh": scenario.measurement_std, "sumo": _plain(settings(scenario), scenario.folder),
+        "libsumo": metadata.version("libsumo")}
+    return configuration, controllers
+
+
 def _plain(chosen: Settings, folder: Path | None) -> dict:
-    """The settings, of the files they name fingerprints; without those of a city's own vehicles where it has none."""
-    if not chosen.routes:
-        return {key: value for key, value in vars(chosen).items() if key not in ("begin", "departure_jitter") and (
-            value != ())}
-    return vars(chosen) | {
-        key: [runs.file_hash(folder / name) for name in getattr(chosen, key)]
-        for key in ("routes", "background", "additional")}
+    """The settings; of the files that they name, fingerprints."""
+    files = {key: getattr(chosen, key) for key in ("routes", "background", "additional")}
+    return vars(chosen) | {key: [runs.file_hash(folder / name) for name in names] for key, names in files.items()} | {
+        "leave_signals": list(chosen.leave_signals)}
 
 
-def _without_model(scenario: Scenario) -> Scenario:
-    """The scenario with an arbitrary regional model and no controller options."""
-    network = scenario.network
-    mfds = (Mfd(a=0.0, b=0.0, c=1e-3, jam=1.0),) * network.regions
-    return replace(scenario, controller_options={}, network=replace(network, mfds=mfds, own_splits={}))
+def _finished(folder: runs.RunFolder) -> set[tuple[str, int]]:
+    return {run for run in folder.finished if record_path(folder.path, *run).is_file()}
 
 
-def _outcomes(todo: Sequence[Task], workers: int, steps: int, progress) -> Iterator[tuple]:
+def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress) -> Iterator[tuple]:
     """(task, Result or Failure); in this process, which reports every control interval, if one run is all there is."""
     report = progress or (lambda done, total, note: None)
-    if len(todo) == 1:
-        def tick(k, _):
+    if len(todo) == 1 and not fresh:
+        def tick(k, steps):
             report(k, steps, f"{todo[0].controller}, seed {todo[0].seed}")
 
         yield todo[0], attempt(lambda task: simulate(task, tick), todo[0])
         return
     report(0, len(todo), "")
-    for done, (task, outcome) in enumerate(outcomes(simulate, todo, workers), start=1):
-        report(done, len(todo), f"last {task.controller}, seed {task.seed}")
+    for done, (task, outcome) in enumerate(outcomes(simulate, todo, workers, fresh=fresh), start=1):
+        report(done, len(todo), f"last {label(task)}")
         yield task, outcome
 
 
@@ -125,6 +179,13 @@ def read_run(folder: Path, controller: str, seed: int) -> Result:
         raise InputError(f"{path}: is no record of a run ({error}); delete it and run again") from None
     trajectory = runs.read_trajectory(folder / f"{controller}-{seed}.npz")
     return Result(trajectory=trajectory, record=record, facts={})
+
+
+def trajectories(folder: Path) -> list[Trajectory]:
+    """The finished runs of the run folder. Raises InputError."""
+    return [
+        runs.read_trajectory(folder / f"{row['controller']}-{row['seed']}.npz")
+        for row in runs.read_summary(folder / "summary.csv")]
 
 
 def _write_facts(folder: runs.RunFolder, result: Result) -> None:

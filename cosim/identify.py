@@ -37,8 +37,7 @@ def identify(
         folder = out / f"level-{level:g}"
         tasks = [
             Task(scenario=scenario, controller="no-control", seed=seed, demand_factor=level) for seed in seeds]
-        experiment.experiment(
-            tasks, out=folder, workers=workers, progress=tell if progress else None, model_free=True)
+        experiment.experiment(tasks, out=folder, workers=workers, progress=tell if progress else None)
         results += [experiment.read_run(folder, "no-control", seed) for seed in seeds]
     network = loaded.network
     samples = [
@@ -117,8 +116,8 @@ def render_network(network: Network, sumo: Mapping[str, str], comment: str) -> s
         curve = network.mfds[region]
         out.write(
             f'\n[[regions]]\nname = "{network.region_names[region]}"\nposition = [{x:.6g}, {y:.6g}]\n'
-            f"adjacent = [{neighbours}]\n{barred}\n[regions.mfd]\na = {curve.a:.6g}\nb = {curve.b:.6g}\nc = {curve.c:.6g}\n"
-            f"jam = {curve.jam:.6g}\n")
+            f"adjacent = [{neighbours}]\n{barred}\n[regions.mfd]\na = {curve.a:.6g}\nb = {curve.b:.6g}\n"
+            f"c = {curve.c:.6g}\njam = {curve.jam:.6g}\n")
     for (i, j), shares in sorted(network.own_splits.items()):
         via = ", ".join(str(h) for h in shares)
         share = ", ".join(f"{value:.4f}" for value in shares.values())

@@ -16,7 +16,8 @@ class LedgerError(RuntimeError):
 @dataclass
 class _Vehicle:
     """origin, destination: regions; edge: the last edge of its route; free: guidance may reroute it; region: where it
-    is now, None before the departure; announced: the region of its last Event (on a junction it may be ahead of that)."""
+    is now, None before the departure; announced: the region of its last Event (on a junction it may be ahead of
+    that)."""
 
     origin: int
     destination: int

@@ -56,7 +56,9 @@ def read_originals(paths: Sequence[Path]) -> Originals:
     return Originals(depart=departs[order], elements=tuple(elements[n][1] for n in order))
 
 
-def draw(originals: Originals, *, seed: int, factor: float, jitter: float, begin: float) -> list[tuple[float, int, str]]:
+def draw(
+    originals: Originals, *, seed: int, factor: float, jitter: float, begin: float,
+) -> list[tuple[float, int, str]]:
     """(departure [s], number of the vehicle, its id) sorted by departure, for one run.
 
     factor: the demand is multiplied by it. Vehicles are left out, or driven twice or more (ids with .1, .2 and so on),

@@ -7,20 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.actuate import HOLD_BACK, MODES, Actuator, GatewaySignal
+from cosim.actuate import GREEN, Actuator, GatewaySignal
 from cosim.city import ensure_built
 from cosim.guidance import Guide
 from cosim.measure import Meter
 from cosim.originals import Originals, read_originals, write_originals
 from cosim.regions import City, Gateway, check_adjacency, load_city
+from cosim.strategy import FIXED, HOLD_BACK, MODES, SIGNALS
 from cosim.sumo import Session
+from cosim.trip_facts import TripFacts, read_trip_facts, trip_options
 from cosim.trips import write_trips
 from nmfd import toml
 from nmfd.errors import InputError
-from nmfd.scenario import Scenario
+from nmfd.scenario import Scenario, read_tables
 from nmfd.types import Controls, Measurement
 
-PRODUCTION_EVERY = 10.0  # s, between two samples of the production
+SAMPLE_EVERY = 10.0  # s, between two samples of the production and of the queues
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +33,8 @@ class Settings:
     actuation: "hold-back" or "redistribute"; min_green: of a gateway movement [s]
     compliance: share of the decisions in which a driver follows the route guidance [-]
     rerouting: share of the drivers with SUMO's own rerouting device [-]
+    signals: one of cosim.strategy.SIGNALS; gateways_fixed (of the strategy, no key of the table): whether signals with
+        a gateway movement stay fixed-time, for perimeter control, where the others are actuated or max-pressure
 
     Of a city with vehicles of its own (cosim import), files relative to the scenario's folder:
     routes: their route files; without any, trips are drawn from the scenario's demand
@@ -48,6 +52,8 @@ class Settings:
     min_green: float = 5.0
     compliance: float = 1.0
     rerouting: float = 0.0
+    signals: str = FIXED
+    gateways_fixed: bool = True
     routes: tuple[str, ...] = ()
     background: tuple[str, ...] = ()
     additional: tuple[str, ...] = ()
@@ -61,7 +67,7 @@ def settings(scenario: Scenario) -> Settings:
     if scenario.folder is None:
         return Settings()
     path, default = scenario.folder / "scenario.toml", Settings()
-    table = toml.Table(toml.read(path).raw_table("sumo"), path, "sumo.")
+    table = toml.Table(read_tables(scenario.folder).raw_table("sumo"), path, "sumo.")
     chosen = Settings(
         step_length=table.number("step_length", default.step_length, above=0.0, high=1.0),
         time_to_teleport=table.number("time_to_teleport", default.time_to_teleport, low=-1.0),
@@ -71,6 +77,7 @@ def settings(scenario: Scenario) -> Settings:
         min_green=table.number("min_green", default.min_green, low=1.0),
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
         rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0),
+        signals=table.text("signals", default.signals, SIGNALS),
         routes=table.texts("routes", ()), background=table.texts("background", ()),
         additional=table.texts("additional", ()), begin=table.number("begin", 0.0, low=0.0),
         departure_jitter=table.number("departure_jitter", default.departure_jitter, low=0.0),
@@ -94,9 +101,12 @@ class Record:
     departures: (T, R, R) [veh]; arrivals: (T, R) [veh], by the region of the destination
     crossings: (T, R, R, R) [veh], [i, h, j] = from i to h, bound for j
     production: (T, R) [veh m/s], mean of samples; mean_accumulation: (T, R) [veh], of the same samples
+    edge_vehicles: (T, E) [veh], mean of the same samples, by the city's edges
     gateway_green: (T, G) [s], green shown per gateway, its links' mean; NaN without a signal
+    gateway_original_green: (T, G) [s], the same in the original programme
     gateway_flow: (T, G) [veh] over the boundary there
-    gateway_queue: (T, G) [veh] halting before it at the end of the interval
+    gateway_queue, gateway_queue_max: (T, G) [veh] halting on the edge before it, mean and largest of samples; gateways
+        that share this edge share its queue
     teleports: (T,); guided: (T, R, R, R) [veh], reroutes by route guidance
     """
 
@@ -105,9 +115,12 @@ class Record:
     crossings: np.ndarray
     production: np.ndarray
     mean_accumulation: np.ndarray
+    edge_vehicles: np.ndarray
     gateway_green: np.ndarray
+    gateway_original_green: np.ndarray
     gateway_flow: np.ndarray
     gateway_queue: np.ndarray
+    gateway_queue_max: np.ndarray
     teleports: np.ndarray
     guided: np.ndarray
 
@@ -119,17 +132,16 @@ class SumoPlant:
     since the reset.
     """
 
-    def __init__(self, scenario: Scenario, *, overrides: Settings | None = None, demand_factor: float = 1.0):
-        """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network.
-
-        demand_factor: of the city's own vehicles, where the scenario names their files; its demand has it already.
-        """
-        self._scenario, self._factor, self._originals = scenario, demand_factor, None
+    def __init__(self, scenario: Scenario, *, overrides: Settings | None = None):
+        """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network."""
+        self._scenario, self._originals = scenario, None
         self._settings = overrides or settings(scenario)
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
         check_adjacency(self.city, scenario.network)
         self._edge_region = np.array([self.city.region_of[edge] for edge in self.city.edges])
+        self._upstream = sorted({g.from_edge for g in self.city.gateways})
+        self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in self.city.gateways], dtype=int)
         self._net_file = files.net_file
         self._folder = tempfile.TemporaryDirectory(prefix="cosim-")
         self._session: Session | None = None
@@ -140,7 +152,10 @@ class SumoPlant:
         scenario, chosen = self._scenario, self._settings
         routes = Path(self._folder.name) / "trips.rou.xml"
         self._drawn, files = self._write_vehicles(routes, seed), [routes]
-        options = ["--begin", str(chosen.begin), "--ignore-route-errors", str(bool(chosen.routes)).lower()]
+        self._trip_file = routes.with_name("tripinfo.xml")
+        options = [
+            *trip_options(self._trip_file), "--begin", str(chosen.begin), "--ignore-route-errors",
+            str(bool(chosen.routes)).lower()]
         if chosen.rerouting > 0:
             options += ["--device.rerouting.probability", str(chosen.rerouting), "--device.rerouting.period", "60"]
         if scenario.folder is not None:
@@ -156,6 +171,7 @@ class SumoPlant:
             self._session, self.city, compliance=chosen.compliance,
             random=np.random.default_rng([seed, 0x67756964]))
         self._signals = self._gateway_signals()
+        self._original_green = self._programmed_green()
         self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
         self._k, self._rows, self._speed = 0, [], None
         return self._measurement()
@@ -166,16 +182,17 @@ class SumoPlant:
         self._actuator.command(controls.perimeter, network.u_min, network.u_max)
         self._guide.command(controls.splits, self._speed)
         begin, steps = session.time, round(self._scenario.step / session.step_length)
-        every = max(1, round(PRODUCTION_EVERY / session.step_length))
+        every = max(1, round(SAMPLE_EVERY / session.step_length))
         vehicles, metres = np.zeros((2, len(self.city.edges)))  # sums over the samples, by edge: n and n v
-        samples = 0
+        queues = []
         for n in range(steps):
             self._actuator.play(session.time)
             session.step()
             self._guide.apply(meter.observe())
             if n % every == every - 1:
                 counts, speeds = self._sample()
-                vehicles, metres, samples = vehicles + counts, metres + counts * speeds, samples + 1
+                vehicles, metres = vehicles + counts, metres + counts * speeds
+                queues.append([session.halting(edge) for edge in self._upstream])
         self._k += 1
         assert abs(session.time - begin - self._scenario.step) < 1e-6
         measurement = self._measurement()
@@ -184,8 +201,12 @@ class SumoPlant:
         with np.errstate(invalid="ignore"):
             self._speed = metres / vehicles
         row["production"], row["mean_accumulation"] = (
-            np.bincount(self._edge_region, amount, network.regions) / max(samples, 1) for amount in (metres, vehicles))
-        row["gateway_queue"] = np.array([session.halting(g.from_edge) for g in self.city.gateways])
+            np.bincount(self._edge_region, amount, network.regions) / len(queues) for amount in (metres, vehicles))
+        row["edge_vehicles"] = (vehicles / len(queues)).astype(np.float16)  # to 0.1 % and as small as an integer
+        queues = np.array(queues).reshape(len(queues), len(self._upstream))
+        row["gateway_queue"], row["gateway_queue_max"] = (
+            queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))
+        row["gateway_original_green"] = self._original_green
         self._rows.append(row)
         return measurement
 
@@ -199,6 +220,12 @@ class SumoPlant:
     def record(self) -> Record:
         """Of all control intervals since the reset."""
         return Record(**{key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]})
+
+    def trip_facts(self) -> TripFacts:
+        """Ends the simulation, for only then does SUMO tell of the trips under way."""
+        end = self._session.time
+        self._end_session()
+        return read_trip_facts(self._trip_file, end)
 
     @property
     def sumo_time(self) -> float:
@@ -227,7 +254,8 @@ class SumoPlant:
         if self._originals is None:
             self._originals: Originals | None = read_originals([scenario.folder / name for name in chosen.routes])
         return write_originals(
-            self._originals, path, seed=seed, factor=self._factor, jitter=chosen.departure_jitter, begin=chosen.begin)
+            self._originals, path, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
+            begin=chosen.begin)
 
     def _end_session(self) -> None:
         if self._session is not None:
@@ -250,6 +278,17 @@ class SumoPlant:
                     programme, movements[signal], min_green=self._settings.min_green,
                     mode=self._settings.actuation, start=self._session.time)
         return signals
+
+    def _programmed_green(self) -> np.ndarray:
+        """(G,) [s] per control interval, as Record.gateway_original_green."""
+        green = np.full(len(self.city.gateways), np.nan)
+        for n, gateway in enumerate(self.city.gateways):
+            if gateway.signal in self._signals:
+                programme = self._session.programme(gateway.signal)
+                lasting = [phase.duration * (phase.state[link] in GREEN)
+                           for phase in programme.phases for link in gateway.links]
+                green[n] = sum(lasting) / len(gateway.links) * self._scenario.step / programme.cycle
+        return green
 
     def _measurement(self) -> Measurement:
         return Measurement(

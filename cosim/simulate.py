@@ -7,19 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
+from cosim.strategy import parse
 from nmfd.scenario import Scenario, load_scenario
 from nmfd.types import Trajectory
 
 # Columns of sumo.csv, beside those of summary.csv.
 FACTS = (
     "controller", "seed", "trips", "departed_veh", "final_backlog_veh", "total_backlog_veh_s", "teleports",
-    "leaking_share", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s")
+    "mean_trip_time_s", "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh",
+    "gateway_queue_max_veh", "gateway_full_share", "late_decisions", "fallbacks", "leaking_share", "wall_time_s",
+    "sumo_time_s", "overhead_share", "setup_time_s")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """scenario: its folder; policy: of a DPC controller, instead of the scenario's own; steps: control intervals, all
-    if None; demand_factor: all flows of the scenario are multiplied by it."""
+    """scenario: its folder; controller: a strategy (cosim.strategy); policy: of a DPC controller, instead of the
+    scenario's own; steps: control intervals, all if None; demand_factor: multiplies all flows."""
 
     scenario: Path
     controller: str
@@ -42,22 +45,25 @@ def scenario_of(task: Task) -> Scenario:
     """The scenario with the horizon and demand of `task`. Raises InputError."""
     scenario = load_scenario(task.scenario)
     steps = scenario.steps if task.steps is None else min(task.steps, scenario.steps)
-    return replace(scenario, steps=steps, demand=task.demand_factor * scenario.demand[:steps])
+    return replace(
+        scenario, steps=steps, demand=task.demand_factor * scenario.demand[:steps],
+        demand_factor=task.demand_factor * scenario.demand_factor)
 
 
 def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> Result:
     """Run `task` in this process, which must hold no other SUMO session. Raises InputError."""
     import torch
 
-    from cosim.plant import SumoPlant
+    from cosim import facts
+    from cosim.plant import SumoPlant, settings
     from nmfd import closed_loop, runs
     from nmfd.controllers import registry
 
     torch.set_num_threads(1)  # runs stand side by side, one core each
     begin = time.perf_counter()
-    scenario = scenario_of(task)
-    controller = registry.make(task.controller, scenario, policy=task.policy)
-    plant = SumoPlant(scenario, demand_factor=task.demand_factor)
+    scenario, strategy = scenario_of(task), parse(task.controller)
+    controller = registry.make(strategy.controller, scenario, policy=task.policy)
+    plant = SumoPlant(scenario, overrides=replace(settings(scenario), **strategy.overrides))
     try:
         trajectory = runs.labelled(
             closed_loop.run(plant, controller, scenario, seed=task.seed, progress=progress),
@@ -65,16 +71,16 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
         record = plant.record()
         departed = int(record.departures.sum())
         backlog = trajectory.backlog.sum(axis=(1, 2))
-        leaks, flow = set(plant.leaks()), record.gateway_flow.sum(axis=0)
-        leaking = sum(passed for gateway, passed in zip(plant.city.gateways, flow, strict=True) if gateway in leaks)
-        facts = {
+        sumo_time, leaks = plant.sumo_time, set(plant.leaks())
+        row = {
             "controller": task.controller, "seed": task.seed, "trips": plant.trips, "departed_veh": departed,
             "final_backlog_veh": int(backlog[-1]), "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
-            "teleports": int(record.teleports.sum()),
-            "leaking_share": float(leaking / max(flow.sum(), 1)),
-            "wall_time_s": trajectory.wall_time, "sumo_time_s": plant.sumo_time,
-            "overhead_share": 1.0 - plant.sumo_time / trajectory.wall_time,
+            "teleports": int(record.teleports.sum()), **facts.trip_facts(plant.trip_facts()),
+            **facts.queue_facts(record, plant.city), **facts.decision_facts(trajectory),
+            "leaking_share": facts.leaking_share(record, plant.city, leaks),
+            "wall_time_s": trajectory.wall_time, "sumo_time_s": sumo_time,
+            "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time}
     finally:
         plant.close()
-    return Result(trajectory=trajectory, record=asdict(record), facts=facts)
+    return Result(trajectory=trajectory, record=asdict(record), facts=row)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nmfd.network import Network
+from nmfd.network import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, Network
 
 # Less than this share of theta left after removing h = g and h = o counts as nothing: what remains is then the
 # rounding of an optimiser or a softmax, and scaling it up to 1 would make a route of noise.
@@ -28,6 +28,7 @@ class Acyclic:
     move_onward: (M,) bool, false where the move turns back because the cell is a dead end
     fallback: (C,) int, the least-bad move of every cell; -1 where the trip ends
     a, b, c, jam: (R,) of the MFDs
+    exit_rates: (C,) [-]; capacity: (R, R) [veh/s] under u = 1, or None; storage: (R,) [veh] or None
     """
 
     origin: np.ndarray
@@ -44,6 +45,9 @@ class Acyclic:
     b: np.ndarray
     c: np.ndarray
     jam: np.ndarray
+    exit_rates: np.ndarray
+    capacity: np.ndarray | None
+    storage: np.ndarray | None
 
 
 def build(network: Network) -> Acyclic:
@@ -74,7 +78,9 @@ def build(network: Network) -> Acyclic:
     table = np.array(moves, dtype=int).reshape(-1, 4)
     index = np.array(list(cells), dtype=int)
     mfds = {name: np.array([getattr(m, name) for m in network.mfds]) for name in ("a", "b", "c", "jam")}
+    rates = np.ones(network.adjacency.shape) if network.exit_rates is None else network.exit_rates
     return Acyclic(
+        exit_rates=rates[index[:, 2], index[:, 3]], capacity=network.open_capacity, storage=network.storage,
         origin=index[:, 0], previous=index[:, 1], region=index[:, 2], destination=index[:, 3], start=start,
         move_from=table[:, 0], move_to=table[:, 1], move_next=table[:, 2],
         move_onward=table[:, 3].astype(bool), fallback=np.array([fallback.get(n, -1) for n in range(len(cells))]),
@@ -105,13 +111,25 @@ def rate(model: Acyclic, x: np.ndarray) -> np.ndarray:
 
 def derivative(model: Acyclic, x, demand, perimeter, theta) -> np.ndarray:
     """dx/dt (C,) [veh/s] of x (C,) [veh] under demand (R, R) [veh/s], perimeter (R, R) [-] and theta (M,) [-]."""
-    leaving = rate(model, x)[model.region] * x
-    passing = perimeter[model.region[model.move_from], model.move_next] * theta * leaving[model.move_from]
+    leaving = model.exit_rates * rate(model, x)[model.region] * x
+    passing = transfers(model, x, leaving, perimeter, theta)
     change = -np.where(model.region == model.destination, leaving, 0.0)
     change[model.start] += demand
     change -= np.bincount(model.move_from, passing, minlength=len(x))
     change += np.bincount(model.move_to, passing, minlength=len(x))
     return change
+
+
+def transfers(model: Acyclic, x, leaving, perimeter, theta) -> np.ndarray:
+    """The flow of every move (M,) [veh/s], of those `leaving` (C,) [veh/s]; capacities as in nmfd.dynamics.passing."""
+    wish, here = theta * leaving[model.move_from], model.region[model.move_from]
+    if model.capacity is None:
+        return perimeter[here, model.move_next] * wish
+    regions = len(model.jam)
+    wish_of_pair = np.bincount(here * regions + model.move_next, wish, minlength=regions**2).reshape(regions, regions)
+    room = np.maximum(1.0 - np.bincount(model.region, x, minlength=regions) / model.storage, LEAST_ROOM)
+    limit = perimeter * model.capacity * room + LEAST_LIMIT
+    return (1.0 + (wish_of_pair / limit) ** SHARPNESS)[here, model.move_next] ** (-1.0 / SHARPNESS) * wish
 
 
 def euler(model: Acyclic, x, demand, perimeter, theta, step: float) -> np.ndarray:

@@ -52,7 +52,7 @@ class OpenLoop:
     def __init__(self, plan: Plan):
         self.name, self._plan = "bound-pc" if plan.splits is None else "bound-pcrg", plan
 
-    def reset(self) -> None:
+    def reset(self, seed: int = 0) -> None:
         pass
 
     def act(self, measurement: Measurement) -> Controls:

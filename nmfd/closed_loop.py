@@ -19,7 +19,7 @@ def run(
     trajectory holds the exact state. `progress(done, steps)` is called after every interval.
     """
     random = np.random.default_rng([seed, 0x6E6F6973])
-    controller.reset()
+    controller.reset(seed)
     states, controls, decision_time = [plant.reset(seed)], [], []
     completed = [plant.completed()]
     begin = time.perf_counter()

@@ -8,12 +8,15 @@ from dataclasses import dataclass
 
 import torch
 
-from nmfd.network import Network
+from nmfd.network import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, Network
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
-    """The network as tensors. a, b, c, jam: (R,) of the MFDs; adjacency, off_diagonal: (R, R), 0 or 1."""
+    """The network as tensors. a, b, c, jam: (R,) of the MFDs; adjacency, off_diagonal: (R, R), 0 or 1.
+
+    exit_rates: (R, R) [-] or None; capacity: (R, R) [veh/s] under u = 1, or None; storage: (R,) [veh]
+    """
 
     a: torch.Tensor
     b: torch.Tensor
@@ -21,16 +24,22 @@ class Parameters:
     jam: torch.Tensor
     adjacency: torch.Tensor
     off_diagonal: torch.Tensor
+    exit_rates: torch.Tensor | None = None
+    capacity: torch.Tensor | None = None
+    storage: torch.Tensor | None = None
 
 
 def parameters(network: Network, *, dtype=torch.float64, device="cpu") -> Parameters:
+    def tensor(values):
+        return None if values is None else torch.tensor(values, dtype=dtype, device=device)
+
     def row(name):
-        return torch.tensor([getattr(m, name) for m in network.mfds], dtype=dtype, device=device)
+        return tensor([getattr(m, name) for m in network.mfds])
 
     return Parameters(
-        a=row("a"), b=row("b"), c=row("c"), jam=row("jam"),
-        adjacency=torch.tensor(network.adjacency, dtype=dtype, device=device),
-        off_diagonal=1.0 - torch.eye(network.regions, dtype=dtype, device=device))
+        a=row("a"), b=row("b"), c=row("c"), jam=row("jam"), adjacency=tensor(network.adjacency),
+        off_diagonal=1.0 - torch.eye(network.regions, dtype=dtype, device=device),
+        exit_rates=tensor(network.exit_rates), capacity=tensor(network.open_capacity), storage=tensor(network.storage))
 
 
 def rate(p: Parameters, accumulation: torch.Tensor) -> torch.Tensor:
@@ -40,12 +49,32 @@ def rate(p: Parameters, accumulation: torch.Tensor) -> torch.Tensor:
 
 
 def flows(p: Parameters, x, perimeter, splits) -> tuple[torch.Tensor, torch.Tensor]:
-    """Trip completions m_ii (..., R) and transfer flows u_ih m_ihj (..., R, R, R) [veh/s]."""
-    leaving = rate(p, x.sum(-1)).unsqueeze(-1) * x
+    """Trip completions m_ii (..., R) and transfer flows (..., R, R, R) [veh/s].
+
+    As published, u_ih m_ihj. Not published: with exit rates k_ij, m_ihj = k_ij theta_ihj q_i x_ij, and likewise m_ii;
+    with capacities, u_ih is replaced by `passing`.
+    """
+    accumulation = x.sum(-1)
+    leaving = rate(p, accumulation).unsqueeze(-1) * x
+    if p.exit_rates is not None:
+        leaving = leaving * p.exit_rates
     completions = torch.diagonal(leaving, dim1=-2, dim2=-1)
     wishing = (leaving * p.off_diagonal).unsqueeze(-2)
-    transfers = (perimeter * p.adjacency).unsqueeze(-1) * splits * wishing
-    return completions, transfers
+    if p.capacity is None:
+        return completions, (perimeter * p.adjacency).unsqueeze(-1) * splits * wishing
+    transfers = splits * wishing
+    return completions, passing(p, transfers.sum(-1), perimeter, accumulation).unsqueeze(-1) * transfers
+
+
+def passing(p: Parameters, wish, perimeter, accumulation) -> torch.Tensor:
+    """The share of `wish` (..., R, R) [veh/s], from i to h, that passes a boundary with a capacity (..., R, R) [-].
+
+    The limit is u_ih times the capacity times the room in h, 1 - x_h / storage_h (boundary capacity that falls with the
+    receiving accumulation, as in Geroliminis, Haddad and Ramezani, 2013), accumulation (..., R) [veh].
+    """
+    room = (1.0 - accumulation / p.storage).clamp(min=LEAST_ROOM)
+    limit = perimeter * p.capacity * room.unsqueeze(-2)
+    return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
 
 
 def derivative(p: Parameters, x, demand, perimeter, splits) -> torch.Tensor:

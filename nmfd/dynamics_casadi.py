@@ -11,27 +11,37 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from nmfd.network import Network
+from nmfd.network import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, Network
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
-    """The network as CasADi constants. a, b, c, jam: (R, 1) of the MFDs; adjacency: (R, R), 1 or structural zero."""
+    """The network as CasADi constants. a, b, c, jam: (R, 1) of the MFDs; adjacency: (R, R), 1 or structural zero.
+
+    exit_rates: (R, R) [-] or None; capacity: (R, R) [veh/s] under u = 1, or None; storage: (1, R) [veh]
+    """
 
     a: ca.DM
     b: ca.DM
     c: ca.DM
     jam: ca.DM
     adjacency: ca.DM
+    exit_rates: ca.DM | None
+    capacity: ca.DM | None
+    storage: ca.DM | None
 
 
 def parameters(network: Network) -> Parameters:
     def column(name):
         return ca.DM([getattr(m, name) for m in network.mfds])
 
+    def matrix(values):
+        return None if values is None else ca.DM(values)
+
     return Parameters(
         a=column("a"), b=column("b"), c=column("c"), jam=column("jam"),
-        adjacency=ca.sparsify(ca.DM(network.adjacency.astype(float))))
+        adjacency=ca.sparsify(ca.DM(network.adjacency.astype(float))), exit_rates=matrix(network.exit_rates),
+        capacity=matrix(network.open_capacity), storage=None if network.storage is None else ca.DM(network.storage).T)
 
 
 def splits_list(splits: np.ndarray) -> list[ca.DM]:
@@ -46,16 +56,28 @@ def rate(p: Parameters, accumulation):
 
 
 def flows(p: Parameters, x, perimeter, splits: Sequence) -> tuple:
-    """Trip completions m_ii (R, 1) and transfer flows u_ih m_ihj [veh/s], R matrices (R, R) [h, j]."""
-    regions = x.shape[0]
-    leaving = ca.repmat(rate(p, ca.sum2(x)), 1, regions) * x
+    """Trip completions m_ii (R, 1) and transfer flows [veh/s], R matrices (R, R) [h, j]; options as in `dynamics`."""
+    regions, accumulation = x.shape[0], ca.sum2(x)
+    leaving = ca.repmat(rate(p, accumulation), 1, regions) * x
+    if p.exit_rates is not None:
+        leaving *= p.exit_rates
     completions = ca.diag(leaving)
     wishing = leaving - ca.diag(completions)
-    open_share = perimeter * p.adjacency
-    transfers = [
-        ca.repmat(open_share[i, :].T, 1, regions) * splits[i] * ca.repmat(wishing[i, :], regions, 1)
-        for i in range(regions)]
-    return completions, transfers
+    transfers = [splits[i] * ca.repmat(wishing[i, :], regions, 1) for i in range(regions)]
+    if p.capacity is None:
+        open_share = perimeter * p.adjacency
+    else:
+        wish = ca.vertcat(*(ca.sum2(transfer).T for transfer in transfers))
+        open_share = passing(p, wish, perimeter, accumulation) * p.adjacency
+    return completions, [
+        ca.repmat(open_share[i, :].T, 1, regions) * transfer for i, transfer in enumerate(transfers)]
+
+
+def passing(p: Parameters, wish, perimeter, accumulation):
+    """The share of `wish` (R, R) [veh/s], from i to h, that passes a boundary with a capacity (R, R) [-]."""
+    room = ca.fmax(1.0 - accumulation.T / p.storage, LEAST_ROOM)
+    limit = perimeter * p.capacity * ca.repmat(room, wish.shape[0], 1)
+    return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
 
 
 def derivative(p: Parameters, x, demand, perimeter, splits: Sequence):

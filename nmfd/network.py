@@ -14,6 +14,12 @@ from nmfd import toml
 from nmfd.errors import InputError
 from nmfd.mfd import Mfd
 
+# Of boundaries with a capacity. What passes is a smooth minimum of wish and limit, (wish^-n + limit^-n)^(-1/n), 84 % of
+# either where they are equal: demand within a control interval is not even.
+SHARPNESS = 4
+LEAST_ROOM = 0.03    # of the capacity, into a region however full: it never locks for good
+LEAST_LIMIT = 1e-6   # veh/s, against a division by zero
+
 
 @dataclass(frozen=True, kw_only=True)
 class Network:
@@ -28,6 +34,11 @@ class Network:
     u_min, u_max: bounds of the perimeter control [-]
     own_splits: {(i, j): {h: share}}, what drivers do by themselves where it was measured; elsewhere they follow the
         fewest boundaries
+    exit_rates: (R, R) [-], [i, j]: how fast vehicles in i bound for j leave i, relative to the mean g_i(x_i)/x_i of
+        the MFD; None for 1: trips of all kinds have the same length in a region
+    capacity: (R, R) [veh/s], [i, h]: the most that passes from i to an empty region h under u_max; None: u_ih is a
+        share of the flow that wishes to pass, however little that is
+    storage: (R,) [veh], the accumulation that leaves no room for vehicles from other regions; with `capacity`
     folder: where network.toml was, or None
     """
 
@@ -39,6 +50,9 @@ class Network:
     u_min: float
     u_max: float
     own_splits: Mapping[tuple[int, int], Mapping[int, float]] = field(default_factory=dict)
+    exit_rates: np.ndarray | None = None
+    capacity: np.ndarray | None = None
+    storage: np.ndarray | None = None
     folder: Path | None = None
 
     @property
@@ -77,12 +91,19 @@ class Network:
         sums = theta.sum(axis=1, keepdims=True)
         return theta / np.where(sums > 0, sums, 1.0)
 
+    @property
+    def open_capacity(self) -> np.ndarray | None:
+        """(R, R) [veh/s]: `capacity` for u = 1."""
+        return None if self.capacity is None else self.capacity / self.u_max
+
     @cached_property
     def hash(self) -> str:
         """A fingerprint of all that the dynamics depend on; a policy is valid for one network only."""
         content = [
             self.adjacency.astype(int).tolist(), [[m.a, m.b, m.c, m.jam] for m in self.mfds], self.u_min, self.u_max,
             self.nominal_splits.round(12).tolist()]
+        options = {"exit_rates": self.exit_rates, "capacity": self.capacity, "storage": self.storage}
+        content += [[name, option.tolist()] for name, option in options.items() if option is not None]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
@@ -110,7 +131,7 @@ def load_network(folder: Path | str) -> Network:
     rows = root.tables("regions")
     if not rows:
         raise root.error("regions", "empty; add at least one [[regions]] table")
-    names, positions, neighbours, barred, mfds = [], [], [], [], []
+    names, positions, neighbours, barred, mfds, boundaries = [], [], [], [], [], []
     for number, row in enumerate(rows):
         names.append(row.text("name", str(number)))
         positions.append(row.numbers("position", length=2))
@@ -120,6 +141,7 @@ def load_network(folder: Path | str) -> Network:
             raise row.error(
                 "no_way_to", f"expected some of the adjacent regions {list(neighbours[-1])}, got {unknown[0]} instead")
         mfds.append(_mfd(row.table("mfd")) if default_mfd is None or row.has("mfd") else default_mfd)
+        boundaries.append(_boundary(row, len(rows), neighbours[-1]))
         row.close()
     own_splits = {}
     for row in root.tables("own_splits", ()):
@@ -136,7 +158,7 @@ def load_network(folder: Path | str) -> Network:
         adjacency[i, list(regions)] = False
     network = Network(
         name=name, region_names=tuple(names), positions=np.array(positions), adjacency=adjacency, mfds=tuple(mfds),
-        u_min=u_min, u_max=u_max, own_splits=own_splits, folder=folder)
+        u_min=u_min, u_max=u_max, own_splits=own_splits, folder=folder, **_boundaries(root, neighbours, boundaries))
     _check_graph(network, root)
     for i, j in own_splits:
         for h in own_splits[i, j]:
@@ -152,6 +174,36 @@ def _shares(row: toml.Table, neighbours: tuple[int, ...]) -> dict[int, float]:
     if len(share) != len(via) or min(share) < 0 or abs(sum(share) - 1.0) > 1e-3:
         raise row.error("share", f"expected {len(via)} numbers >= 0 with sum 1, got {list(share)} instead")
     return dict(zip(via, share, strict=True))
+
+
+def _boundary(row: toml.Table, regions: int, adjacent: tuple[int, ...]) -> dict:
+    """The options of one region: exit_rates (R,), capacity (one per adjacent region), storage; None if absent."""
+    found = {
+        "exit_rates": row.numbers("exit_rates", length=regions) if row.has("exit_rates") else None,
+        "capacity": row.numbers("capacity", length=len(adjacent)) if row.has("capacity") else None,
+        "storage": row.number("storage", above=0.0) if row.has("storage") else None}
+    for key in ("exit_rates", "capacity"):
+        if found[key] is not None and min(found[key], default=1.0) <= 0:
+            raise row.error(key, f"expected numbers above 0, got {list(found[key])} instead")
+    for key, other in (("storage", "capacity"), ("capacity", "storage")):
+        if found[key] is not None and found[other] is None:
+            raise row.error(key, f"needs {other} beside it: both limit what passes a boundary; add or remove one")
+    return found
+
+
+def _boundaries(root: toml.Table, neighbours: list[tuple], rows: list[dict]) -> dict[str, np.ndarray | None]:
+    """The fields exit_rates, capacity and storage of Network; InputError where only some of the regions have one."""
+    fields: dict[str, np.ndarray | None] = {}
+    for key in rows[0]:
+        given = [row[key] is not None for row in rows]
+        if any(given) and not all(given):
+            raise root.error(f"regions[{given.index(False)}].{key}", "missing; give it for every region or for none")
+        fields[key] = np.array([row[key] for row in rows], dtype=float) if all(given) and key != "capacity" else None
+    if rows[0]["capacity"] is not None:
+        fields["capacity"] = np.zeros((len(rows), len(rows)))
+        for i, row in enumerate(rows):
+            fields["capacity"][i, list(neighbours[i])] = row["capacity"]
+    return fields
 
 
 def _mfd(table: toml.Table) -> Mfd:
@@ -184,6 +236,8 @@ def check_step(network: Network, step: float, where: str) -> None:
     for region, mfd in enumerate(network.mfds):
         grid = np.linspace(0.0, mfd.jam, 2001)
         fastest = float(mfd.rate(grid).max())
+        if network.exit_rates is not None:
+            fastest *= float(network.exit_rates[region].max())
         if step * fastest > 1.0:
             raise InputError(
                 f"{where}: step: an integration step of {step:g} s is too long for region {region} of network "

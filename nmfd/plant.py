@@ -76,10 +76,9 @@ class AcyclicPlant:
         splits = scenario.network.nominal_splits if controls.splits is None else controls.splits
         theta, forced = acyclic.shares(model, splits)
         if forced.any():
-            ahead = model.move_next[model.fallback[forced]]
-            passing = controls.perimeter[model.region[forced], ahead] * acyclic.rate(model, self._x)[
-                model.region[forced]] * self._x[forced]
-            self._forced += scenario.step * float(passing.sum())
+            leaving = model.exit_rates * acyclic.rate(model, self._x)[model.region] * self._x
+            passing = acyclic.transfers(model, self._x, leaving, controls.perimeter, theta)
+            self._forced += scenario.step * float(passing[model.fallback[forced]].sum())
         self._x = acyclic.advance(
             model, self._x, demand, controls.perimeter, theta, scenario.step, integrator=scenario.integrator,
             substeps=scenario.substeps)

@@ -4,6 +4,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 
@@ -25,7 +26,7 @@ class Rollout:
 
         network = scenario.network
         self.scenario, self.dtype, self.device = scenario, dtype, torch.device(device)
-        self.parameters = dynamics.parameters(network, dtype=dtype, device=device)
+        self.parameters = self._nominal = dynamics.parameters(network, dtype=dtype, device=device)
         self.demand = tensor(scenario.demand)
         self.nominal_splits = tensor(network.nominal_splits)
         self.jam = tensor([m.jam for m in network.mfds])
@@ -51,6 +52,32 @@ class Rollout:
         total = uniform(batch, regions) * uniform(batch, 1) * 0.8 * self.jam
         x = total.unsqueeze(-1) * weight / weight.sum(-1, keepdim=True).clamp(min=1e-6)
         return x * (rollout < share * batch)[:, None, None], demand
+
+    def draw_model(self, batch: int, spread: float, generator) -> None:
+        """From now on every one of `batch` rollouts has a regional model of its own, around the nominal one.
+
+        spread: standard deviation of the logarithm of every region's accumulation axis (jam and critical accumulation,
+        storage), and half of it of its outflow and of the capacities [-]; 0 for the nominal model
+        """
+        p, regions = self._nominal, len(self.jam)
+        if spread:
+            def factor(*shape, share=1.0):
+                normal = torch.randn(batch, *shape, generator=generator, dtype=self.dtype).to(self.device)
+                return torch.exp(share * spread * normal.clamp(-2.0, 2.0))
+
+            wide, high = factor(regions), factor(regions, share=0.5)
+            # The integration step stays short enough: no rate rises above the largest that the network was checked for.
+            high = high.clamp(max=1.0 / (self._fastest() * self.scenario.step / self.scenario.substeps))
+            p = replace(
+                p, a=high * p.a / wide**2, b=high * p.b / wide, c=high * p.c, jam=wide * p.jam,
+                capacity=None if p.capacity is None else p.capacity * factor(regions, regions, share=0.5),
+                storage=None if p.storage is None else p.storage * wide)
+        self.parameters = p
+
+    def _fastest(self) -> torch.Tensor:
+        """The largest rate at which vehicles leave each region (R,) [1/s]."""
+        p = self._nominal
+        return p.c if p.exit_rates is None else p.c * p.exit_rates.amax(-1)
 
     def perturb(self, demand: torch.Tensor, level, noise: float, noise_all: float, generator) -> torch.Tensor:
         """`demand` (T, B, R, R) [veh/s] with Gaussian noise, clipped at zero.

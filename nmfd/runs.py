@@ -14,7 +14,7 @@ import platform
 import re
 import subprocess
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
@@ -201,20 +201,33 @@ class RunFolder:
 def open_folder(
     path: Path, *, configuration: Mapping, order: Sequence[tuple[str, int]],
     controllers: Mapping[str, Mapping] | None = None, session: Mapping | None = None,
+    renew: Callable[[str], None] | None = None,
 ) -> Iterator[RunFolder]:
     """A RunFolder at `path` for the runs `order`, as (controller, seed); made if it is not there.
 
     configuration: what all runs have in common; the same at every opening (JSON types only, as all of these)
     controllers: what the runs of each controller depend on besides, such as the hash of a policy; a later opening
-        may add controllers but not change one
+        may add controllers, but change one only with `renew`
     session: added to the provenance that every opening leaves in manifest.json
+    renew: takes one line for every controller that changed, whose runs here do not count any more; the others do
 
     Finished runs are kept. Raises InputError if the folder holds another configuration or is no run folder. When
-    the body fails before any run is finished, everything made here is removed again.
+    the body ends before any run is finished, everything made here is removed again.
     """
     summary_path = Path(path) / "summary.csv"
     session = {"seeds": sorted({seed for _, seed in order}), **(session or {})}
-    with manifest(path, configuration=configuration, controllers=controllers, session=session, results=summary_path):
+
+    def drop(changed: Mapping[str, str]) -> None:
+        rows = read_summary(summary_path) if summary_path.is_file() else []
+        for name, what in changed.items():
+            if kept := sum(row["controller"] == name for row in rows):
+                renew(f"{path}: {name}: its {what} differs from that of its {kept} kept runs, which do not count any "
+                      "more; those asked for are run again")
+        if rows:
+            write_summary(summary_path, [row for row in rows if row["controller"] not in changed])
+
+    with manifest(path, configuration=configuration, controllers=controllers, session=session, results=summary_path,
+                  renew=drop if renew else None):
         folder = RunFolder(Path(path), order, read_summary(summary_path) if summary_path.is_file() else [])
         try:
             yield folder
@@ -229,10 +242,12 @@ def open_folder(
 @contextmanager
 def manifest(
     path: Path, *, configuration: Mapping, results: Path, controllers: Mapping[str, Mapping] | None = None,
-    session: Mapping | None = None,
+    session: Mapping | None = None, renew: Callable[[Mapping[str, str]], None] | None = None,
 ) -> Iterator[None]:
     """manifest.json in the folder `path`, which is made if it is not there; arguments as in `open_folder`.
 
+    renew: takes the controllers that changed, and what of them, before the manifest says so; without it they are an
+        error
     results: the file in `path` that holds what is finished. If the body fails at the first opening before this file
     is there, everything made here is removed again. Raises InputError as `open_folder`.
     """
@@ -240,7 +255,9 @@ def manifest(
     configuration, controllers = json.loads(json.dumps([configuration, controllers or {}]))
     file, sessions = path / "manifest.json", []
     if file.is_file():
-        sessions, controllers = _continued(file, configuration, controllers)
+        sessions, controllers, changed = _continued(file, configuration, controllers, renewable=renew is not None)
+        if changed:
+            renew(changed)
     elif path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; choose another folder with --out")
     elif path.is_dir() and any(path.iterdir()):
@@ -252,31 +269,36 @@ def manifest(
         path.mkdir(parents=True, exist_ok=True)
         write_text(file, json.dumps(content, indent=2) + "\n")
         yield
-    except BaseException:
+    finally:
         if not results.exists() and len(sessions) == 1:
             with suppress(OSError):
                 file.unlink()
             for parent in made:
                 with suppress(OSError):
                     parent.rmdir()
-        raise
 
 
-def _continued(manifest_path: Path, configuration: dict, controllers: dict) -> tuple[list, dict]:
-    """The sessions so far, and the controllers there and in `controllers`. InputError where they do not agree."""
+def _continued(manifest_path: Path, configuration: dict, controllers: dict, *, renewable: bool) -> tuple:
+    """The sessions so far, the controllers there and in `controllers`, and those that changed -> what of them.
+
+    InputError where the configurations, or without `renewable` the controllers, do not agree.
+    """
     try:
         manifest = json.loads(manifest_path.read_text(encoding="utf-8"))
         sessions, known = list(manifest["sessions"]), dict(manifest["controllers"])
         there = {**{name: known.get(name, controllers[name]) for name in controllers}, **manifest["configuration"]}
+        changed = {
+            name: ", ".join(key for key in {**known[name], **wanted} if known[name].get(key) != wanted.get(key))
+            for name, wanted in controllers.items() if name in known and known[name] != wanted}
     except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(f"{manifest_path}: is no manifest of a run; choose another folder with --out") from None
     asked = {**controllers, **configuration}
     for key in {**asked, **there}:
-        if asked.get(key) != there.get(key):
+        if asked.get(key) != there.get(key) and not (renewable and key in changed):
             raise InputError(
                 f"{manifest_path.parent}: holds runs of another configuration ({key}: {json.dumps(there.get(key))} "
                 f"there, {json.dumps(asked.get(key))} asked for); choose another folder with --out")
-    return sessions, {**known, **controllers}
+    return sessions, {**known, **controllers}, changed
 
 
 def labelled(trajectory: Trajectory, *, controller: str, plant: str) -> Trajectory:

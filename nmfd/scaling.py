@@ -127,8 +127,9 @@ def run_one(case: Case, *, memory_gib: float) -> dict:
         times.append(time.perf_counter() - begin)
         unsolved += controls.status != "ok"
         splits = city.nominal_splits if controls.splits is None else controls.splits
-        passing = controls.perimeter[tuple(model.turns[:, :2].T)] * splits[tuple(model.turns.T)]
-        x = turns.advance(model, x.ravel(), 0.0, passing, INTERVAL)[0].reshape(x.shape)
+        x = turns.advance(
+            model, x.ravel(), 0.0, controls.perimeter[tuple(model.edges.T)], splits[tuple(model.turns.T)], INTERVAL,
+        )[0].reshape(x.shape)
     return {
         **case._asdict(), "status": "ok" if not unsolved else controls.status, "set_up_s": set_up,
         "first_decision_s": times[0], "median_decision_s": statistics.median(times[1:]),

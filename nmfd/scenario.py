@@ -1,8 +1,9 @@
 """Demand, noise, horizon: loaded from scenario.toml and checked."""
 
 import csv
+import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -25,6 +26,7 @@ class Scenario:
     integrator: "euler" or "rk4", of the regional model
     substeps: integration steps of the regional model per control interval
     protected: the regions that gating protects
+    demand_factor: what the demand was multiplied by already, for a city that drives vehicles of its own
     forecast_error: standard deviation of the logarithm of what a controller is told of the demand, over the truth [-]
     forecast_seed: of that error
     controller_options: controller name -> its table in [controllers], checked by that controller
@@ -41,6 +43,7 @@ class Scenario:
     substeps: int = 1
     protected: tuple[int, ...] = ()
     controller_options: Mapping[str, dict] = field(default_factory=dict)
+    demand_factor: float = 1.0
     forecast_error: float = 0.0
     forecast_seed: int = 0
     folder: Path | None = None
@@ -68,10 +71,47 @@ def trapezoid(time: np.ndarray, *, start: float, peak: float, ramp_up: float, fl
     return peak * np.clip(np.minimum(rising, falling), 0.0, 1.0)
 
 
+def read_tables(folder: Path) -> toml.Table:
+    """`folder`/scenario.toml; what it does not say is that of the scenario in the folder `base`, if it names one.
+
+    The tables [controllers] and [sumo] are completed key by key, everything else is taken whole. Raises InputError.
+    """
+    path, folders, content = folder / "scenario.toml", [], {}
+    while True:
+        table = toml.read(folder / "scenario.toml")
+        own = table.raw()
+        if folder.resolve() in folders:
+            raise table.error("base", "the scenarios are each other's base; remove one of the keys")
+        folders.append(folder.resolve())
+        _name_from(own, folder, path.parent)
+        merged = {key: {**own[key], **content[key]} for key in ("controllers", "sumo")
+                  if isinstance(own.get(key), dict) and isinstance(content.get(key), dict)}
+        content = {**own, **content, **merged}
+        base = table.text("base", None)
+        if base is None:
+            content.pop("base", None)
+            return toml.Table(content, path)
+        folder = folder / base
+
+
+def _name_from(own: dict, folder: Path, here: Path) -> None:
+    """Files that a scenario.toml names are relative to it: rewrite them as seen from the folder `here`."""
+    def seen(name: str) -> str:
+        return os.path.relpath(folder / name, here)
+
+    for key in ("network", "demand_file"):
+        if isinstance(own.get(key), str):
+            own[key] = seen(own[key])
+    sumo = own.get("sumo")
+    for key in ("routes", "background", "additional") if isinstance(sumo, dict) else ():
+        if isinstance(sumo.get(key), list) and all(isinstance(name, str) for name in sumo[key]):
+            sumo[key] = [seen(name) for name in sumo[key]]
+
+
 def load_scenario(folder: Path | str) -> Scenario:
     """Read `folder`/scenario.toml and its network. Raises InputError; the table [sumo] is left to cosim."""
     folder = Path(folder)
-    root = toml.read(folder / "scenario.toml")
+    root = read_tables(folder)
     name = root.text("name")
     network = load_network(folder / root.text("network"))
     step = root.number("step", above=0.0)
@@ -82,6 +122,7 @@ def load_scenario(folder: Path | str) -> Scenario:
     noise = root.table("noise", None)
     measurement_std = noise.number("measurement_std", 0.0, low=0.0)
     noise.close()
+    factor = root.number("demand_factor", 1.0, low=0.0)
     demand = np.zeros((steps, network.regions, network.regions))
     time = step * np.arange(steps)
     for row in root.tables("demand", () if root.has("demand_file") else ...):
@@ -104,9 +145,9 @@ def load_scenario(folder: Path | str) -> Scenario:
     root.close()
     check_step(network, step / substeps, str(folder / "scenario.toml"))
     return Scenario(
-        name=name, network=network, step=step, steps=steps, demand=demand, measurement_std=measurement_std,
+        name=name, network=network, step=step, steps=steps, demand=factor * demand, measurement_std=measurement_std,
         integrator=integrator, substeps=substeps, protected=protected, controller_options=controller_options,
-        forecast_error=forecast_error, forecast_seed=forecast_seed, folder=folder)
+        demand_factor=factor, forecast_error=forecast_error, forecast_seed=forecast_seed, folder=folder)
 
 
 def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
@@ -138,6 +179,25 @@ def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
         if k < steps:
             demand[k, i, j] += rate
     return demand
+
+
+def as_modelled(scenario: Scenario, controller: str) -> Scenario:
+    """`scenario` with the regional model that `controller` plans with: the network that its option `model` names.
+
+    Drivers who are guided, or who reroute by themselves, make another model of the same city. Raises InputError.
+    """
+    options = dict(scenario.controller_options.get(controller, {}))
+    if "model" not in options or scenario.folder is None:
+        return scenario
+    table = toml.Table(options, scenario.folder / "scenario.toml", f"controllers.{controller}.")
+    model = load_network(scenario.folder / table.text("model"))
+    if not np.array_equal(model.adjacency, scenario.network.adjacency):
+        raise table.error("model", f"network {model.name} has other regions or boundaries than {scenario.network.name}"
+                          "; identify one for the same city with 'cosim identify'")
+    del options["model"]
+    check_step(model, scenario.step / scenario.substeps, f"{model.folder}")
+    return replace(
+        scenario, network=model, controller_options={**scenario.controller_options, controller: options})
 
 
 def _region(row: toml.Table, key: str, network: Network) -> int:

@@ -34,6 +34,10 @@ class Table:
     def error(self, key: str, problem: str) -> InputError:
         return InputError(f"{self._path}: {self._prefix}{key}: {problem}")
 
+    def raw(self) -> dict:
+        """Everything in it that nobody has taken yet, unchecked."""
+        return dict(self._values)
+
     def has(self, key: str) -> bool:
         return key in self._values
 

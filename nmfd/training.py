@@ -18,7 +18,7 @@ from nmfd.controllers.dpc import ACTIVATIONS, Architecture, Policy, checkpoint
 from nmfd.errors import InputError
 from nmfd.rollout import Rollout, compiled_step
 from nmfd.runs import atomic
-from nmfd.scenario import Scenario
+from nmfd.scenario import Scenario, as_modelled
 
 VALIDATE_EVERY = 20  # Adam steps
 ROBUST_NOISE = 3.0     # veh/s, of the policies whose name ends in -robust
@@ -40,6 +40,7 @@ class Training:
     initial_share: share of the rollouts that start from a random state, at a random time of the scenario
     noise: largest sigma [veh/s] of the Gaussian noise on the demand of the pairs that have any, at every step; every
         rollout has its own sigma, evenly between 0 and `noise` (demand_noise.WHERE, "pairs")
+    mfd_spread: of the regional model that every rollout has for itself (Rollout.draw_model) [-]
     noise_all: the same of the noise on every pair of regions ("all"), in every other rollout, instead of `noise`
     """
 
@@ -54,6 +55,7 @@ class Training:
     initial_share: float = 0.5
     noise: float = 0.0
     noise_all: float = 0.0
+    mfd_spread: float = 0.0
 
 
 def settings(scenario: Scenario, controller: str, steps: int | None = None) -> Training:
@@ -73,7 +75,8 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         demand_spread=table.number("demand_spread", default.demand_spread, low=0.0, high=1.0),
         initial_share=table.number("initial_share", default.initial_share, low=0.0, high=1.0),
         noise=table.number("noise", default.noise, low=0.0),
-        noise_all=table.number("noise_all", default.noise_all, low=0.0))
+        noise_all=table.number("noise_all", default.noise_all, low=0.0),
+        mfd_spread=table.number("mfd_spread", default.mfd_spread, low=0.0, high=1.0))
     table.close()
     return chosen if steps is None else Training(**{**asdict(chosen), "steps": steps})
 
@@ -97,6 +100,7 @@ def train(
     every validation. `compiled` makes a step several times as fast, after up to a minute or two of compilation; the
     weights differ by rounding.
     """
+    scenario = as_modelled(scenario, controller)
     chosen = settings(scenario, controller, steps)
     configuration = {
         "controller": controller, "scenario": scenario.name, "seed": seed, "compiled": compiled, **asdict(chosen)}
@@ -116,6 +120,7 @@ def train(
         for group in optimizer.param_groups:
             cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
             group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
+        rollout.draw_model(chosen.batch, chosen.mfd_spread, generator)
         x, demand = rollout.random_start(chosen.batch, chosen.demand_spread, chosen.initial_share, generator)
         demand = rollout.perturb(
             demand, torch.rand(chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
@@ -153,10 +158,11 @@ def train(
 def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> float:
     """TTS of the scenario itself from its own start, the geometric mean of two noise draws [veh s].
 
-    If training perturbs the demand: also of VALIDATIONS perturbed scenarios, whose sigma rises to that of `chosen`.
+    If training perturbs demand or model: also of VALIDATIONS perturbed ones, whose sigma rises to that of `chosen`.
     """
     generator = torch.Generator().manual_seed(seed)
-    count = 2 + (VALIDATIONS if chosen.noise or chosen.noise_all else 0)
+    count = 2 + (VALIDATIONS if chosen.noise or chosen.noise_all or chosen.mfd_spread else 0)
+    rollout.draw_model(count, chosen.mfd_spread, generator)
     level = torch.linspace(0.0, 1.0, count // 2).repeat_interleave(2)  # in twos: one of each kind of noise
     nominal = rollout.demand.unsqueeze(1).expand(-1, count, -1, -1)
     demand = rollout.perturb(nominal, level, chosen.noise, chosen.noise_all, generator)
@@ -168,6 +174,7 @@ def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> f
 def visited(policy: Policy, rollout: Rollout, chosen: Training, seed: int) -> np.ndarray:
     """States (N, R*R) [-], as a share of the policy's scale, that `policy` sees in rollouts like those in training."""
     generator = torch.Generator().manual_seed(seed)
+    rollout.draw_model(4 * chosen.batch, chosen.mfd_spread, generator)
     x, demand = rollout.random_start(4 * chosen.batch, chosen.demand_spread, chosen.initial_share, generator)
     demand = rollout.perturb(
         demand, torch.rand(4 * chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)

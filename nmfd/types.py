@@ -59,8 +59,8 @@ class Controller(Protocol):
 
     name: str
 
-    def reset(self) -> None:
-        """Forget everything of an earlier run."""
+    def reset(self, seed: int = 0) -> None:
+        """Forget everything of an earlier run; what the controller draws by lot follows from `seed`."""
 
     def act(self, measurement: Measurement) -> Controls:
         """The controls of the interval that begins now."""

@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from cosim.actuate import MODES, GatewaySignal
+from cosim.actuate import GatewaySignal
+from cosim.strategy import MODES
 from cosim.sumo import Phase, Programme
 
 MIN_GREEN = 5.0

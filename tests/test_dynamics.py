@@ -1,19 +1,23 @@
 """The physics of the regional model, and its torch and CasADi twins against each other."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
+import tiny
 import torch
 
 from nmfd import dynamics, dynamics_casadi
 from nmfd.mfd import Mfd
-from nmfd.network import Network, load_network
+from nmfd.network import LEAST_ROOM, Network, load_network
 
 STEP = 30.0
 NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
 PARAMETERS = dynamics.parameters(NETWORK)
+LIMITED = tiny.limited(NETWORK)
+KINDS = pytest.mark.parametrize("network", [NETWORK, LIMITED], ids=["published", "limited"])
 
 
 def random_controls(random, network=NETWORK, batch=()):
@@ -39,9 +43,11 @@ def one_region(mfd):
         mfds=(mfd,), u_min=0.1, u_max=0.9))
 
 
+@KINDS
 @pytest.mark.parametrize("integrator", dynamics.INTEGRATORS)
-def test_no_vehicle_is_negative_or_lost_inside(integrator):
+def test_no_vehicle_is_negative_or_lost_inside(integrator, network):
     """Without trips that end, the vehicles only move: their number grows by the demand exactly."""
+    p = dynamics.parameters(network)
     x, demand, perimeter, splits = random_tensors(1, filling=25_000.0, batch=(40,))
     off = PARAMETERS.off_diagonal
     x, demand = x * off, demand * off
@@ -49,7 +55,7 @@ def test_no_vehicle_is_negative_or_lost_inside(integrator):
     splits = splits * (1.0 - torch.eye(7, dtype=torch.float64))
     total = x.sum((-2, -1))
     for _ in range(60):
-        x = dynamics.advance(PARAMETERS, x, demand, perimeter, splits, STEP, integrator=integrator)
+        x = dynamics.advance(p, x, demand, perimeter, splits, STEP, integrator=integrator)
         total = total + STEP * demand.sum((-2, -1))
         assert x.min() >= 0.0
         torch.testing.assert_close(x.sum((-2, -1)), total, rtol=0.0, atol=1e-6)
@@ -100,30 +106,33 @@ def test_order_of_convergence(integrator, order):
     assert np.log2(error[0] / error[1]) == pytest.approx(order, abs=0.3)
 
 
+@KINDS
 @pytest.mark.parametrize("filling", [3000.0, 30_000.0], ids=["free", "jammed"])
 @pytest.mark.parametrize("integrator", dynamics.INTEGRATORS)
-def test_gradients_against_finite_differences(integrator, filling):
+def test_gradients_against_finite_differences(integrator, filling, network):
     """In vehicles by the thousand, so that one step of differences suits states and controls."""
     x, demand, perimeter, splits = random_tensors(5, filling=filling)
     inputs = tuple(tensor.clone().requires_grad_() for tensor in (x / 1000.0, demand, perimeter, splits))
 
     def advanced(x, *others):
-        return dynamics.advance(PARAMETERS, 1000.0 * x, *others, STEP, integrator=integrator) / 1000.0
+        return dynamics.advance(dynamics.parameters(network), 1000.0 * x, *others, STEP, integrator=integrator) / 1000.0
 
     assert torch.autograd.gradcheck(advanced, inputs, fast_mode=True)
 
 
+@KINDS
 @pytest.mark.parametrize("substeps", [1, 3])
 @pytest.mark.parametrize("integrator", dynamics.INTEGRATORS)
-def test_torch_and_casadi_agree(integrator, substeps):
+def test_torch_and_casadi_agree(integrator, substeps, network):
     """Over a rollout into the jam and beyond, with new controls in every interval."""
     random = np.random.default_rng(6)
-    p, x, twin, most = dynamics_casadi.parameters(NETWORK), torch.zeros(7, 7, dtype=torch.float64), ca.DM(7, 7), 0.0
+    p, x, twin, most = dynamics_casadi.parameters(network), torch.zeros(7, 7, dtype=torch.float64), ca.DM(7, 7), 0.0
     for _ in range(120):
         demand, (perimeter, splits) = random.uniform(0.0, 2.0, (7, 7)), random_controls(random)
         kwargs = {"integrator": integrator, "substeps": substeps}
         x = dynamics.advance(
-            PARAMETERS, x, *(torch.from_numpy(array) for array in (demand, perimeter, splits)), STEP, **kwargs)
+            dynamics.parameters(network), x, *(torch.from_numpy(array) for array in (demand, perimeter, splits)), STEP,
+            **kwargs)
         twin = dynamics_casadi.advance(
             p, twin, ca.DM(demand), ca.DM(perimeter), dynamics_casadi.splits_list(splits), STEP, **kwargs)
         most = max(most, x.sum(-1).max().item())
@@ -145,3 +154,27 @@ def test_the_outflow_stays_at_its_jam_value_beyond():
     n = torch.linspace(jam, 3.0 * jam, 7, dtype=torch.float64)
     outflow = dynamics.rate(PARAMETERS, n) * n
     torch.testing.assert_close(outflow, outflow[:1].expand(7), rtol=1e-12, atol=0.0)
+
+
+def test_a_boundary_passes_the_smaller_of_wish_and_limit():
+    """Far from each other the smooth minimum is the smaller one; a region that is full takes next to nobody."""
+    p = dynamics.parameters(LIMITED)
+    perimeter, empty = torch.tensor(0.5 * NETWORK.adjacency), torch.zeros(7, dtype=torch.float64)
+    limit = perimeter * p.capacity
+    few = dynamics.passing(p, 0.1 * limit, perimeter, empty)
+    many = dynamics.passing(p, 10.0 * limit, perimeter, empty) * 10.0 * limit
+    used = torch.tensor(NETWORK.adjacency)
+    torch.testing.assert_close(few[used], torch.ones_like(few[used]), rtol=1e-4, atol=0.0)
+    torch.testing.assert_close(many[used], limit[used], rtol=1e-4, atol=0.0)
+    full = dynamics.passing(p, 10.0 * limit, perimeter, 2.0 * p.storage) * 10.0 * limit
+    torch.testing.assert_close(full[used], LEAST_ROOM * limit[used], rtol=1e-3, atol=0.0)
+
+
+def test_exit_rates_scale_what_leaves():
+    """By kind of trip: an exit rate of two is a trip half as long."""
+    x, _, perimeter, splits = random_tensors(7, filling=6000.0)
+    rates = np.random.default_rng(8).uniform(0.5, 2.0, (7, 7))
+    plain = dynamics.flows(PARAMETERS, x, perimeter, splits)
+    scaled = dynamics.flows(dynamics.parameters(replace(NETWORK, exit_rates=rates)), x, perimeter, splits)
+    torch.testing.assert_close(scaled[0], plain[0] * torch.from_numpy(rates.diagonal().copy()))
+    torch.testing.assert_close(scaled[1], plain[1] * torch.from_numpy(rates)[:, None, :])

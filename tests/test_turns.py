@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tiny
 import torch
 
 from nmfd import dynamics, turns
@@ -13,6 +14,7 @@ from nmfd.descent import minimise
 from nmfd.network import load_network
 
 NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
+LIMITED = tiny.limited(NETWORK)
 BOTH = pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
 EVERY, SOME = np.arange(7), np.array([1, 2, 6])
 
@@ -26,14 +28,14 @@ def problem(model, *, moves=3, horizon=4, seed=0, guidance=True):
         Admissible(NETWORK, model, guidance=guidance).project(plan))
 
 
-def by_dynamics(model, start, demand, plan, *, step, substeps, integrator):
+def by_dynamics(network, model, start, demand, plan, *, step, substeps, integrator):
     """The same sum by nmfd.dynamics, as a tensor that knows its gradient with respect to `plan`."""
     def cells(vector):
         full = torch.zeros(7, 7, dtype=torch.float64)
         full[:, model.destinations] = torch.from_numpy(vector.reshape(7, -1))
         return full
 
-    p, x, total, edges = dynamics.parameters(NETWORK), cells(start), 0.0, len(model.edges)
+    p, x, total, edges = dynamics.parameters(network), cells(start), 0.0, len(model.edges)
     for k in range(len(demand)):
         row = plan[min(k, len(plan) - 1)]
         perimeter = torch.zeros(7, 7, dtype=torch.float64).index_put(
@@ -46,15 +48,16 @@ def by_dynamics(model, start, demand, plan, *, step, substeps, integrator):
 
 
 @BOTH
+@pytest.mark.parametrize("network", [NETWORK, LIMITED], ids=["published", "limited"])
 @pytest.mark.parametrize("used", [EVERY, SOME], ids=["every", "some"])
 @pytest.mark.parametrize("scheme", [
     {"step": 30.0, "substeps": 1, "integrator": "euler"}, {"step": 90.0, "substeps": 3, "integrator": "euler"},
     {"step": 60.0, "substeps": 2, "integrator": "rk4"}])
-def test_the_twin_of_dynamics_and_its_gradient(scheme, used, guidance):
-    model = turns.build(NETWORK, used, guidance=guidance)
+def test_the_twin_of_dynamics_and_its_gradient(scheme, used, network, guidance):
+    model = turns.build(network, used, guidance=guidance)
     start, demand, plan = problem(model, guidance=guidance)
     tensor = torch.tensor(plan, requires_grad=True)
-    expected = by_dynamics(model, start, demand, tensor, **scheme)
+    expected = by_dynamics(network, model, start, demand, tensor, **scheme)
     expected.backward()
     value, gradient = turns.vehicle_steps(model, start, demand, plan, gradient=True, **scheme)
     assert value == pytest.approx(expected.item(), rel=1e-12)

@@ -1,6 +1,11 @@
 """A scenario small enough for tests: two or three regions in a row, 0-1-2, twenty control intervals."""
 
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
+
+from nmfd.network import Network
 
 NETWORK = """
 name = "{name}"
@@ -54,3 +59,13 @@ def write(folder: Path, *, scenario: str = SCENARIO, network: str | None = None)
         (folder / name).mkdir(parents=True)
         (folder / name / f"{name}.toml").write_text(text)
     return folder / "scenario"
+
+
+def limited(network: Network, *, seed: int = 0) -> Network:
+    """`network` with exit rates, boundary capacities and storage, all of a size that matters."""
+    random, shape = np.random.default_rng(seed), network.adjacency.shape
+    most = max(mfd.capacity for mfd in network.mfds)
+    return replace(
+        network, exit_rates=random.uniform(0.5, 1.5, shape),
+        capacity=random.uniform(0.1, 0.6, shape) * most * network.adjacency,
+        storage=random.uniform(0.8, 1.6, network.regions) * np.array([m.jam for m in network.mfds]))

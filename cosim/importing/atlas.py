@@ -41,8 +41,9 @@ def region_map(ax: Axes, streets: Streets, regions: np.ndarray, names: Sequence[
     length = 10.0 ** np.floor(np.log10(0.4 * (right - left)))
     bottom = ax.get_ylim()[0]
     ax.plot([left, left + length], [bottom, bottom], color="black", linewidth=2)
-    ax.annotate(f"{length:g} m" if length < 1000 else f"{length / 1000:g} km", (left + length / 2, bottom), xytext=(0, 3),
-                textcoords="offset points", ha="center", fontsize="small")
+    text = f"{length:g} m" if length < 1000 else f"{length / 1000:g} km"
+    ax.annotate(text, (left + length / 2, bottom), xytext=(0, 3), textcoords="offset points", ha="center",
+                fontsize="small")
     return ax
 
 

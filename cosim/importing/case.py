@@ -78,8 +78,8 @@ def seconds(text: str, where: str) -> float:
             raise ValueError
     except ValueError:
         raise InputError(f"{where}: expected seconds or hours:minutes:seconds, got {text!r} instead") from None
-    sign = -1.0 if text.startswith("-") else 1.0
-    return sign * sum(abs(part) * unit for part, unit in zip(reversed(parts), (1.0, 60.0, 3600.0, 86400.0), strict=False))
+    size = sum(abs(part) * unit for part, unit in zip(reversed(parts), (1.0, 60.0, 3600.0, 86400.0), strict=False))
+    return -size if text.startswith("-") else size
 
 
 def read_xml(path: Path) -> ElementTree.Element:

@@ -1,8 +1,7 @@
 """Agglomerative clustering of blocks on their densities: Ward's criterion, but only neighbours merge.
 
-After Saeedmanesh and Geroliminis, "Clustering of heterogeneous networks with directional flows based on snake
-similarities", and Ji and Geroliminis, "On the spatial partitioning of urban transportation networks": regions homogeneous
-in density, and compact. Single links are bimodal, so that densities are averaged over the neighbourhood first; the
+The aims are those of Ji and Geroliminis, "On the spatial partitioning of urban transportation networks": regions
+homogeneous in density, and compact. Single links are bimodal, so that densities are averaged over the neighbourhood first; the
 place counts too, or regions would be threads along the congested roads.
 """
 

@@ -23,7 +23,8 @@ def taz_xml(streets: Streets, regions: np.ndarray, names: tuple[str, ...]) -> st
     out.write("<additional>\n")
     for region, name in enumerate(names):
         edges = " ".join(streets.edges[n] for n in np.flatnonzero(regions == region))
-        out.write(f'  <taz id="region{region}" name={quoteattr(name)} color="{_rgb(region)}" edges={quoteattr(edges)}/>\n')
+        out.write(
+            f'  <taz id="region{region}" name={quoteattr(name)} color="{_rgb(region)}" edges={quoteattr(edges)}/>\n')
     out.write("</additional>\n")
     return out.getvalue()
 
@@ -36,8 +37,8 @@ def polygons_xml(streets: Streets, regions: np.ndarray, names: tuple[str, ...]) 
         for n, ring in enumerate(rings):
             shape = " ".join(f"{x:.1f},{y:.1f}" for x, y in ring)
             mark = f"region{region}" + (f".{n}" if n else "")
-            out.write(f'  <poly id="{mark}" type={quoteattr(names[region])} color="{_rgb(region)},90" fill="1" layer="-1" '
-                      f'shape="{shape}"/>\n')
+            out.write(f'  <poly id="{mark}" type={quoteattr(names[region])} color="{_rgb(region)},90" fill="1" '
+                      f'layer="-1" shape="{shape}"/>\n')
     out.write("</additional>\n")
     return out.getvalue()
 

@@ -102,7 +102,8 @@ def _signals(streets: Streets, regions: np.ndarray, city: City) -> np.ndarray:
 
 def text(tables: Tables) -> str:
     """The quality table for the terminal."""
-    head = ("region", "lane-km", "signals", "density", "var. before", "within", "gateways", "controlled", "uncontrolled")
+    head = (
+        "region", "lane-km", "signals", "density", "var. before", "within", "gateways", "controlled", "uncontrolled")
     lines = [f"{head[0]:<18}" + "".join(f"{column:>13}" for column in head[1:])]
     for row in tables.quality:
         share = "-" if np.isnan(row["uncontrolled_share"]) else f"{100 * row['uncontrolled_share']:.0f} %"
@@ -110,6 +111,7 @@ def text(tables: Tables) -> str:
                  row["variance_within"], row["gateways"], row["controlled_gateways"], share)
         title = row["name"] if row["region"] == "all" else f"{row['region']} {row['name']}"
         lines.append(f"{title:<18}" + "".join(f"{cell:>13}" for cell in cells))
-    lines.append("density: vehicles per lane-km in the busiest quarter of an hour without control, and its variance "
-                 "over the lanes;\nuncontrolled: share of the flow over the region's boundary that no controlled signal sees")
+    lines.append(
+        "density: vehicles per lane-km in the busiest quarter of an hour without control, and its variance over lanes;\n"
+        "uncontrolled: share of the flow over the region's boundary that no controlled signal sees")
     return "\n".join(lines)

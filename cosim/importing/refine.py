@@ -31,8 +31,8 @@ def prices(streets: Streets, blocks: Blocks, controlled: np.ndarray, baseline: B
     ends = blocks.of[streets.links]
     keep = (ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])
     rows, columns, price = ends[keep, 0], ends[keep, 1], price[keep]
-    found = coo_array((np.tile(price, 2), (np.r_[rows, columns], np.r_[columns, rows])), shape=(len(blocks.weight),) * 2)
-    return found.tocsr()
+    both = np.r_[rows, columns], np.r_[columns, rows]
+    return coo_array((np.tile(price, 2), both), shape=(len(blocks.weight),) * 2).tocsr()
 
 
 def refine(blocks: Blocks, labels: np.ndarray, feature: np.ndarray, price: csr_array) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""From labels to regions that can be used: connected, reachable from each other, every edge in one, numbered by place."""
+"""From labels to regions that can be used: connected, reachable from each other, every edge in one, in order."""
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -14,8 +14,8 @@ def finish(streets: Streets, labels: np.ndarray, *, renumber: bool = True) -> np
 
     Every region is made connected by the connections between its edges, and all regions can be reached from each
     other: pieces and regions that fail go to a neighbour, so that fewer regions may be left than were asked for.
-    Numbered from north to south, or with renumber = False in the order of the labels. Edges closed to cars, and parts of the network that nothing joins to the rest, belong
-    to a region that they adjoin, or the nearest.
+    Numbered from north to south, or with renumber = False in the order of the labels. Edges closed to cars, and parts
+    of the network that nothing joins to the rest, belong to a region that they adjoin, or to the nearest.
     """
     regions = labels.copy()
     regions[~streets.drivable] = -1
@@ -111,7 +111,8 @@ def _spread(streets: Streets, regions: np.ndarray, links: np.ndarray, wanted: np
 def _numbered(streets: Streets, regions: np.ndarray) -> np.ndarray:
     """The same regions as 0, 1, ... from north to south, and from west to east where that is a tie."""
     used = np.unique(regions)
-    order = sorted(used, key=lambda r: (-round(_gravity(streets, regions == r)[1], 1), _gravity(streets, regions == r)[0]))
+    middle = {region: _gravity(streets, regions == region) for region in used}
+    order = sorted(used, key=lambda region: (-round(middle[region][1], 1), middle[region][0]))
     place = {region: n for n, region in enumerate(order)}
     return np.array([place[region] for region in regions])
 

@@ -135,7 +135,7 @@ class DpcController:
         self._onward = policy.onward.numpy() if policy.architecture.sparse else None
         self._u_max = self._full(policy.u_max * policy.adjacency.numpy())
 
-    def reset(self) -> None:
+    def reset(self, seed: int = 0) -> None:
         pass
 
     def act(self, measurement: Measurement) -> Controls:

@@ -15,7 +15,7 @@ class NoControl:
         network = scenario.network
         self._controls = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None)
 
-    def reset(self) -> None:
+    def reset(self, seed: int = 0) -> None:
         pass
 
     def act(self, measurement: Measurement) -> Controls:

@@ -38,11 +38,11 @@ class PiGating:
                 f"add protected = [<region>, ...] with regions from 0 to {network.regions - 1}")
         options = toml.Table(scenario.controller_options.get(self.name, {}), where, f"controllers.{self.name}.")
         self._regions = np.array(scenario.protected)
-        self._critical = np.array([network.mfds[region].critical for region in self._regions])
-        set_point = options.numbers("set_point", tuple(self._critical), length=len(self._regions))
+        self.critical = np.array([network.mfds[region].critical for region in self._regions])
+        set_point = options.numbers("set_point", tuple(self.critical), length=len(self._regions))
         if min(set_point) <= 0:
             raise options.error("set_point", f"expected numbers above 0 [veh], got {list(set_point)} instead")
-        self._set_point = np.array(set_point)
+        self.set_point = np.array(set_point)
         self._kp = options.number("kp", KP, low=0.0)
         self._ki = options.number("ki", KI, above=0.0) * scenario.step
         options.close()
@@ -51,15 +51,15 @@ class PiGating:
         self._bounds = network.u_min, network.u_max
         self.reset()
 
-    def reset(self) -> None:
+    def reset(self, seed: int = 0) -> None:
         self._gate = np.full(len(self._regions), self._bounds[1])
         self._before = None
 
     def act(self, measurement: Measurement) -> Controls:
         now = measurement.accumulation.sum(axis=1)[self._regions]
         before = now if self._before is None else self._before
-        change = self._kp * (before - now) + self._ki * (self._set_point - now)
-        self._gate = np.clip(self._gate + change / self._critical, *self._bounds)
+        change = self._kp * (before - now) + self._ki * (self.set_point - now)
+        self._gate = np.clip(self._gate + change / self.critical, *self._bounds)
         self._before = now
         perimeter = self._open.copy()
         perimeter[:, self._regions] = np.where(self._entries, self._gate, 0.0)

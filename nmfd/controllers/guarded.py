@@ -47,7 +47,7 @@ class Guarded:
         self._limit = float(states["limit"])
         self.reset()
 
-    def reset(self) -> None:
+    def reset(self, seed: int = 0) -> None:
         self._policy.reset()
         self._left = 0  # intervals that PI gating keeps the control for
 

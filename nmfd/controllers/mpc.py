@@ -152,7 +152,7 @@ class EconomicMpc:
         self._open = self.admissible.open(self._moves)
         self.reset()
 
-    def reset(self) -> None:
+    def reset(self, seed: int = 0) -> None:
         self._plan, self._left = self._open, 0  # left: intervals of the plan that are still to come
 
     def act(self, measurement: Measurement) -> Controls:

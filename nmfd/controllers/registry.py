@@ -37,11 +37,25 @@ def _mpc_pcrg(scenario: Scenario) -> Controller:
     return EconomicMpc(scenario, guidance=True)
 
 
+def _probing_pc(scenario: Scenario) -> Controller:
+    from nmfd.controllers.probing import Probing
+
+    return Probing(scenario, guidance=False)
+
+
+def _probing_pcrg(scenario: Scenario) -> Controller:
+    from nmfd.controllers.probing import Probing
+
+    return Probing(scenario, guidance=True)
+
+
 _WITHOUT_POLICY: dict[str, Callable[[Scenario], Controller]] = {
     "no-control": _no_control,
     "pi-gating": _pi_gating,
     "mpc-pc": _mpc_pc,
     "mpc-pcrg": _mpc_pcrg,
+    "probing-pc": _probing_pc,
+    "probing-pcrg": _probing_pcrg,
 }
 # Whether the policy guides routes too. The same as training.NAMES, which cannot be read without importing torch.
 _WITH_POLICY = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
@@ -97,7 +111,10 @@ def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Contro
 
     Raises InputError as `policy_path` does, and what the controller itself finds wrong with its options or policy.
     """
+    from nmfd.scenario import as_modelled
+
     path = policy_path(name, scenario, policy)
+    scenario = as_modelled(scenario, _GUARDED.get(name, name))
     if path is None:
         return _WITHOUT_POLICY[name](scenario)
     if name in _WITH_PLAN:

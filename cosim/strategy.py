@@ -1,0 +1,76 @@
+"""Strategies by name: CONTROLLER[+OPTION...], a regional controller and what else the city does.
+
+    dpc-pc+max-pressure      DPC at the gateways, max-pressure at the other signals
+    no-control+rerouting-30  nobody controls, 30 % of the drivers reroute; `rerouting-30` for short
+"""
+
+from dataclasses import dataclass, field
+
+from nmfd.controllers import registry
+from nmfd.errors import InputError
+
+ALONE = "no-control"  # the controller of a name that is only options
+FIXED, WEBSTER, ACTUATED, MAX_PRESSURE = "fixed", "webster", "actuated", "max-pressure"
+SIGNALS = (FIXED, WEBSTER, ACTUATED, MAX_PRESSURE)
+HOLD_BACK, REDISTRIBUTE = "hold-back", "redistribute"
+MODES = (HOLD_BACK, REDISTRIBUTE)
+
+# Option -> (field of cosim.plant.Settings, its value).
+_WORDS = {name: ("signals", name) for name in SIGNALS[1:]} | {name: ("actuation", name) for name in MODES}
+# Option with a number -> (field of cosim.plant.Settings, least percentage); at most 100.
+_PERCENTAGES = {"rerouting": ("rerouting", 1), "compliance": ("compliance", 0)}
+OPTIONS = (*_WORDS, *(f"{name}-N" for name in _PERCENTAGES))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Strategy:
+    """name: as the user wrote it; controller: of nmfd.controllers.registry; overrides: field of
+    cosim.plant.Settings -> value, instead of that of the scenario."""
+
+    name: str
+    controller: str
+    overrides: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def model_free(self) -> bool:
+        """Whether a run does not depend on the regional model."""
+        return self.controller == ALONE
+
+
+def parse(name: str) -> Strategy:
+    """The strategy `name`. InputError for a controller or option that there is not, and for contradictory ones."""
+    first, *words = name.split("+")
+    controller = first
+    if _option(first) is not None:
+        controller, words = ALONE, [first, *words]
+    elif first not in registry.names():
+        raise _unknown(name, first, controllers=True)
+    overrides: dict[str, object] = {"gateways_fixed": controller != ALONE}
+    chosen: dict[str, str] = {}
+    for word in words:
+        option = _option(word)
+        if option is None:
+            raise _unknown(name, word, controllers=False)
+        key, value = option
+        if key in chosen:
+            raise InputError(f"strategy {name!r}: {chosen[key]} and {word} exclude each other; leave one of them out")
+        chosen[key], overrides[key] = word, value
+    return Strategy(name=name, controller=controller, overrides=overrides)
+
+
+def _option(word: str) -> tuple[str, object] | None:
+    if word in _WORDS:
+        return _WORDS[word]
+    stem, _, digits = word.rpartition("-")
+    if stem in _PERCENTAGES and digits.isascii() and digits.isdigit():
+        key, least = _PERCENTAGES[stem]
+        if least <= int(digits) <= 100 and digits == str(int(digits)):
+            return key, int(digits) / 100
+    return None
+
+
+def _unknown(name: str, word: str, *, controllers: bool) -> InputError:
+    where = f"controller {name!r}" if word == name else f"strategy {name!r}: {word!r}"
+    ranges = ", ".join(f"{stem}-N from {least} to 100" for stem, (_, least) in _PERCENTAGES.items())
+    first = f"{', '.join(registry.names())}, with options joined by +: " if controllers else ""
+    return InputError(f"{where} is unknown; choose from {first}{', '.join(OPTIONS)} (in whole percent, {ranges})")

@@ -1,0 +1,54 @@
+"""Excitation for identification: every control moves over its range, while the city stays alive."""
+
+import numpy as np
+
+from nmfd.controllers.gating import PiGating
+from nmfd.scenario import Scenario
+from nmfd.types import Controls, Measurement
+
+HOLD = (3, 9)            # control intervals between two draws, from and to
+SET_POINTS = (0.5, 1.3)  # of the critical accumulation, of every protected region
+DISTURBED = 0.35         # share of the gateways whose u is drawn by lot
+MOST_DIVERTED = 0.6      # share of the vehicles of one kind in a region whose way is drawn by lot; more locks a city
+
+
+class Probing:
+    """Gating at set points drawn by lot, with some gateways open at random besides, for loading runs.
+
+    Random controls alone would lock the city early in every run; gating alone moves all gateways of a region together
+    and never those between the others. With guidance, theta lies between the drivers' own and a point of the simplex
+    drawn by lot. Everything is drawn anew every few control intervals, from the seed of the run.
+    """
+
+    def __init__(self, scenario: Scenario, *, guidance: bool):
+        self.name = "probing-pcrg" if guidance else "probing-pc"
+        self._network, self._guidance = scenario.network, guidance
+        self._gating = PiGating(scenario) if scenario.protected else None
+        self._open = np.where(scenario.network.adjacency, scenario.network.u_max, 0.0)
+        self.reset()
+
+    def reset(self, seed: int = 0) -> None:
+        self._random, self._left = np.random.default_rng([seed, 0x70726F62]), 0
+        if self._gating is not None:
+            self._gating.reset()
+
+    def act(self, measurement: Measurement) -> Controls:
+        if self._left == 0:
+            self._draw()
+        self._left -= 1
+        perimeter = self._open if self._gating is None else self._gating.act(measurement).perimeter
+        return Controls(perimeter=np.where(self._disturbed, self._by_lot, perimeter), splits=self._splits)
+
+    def _draw(self) -> None:
+        random, network = self._random, self._network
+        self._left = int(random.integers(*HOLD))
+        if self._gating is not None:
+            self._gating.set_point = random.uniform(*SET_POINTS) * self._gating.critical
+        self._by_lot = random.uniform(network.u_min, network.u_max, network.adjacency.shape)
+        self._disturbed = network.adjacency & (random.random(network.adjacency.shape) < DISTURBED)
+        self._splits = None
+        if self._guidance:
+            lot = random.exponential(size=network.split_mask.shape) ** 2 * network.split_mask
+            lot /= np.maximum(lot.sum(axis=1, keepdims=True), 1e-12)
+            share = MOST_DIVERTED * random.random((network.regions, 1, network.regions)) ** 2
+            self._splits = (1.0 - share) * network.nominal_splits + share * lot

@@ -1,0 +1,57 @@
+"""Strategies by name."""
+
+from dataclasses import fields
+
+import pytest
+
+from cosim.plant import Settings
+from cosim.strategy import ALONE, OPTIONS, parse
+from nmfd.controllers import registry
+from nmfd.errors import InputError
+
+
+@pytest.mark.parametrize("name, controller, overrides", [
+    ("no-control", "no-control", {"gateways_fixed": False}),
+    ("pi-gating", "pi-gating", {"gateways_fixed": True}),
+    ("actuated", "no-control", {"gateways_fixed": False, "signals": "actuated"}),
+    ("max-pressure+rerouting-100", "no-control",
+     {"gateways_fixed": False, "signals": "max-pressure", "rerouting": 1.0}),
+    ("dpc-pc+rerouting-30+webster", "dpc-pc", {"gateways_fixed": True, "signals": "webster", "rerouting": 0.3}),
+    ("dpc-pcrg+redistribute+compliance-0", "dpc-pcrg",
+     {"gateways_fixed": True, "actuation": "redistribute", "compliance": 0.0}),
+])
+def test_what_a_name_means(name, controller, overrides):
+    strategy = parse(name)
+    assert (strategy.name, strategy.controller, strategy.overrides) == (name, controller, overrides)
+    assert strategy.model_free == (controller == ALONE)
+
+
+def test_every_controller_and_option_is_a_strategy():
+    names = {field.name for field in fields(Settings)}
+    for controller in registry.names():
+        assert parse(controller).controller == controller
+    for option in OPTIONS:
+        option = option.replace("-N", "-50")
+        assert parse(option).overrides == parse(f"no-control+{option}").overrides
+        assert set(parse(f"mpc-pc+{option}").overrides) <= names
+
+
+@pytest.mark.parametrize("name, expected", [
+    ("nobody", "controller 'nobody' is unknown; choose from no-control, pi-gating"),
+    ("", "controller '' is unknown"),
+    ("dpc-pc+", "strategy 'dpc-pc+': '' is unknown; choose from webster, actuated, max-pressure"),
+    ("dpc-pc+pi-gating", "'pi-gating' is unknown"),
+    ("webster+no-control", "'no-control' is unknown"),
+    ("rerouting-0", "rerouting-N from 1 to 100"),
+    ("rerouting-101", "unknown"),
+    ("rerouting-05", "unknown"),
+    ("rerouting", "unknown"),
+    ("rerouting-2.5", "unknown"),
+    ("actuated+webster", "actuated and webster exclude each other"),
+    ("rerouting-30+rerouting-40", "exclude each other"),
+    ("pi-gating+hold-back+redistribute", "exclude each other"),
+])
+def test_errors_say_what_is_allowed(name, expected):
+    with pytest.raises(InputError) as caught:
+        parse(name)
+    assert expected in str(caught.value) and "\n" not in str(caught.value)
