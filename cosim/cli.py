@@ -218,6 +218,9 @@ def identify(scenario: Path, levels: str, seeds: int, workers: int, out: Path | 
 @click.option("--edges", type=FILE, metavar="CSV", help="Or your own regions: a table with the columns edge,region,")
 @click.option("--taz", type=FILE, metavar="FILE", help="or a SUMO file with a TAZ per region,")
 @click.option("--polygons", type=FILE, metavar="FILE", help="or one with a polygon or more (id, id.1, ...) per region.")
+@click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak, for a city without demand.")
+@click.option("--level", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True,
+              help="Of --demand peak: times its usual number of trips.")
 @click.option("--begin", metavar="TIME", help="Instead of the sumocfg's, in seconds or as hours:minutes:seconds.")
 @click.option("--end", metavar="TIME", help="Later departures are left out.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
@@ -225,7 +228,8 @@ def identify(scenario: Path, levels: str, seeds: int, workers: int, out: Path | 
 @click.option("--force", is_flag=True, help="Replace a network and scenario that are there.")
 def import_(
     source: Path, regions: int | None, out: Path, scenario: Path | None, method: str, edges: Path | None,
-    taz: Path | None, polygons: Path | None, begin: str | None, end: str | None, seed: int, no_run: bool, force: bool,
+    taz: Path | None, polygons: Path | None, demand: str | None, level: float, begin: str | None, end: str | None,
+    seed: int, no_run: bool, force: bool,
 ) -> None:
     """Turn any SUMO city into a network and a scenario: regions, gateways, demand by pair of regions, map.
 
@@ -234,6 +238,7 @@ def import_(
     \b
     Examples:
       cosim import city.sumocfg --regions 5 --out networks/mycity
+      cosim import city.net.xml.gz --regions 6 --demand peak --out networks/mycity
       cosim import city.sumocfg --taz districts.taz.xml --out networks/mycity --begin 7:00:00 --end 9:00:00
     """
     from cosim.importing.importer import Order, import_city, parse_time
@@ -247,8 +252,8 @@ def import_(
     method, given = next(iter(own.items()), (method, None))
     order = Order(
         source=source, regions=regions, out=out, method=method, given=given, seed=seed, run=not no_run, force=force,
-        scenario=scenario or out.parent.parent / "scenarios" / out.name, begin=parse_time(begin, "--begin"),
-        end=parse_time(end, "--end"))
+        level=level if demand else None, scenario=scenario or out.parent.parent / "scenarios" / out.name,
+        begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"))
     with progress_line("import") as progress:
         report = import_city(order, (lambda stage: progress(0, 1, stage)) if progress else lambda stage: None)
     click.echo(report)

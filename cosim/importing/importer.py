@@ -18,6 +18,7 @@ from cosim.importing import atlas, layers, model, quality
 from cosim.importing.baseline import Baseline, run_baseline
 from cosim.importing.case import Case, read_case, seconds
 from cosim.importing.demand import Traffic, read_traffic, wrapped
+from cosim.importing.generated import morning_peak
 from cosim.importing.partition import partition
 from cosim.importing.regions import positions
 from cosim.importing.streets import Streets, read_streets
@@ -31,8 +32,13 @@ FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz",
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """What the user asked for. method: see partition.METHODS; given: the file of regions of a method that reads one;
-    run: simulate the city without control first; begin, end [s]: instead of the sumocfg's."""
+    """What the user asked for.
+
+    method: see partition.METHODS; given: the file of regions of a method that reads one
+    run: simulate the city without control first
+    level: of a generated morning peak, instead of route files
+    begin, end [s]: instead of the sumocfg's
+    """
 
     source: Path
     regions: int | None
@@ -42,6 +48,7 @@ class Order:
     given: Path | None = None
     seed: int = 0
     run: bool = True
+    level: float | None = None
     force: bool = False
     begin: float | None = None
     end: float | None = None
@@ -54,11 +61,7 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
     tell("reading")
     case = _windowed(read_case(order.source), order)
     streets = read_streets(case.net, case.additional)
-    traffic = read_traffic(case, streets, order.seed)
-    if not len(traffic.depart):
-        raise InputError(
-            f"{order.source}: names no vehicles that cars' streets could carry{_notes(traffic)}; give a sumocfg with "
-            "route-files")
+    traffic = _traffic(case, streets, order)
     clock = model.clock(case, streets, traffic)
     with _folders(order) as (net_folder, folder):
         files = _write_traffic(folder, traffic)
@@ -88,6 +91,25 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
         report = _report(order, case, streets, traffic, clock, network, city, found, left, baseline)
         (net_folder / "import.txt").write_text(report + "\n")
     return report
+
+
+def _traffic(case: Case, streets: Streets, order: Order) -> Traffic:
+    """The city's own vehicles, or a generated demand beside what else its files hold."""
+    traffic = read_traffic(case, streets, order.seed)
+    if order.level is None:
+        if not len(traffic.depart):
+            raise InputError(
+                f"{order.source}: names no vehicles for the streets of cars{_notes(traffic)}; give a sumocfg with "
+                "route-files, or add --demand peak")
+        return traffic
+    if len(traffic.depart):
+        raise InputError(
+            f"--demand: {order.source} has {len(traffic.depart):,} vehicles of its own; leave --demand away, or give "
+            "the network alone")
+    peak = morning_peak(streets, level=order.level, begin=case.begin, seed=order.seed)
+    return replace(
+        peak, background=traffic.background, shared=traffic.shared + peak.shared, switched=traffic.switched,
+        notes={**traffic.notes, **peak.notes})
 
 
 def left_alone(streets: Streets, traffic: Traffic) -> dict[str, str]:

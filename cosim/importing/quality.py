@@ -112,6 +112,6 @@ def text(tables: Tables) -> str:
         title = row["name"] if row["region"] == "all" else f"{row['region']} {row['name']}"
         lines.append(f"{title:<18}" + "".join(f"{cell:>13}" for cell in cells))
     lines.append(
-        "density: vehicles per lane-km in the busiest quarter of an hour without control, and its variance over lanes;\n"
+        "density: vehicles per lane-km in the busiest quarter of an hour without control; its variance over lanes;\n"
         "uncontrolled: share of the flow over the region's boundary that no controlled signal sees")
     return "\n".join(lines)
