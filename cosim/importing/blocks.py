@@ -23,13 +23,15 @@ class Blocks:
     """B blocks of the main part of a network.
 
     of: (E,) block of an edge, -1 outside the main part
-    weight: (B,) lane metres; position: (B, 2) [m]
+    weight: (B,) lane metres; core: (B,) those of edges from which each other such edge can be reached; a region without
+        any is a way in or out of the city, from or to which nobody can come back; position: (B, 2) [m]
     near: (B, B) symmetric, the distance [m] between the middles of two blocks that traffic joins
     joins: (B, B) symmetric, how many connections join them
     """
 
     of: np.ndarray
     weight: np.ndarray
+    core: np.ndarray
     position: np.ndarray
     near: csr_array
     joins: csr_array
@@ -67,7 +69,8 @@ def make_blocks(streets: Streets) -> Blocks:
     near = joins.tocoo()
     apart = np.hypot(*(position[near.row] - position[near.col]).T)
     near = csr_array((np.maximum(apart, 1.0), (near.row, near.col)), shape=(count, count))
-    return Blocks(of=of, weight=weight, position=position, near=near, joins=joins)
+    core = np.bincount(number, (streets.lane_metres * streets.core)[inside], count)
+    return Blocks(of=of, weight=weight, core=core, position=position, near=near, joins=joins)
 
 
 def _carriageways(streets: Streets, label: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Agglomerative clustering of blocks on their densities: Ward's criterion, but only neighbours merge.
 
 The aims are those of Ji and Geroliminis, "On the spatial partitioning of urban transportation networks": regions
-homogeneous in density, and compact. Single links are bimodal, so that densities are averaged over the neighbourhood first; the
-place counts too, or regions would be threads along the congested roads.
+homogeneous in density, and compact. Single links are bimodal, so that densities are averaged over the neighbourhood
+first; the place counts too, or regions would be threads along the congested roads.
 """
 
 import heapq
@@ -14,7 +14,7 @@ from cosim.importing.blocks import Blocks
 SMOOTHING = 2       # rounds of averaging with the neighbours
 PLACE = 1.0         # weight of the place against the density, both with variance 1 over the city
 HIGHEST = 0.15      # veh/m; denser is as dense
-SMALLEST = 0.4      # of the mean size: a cluster below is none of the regions that were asked for
+SMALLEST = 0.4      # of the mean size, of Blocks.core: a cluster below is none of the regions that were asked for
 
 
 def features(blocks: Blocks, density: np.ndarray) -> np.ndarray:
@@ -32,8 +32,8 @@ def features(blocks: Blocks, density: np.ndarray) -> np.ndarray:
 def agglomerate(blocks: Blocks, feature: np.ndarray, regions: int) -> np.ndarray:
     """(B,) region of every block, 0 to regions - 1 (fewer where there are not enough blocks of a size)."""
     merges = _merges(blocks, feature)
-    least = SMALLEST * blocks.weight.sum() / regions
-    sizes = {n: weight for n, weight in enumerate(blocks.weight)}
+    least = SMALLEST * blocks.core.sum() / regions
+    sizes = dict(enumerate(blocks.core))
     history = []  # after n merges: how many clusters are large enough
     large = sum(size >= least for size in sizes.values())
     history.append(large)
@@ -95,7 +95,7 @@ def _without_tiny(blocks: Blocks, feature: np.ndarray, labels: np.ndarray, regio
     joins = blocks.joins.tocoo()
     while labels.max() + 1 > regions:
         sizes = np.bincount(labels, blocks.weight)
-        smallest = int(np.argmin(sizes))
+        smallest = int(np.argmin(np.bincount(labels, blocks.core)))
         mean = np.array([np.bincount(labels, blocks.weight * axis) / sizes for axis in feature.T]).T
         beyond = np.unique(labels[joins.col[labels[joins.row] == smallest]])
         beyond = beyond[beyond != smallest]

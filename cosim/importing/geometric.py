@@ -1,6 +1,8 @@
 """k-means on the road graph: every block belongs to the centre that is nearest by road, with a handicap for centres
 of regions that are too large. Such regions are connected, compact and of similar size."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
@@ -14,6 +16,7 @@ GAIN = 0.3  # of the handicap's growth per round, in mean radii
 def k_means(blocks: Blocks, regions: int, seed: int) -> np.ndarray:
     """(B,) region of every block, 0 to regions - 1. The best of all rounds: sizes alike first, then compact."""
     random = np.random.default_rng([seed, 0x6B6D])
+    blocks = replace(blocks, weight=blocks.core + 0.1 * blocks.weight)  # ways in and out make no region
     centres = _start(blocks, regions, random)
     radius = np.sqrt(np.ptp(blocks.position, axis=0).prod() / regions) / 2
     handicap, share = np.zeros(regions), blocks.weight.sum() / regions
