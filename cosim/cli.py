@@ -186,16 +186,21 @@ def identify(scenario: Path, levels: str, seeds: int, workers: int, out: Path | 
     The city is loaded with multiples of the scenario's demand under no control. Policies that were trained on the
     network as it was before do not fit the new one: train them again.
 
+    Of an imported city the network's folder will do.
+
     \b
-    Example:
+    Examples:
       cosim identify scenarios/grid7_peak --levels 0.6,0.8,1.0 --seeds 2
+      cosim identify networks/mycity
     """
     from cosim import identify
+    from cosim.importing import find
     from nmfd import runs
     from nmfd.progress import progress_line
     from nmfd.scenario import load_scenario
 
     factors = _levels("--levels", levels)
+    scenario = find.scenario_of(scenario)
     loaded = load_scenario(scenario)
     out = Path("runs") / f"{runs.file_name(loaded.name)}-identify" if out is None else out
     try:
