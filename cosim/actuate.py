@@ -11,13 +11,13 @@ unchanged cycle and unchanged intergreens (redistribute).
 """
 
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate
 
 import numpy as np
 
 from cosim.strategy import HOLD_BACK
-from cosim.sumo import Programme
+from cosim.sumo import Phase, Programme
 
 YELLOW = 3.0  # s, where the original programme has none after a green
 GREEN = frozenset("Gg")
@@ -41,7 +41,7 @@ class GatewaySignal:
         self._movements = {link: _Movement(pair) for link, pair in movements.items()}
         self._min_green, self._mode, self._cycle = min_green, mode, programme.cycle
         self._windows = {link: _windows(programme, link) for link in movements}
-        self._yellow = {link: _yellow(programme, link) for link in movements}
+        self._yellow = {link: yellow_time(programme.phases, link) for link in movements}
         self._cycle_start = start - programme.position
         self._ends = list(accumulate(self._original))
         self._share: dict[tuple[int, int], float] = {}
@@ -152,13 +152,13 @@ def _windows(programme: Programme, link: int) -> dict[int, float]:
     return windows
 
 
-def _yellow(programme: Programme, link: int) -> float:
-    """The shortest yellow after a green of `link` [s]."""
-    phases, found = programme.phases, []
+def yellow_time(phases: Sequence[Phase], link: int) -> float:
+    """The longest yellow after a green of `link` [s]."""
+    cycle, found = sum(phase.duration for phase in phases), []
     for n, phase in enumerate(phases):
         if phase.state[link] == "y" and phases[n - 1].state[link] in GREEN:
             length = 0.0
-            while phases[n % len(phases)].state[link] == "y" and length < programme.cycle:
+            while phases[n % len(phases)].state[link] == "y" and length < cycle:
                 length, n = length + phases[n % len(phases)].duration, n + 1
             found.append(length)
     return max(found, default=YELLOW)

@@ -179,12 +179,19 @@ def compare(target: Path, controller: str, seed: int, steps: int | None, out: Pa
 @click.option("--seeds", type=click.IntRange(min=1), default=2, show_default=True, metavar="N",
               help="Loading runs per level, with seeds 1000 to 1000 + N - 1.")
 @click.option("--workers", type=click.IntRange(min=1), default=2, show_default=True, metavar="N")
+@click.option("--guided", is_flag=True, help="With route guidance: the model of a city whose drivers are guided.")
+@click.option("--network", "target", type=FOLDER, metavar="DIR",
+              help="The folder whose network.toml is written. [default: the scenario's network]")
 @click.option("--out", type=FOLDER, metavar="DIR", help="Samples and pictures. [default: runs/<scenario>-identify]")
-def identify(scenario: Path, levels: str, seeds: int, workers: int, out: Path | None) -> None:
-    """Fit the MFDs and the drivers' own split ratios of a SUMO city; writes its network.toml.
+def identify(
+    scenario: Path, levels: str, seeds: int, workers: int, guided: bool, target: Path | None, out: Path | None,
+) -> None:
+    """Fit the regional model and the drivers' own split ratios of a SUMO city; writes a network.toml.
 
-    The city is loaded with multiples of the scenario's demand under no control. Policies that were trained on the
-    network as it was before do not fit the new one: train them again.
+    The city is loaded with multiples of the scenario's demand, first without perimeter control, then under a controller
+    that probes it. Policies that were trained on the network as it was before do not fit the new one: train them again.
+    A controller plans with a model other than the scenario's if its table says so, such as
+    [controllers.dpc-pcrg] with model = "../../networks/grid7_guided".
 
     Of an imported city the network's folder will do.
 
@@ -192,6 +199,7 @@ def identify(scenario: Path, levels: str, seeds: int, workers: int, out: Path | 
     Examples:
       cosim identify scenarios/grid7_peak --levels 0.6,0.8,1.0 --seeds 2
       cosim identify networks/mycity
+      cosim identify scenarios/grid7_peak --guided --network networks/grid7_guided
     """
     from cosim import identify
     from cosim.importing import find
@@ -202,15 +210,16 @@ def identify(scenario: Path, levels: str, seeds: int, workers: int, out: Path | 
     factors = _levels("--levels", levels)
     scenario = find.scenario_of(scenario)
     loaded = load_scenario(scenario)
-    out = Path("runs") / f"{runs.file_name(loaded.name)}-identify" if out is None else out
+    if out is None:
+        out = Path("runs") / f"{runs.file_name(loaded.name)}-identify{'-guided' if guided else ''}"
+    loading = identify.Loading(levels=factors, seeds=range(1000, 1000 + seeds), guided=guided, network=target)
     try:
         with progress_line("identify") as progress:
-            text = identify.identify(scenario, factors, range(1000, 1000 + seeds), out=out, workers=workers,
-                                     progress=progress)
+            text = identify.identify(scenario, loading, out=out, workers=workers, progress=progress)
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted; finished loading runs are in {out}: the same command goes on") from None
     click.echo(text)
-    click.echo(f"Written to {loaded.network.folder / 'network.toml'}; samples and pictures to {out}")
+    click.echo(f"Written to {(target or loaded.network.folder) / 'network.toml'}; samples and pictures to {out}")
 
 
 @main.command(name="import")

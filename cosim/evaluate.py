@@ -2,6 +2,7 @@
 
     <folder>/demand-<level>/    the run folder of a demand level (cosim.experiment)
     <folder>/evaluate.md, evaluate.csv, pairs.csv, runs.csv    the tables (cosim.tables), new after every run
+    pictures of a level in its folder, those across levels here (cosim.report)
 """
 
 import re
@@ -11,9 +12,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from cosim import experiment, tables
+from cosim import experiment, report, tables
 from cosim.simulate import Task
 from nmfd.errors import InputError
+from nmfd.scenario import load_scenario
 
 FIRST_SEED = 2000  # these seeds are kept for evaluations: nothing was chosen, trained or identified on them
 
@@ -60,8 +62,10 @@ def evaluate(
     failures = experiment.perform(
         evaluation.plan(), workers=workers, fresh=True, progress=progress, tell=tell,
         kept=lambda: tables.write(out, all_runs(evaluation), None))
-    rows = all_runs(evaluation)
-    table = tables.statistics(rows) if rows.empty else tables.write(out, rows, evaluation.reference)
+    rows, table = all_runs(evaluation), pd.DataFrame()
+    if len(rows):
+        table = tables.write(out, rows, evaluation.reference)
+        report.draw_all(out, level_folders(out), load_scenario(evaluation.scenario), rows)
     return table, [f"{experiment.label(task)}: {reason}" for task, reason in failures]
 
 

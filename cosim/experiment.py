@@ -23,6 +23,8 @@ from nmfd.scenario import Scenario, as_modelled
 from nmfd.types import Trajectory
 from nmfd.workers import Failure, RunFailed, attempt, outcomes
 
+# Of loading runs: whether they guide routes, and so depend on the drivers' own split ratios.
+LOADING = {"probing-pc": False, "probing-pcrg": True, "route-guidance": True}
 CAPTION = (
     "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; backlog: not\n"
     "inserted at the end; step: median / longest decision; outside SUMO: share of the wall time not in its own step")
@@ -98,17 +100,22 @@ def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> d
     """What the runs of a controller depend on, besides the city and its demand, which all runs share.
 
     Its own options, its policy or plan, the regional model and the library that computes with it. No control depends
-    on none of these. Raises InputError for a controller that cannot be made.
+    on none of these, and loading runs only on their options and the split ratios that they start from. Raises
+    InputError for a controller that cannot be made.
     """
     controller = parse(name).controller
     registry.make(controller, scenario, policy=policy)
     if controller == REFERENCE:
         return {}
+    options = scenario.controller_options.get(controller, {})
+    if controller in LOADING:
+        splits = scenario.network.nominal_splits if LOADING[controller] else np.empty(0)
+        return {"options": options, "splits_hash": hashlib.sha256(splits.round(9).tobytes()).hexdigest()[:16]}
     path = registry.policy_path(controller, scenario, policy)
     network = as_modelled(scenario, controller).network
     model = json.dumps([network.hash, scenario.integrator, scenario.substeps, scenario.protected])
     return {
-        "options": scenario.controller_options.get(controller, {}),
+        "options": options,
         "policy_hash": None if path is None else runs.file_hash(path),
         "model_hash": hashlib.sha256(model.encode()).hexdigest()[:16], "torch": metadata.version("torch")}
 
@@ -117,8 +124,8 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
     """The configuration that the tasks of one folder share, and what each of their controllers depends on."""
     first = tasks[0]
     scenario = scenario_of(first)
-    policies = {task.controller: task.policy for task in tasks}
-    controllers = {name: dependencies(name, scenario, policy) for name, policy in policies.items()}
+    controllers = {task.controller: dependencies(task.controller, scenario_of(task), task.policy)
+                   for task in {task.controller: task for task in tasks}.values()}
     files = ensure_built(scenario.network)
     check_adjacency(load_city(files.net_file, files.regions_csv, scenario.network.regions), scenario.network)
     configuration = {

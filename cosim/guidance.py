@@ -7,7 +7,9 @@ regions that are behind their share; the bonus grows until the shares are met, b
 
 A guided vehicle in region i bound for edge d takes the fastest way inside i to a gateway i -> h, and from there to d
 without coming back to i, at the travel times of the last control interval (smoothed), as its group of drivers sees
-them. In h it is guided again.
+them. In h it is guided again, and in the region of d it is sent there on the fastest way. Nobody is sent on a detour
+that takes much longer, whatever theta says, and nobody leaves the way that he is on for a small gain: everybody who
+changes his way makes the travel times that the others were told wrong.
 """
 
 import numpy as np
@@ -23,27 +25,34 @@ TASTES = 4       # groups of drivers who see different travel times: were they a
 SPREAD = 0.15    # standard deviation of the logarithm of their travel times
 SLOWEST = 0.1    # m/s; slower is as good as standing
 BONUS = 30.0     # s per vehicle that a region is behind its share
+LOYALTY = 0.3    # a driver keeps his way if the best one does not save more than this share of its own time
 MEMORY = 0.9     # of the vehicles assigned before, per control interval
 
 
 class Guide:
-    """Reroutes vehicles; `compliance` is the probability that a driver follows, drawn anew in every region.
+    """Reroutes vehicles; `compliance` is the probability that a driver follows, drawn anew in every region, and
+    `most_detour` [s] the most that a commanded next region may cost him.
 
     realised: (R, R, R) [veh], [i, h, j] = vehicles sent from i to h on their way to j since the start
     """
 
-    def __init__(self, session: Session, city: City, *, compliance: float, random: np.random.Generator):
+    def __init__(
+        self, session: Session, city: City, *, compliance: float, most_detour: float, random: np.random.Generator,
+    ):
+        self._most_detour = most_detour
         self._session, self._city, self._compliance, self._random = session, city, compliance, random
         self._index = {edge: n for n, edge in enumerate(city.edges)}
         self._region = np.array([city.region_of[edge] for edge in city.edges])
         moves = [(e, f) for e, after in city.successors.items() for f in after]
         self._from, self._to = np.array([(self._index[e], self._index[f]) for e, f in moves]).T
         self._turn = np.array([city.turn_time[move] for move in moves])
+        self._turn_time = dict(zip(zip(self._from.tolist(), self._to.tolist(), strict=True), self._turn, strict=True))
         self._taste = np.exp(SPREAD * random.standard_normal((TASTES, len(city.edges))))
         self._length = np.array([city.length[edge] for edge in city.edges])
         self._free = self._length / np.array([city.speed[edge] for edge in city.edges])
         self._time = self._free.copy()
         self._ways: dict[tuple[int, int], _Ways] = {}
+        self._home: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         self._splits: np.ndarray | None = None
         self._assigned = np.zeros((city.regions,) * 3)
         self.realised = np.zeros((city.regions,) * 3, dtype=int)
@@ -60,7 +69,7 @@ class Guide:
             if speed is not None:
                 now = np.where(np.isnan(speed), self._free, self._length / np.maximum(speed, SLOWEST))
                 self._time += SMOOTHING * (np.maximum(now, self._free) - self._time)
-            self._ways = {}
+            self._ways, self._home = {}, {}
             self._assigned *= MEMORY
 
     def apply(self, events: list[Event]) -> None:
@@ -68,15 +77,33 @@ class Guide:
         if self._splits is None:
             return
         for event in events:
-            if event.free and event.region != event.destination and self._random.random() < self._compliance:
-                self._guide(event)
+            if event.free and self._random.random() < self._compliance:
+                taste, target = int(self._random.integers(TASTES)), self._index[event.edge]
+                here = self._index.get(self._session.road(event.vehicle))
+                if here is None or self._region[here] != event.region:  # on a junction already: too late to turn
+                    continue
+                if event.region == event.destination:
+                    self._guide_home(event, here, target, taste)
+                else:
+                    self._guide_on(event, here, target, taste)
 
-    def _guide(self, event: Event) -> None:
-        ways = self._ways_from(event.region, int(self._random.integers(TASTES)))
-        target = self._index[event.edge]
-        here = self._index.get(self._session.road(event.vehicle))
-        if here is None or self._region[here] != event.region:  # on a junction already: too late to turn
+    def _guide_home(self, event: Event, here: int, target: int, taste: int) -> None:
+        """The fastest way inside the region of destination."""
+        time = self._time * self._taste[taste]
+        if (taste, target) not in self._home:
+            inside = self._graph(time, self._region == event.region, reverse=True)
+            self._home[taste, target] = dijkstra(inside, indices=target, return_predecessors=True)
+        cost, after = self._home[taste, target]
+        if here == target or not np.isfinite(cost[here]) or self._keeps(event.vehicle, here, time, cost[here]):
             return
+        way = [here]
+        while way[-1] != target:
+            way.append(int(after[way[-1]]))
+        self._send(event.vehicle, way)
+
+    def _guide_on(self, event: Event, here: int, target: int, taste: int) -> None:
+        """The next region, and the fastest way through it."""
+        ways = self._ways_from(event.region, taste)
         cost = ways.cost(here, target)
         least = np.minimum.reduceat(cost, ways.begins)
         cell = event.region, ways.neighbours, event.destination
@@ -85,15 +112,35 @@ class Guide:
             return
         shares /= shares.sum()
         behind = shares * (self._assigned[cell].sum() + 1.0) - self._assigned[cell]
-        n = int(np.argmin(np.where(shares > 1e-3, least - BONUS * behind, np.inf)))
+        allowed = (shares > 1e-3) & (least <= least.min() + self._most_detour)
+        if not allowed.any():  # every region with a share is too far out of the way
+            allowed = least <= least.min()
+        n = int(np.argmin(np.where(allowed, least - BONUS * behind, np.inf)))
         following = int(ways.neighbours[n])
         gateway = int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]]))
-        route = [self._city.edges[n] for n in ways.route(here, gateway, target)]
-        if self._session.set_route(event.vehicle, route):
+        if self._keeps(event.vehicle, here, ways.time, cost[gateway], following) or self._send(
+                event.vehicle, ways.route(here, gateway, target)):
             self.realised[event.region, following, event.destination] += 1
             self._assigned[event.region, following, event.destination] += 1.0
-        else:
-            self.refused += 1
+
+    def _keeps(self, vehicle: str, here: int, time: np.ndarray, cost: float, following: int | None = None) -> bool:
+        """Whether the driver's present way, at `time` (E,) [s], is about as good as one of `cost` [s], and leads into
+        the region `following` next, if that is given."""
+        route = self._session.route(vehicle)[self._session.route_index(vehicle):]
+        way = [self._index[edge] for edge in route]
+        if way[0] != here:
+            return False
+        regions = self._region[way]
+        if following is not None and regions[np.argmax(regions != regions[0])] != following:
+            return False
+        turns = sum(self._turn_time.get(move, 0.0) for move in zip(way[:-1], way[1:], strict=True))
+        return time[way[1:]].sum() + turns <= (1.0 + LOYALTY) * cost
+
+    def _send(self, vehicle: str, way: list[int]) -> bool:
+        """Give a vehicle this way; counts the refusals."""
+        taken = self._session.set_route(vehicle, [self._city.edges[n] for n in way])
+        self.refused += not taken
+        return taken
 
     def _ways_from(self, region: int, taste: int) -> "_Ways":
         if (region, taste) not in self._ways:
@@ -123,6 +170,7 @@ class _Ways:
     """
 
     def __init__(self, *, first, second, next_region, inside, outside, time):
+        self.time = time
         self._first, self._second, self._enter = first, second, time[second]
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))

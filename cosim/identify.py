@@ -1,9 +1,15 @@
-"""Loading runs -> MFD samples -> fitted MFDs and the drivers' own split ratios -> network.toml."""
+"""Loading runs -> the regional model of a SUMO city and its drivers' own split ratios -> network.toml.
+
+First the city is loaded without perimeter control, and every region's MFD is fitted to its outflow samples. Then it is
+loaded again under a probing controller, whose set points come from these MFDs, and the whole model is fitted to all
+runs by prediction error (nmfd.identification).
+"""
 
 import csv
 import io
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,50 +17,122 @@ import numpy as np
 from cosim import experiment
 from cosim.compare import HELD_UP, draw_mfds, outflow_samples
 from cosim.simulate import Result, Task
-from nmfd import mfd, runs, toml
+from nmfd import identification, mfd, runs, toml
 from nmfd.errors import InputError
+from nmfd.identification import Observed
 from nmfd.network import Network
-from nmfd.scenario import load_scenario
+from nmfd.scenario import Scenario, load_scenario
+from nmfd.workers import RunFailed
 
-FEWEST = 30.0  # vehicles that must have crossed before their split ratios count
+FEWEST = 30.0   # vehicles that must have crossed before their split ratios count
+AHEAD = 900.0   # s, of the longer prediction that is judged
+BINS = 12       # of accumulation, for the hysteresis
+PATHS = ("recipe", "net", "regions")  # keys of [sumo] in network.toml
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loading:
+    """levels: multiples of the scenario's demand; seeds: of the runs at every level
+    guided: with route guidance, first towards the drivers' own split ratios, then probing; else without
+    network: the folder whose network.toml is written, None for the scenario's own
+    """
+
+    levels: Sequence[float]
+    seeds: Sequence[int]
+    guided: bool = False
+    network: Path | None = None
+
+    @property
+    def stages(self) -> tuple[str, str]:
+        """The controllers of the two stages."""
+        return ("route-guidance", "probing-pcrg") if self.guided else ("no-control", "probing-pc")
 
 
 def identify(
-    scenario: Path, levels: Sequence[float], seeds: Sequence[int], *, out: Path, workers: int = 1,
+    scenario: Path, loading: Loading, *, out: Path, workers: int = 1,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> str:
-    """Load the city of `scenario` with `levels` times its demand under no control, fit, and write its network.toml.
+    """Load the city of `scenario`, fit its regional model, and write the network.toml of `loading`.
 
     Samples, pictures and the loading runs go to `out`, one run folder per level. Returns the fit as a table. Raises
-    InputError for a network that does not come from a folder, RunFailed if a loading run failed.
+    InputError for a network that does not come from a folder, RunFailed if a loading run failed. Loading runs are kept:
+    the same call goes on where it was interrupted, and gives the same model.
     """
     loaded = load_scenario(scenario)
-    results: list[Result] = []
-    for n, level in enumerate(levels):
-        def tell(done, total, note, before=n, level=level):
-            progress((before * total + done), len(levels) * total, f"{level:g} times the demand")
+    target = loaded.network.folder if loading.network is None else loading.network
+    if loading.guided and target.resolve() == loaded.network.folder.resolve():
+        raise InputError(
+            f"--guided: {loaded.name} runs on {target}, whose model must stay that of its own drivers; name another "
+            "folder with --network")
+    first, second = loading.stages
+    found = _load(scenario, loading, first, {}, out, workers, progress)
+    network = static_model(loaded, found)
+    set_point = tuple(network.mfds[region].critical for region in loaded.protected)
+    found += _load(scenario, loading, second, {"set_point": set_point}, out, workers, progress)
+    held_out = [result for result in found if len(loading.seeds) > 1 and result.trajectory.seed == loading.seeds[-1]]
+    scheme = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
-        folder = out / f"level-{level:g}"
-        tasks = [
-            Task(scenario=scenario, controller="no-control", seed=seed, demand_factor=level) for seed in seeds]
-        experiment.experiment(tasks, out=folder, workers=workers, progress=tell if progress else None)
-        results += [experiment.read_run(folder, "no-control", seed) for seed in seeds]
-    network = loaded.network
-    samples = [
+    def fitted(results: Sequence[Result], what: str) -> Network:
+        def tell(done, total, note):
+            progress(done, total, f"{what}, {note}")
+
+        return identification.fit(
+            network, [observed(result) for result in results], progress=tell if progress else None, **scheme)
+
+    model = fitted(found, "fitting")
+    samples = samples_of(network, found)
+    text = fit_table(model, samples)
+    if held_out:
+        kept = [result for result in found if not any(result is other for other in held_out)]
+        text += "\n" + prediction_table(
+            fitted(kept, "fitting without the last seed"), [observed(result) for result in held_out], scheme)
+    _write_samples(out / "samples.csv", samples)
+    draw_mfds(out / "mfd.png", model, samples)
+    levels, seeds = ", ".join(f"{level:g}" for level in loading.levels), f"{min(loading.seeds)} to {max(loading.seeds)}"
+    target.mkdir(parents=True, exist_ok=True)
+    runs.write_text(target / "network.toml", network_toml(
+        model, _sumo_table(loaded.network.folder, target),
+        f"Regional model: written by cosim identify from {len(found)} loading runs of {loaded.name} under {first} and\n"
+        f"# {second}, demand times {levels}, seeds {seeds}."))
+    return text
+
+
+def _load(
+    scenario: Path, loading: Loading, controller: str, options: dict, out: Path, workers: int, progress,
+) -> list[Result]:
+    """The loading runs of one controller at all levels, those that are kept or new ones."""
+    plan = [
+        (out / f"level-{level:g}", Task(
+            scenario=scenario, controller=controller, seed=seed, demand_factor=level, options=tuple(options.items())))
+        for level in loading.levels for seed in loading.seeds]
+    failures = experiment.perform(plan, workers=workers, progress=progress, tell=lambda line: None)
+    if failures:
+        raise RunFailed("; ".join(f"{experiment.label(task)}: {reason}" for task, reason in failures))
+    return [experiment.read_run(folder, controller, task.seed) for folder, task in plan]
+
+
+def static_model(scenario: Scenario, results: Sequence[Result]) -> Network:
+    """The scenario's network with the published model: an MFD per region, fitted to outflow samples, and own splits."""
+    network = replace(scenario.network, exit_rates=None, capacity=None, storage=None)
+    return replace(
+        network, mfds=tuple(_fit(cloud, scenario.step / scenario.substeps) for cloud in samples_of(network, results)),
+        own_splits=own_splits(network, [result.record for result in results]))
+
+
+def samples_of(network: Network, results: Sequence[Result]) -> list[dict[str, np.ndarray]]:
+    """Outflow samples of every region (cosim.compare.outflow_samples)."""
+    return [
         outflow_samples(
             [r.trajectory for r in results], [r.record for r in results], network.u_max, region, network.adjacency)
         for region in range(network.regions)]
-    fitted = replace(
-        network, mfds=tuple(_fit(cloud, loaded.step / loaded.substeps) for cloud in samples),
-        own_splits=own_splits(network, [r.record for r in results]))
-    _write_samples(out / "samples.csv", samples)
-    draw_mfds(out / "mfd.png", fitted, samples)
-    runs.write_text(
-        network.folder / "network.toml", network_toml(
-            fitted, network.folder / "network.toml",
-            f"MFDs and own splits: written by cosim identify from {len(results)} loading runs of {loaded.name},\n"
-            f"# demand times {', '.join(f'{level:g}' for level in levels)}, seeds {min(seeds)} to {max(seeds)}."))
-    return fit_table(fitted, samples)
+
+
+def observed(result: Result) -> Observed:
+    """A run as identification sees it; the demand is what entered the streets."""
+    trajectory, record = result.trajectory, result.record
+    return Observed(
+        accumulation=trajectory.accumulation, demand=record["departures"] / trajectory.step,
+        perimeter=trajectory.perimeter, splits=trajectory.splits, crossings=record["crossings"].sum(axis=3))
 
 
 def _fit(cloud: dict[str, np.ndarray], step: float) -> mfd.Mfd:
@@ -81,27 +159,63 @@ def own_splits(network: Network, records: Sequence[dict]) -> dict[tuple[int, int
     return found
 
 
+def hysteresis(cloud: dict[str, np.ndarray]) -> float:
+    """How much larger the outflow is while loading than while unloading at the same accumulation, as a share of it [-].
+
+    The mean over bins of accumulation with both, weighted by the outflow; NaN where there is none.
+    """
+    loading, unloading = (cloud.get(label, np.empty((0, 2))) for label in ("loading", "unloading"))
+    most = max((part[:, 0].max() for part in (loading, unloading) if len(part)), default=0.0)
+    means = np.full((2, BINS), np.nan)
+    for row, part in zip(means, (loading, unloading), strict=True):
+        number = np.minimum((BINS * part[:, 0] / max(most, 1e-9)).astype(int), BINS - 1)
+        for n in range(BINS):
+            if (number == n).sum() >= 3:
+                row[n] = part[number == n, 1].mean()
+    both = means[:, ~np.isnan(means).any(axis=0)]
+    return float((both[0] - both[1]).sum() / both.mean(axis=0).sum()) if both.size else float("nan")
+
+
 def fit_table(network: Network, samples: Sequence[dict]) -> str:
-    """Per region: critical and jam accumulation, maximum outflow, samples, and how well the curve explains them."""
-    lines = [f"{'region':<16}{'critical':>10}{'jam':>8}{'max outflow':>13}{'samples':>9}{'R2':>7}   [veh, veh/s]"]
+    """Per region: the curve of the MFD, how well it explains the samples, and their hysteresis."""
+    lines = [f"{'region':<16}{'critical':>10}{'jam':>8}{'storage':>9}{'max outflow':>13}{'samples':>9}{'R2':>7}"
+             f"{'hysteresis':>12}   [veh, veh/s]"]
     for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
         points = own_points(cloud)
         residual = points[:, 1] - curve.outflow(points[:, 0])
-        explained = 1.0 - residual.var() / points[:, 1].var()
-        name = f"{region} {network.region_names[region]}"
+        explained = 1.0 - (residual**2).mean() / points[:, 1].var()
+        storage = float("inf") if network.storage is None else network.storage[region]
         lines.append(
-            f"{name:<16}{curve.critical:>10.0f}{curve.jam:>8.0f}{curve.capacity:>13.3f}{len(points):>9}"
-            f"{explained:>7.2f}")
+            f"{f'{region} {network.region_names[region]}':<16}{curve.critical:>10.0f}{curve.jam:>8.0f}{storage:>9.0f}"
+            f"{curve.capacity:>13.3f}{len(points):>9}{explained:>7.2f}{100 * hysteresis(cloud):>10.0f} %")
     return "\n".join(lines)
 
 
-def network_toml(network: Network, path: Path, comment: str) -> str:
-    """network.toml of `network`, with the table [sumo] of the one at `path`."""
-    return render_network(network, toml.read(path).raw_table("sumo"), comment)
+def prediction_table(network: Network, held_out: Sequence[Observed], scheme: dict) -> str:
+    """RMSE of the accumulation one control interval and AHEAD seconds ahead, in runs that the fit did not see."""
+    critical = np.array([curve.critical for curve in network.mfds])
+    intervals = min(max(1, round(AHEAD / scheme["step"])), max(len(run.demand) for run in held_out))
+    share = [
+        np.sqrt((identification.prediction_errors(network, held_out, n, **scheme) ** 2).mean(axis=0)) / critical
+        for n in (1, intervals)]
+    heads = [f"{n * scheme['step']:g} s ahead" for n in (1, intervals)]
+    lines = [f"{'region':<16}{heads[0]:>14}{heads[1]:>14}   RMSE of critical, runs of the last seed, fit without them"]
+    for region, (one, many) in enumerate(zip(*share, strict=True)):
+        lines.append(f"{f'{region} {network.region_names[region]}':<16}{100 * one:>12.1f} %{100 * many:>12.1f} %")
+    lines.append(f"{'mean':<16}{100 * share[0].mean():>12.1f} %{100 * share[1].mean():>12.1f} %")
+    return "\n".join(lines)
 
 
-def render_network(network: Network, sumo: Mapping[str, str], comment: str) -> str:
-    """network.toml of `network`, with the table [sumo] given."""
+def _sumo_table(folder: Path, target: Path) -> dict[str, str]:
+    """The table [sumo] of the network in `folder`, its paths seen from `target`."""
+    table = toml.read(folder / "network.toml").raw_table("sumo")
+    return {
+        key: os.path.relpath(folder / value, target) if key in PATHS and isinstance(value, str) else value
+        for key, value in table.items()}
+
+
+def network_toml(network: Network, sumo: dict[str, str], comment: str) -> str:
+    """network.toml of `network` with this table [sumo]."""
     out = io.StringIO()
     out.write(f"# {comment}\nname = \"{network.name}\"\n\n")
     out.write(f"[perimeter]\nmin = {network.u_min:g}\nmax = {network.u_max:g}\n")
@@ -109,20 +223,33 @@ def render_network(network: Network, sumo: Mapping[str, str], comment: str) -> s
         out.write("\n[sumo]\n" + "".join(f'{key} = "{value}"\n' for key, value in sumo.items()))
     for region in range(network.regions):
         x, y = network.positions[region]
-        either = network.adjacency | network.adjacency.T
-        neighbours = ", ".join(str(h) for h in np.flatnonzero(either[region]))
-        one_way = ", ".join(str(h) for h in np.flatnonzero((either & ~network.adjacency)[region]))
+        adjacent = np.flatnonzero((network.adjacency | network.adjacency.T)[region])
+        one_way = ", ".join(str(h) for h in adjacent if not network.adjacency[region, h])
         barred = f"no_way_to = [{one_way}]\n" if one_way else ""
+        neighbours = ", ".join(str(h) for h in adjacent)
         curve = network.mfds[region]
         out.write(
             f'\n[[regions]]\nname = "{network.region_names[region]}"\nposition = [{x:.6g}, {y:.6g}]\n'
-            f"adjacent = [{neighbours}]\n{barred}\n[regions.mfd]\na = {curve.a:.6g}\nb = {curve.b:.6g}\n"
-            f"c = {curve.c:.6g}\njam = {curve.jam:.6g}\n")
+            f"adjacent = [{neighbours}]\n{barred}{_options(network, region)}\n"
+            f"[regions.mfd]\na = {curve.a:.6g}\nb = {curve.b:.6g}\nc = {curve.c:.6g}\n"
+            f"jam = {curve.jam:.6g}\n")
     for (i, j), shares in sorted(network.own_splits.items()):
         via = ", ".join(str(h) for h in shares)
         share = ", ".join(f"{value:.4f}" for value in shares.values())
         out.write(f"\n[[own_splits]]\nregion = {i}\ndestination = {j}\nnext = [{via}]\nshare = [{share}]\n")
     return out.getvalue()
+
+
+def _options(network: Network, region: int) -> str:
+    """exit_rates, capacity and storage of one region, as far as the network has them."""
+    lines = ""
+    if network.exit_rates is not None:
+        lines += f"exit_rates = [{', '.join(f'{value:.4g}' for value in network.exit_rates[region])}]\n"
+    if network.capacity is not None:
+        lines += (
+            f"capacity = [{', '.join(f'{value:.4g}' for value in network.capacity[region, network.adjacency[region]])}]\n"
+            f"storage = {network.storage[region]:.6g}\n")
+    return lines
 
 
 def _write_samples(path: Path, samples: Sequence[dict]) -> None:

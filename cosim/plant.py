@@ -2,18 +2,24 @@
 
 import tempfile
 from collections import Counter
+from collections.abc import Set
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from cosim import webster
 from cosim.actuate import GREEN, Actuator, GatewaySignal
+from cosim.actuated import actuated_row
 from cosim.city import ensure_built
+from cosim.flows import turning_flows
 from cosim.guidance import Guide
+from cosim.max_pressure import MaxPressure
 from cosim.measure import Meter
 from cosim.originals import Originals, read_originals, write_originals
 from cosim.regions import City, Gateway, check_adjacency, load_city
-from cosim.strategy import FIXED, HOLD_BACK, MODES, SIGNALS
+from cosim.signals import Signal, read_signals, write_programmes
+from cosim.strategy import ACTUATED, FIXED, HOLD_BACK, MAX_PRESSURE, MODES, SIGNALS, WEBSTER
 from cosim.sumo import Session
 from cosim.trip_facts import TripFacts, read_trip_facts, trip_options
 from cosim.trips import write_trips
@@ -23,6 +29,11 @@ from nmfd.scenario import Scenario, read_tables
 from nmfd.types import Controls, Measurement
 
 SAMPLE_EVERY = 10.0  # s, between two samples of the production and of the queues
+# Equipped drivers take the fastest route by the mean speeds of the last 180 s (SUMO's default): when they depart, which
+# needs their route to be read no earlier, and every minute from then on, as drivers with navigation do.
+REROUTING = (
+    "--route-steps", "1", "--device.rerouting.pre-period", "60", "--device.rerouting.period", "60",
+    "--device.rerouting.adaptation-interval", "1", "--device.rerouting.adaptation-steps", "180")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +43,7 @@ class Settings:
     step_length: of SUMO [s]; time_to_teleport: [s], -1 for never; collision_action: SUMO's
     actuation: "hold-back" or "redistribute"; min_green: of a gateway movement [s]
     compliance: share of the decisions in which a driver follows the route guidance [-]
+    most_detour: a driver does not follow route guidance into a next region that costs him more than this [s]
     rerouting: share of the drivers with SUMO's own rerouting device [-]
     signals: one of cosim.strategy.SIGNALS; gateways_fixed (of the strategy, no key of the table): whether signals with
         a gateway movement stay fixed-time, for perimeter control, where the others are actuated or max-pressure
@@ -54,6 +66,7 @@ class Settings:
     actuation: str = HOLD_BACK
     min_green: float = 5.0
     compliance: float = 1.0
+    most_detour: float = 60.0
     rerouting: float = 0.0
     signals: str = FIXED
     gateways_fixed: bool = True
@@ -80,6 +93,7 @@ def settings(scenario: Scenario) -> Settings:
         actuation=table.text("actuation", default.actuation, MODES),
         min_green=table.number("min_green", default.min_green, low=1.0),
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
+        most_detour=table.number("most_detour", default.most_detour, low=0.0),
         rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0),
         signals=table.text("signals", default.signals, SIGNALS),
         routes=table.texts("routes", ()), background=table.texts("background", ()),
@@ -132,6 +146,7 @@ class Record:
 class SumoPlant:
     """A SUMO simulation of the scenario's city (nmfd.types.Plant).
 
+    `simple_signals` may get another programme, `other_signals` are left alone (cosim.signals).
     `record()` tells what happened; `trips` is their number; `sumo_time` [s] is the wall time inside SUMO's own step
     since the reset.
     """
@@ -147,6 +162,12 @@ class SumoPlant:
         self._upstream = sorted({g.from_edge for g in self.city.gateways})
         self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in self.city.gateways], dtype=int)
         self._net_file = files.net_file
+        self.simple_signals, self.other_signals = read_signals(self.city)
+        if self._settings.signals != FIXED and not self.simple_signals:
+            raise InputError(
+                f"{files.net_file}: sumo.signals: {self._settings.signals} needs fixed-time signals with several green "
+                f"phases, but none of the {len(self.other_signals)} signals here is one; choose fixed")
+        self._gateway_ids = {gateway.signal for gateway in self.city.gateways if gateway.signal is not None}
         self._folder = tempfile.TemporaryDirectory(prefix="cosim-")
         self._session: Session | None = None
 
@@ -157,26 +178,35 @@ class SumoPlant:
         routes = Path(self._folder.name) / "trips.rou.xml"
         self._drawn, files = self._write_vehicles(routes, seed), [routes]
         self._trip_file = routes.with_name("tripinfo.xml")
+        steered = [s for s in self.simple_signals if s.id not in chosen.leave_signals and not (
+            chosen.gateways_fixed and s.id in self._gateway_ids)]
         options = [
             *trip_options(self._trip_file), "--begin", str(chosen.begin), "--ignore-route-errors",
             str(bool(chosen.routes)).lower()]
         if chosen.rerouting > 0:
-            options += ["--device.rerouting.probability", str(chosen.rerouting), "--device.rerouting.period", "60"]
+            options += [*REROUTING, "--device.rerouting.probability", str(chosen.rerouting)]
         if chosen.mesoscopic:
             options += ["--mesosim", "true", "--meso-junction-control", "true"]
+        additional = self._signal_plan(steered)
         if scenario.folder is not None:
             files += [scenario.folder / name for name in chosen.background]
-            if chosen.additional:
-                options += ["--additional-files", ",".join(str(scenario.folder / name) for name in chosen.additional)]
+            additional = [scenario.folder / name for name in chosen.additional] + additional
+        if additional:
+            options += ["--additional-files", ",".join(map(str, additional))]
         self._session = Session(
             self._net_file, files, seed=seed, step_length=chosen.step_length,
             time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action,
             options=tuple(options))
         self._meter = Meter(self._session, self.city)
         self._guide = Guide(
-            self._session, self.city, compliance=chosen.compliance,
+            self._session, self.city, compliance=chosen.compliance, most_detour=chosen.most_detour,
             random=np.random.default_rng([seed, 0x67756964]))
-        self._signals = self._gateway_signals()
+        self._max_pressure, steered_ids = None, set()
+        if chosen.signals == MAX_PRESSURE:
+            flows = turning_flows(self.city, scenario.demand, scenario.step)
+            self._max_pressure = MaxPressure(self._session, self.city, steered, flows)
+            steered_ids = {signal.id for signal in steered}
+        self._signals = self._gateway_signals(without=steered_ids)
         self._original_green = self._programmed_green()
         self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
         self._k, self._rows, self._speed = 0, [], None
@@ -193,6 +223,8 @@ class SumoPlant:
         queues = []
         for n in range(steps):
             self._actuator.play(session.time)
+            if self._max_pressure is not None:
+                self._max_pressure.play(session.time)
             session.step()
             self._guide.apply(meter.observe())
             if n % every == every - 1:
@@ -229,9 +261,8 @@ class SumoPlant:
 
     def trip_facts(self) -> TripFacts:
         """Ends the simulation, for only then does SUMO tell of the trips under way."""
-        end = self._session.time
         self._end_session()
-        return read_trip_facts(self._trip_file, end)
+        return read_trip_facts(self._trip_file)
 
     @property
     def sumo_time(self) -> float:
@@ -268,10 +299,23 @@ class SumoPlant:
             self._session.close()
             self._session = None
 
-    def _gateway_signals(self) -> dict[str, GatewaySignal]:
+    def _signal_plan(self, signals: list[Signal]) -> list[Path]:
+        """Additional files with which SUMO runs other programmes than those of the network file."""
+        if self._settings.signals == WEBSTER:
+            path = webster.plan(
+                self.city, self.simple_signals, self._scenario.demand, self._scenario.step,
+                folder=self._scenario.network.folder / "build")
+        elif self._settings.signals == ACTUATED:
+            path = Path(self._folder.name) / "actuated.add.xml"
+            write_programmes(path, [actuated_row(signal) for signal in signals])
+        else:
+            return []
+        return [path]
+
+    def _gateway_signals(self, *, without: Set[str]) -> dict[str, GatewaySignal]:
         movements: dict[str, dict[int, tuple[int, int]]] = {}
         for gateway in self.city.gateways:
-            if gateway.signal is not None:
+            if gateway.signal is not None and gateway.signal not in without:
                 for link in gateway.links:
                     movements.setdefault(gateway.signal, {})[link] = (gateway.source, gateway.target)
         signals = {}

@@ -130,6 +130,22 @@ def check_adjacency(city: City, network: Network) -> None:
             f"remove it, add no_way_to = [{h}], or change the regions of edges")
 
 
+def edge_shapes(city: City) -> list[np.ndarray]:
+    """(n, 2) [m] for every edge of the city: its line on the map, midway between its outermost lanes."""
+    shapes: dict[str, np.ndarray] = {}
+    with (gzip.open if city.net_file.suffix == ".gz" else open)(city.net_file, "rb") as stream:
+        for _, element in ElementTree.iterparse(stream):
+            if element.tag == "edge":
+                lanes = [
+                    np.array([point.split(",")[:2] for point in lane.get("shape").split()], dtype=float)
+                    for lane in element.iter("lane") if for_cars(lane)]
+                if lanes:
+                    same = len(lanes[0]) == len(lanes[-1])
+                    shapes[element.get("id")] = (lanes[0] + lanes[-1]) / 2 if same else lanes[0]
+                element.clear()
+    return [shapes[edge] for edge in city.edges]
+
+
 def _read_net(path: Path):
     """(edge -> [(length, speed) of each car lane], the car lanes, internal edge -> free-flow time [s], connections)."""
     cars: set[tuple[str, int]] = set()

@@ -22,7 +22,8 @@ FACTS = (
 @dataclass(frozen=True, kw_only=True)
 class Task:
     """scenario: its folder; controller: a strategy (cosim.strategy); policy: of a DPC controller, instead of the
-    scenario's own; steps: control intervals, all if None; demand_factor: multiplies all flows."""
+    scenario's own; steps: control intervals, all if None; demand_factor: multiplies all flows;
+    options: of the controller, instead of those of the scenario."""
 
     scenario: Path
     controller: str
@@ -30,6 +31,7 @@ class Task:
     policy: Path | None = None
     steps: int | None = None
     demand_factor: float = 1.0
+    options: tuple[tuple[str, object], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,9 +47,14 @@ def scenario_of(task: Task) -> Scenario:
     """The scenario with the horizon and demand of `task`. Raises InputError."""
     scenario = load_scenario(task.scenario)
     steps = scenario.steps if task.steps is None else min(task.steps, scenario.steps)
-    return replace(
+    scenario = replace(
         scenario, steps=steps, demand=task.demand_factor * scenario.demand[:steps],
         demand_factor=task.demand_factor * scenario.demand_factor)
+    if not task.options:
+        return scenario
+    controller = parse(task.controller).controller
+    options = {**scenario.controller_options.get(controller, {}), **dict(task.options)}
+    return replace(scenario, controller_options={**scenario.controller_options, controller: options})
 
 
 def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> Result:

@@ -38,7 +38,7 @@ class Session:
     """One running simulation.
 
     libsumo holds a single simulation per process and a second start would silently replace the first: here it is an
-    error. `sumo_time` [s] is the wall time spent inside SUMO's own step.
+    error. `sumo_time` [s] is the wall time spent inside SUMO's own step; `command` is the command line of the same run.
     """
 
     _open = False
@@ -52,13 +52,13 @@ class Session:
             raise RuntimeError("a SUMO session is already open in this process; close it first")
         self.sumo_time, self.step_length = 0.0, step_length
         routes = ",".join(map(str, [route_file] if isinstance(route_file, Path) else route_file))
-        command = [
+        self.command = [
             "sumo", "--net-file", str(net_file), "--route-files", routes, "--seed", str(seed),
             "--step-length", str(step_length), "--time-to-teleport", str(time_to_teleport), "--collision.action",
             collision_action, "--no-step-log", "true", "--no-warnings", "true", "--duration-log.disable", "true",
             *options]
         try:
-            libsumo.start(command)
+            libsumo.start(self.command)
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
             raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {_one_line(error)}") from None
         Session._open = True
@@ -117,6 +117,13 @@ class Session:
             libsumo.vehicle.getVehicleClass(vehicle) not in BOUND and not libsumo.vehicle.getLine(vehicle)
             and not libsumo.vehicle.getStops(vehicle, 1))
 
+    def route_index(self, vehicle: str) -> int:
+        """Where on its route a vehicle is."""
+        return libsumo.vehicle.getRouteIndex(vehicle)
+
+    def emission_class(self, vehicle_type: str) -> str:
+        return libsumo.vehicletype.getEmissionClass(vehicle_type)
+
     def set_route(self, vehicle: str, edges: list[str]) -> bool:
         """Give a vehicle on edges[0] a new route; False where SUMO refuses it (the old route then stays)."""
         try:
@@ -125,11 +132,19 @@ class Session:
             return False
         return True
 
+    def reroutes(self, vehicle: str) -> bool:
+        """Whether it has SUMO's rerouting device."""
+        return libsumo.vehicle.getParameter(vehicle, "has.rerouting.device") == "true"
+
     # Edges: the vehicles on one and their number, mean speed [m/s] (the limit if empty), vehicles under 0.1 m/s.
     vehicles_on = staticmethod(libsumo.edge.getLastStepVehicleIDs)
     vehicle_count = staticmethod(libsumo.edge.getLastStepVehicleNumber)
     mean_speed = staticmethod(libsumo.edge.getLastStepMeanSpeed)
     halting = staticmethod(libsumo.edge.getLastStepHaltingNumber)
+
+    # Lanes: the same, for max-pressure control, which asks for a thousand of them every few seconds.
+    lane_vehicles = staticmethod(libsumo.lane.getLastStepVehicleNumber)
+    lane_halting = staticmethod(libsumo.lane.getLastStepHaltingNumber)
 
     # Signals.
 

@@ -36,8 +36,8 @@ def trip_options(path: Path) -> tuple[str, ...]:
         "--tripinfo-output.write-undeparted", "true", "--device.emissions.probability", "1")
 
 
-def read_trip_facts(path: Path, end: float) -> TripFacts:
-    """Read SUMO's tripinfo output of a simulation that ended at `end` [s]."""
+def read_trip_facts(path: Path) -> TripFacts:
+    """Read SUMO's tripinfo output of a simulation that has ended."""
     trips = completed = 0
     travel_time = departure_delay = co2 = fuel = 0.0
     for _, element in ElementTree.iterparse(path):

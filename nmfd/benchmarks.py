@@ -116,18 +116,23 @@ def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -
     draw_scenario(folder, scenario)
 
 
-def draw_accumulations(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -> None:
-    """Total and regional accumulation over time, as png files in `folder`."""
+def draw_accumulations(
+    folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory], seed: int | None = None,
+) -> None:
+    """Total and regional accumulation over time, as png files in `folder`.
+
+    seed: shown instead of the mean over seeds.
+    """
     from nmfd import plots  # workers import this module, and none of them draws
 
     drawing = plots.figure(8.0, 4.6)
-    ax = plots.total_accumulation(drawing.subplots(), trajectories)
+    ax = plots.total_accumulation(drawing.subplots(), trajectories, seed)
     plots.legend_below(drawing, [ax], columns=6)
     plots.save(drawing, folder / "total_accumulation.png")
     network = scenario.network
     drawing, axes = plots.panels(network.regions)
     for region, ax in enumerate(axes):
-        plots.region_accumulation(ax, network, region, trajectories)
+        plots.region_accumulation(ax, network, region, trajectories, seed)
     plots.legend_below(drawing, axes, columns=3)
     plots.save(drawing, folder / "region_accumulation.png")
 

@@ -24,8 +24,9 @@ def main() -> None:
 @main.command()
 @click.argument("scenario", type=FOLDER)
 @click.option("--controllers", required=True, metavar="A,B,...",
-              help="Which to run: no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, "
-                   "dpc-pcrg-robust, dpc-pc-guarded, dpc-pcrg-guarded, bound-pc, bound-pcrg.")
+              help="Which to run: no-control, route-guidance, pi-gating, mpc-pc, mpc-pcrg, probing-pc, "
+                   "probing-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, dpc-pcrg-robust, dpc-pc-guarded, "
+                   "dpc-pcrg-guarded, bound-pc, bound-pcrg.")
 @click.option("--seeds", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
               help="Run seeds 0 to N-1 of the measurement noise.")
 @click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", show_default=True,

@@ -97,7 +97,8 @@ def fit(
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     model = _Model(network, runs, step, substeps / step)
-    data, scheme = windows(runs, HORIZON), {"step": step, "substeps": substeps, "integrator": integrator}
+    horizon = min(HORIZON, max(len(run.demand) for run in runs))
+    data, scheme = windows(runs, horizon), {"step": step, "substeps": substeps, "integrator": integrator}
     scale = torch.tensor([mfd.critical for mfd in network.mfds], dtype=torch.float32)
     off_diagonal = 1.0 - torch.eye(network.regions)
     optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)

@@ -131,7 +131,7 @@ def load_network(folder: Path | str) -> Network:
     rows = root.tables("regions")
     if not rows:
         raise root.error("regions", "empty; add at least one [[regions]] table")
-    names, positions, neighbours, barred, mfds, boundaries = [], [], [], [], [], []
+    names, positions, neighbours, barred, onward, mfds, boundaries = [], [], [], [], [], [], []
     for number, row in enumerate(rows):
         names.append(row.text("name", str(number)))
         positions.append(row.numbers("position", length=2))
@@ -141,12 +141,13 @@ def load_network(folder: Path | str) -> Network:
             raise row.error(
                 "no_way_to", f"expected some of the adjacent regions {list(neighbours[-1])}, got {unknown[0]} instead")
         mfds.append(_mfd(row.table("mfd")) if default_mfd is None or row.has("mfd") else default_mfd)
-        boundaries.append(_boundary(row, len(rows), neighbours[-1]))
+        onward.append(tuple(h for h in neighbours[-1] if h not in barred[-1]))
+        boundaries.append(_boundary(row, len(rows), onward[-1]))
         row.close()
     own_splits = {}
     for row in root.tables("own_splits", ()):
         here, to = row.integer("region", high=len(rows) - 1), row.integer("destination", high=len(rows) - 1)
-        own_splits[here, to] = _shares(row, tuple(h for h in neighbours[here] if h not in barred[here]))
+        own_splits[here, to] = _shares(row, onward[here])
         row.close()
     root.raw_table("sumo")
     root.close()
@@ -158,7 +159,7 @@ def load_network(folder: Path | str) -> Network:
         adjacency[i, list(regions)] = False
     network = Network(
         name=name, region_names=tuple(names), positions=np.array(positions), adjacency=adjacency, mfds=tuple(mfds),
-        u_min=u_min, u_max=u_max, own_splits=own_splits, folder=folder, **_boundaries(root, neighbours, boundaries))
+        u_min=u_min, u_max=u_max, own_splits=own_splits, folder=folder, **_boundaries(root, onward, boundaries))
     _check_graph(network, root)
     for i, j in own_splits:
         for h in own_splits[i, j]:
@@ -177,7 +178,7 @@ def _shares(row: toml.Table, neighbours: tuple[int, ...]) -> dict[int, float]:
 
 
 def _boundary(row: toml.Table, regions: int, adjacent: tuple[int, ...]) -> dict:
-    """The options of one region: exit_rates (R,), capacity (one per adjacent region), storage; None if absent."""
+    """The options of one region: exit_rates (R,), capacity (one per region it leads to), storage; None if absent."""
     found = {
         "exit_rates": row.numbers("exit_rates", length=regions) if row.has("exit_rates") else None,
         "capacity": row.numbers("capacity", length=len(adjacent)) if row.has("capacity") else None,

@@ -27,7 +27,11 @@ CONTROLLER_COLOURS = {
     "dpc-pc": "#e377c2", "dpc-pcrg": "#882255", "dpc-pc-robust": "#b07aa1", "dpc-pcrg-robust": "#d62d20",
     "dpc-pc-guarded": "#c9a0dc", "dpc-pcrg-guarded": "#6a3d9a", "bound-pc": "#9aa33c", "bound-pcrg": "#4d6600",
 }
-OTHER_COLOURS = ("#8c6d31", "#17becf", "#7f7f7f", "#5254a3", "#843c39", "#b5a642")
+CITY_COLOURS = {  # what a city may do without a regional controller
+    "webster": "#8c6d31", "actuated": "#a6761d", "max-pressure": "#009e73", "rerouting-30": "#7f7f7f",
+    "rerouting-100": "#b5a642",
+}
+OTHER_COLOURS = ("#17becf", "#5254a3", "#843c39", "#66c2a5", "#bc80bd", "#1b5e20", "#fb8072", "#556b2f")
 PLANT_LABELS = {"nmfd": "regional model", "acyclic": "acyclic model", "sumo": "SUMO"}
 LINE_STYLES = ("-", "--", ":", "-.")
 GREEN, RED = "#2ca02c", "#d62728"
@@ -40,7 +44,16 @@ ZONES = (  # of a region's accumulation: label, colour, opacity
 
 def colour(controller: str) -> str:
     """The colour of a controller, the same in every figure; unknown names get one of OTHER_COLOURS by their hash."""
-    return CONTROLLER_COLOURS.get(controller, OTHER_COLOURS[zlib.crc32(controller.encode()) % len(OTHER_COLOURS)])
+    other = OTHER_COLOURS[zlib.crc32(controller.encode()) % len(OTHER_COLOURS)]
+    return (CONTROLLER_COLOURS | CITY_COLOURS).get(controller, other)
+
+
+def colours(controllers: Sequence[str]) -> dict[str, str]:
+    """The colour of each of `controllers`; unknown names get different ones of OTHER_COLOURS while there are any."""
+    known = CONTROLLER_COLOURS | CITY_COLOURS
+    unknown = [name for name in dict.fromkeys(controllers) if name not in known]
+    others = OTHER_COLOURS * (1 + len(unknown) // len(OTHER_COLOURS))
+    return {**known, **dict(zip(unknown, others, strict=False))}
 
 
 def figure(width: float, height: float) -> Figure:
@@ -87,16 +100,20 @@ def optimal_band(mfd: Mfd) -> tuple[float, float]:
     return float(inside[0]), float(inside[-1])
 
 
-def total_accumulation(ax: Axes, trajectories: Sequence[Trajectory]) -> Axes:
-    """Vehicles in the network, with those that wait to enter, over time."""
-    _curves(ax, trajectories, lambda t: t.accumulation.sum(axis=(1, 2)) + t.backlog.sum(axis=(1, 2)))
+def total_accumulation(ax: Axes, trajectories: Sequence[Trajectory], seed: int | None = None) -> Axes:
+    """Vehicles in the network, with those that wait to enter, over time. seed: shown instead of the mean over seeds."""
+    _curves(ax, trajectories, lambda t: t.accumulation.sum(axis=(1, 2)) + t.backlog.sum(axis=(1, 2)), seed)
     ax.set_ylabel("vehicles in the network [veh]")
     ax.set_ylim(bottom=0.0)
     return ax
 
 
-def region_accumulation(ax: Axes, network: Network, region: int, trajectories: Sequence[Trajectory]) -> Axes:
+def region_accumulation(
+    ax: Axes, network: Network, region: int, trajectories: Sequence[Trajectory], seed: int | None = None,
+) -> Axes:
     """Accumulation of one region over time, over its green band (within 10 % of maximum outflow) and red zone.
+
+    seed: shown instead of the mean over seeds.
 
     The red zone is what lies between the green band and the jam accumulation, and darker beyond it. Trajectories of
     several plants, such as the microsimulation and the regional model, share the controller's colour and differ in
@@ -106,7 +123,7 @@ def region_accumulation(ax: Axes, network: Network, region: int, trajectories: S
     highest = max((t.accumulation[:, region].sum(axis=1).max() for t in trajectories), default=0.0)
     top = 1.06 * max(highest, 1.25 * optimal_band(mfd)[1])
     _zones(ax.axhspan, mfd, top)
-    _curves(ax, trajectories, lambda t: t.accumulation[:, region].sum(axis=1))
+    _curves(ax, trajectories, lambda t: t.accumulation[:, region].sum(axis=1), seed)
     ax.set_ylabel("accumulation [veh]")
     ax.set_ylim(0.0, top)
     ax.set_title(_region_title(network, region), fontsize="medium")
@@ -195,7 +212,7 @@ def demand(ax: Axes, scenario: Scenario) -> Axes:
     used = np.flatnonzero(arriving.sum(axis=1) > 0)
     steps = np.flatnonzero(arriving.sum(axis=0) > 0)
     end = min(scenario.steps, 1 + steps[-1] + max(1, scenario.steps // 20)) if len(steps) else scenario.steps
-    time = _time_axis(ax, scenario.step * np.arange(end + 1))
+    time = time_axis(ax, scenario.step * np.arange(end + 1))
     if len(used):
         rates = np.concatenate([arriving[used, :end], arriving[used, end - 1:end]], axis=1)
         ax.stackplot(
@@ -207,23 +224,25 @@ def demand(ax: Axes, scenario: Scenario) -> Axes:
     return ax
 
 
-def _curves(ax: Axes, trajectories: Sequence[Trajectory], quantity) -> None:
-    """One curve per controller and plant: the mean over its seeds, and their range as a shade."""
+def _curves(ax: Axes, trajectories: Sequence[Trajectory], quantity, seed: int | None = None) -> None:
+    """One curve per controller and plant: the mean over its seeds, or one `seed`, and their range as a shade."""
     groups: dict[tuple[str, str], list[Trajectory]] = {}
     for trajectory in trajectories:
         groups.setdefault((trajectory.controller, trajectory.plant), []).append(trajectory)
     plants = list(dict.fromkeys(plant for _, plant in groups))
+    tones = colours([controller for controller, _ in groups])
     for (controller, plant), members in groups.items():
         values = np.stack([quantity(member) for member in members])
-        time = _time_axis(ax, members[0].step * np.arange(values.shape[1]))
+        time = time_axis(ax, members[0].step * np.arange(values.shape[1]))
         # With a single controller in two plants, as in a comparison of models, the plant is all that matters.
         parts = [controller] * (len(groups) > len(plants) or len(plants) == 1)
         parts += [PLANT_LABELS.get(plant, plant)] * (len(plants) > 1)
-        ax.plot(time, values.mean(axis=0), color=colour(controller), linewidth=1.6, label=", ".join(parts),
-                linestyle=LINE_STYLES[plants.index(plant) % len(LINE_STYLES)])
+        shown = [n for n, member in enumerate(members) if member.seed == seed]
+        ax.plot(time, values[shown[0]] if shown else values.mean(axis=0), color=tones[controller], linewidth=1.6,
+                label=", ".join(parts), linestyle=LINE_STYLES[plants.index(plant) % len(LINE_STYLES)])
         if len(members) > 1:
-            ax.fill_between(time, values.min(axis=0), values.max(axis=0), color=colour(controller), alpha=0.2,
-                            linewidth=0)
+            ax.fill_between(time, values.min(axis=0), values.max(axis=0), color=tones[controller],
+                            alpha=0.2 if len(groups) < 4 else 0.1, linewidth=0)
     _thousands(ax.yaxis)
     ax.spines[["top", "right"]].set_visible(False)
 
@@ -237,7 +256,7 @@ def _zones(span, mfd: Mfd, top: float) -> None:
             span(begin, min(end, top), color=tone, alpha=opacity, linewidth=0, label=label)
 
 
-def _time_axis(ax: Axes, seconds: np.ndarray) -> np.ndarray:
+def time_axis(ax: Axes, seconds: np.ndarray) -> np.ndarray:
     """`seconds` in the unit of the time axis of `ax`: minutes up to four hours, then hours."""
     unit, name = (60.0, "min") if seconds[-1] <= 4 * 3600 else (3600.0, "h")
     ax.set_xlabel(f"time [{name}]")

@@ -20,11 +20,13 @@ class Rollout:
     Random numbers are drawn on the CPU, so that they are the same on every device.
     """
 
-    def __init__(self, scenario: Scenario, dtype=torch.float32, device="cpu"):
+    def __init__(self, scenario: Scenario, dtype=torch.float32, device="cpu", detour_cost: float = 0.0):
+        """detour_cost: what a vehicle loses that is guided off the drivers' own split ratios [s]"""
         def tensor(values):
             return torch.tensor(values, dtype=dtype, device=device)
 
         network = scenario.network
+        self.detour_cost = detour_cost
         self.scenario, self.dtype, self.device = scenario, dtype, torch.device(device)
         self.parameters = self._nominal = dynamics.parameters(network, dtype=dtype, device=device)
         self.demand = tensor(scenario.demand)
@@ -115,9 +117,20 @@ class Rollout:
         return exact, exact + noise
 
     def total_time_spent(self, policy: Policy, x, demand, generator, step=None) -> torch.Tensor:
-        """TTS (B,) [veh s] of rollouts from x (B, R, R) under `policy`; arguments as in `states`."""
-        exact, _ = self.states(policy, x, demand, generator, step)
-        return self.scenario.step * exact.sum((0, -2, -1))
+        """TTS (B,) [veh s] of rollouts from x (B, R, R) under `policy`, with detours; arguments as `states`."""
+        exact, seen = self.states(policy, x, demand, generator, step)
+        vehicles = exact.sum((0, -2, -1))
+        if self.detour_cost and policy.architecture.guidance:
+            vehicles = vehicles + self.detour_cost * self._diverted(exact, policy(seen)[1]).sum((0, -2, -1))
+        return self.scenario.step * vehicles
+
+    def _diverted(self, x: torch.Tensor, splits: torch.Tensor) -> torch.Tensor:
+        """Vehicles (..., R, R) [veh/s] that leave a region another way than by the drivers' own split ratios."""
+        p = self.parameters
+        leaving = dynamics.rate(p, x.sum(-1)).unsqueeze(-1) * x
+        if p.exit_rates is not None:
+            leaving = leaving * p.exit_rates
+        return 0.5 * (splits - self.nominal_splits).abs().sum(-2) * leaving
 
 
 def can_compile() -> bool:

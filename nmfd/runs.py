@@ -221,8 +221,8 @@ def open_folder(
         rows = read_summary(summary_path) if summary_path.is_file() else []
         for name, what in changed.items():
             if kept := sum(row["controller"] == name for row in rows):
-                renew(f"{path}: {name}: its {what} differs from that of its {kept} kept runs, which do not count any "
-                      "more; those asked for are run again")
+                renew(f"{path}: {name} has changed ({what}): its {kept} kept runs do not count any more, and those "
+                      "asked for are run again")
         if rows:
             write_summary(summary_path, [row for row in rows if row["controller"] not in changed])
 

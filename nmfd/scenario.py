@@ -74,7 +74,7 @@ def trapezoid(time: np.ndarray, *, start: float, peak: float, ramp_up: float, fl
 def read_tables(folder: Path) -> toml.Table:
     """`folder`/scenario.toml; what it does not say is that of the scenario in the folder `base`, if it names one.
 
-    The tables [controllers] and [sumo] are completed key by key, everything else is taken whole. Raises InputError.
+    Tables are completed key by key, everything else is taken whole. Raises InputError.
     """
     path, folders, content = folder / "scenario.toml", [], {}
     while True:
@@ -84,9 +84,7 @@ def read_tables(folder: Path) -> toml.Table:
             raise table.error("base", "the scenarios are each other's base; remove one of the keys")
         folders.append(folder.resolve())
         _name_from(own, folder, path.parent)
-        merged = {key: {**own[key], **content[key]} for key in ("controllers", "sumo")
-                  if isinstance(own.get(key), dict) and isinstance(content.get(key), dict)}
-        content = {**own, **content, **merged}
+        content = _completed(content, own)
         base = table.text("base", None)
         if base is None:
             content.pop("base", None)
@@ -106,6 +104,13 @@ def _name_from(own: dict, folder: Path, here: Path) -> None:
     for key in ("routes", "background", "additional") if isinstance(sumo, dict) else ():
         if isinstance(sumo.get(key), list) and all(isinstance(name, str) for name in sumo[key]):
             sumo[key] = [seen(name) for name in sumo[key]]
+
+
+def _completed(content: dict, base: dict) -> dict:
+    """`content` with what only `base` has, in the tables of both too."""
+    both = {key: _completed(content[key], base[key]) for key in content
+            if isinstance(content[key], dict) and isinstance(base.get(key), dict)}
+    return {**base, **content, **both}
 
 
 def load_scenario(folder: Path | str) -> Scenario:

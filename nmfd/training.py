@@ -40,6 +40,7 @@ class Training:
     initial_share: share of the rollouts that start from a random state, at a random time of the scenario
     noise: largest sigma [veh/s] of the Gaussian noise on the demand of the pairs that have any, at every step; every
         rollout has its own sigma, evenly between 0 and `noise` (demand_noise.WHERE, "pairs")
+    detour_cost: what a vehicle loses that is guided off the drivers' own split ratios, in the objective [s]
     mfd_spread: of the regional model that every rollout has for itself (Rollout.draw_model) [-]
     noise_all: the same of the noise on every pair of regions ("all"), in every other rollout, instead of `noise`
     """
@@ -56,6 +57,7 @@ class Training:
     noise: float = 0.0
     noise_all: float = 0.0
     mfd_spread: float = 0.0
+    detour_cost: float = 0.0
 
 
 def settings(scenario: Scenario, controller: str, steps: int | None = None) -> Training:
@@ -76,7 +78,8 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         initial_share=table.number("initial_share", default.initial_share, low=0.0, high=1.0),
         noise=table.number("noise", default.noise, low=0.0),
         noise_all=table.number("noise_all", default.noise_all, low=0.0),
-        mfd_spread=table.number("mfd_spread", default.mfd_spread, low=0.0, high=1.0))
+        mfd_spread=table.number("mfd_spread", default.mfd_spread, low=0.0, high=1.0),
+        detour_cost=table.number("detour_cost", default.detour_cost, low=0.0))
     table.close()
     return chosen if steps is None else Training(**{**asdict(chosen), "steps": steps})
 
@@ -109,7 +112,8 @@ def train(
     generator = torch.Generator().manual_seed(seed)
     architecture = Architecture(
         width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=NAMES[controller])
-    policy, rollout = Policy(scenario.network, architecture).to(device), Rollout(scenario, device=device)
+    policy = Policy(scenario.network, architecture).to(device)
+    rollout = Rollout(scenario, device=device, detour_cost=chosen.detour_cost)
     advance = compiled_step(rollout.step) if compiled else rollout.step
     optimizer = torch.optim.Adam(policy.parameters(), lr=chosen.learning_rate)
     first, best, history = 0, float("inf"), []

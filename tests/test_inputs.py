@@ -86,7 +86,7 @@ def check_file_error(scenario, command, fragments):
 @pytest.mark.parametrize("arguments, fragment", [
     (["benchmark", "{tmp}/none", "--controllers", "no-control"], "none/scenario.toml: no such file"),
     (["show", "{tmp}/none"], "none/scenario.toml: no such file"),
-    ([*BENCHMARK, "none"], "controller 'none' is unknown; choose from no-control, pi-gating, mpc-pc"),
+    ([*BENCHMARK, "none"], "controller 'none' is unknown; choose from no-control, route-guidance, pi-gating, mpc-pc"),
     ([*BENCHMARK, ""], "controller '' is unknown"),
     ([*BENCHMARK, "no-control,no-control"], "no-control is there twice"),
     ([*BENCHMARK, "no-control", "--seeds", "0"], "'--seeds': 0 is not in the range"),

@@ -133,7 +133,19 @@ def test_teleporting_vehicles_stay_in_the_ledger(scenario, plant_of):
 
 def test_guided_vehicles_go_where_theta_sends_them(scenario, plant_of):
     """All vehicles in region 2 bound for 4 are sent through 0: with full compliance none leaves for 3 or 5."""
-    network, plant = scenario.network, plant_of()
+    crossings, guided = sent_round(scenario, plant_of(most_detour=1e9))
+    assert guided > 20
+    assert crossings[0] > 10 and crossings[0] > 0.9 * crossings.sum()
+
+
+def test_nobody_follows_on_a_long_detour(scenario, plant_of):
+    crossings, guided = sent_round(scenario, plant_of(most_detour=30.0))
+    assert crossings[0] < 0.3 * crossings.sum()
+
+
+def sent_round(scenario, plant):
+    """Vehicles in 2 bound for 4 that left for every region (R,), and those guided to 0, where theta sends all there."""
+    network = scenario.network
     splits = network.nominal_splits.copy()
     splits[2, :, 4] = 0.0
     splits[2, 0, 4] = 1.0
@@ -141,9 +153,7 @@ def test_guided_vehicles_go_where_theta_sends_them(scenario, plant_of):
     for _ in range(scenario.steps):
         plant.step(Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=splits))
     record = plant.record()
-    crossings = record.crossings.sum(axis=0)[2, :, 4]
-    assert record.guided.sum(axis=0)[2, 0, 4] > 20
-    assert crossings[0] > 10 and crossings[0] > 0.9 * crossings.sum()
+    return record.crossings.sum(axis=0)[2, :, 4], record.guided.sum(axis=0)[2, 0, 4]
 
 
 def test_compliance_zero_reroutes_nobody(scenario, plant_of):

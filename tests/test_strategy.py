@@ -37,7 +37,7 @@ def test_every_controller_and_option_is_a_strategy():
 
 
 @pytest.mark.parametrize("name, expected", [
-    ("nobody", "controller 'nobody' is unknown; choose from no-control, pi-gating"),
+    ("nobody", "controller 'nobody' is unknown; choose from no-control, route-guidance, pi-gating"),
     ("", "controller '' is unknown"),
     ("dpc-pc+", "strategy 'dpc-pc+': '' is unknown; choose from webster, actuated, max-pressure"),
     ("dpc-pc+pi-gating", "'pi-gating' is unknown"),

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cosim.identify import own_splits, render_network
+from cosim.identify import network_toml, own_splits
 from cosim.importing.baseline import Baseline
 from cosim.importing.case import Case, seconds
 from cosim.importing.demand import Traffic
@@ -87,7 +87,7 @@ def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline | No
 
 
 def network_text(network: Network, sumo: Mapping[str, str], source: str) -> str:
-    return render_network(
+    return network_toml(
         network, sumo,
         f"Imported from {source}. The MFDs are PLACEHOLDERS from lane length and speed limits:\n"
         "# cosim identify replaces them by measured ones.")

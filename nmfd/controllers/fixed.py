@@ -1,4 +1,4 @@
-"""No control: perimeter open, no route guidance."""
+"""Nothing decided: no control, and route guidance towards what drivers do anyway."""
 
 import numpy as np
 
@@ -20,3 +20,13 @@ class NoControl:
 
     def act(self, measurement: Measurement) -> Controls:
         return self._controls
+
+
+class RouteGuidance(NoControl):
+    """u = u_max everywhere; theta is the drivers' own: guidance by travel times inside the regions, and no more."""
+
+    name = "route-guidance"
+
+    def __init__(self, scenario: Scenario):
+        super().__init__(scenario)
+        self._controls = Controls(perimeter=self._controls.perimeter, splits=scenario.network.nominal_splits)

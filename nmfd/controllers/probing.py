@@ -1,13 +1,16 @@
 """Excitation for identification: every control moves over its range, while the city stays alive."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from nmfd import toml
 from nmfd.controllers.gating import PiGating
 from nmfd.scenario import Scenario
 from nmfd.types import Controls, Measurement
 
 HOLD = (3, 9)            # control intervals between two draws, from and to
-SET_POINTS = (0.5, 1.3)  # of the critical accumulation, of every protected region
+SET_POINTS = (0.5, 1.3)  # of the middle one, of every protected region
 DISTURBED = 0.35         # share of the gateways whose u is drawn by lot
 MOST_DIVERTED = 0.6      # share of the vehicles of one kind in a region whose way is drawn by lot; more locks a city
 
@@ -18,12 +21,23 @@ class Probing:
     Random controls alone would lock the city early in every run; gating alone moves all gateways of a region together
     and never those between the others. With guidance, theta lies between the drivers' own and a point of the simplex
     drawn by lot. Everything is drawn anew every few control intervals, from the seed of the run.
+
+    Options, in [controllers.probing-pc] or [controllers.probing-pcrg]:
+        set_point: [veh], one per protected region, the middle of the set points; default the critical accumulation
     """
 
     def __init__(self, scenario: Scenario, *, guidance: bool):
+        """InputError for a wrong option."""
         self.name = "probing-pcrg" if guidance else "probing-pc"
-        self._network, self._guidance = scenario.network, guidance
-        self._gating = PiGating(scenario) if scenario.protected else None
+        self._network, self._guidance, self._gating = scenario.network, guidance, None
+        where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
+        options = toml.Table(scenario.controller_options.get(self.name, {}), where, f"controllers.{self.name}.")
+        critical = tuple(scenario.network.mfds[region].critical for region in scenario.protected)
+        middle = options.numbers("set_point", critical, length=len(critical))
+        options.close()
+        if middle:
+            self._gating = PiGating(replace(scenario, controller_options={PiGating.name: {"set_point": list(middle)}}))
+            self._gating.critical = np.array(middle)
         self._open = np.where(scenario.network.adjacency, scenario.network.u_max, 0.0)
         self.reset()
 

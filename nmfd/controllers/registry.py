@@ -19,6 +19,12 @@ def _no_control(scenario: Scenario) -> Controller:
     return NoControl(scenario)
 
 
+def _route_guidance(scenario: Scenario) -> Controller:
+    from nmfd.controllers.fixed import RouteGuidance
+
+    return RouteGuidance(scenario)
+
+
 def _pi_gating(scenario: Scenario) -> Controller:
     from nmfd.controllers.gating import PiGating
 
@@ -51,6 +57,7 @@ def _probing_pcrg(scenario: Scenario) -> Controller:
 
 _WITHOUT_POLICY: dict[str, Callable[[Scenario], Controller]] = {
     "no-control": _no_control,
+    "route-guidance": _route_guidance,
     "pi-gating": _pi_gating,
     "mpc-pc": _mpc_pc,
     "mpc-pcrg": _mpc_pcrg,

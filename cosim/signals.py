@@ -1,0 +1,94 @@
+"""Signals as the network file describes them, and other programmes for them as an additional file of SUMO."""
+
+import gzip
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+from cosim.regions import City
+from cosim.sumo import Phase
+from nmfd import runs
+
+GREEN = frozenset("Gg")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Link:
+    """One index of a state string: from a lane to an edge."""
+
+    index: int
+    from_edge: str
+    lane: int
+    to_edge: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Signal:
+    """A simple signal: one fixed-time programme, in which green is always followed by yellow.
+
+    links: of cars; several may have one index
+    stages: the phases that are green and have no yellow, by their number
+    """
+
+    id: str
+    offset: float
+    phases: tuple[Phase, ...]
+    links: tuple[Link, ...]
+
+    @property
+    def stages(self) -> tuple[int, ...]:
+        return tuple(n for n, phase in enumerate(self.phases) if is_stage(phase.state))
+
+
+def is_stage(state: str) -> bool:
+    return bool(GREEN & set(state)) and "y" not in state
+
+
+def read_signals(city: City) -> tuple[list[Signal], list[str]]:
+    """The simple signals of the city, and the names of all others, which no signal plan here touches: already actuated,
+    several programmes, fewer than two stages, or lights other than red, yellow and green."""
+    path = city.net_file
+    with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as stream:
+        root = ElementTree.parse(stream).getroot()
+    programmes = Counter(logic.get("id") for logic in root.iter("tlLogic"))
+    links: dict[str, list[Link]] = {}
+    for connection in root.iter("connection"):
+        ends = connection.get("from"), connection.get("to")
+        if connection.get("tl") is not None and set(ends) <= city.lanes.keys():
+            links.setdefault(connection.get("tl"), []).append(Link(
+                index=int(connection.get("linkIndex")), from_edge=ends[0], lane=int(connection.get("fromLane")),
+                to_edge=ends[1]))
+    simple, others = [], []
+    for logic in root.iter("tlLogic"):
+        phases = tuple(Phase(duration=float(p.get("duration")), state=p.get("state")) for p in logic.iter("phase"))
+        lights = set("".join(phase.state for phase in phases))
+        signal = Signal(id=logic.get("id"), offset=float(logic.get("offset")), phases=phases,
+                        links=tuple(links.get(logic.get("id"), ())))
+        fixed = programmes[signal.id] == 1 and logic.get("type") == "static" and lights <= set("Ggyr")
+        if fixed and len(signal.stages) > 1 and signal.links:
+            simple.append(signal)
+        else:
+            others.append(signal.id)
+    return sorted(simple, key=lambda signal: signal.id), sorted(set(others))
+
+
+def write_programmes(path: Path, rows: Iterable[str]) -> None:
+    """An additional file of SUMO with rows from `programme_row`."""
+    runs.write_text(path, "".join(["<additional>\n", *rows, "</additional>\n"]))
+
+
+def programme_row(signal: Signal, kind: str, *, limits: Mapping[int, tuple[float, float]] | None = None) -> str:
+    """A tlLogic with the phases and the offset of `signal`; SUMO runs the programme of a signal that it reads last.
+
+    kind: SUMO's type; limits: phase -> (minimum, maximum) [s] of an actuated one
+    """
+    rows = []
+    for n, phase in enumerate(signal.phases):
+        low, high = (limits or {}).get(n, (phase.duration, phase.duration))
+        extra = "" if low == high else f' minDur="{low:g}" maxDur="{high:g}"'
+        rows.append(f'    <phase duration="{phase.duration:g}"{extra} state="{phase.state}"/>\n')
+    return (f'  <tlLogic id={quoteattr(signal.id)} type="{kind}" programID="plan" offset="{signal.offset:g}">\n'
+            f"{''.join(rows)}  </tlLogic>\n")

@@ -1,0 +1,162 @@
+"""cosim evaluate: order, what is kept and what is run again, failures, and one small evaluation in SUMO."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+
+from cosim import evaluate, experiment
+from cosim.cli import main
+from cosim.simulate import FACTS, Result
+from nmfd.errors import InputError
+from nmfd.types import Trajectory
+from nmfd.workers import Failure
+
+ROOT = Path(__file__).parents[1]
+PI = "set_point = [338.0]"
+
+
+def cosim(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def city(tmp_path):
+    """A copy of grid7 and its scenario, which a test may change; the folder of the scenario."""
+    shutil.copytree(ROOT / "networks" / "grid7", tmp_path / "networks" / "grid7")
+    shutil.copytree(ROOT / "scenarios" / "grid7_peak", tmp_path / "scenarios" / "peak",
+                    ignore=shutil.ignore_patterns("reference"))
+    return tmp_path / "scenarios" / "peak"
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """SUMO is not started: the tasks that would be run, and which of them fail."""
+    tasks, failing = [], set()
+
+    def outcomes(function, todo, workers, *, fresh):
+        assert fresh
+        for task in todo:
+            tasks.append((task.controller, task.seed, task.demand_factor))
+            yield task, Failure("SUMO fell over") if (task.controller, task.seed) in failing else made_up(task)
+
+    monkeypatch.setattr(experiment, "outcomes", outcomes)
+    monkeypatch.setattr(evaluate.report, "draw_all", lambda *_: None)
+    return tasks, failing
+
+
+def made_up(task) -> Result:
+    trajectory = Trajectory(
+        controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=np.ones((3, 7, 7)),
+        backlog=np.zeros((3, 7, 7)), completed=np.zeros(3), perimeter=np.ones((2, 7, 7)),
+        splits=np.zeros((2, 7, 7, 7)), decision_time=np.zeros(2), status=("ok", "ok"), wall_time=1.0)
+    facts = {name: 0 for name in FACTS} | {"controller": task.controller, "seed": task.seed}
+    return Result(trajectory=trajectory, record={"departures": np.zeros(1)}, facts=facts)
+
+
+def evaluation(city, tmp_path, *, controllers=("no-control", "pi-gating"), seeds=(2000, 2001), **others):
+    return evaluate.Evaluation(
+        scenario=city, controllers=controllers, seeds=seeds, out=tmp_path / "out", steps=2, **others)
+
+
+def test_runs_come_seed_by_seed_and_are_kept(city, tmp_path, ran):
+    tasks, _ = ran
+    table, failures = evaluate.evaluate(evaluation(city, tmp_path, levels=(0.8, 1.0)))
+    assert not failures and list(table["seeds"]) == [2, 2, 2, 2]
+    assert tasks[:4] == [
+        ("no-control", 2000, 0.8), ("pi-gating", 2000, 0.8), ("no-control", 2000, 1.0), ("pi-gating", 2000, 1.0)]
+    assert [seed for _, seed, _ in tasks] == [2000] * 4 + [2001] * 4
+    tasks.clear()
+    wider = evaluation(city, tmp_path, seeds=(2000, 2001, 2002), controllers=("mpc-pc", "no-control", "pi-gating"))
+    table, _ = evaluate.evaluate(wider)
+    assert tasks == [("mpc-pc", 2000, 1.0), ("mpc-pc", 2001, 1.0)] + [
+        (name, 2002, 1.0) for name in ("mpc-pc", "no-control", "pi-gating")]
+    assert list(table["controller"]) == ["no-control", "pi-gating", "mpc-pc", "no-control", "pi-gating"]
+
+
+def test_a_failed_run_is_named_and_tried_again(city, tmp_path, ran):
+    tasks, failing = ran
+    failing.add(("pi-gating", 2000))
+    table, failures = evaluate.evaluate(evaluation(city, tmp_path))
+    assert failures == ["controller pi-gating, seed 2000: SUMO fell over"]
+    assert dict(zip(table["controller"], table["seeds"], strict=True)) == {"no-control": 2, "pi-gating": 1}
+    tasks.clear()
+    failing.clear()
+    assert evaluate.evaluate(evaluation(city, tmp_path))[1] == []
+    assert tasks == [("pi-gating", 2000, 1.0)]
+
+
+def test_nothing_is_left_where_every_run_failed(city, tmp_path, ran):
+    ran[1].update({("no-control", 2000), ("pi-gating", 2000)})
+    table, failures = evaluate.evaluate(evaluation(city, tmp_path, seeds=(2000,)))
+    assert len(failures) == 2 and table.empty and not (tmp_path / "out").exists()
+
+
+def test_another_option_of_one_controller_costs_its_own_runs_only(city, tmp_path, ran):
+    tasks, _ = ran
+    evaluate.evaluate(evaluation(city, tmp_path))
+    tasks.clear()
+    file = city / "scenario.toml"
+    file.write_text(file.read_text().replace(PI, "set_point = [300.0]"))
+    said = []
+    evaluate.evaluate(evaluation(city, tmp_path), tell=said.append)
+    assert {name for name, _, _ in tasks} == {"pi-gating"} and len(tasks) == 2
+    assert len(said) == 1 and "pi-gating has changed (options): its 2 kept runs do not" in said[0]
+
+
+def test_another_model_leaves_runs_without_control_alone(city, tmp_path, ran):
+    tasks, _ = ran
+    evaluate.evaluate(evaluation(city, tmp_path))
+    tasks.clear()
+    file = city.parent.parent / "networks" / "grid7" / "network.toml"
+    file.write_text(file.read_text().replace("c = 0.0166955", "c = 0.0160000"))
+    said = []
+    evaluate.evaluate(evaluation(city, tmp_path), tell=said.append)
+    assert {name for name, _, _ in tasks} == {"pi-gating"} and "model_hash" in said[0]
+
+
+@pytest.mark.parametrize("old, new, key", [
+    ("peak = 0.08", "peak = 0.09", "demand_hash"), ("compliance = 1.0", "compliance = 0.5", "sumo"),
+])
+def test_another_city_needs_another_folder(city, tmp_path, ran, old, new, key):
+    evaluate.evaluate(evaluation(city, tmp_path))
+    file = city / "scenario.toml"
+    file.write_text(file.read_text().replace(old, new, 1))
+    with pytest.raises(InputError, match=f"holds runs of another configuration .{key}: .*choose another folder"):
+        evaluate.evaluate(evaluation(city, tmp_path), tell=print)
+
+
+@pytest.mark.parametrize("arguments, expected", [
+    (("--controllers", "no-control,nobody"), "controller 'nobody' is unknown"),
+    (("--controllers", "no-control,no-control"), "--controllers: no-control is there twice"),
+    (("--controllers", "no-control", "--demand", "1,x"), "--demand: expected numbers above 0 up to 10"),
+    (("--controllers", "no-control", "--demand", "1,1.0"), "--demand: '1,1.0' names a level twice"),
+    (("--controllers", "no-control", "--reference", "mpc-pc", "--out", "{tmp}/none"), "'mpc-pc' is neither among"),
+    (("--controllers", "no-control", "--policy", "dpc-pc=x.pt"), "--policy: 'dpc-pc' is not among --controllers"),
+])
+def test_command_line_errors(tmp_path, arguments, expected):
+    result = cosim("evaluate", ROOT / "scenarios" / "grid7_peak", *(a.format(tmp=tmp_path) for a in arguments))
+    assert result.exit_code == 2 and expected in result.stderr and result.stderr.count("\n") == 1
+
+
+def test_a_small_evaluation_in_sumo(city, tmp_path):
+    file = city / "scenario.toml"
+    file.write_text(file.read_text().replace("ramp_up = 1500.0", "ramp_up = 60.0").replace(PI, "set_point = [20.0]"))
+    out = tmp_path / "out"
+    arguments = ("evaluate", city, "--controllers", "no-control,pi-gating", "--seeds", "2", "--steps", "3", "--workers",
+                 "1", "--out", out)
+    result = cosim(*arguments)
+    assert result.exit_code == 0, result.output + str(result.exception)
+    rows = pd.read_csv(out / "runs.csv")
+    assert list(rows["seed"]) == [2000, 2001, 2000, 2001] and (rows["co2_kg"] > 0).all()
+    assert set(rows["controller"]) == {"no-control", "pi-gating"} and "teleports" in result.stdout
+    level = out / "demand-1"
+    for picture in ("total_accumulation", "region_accumulation", "link_densities", "gateway_queues", "perimeter"):
+        assert (level / f"{picture}.png").stat().st_size > 10_000
+    assert max(path.stat().st_size for path in level.glob("*.record.npz")) < 1_000_000
+    before = {path: path.read_bytes() for path in level.glob("*.npz")}
+    assert cosim(*arguments).exit_code == 0
+    assert before == {path: path.read_bytes() for path in level.glob("*.npz")}

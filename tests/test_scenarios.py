@@ -1,0 +1,75 @@
+"""Scenarios on a base, and controllers that plan with another model than that of the scenario."""
+
+import numpy as np
+import pytest
+import tiny
+
+from nmfd.controllers import registry
+from nmfd.errors import InputError
+from nmfd.scenario import as_modelled, load_scenario
+
+OTHER = """
+name = "other"
+base = "../scenario"
+steps = 5
+demand_factor = 2.0
+
+[controllers.pi-gating]
+kp = 3.0
+"""
+
+
+@pytest.fixture
+def base(tmp_path):
+    return tiny.write(tmp_path, scenario=tiny.SCENARIO + "\n[controllers.pi-gating]\nkp = 1.0\nki = 0.02\n")
+
+
+def beside(base, text, name="other"):
+    folder = base.parent / name
+    folder.mkdir()
+    (folder / "scenario.toml").write_text(text)
+    return folder
+
+
+def test_what_a_scenario_does_not_say_is_its_bases(base):
+    own, inherited = load_scenario(base), load_scenario(beside(base, OTHER))
+    assert (inherited.name, inherited.steps, inherited.step) == ("other", 5, own.step)
+    assert inherited.network.hash == own.network.hash and inherited.protected == own.protected
+    np.testing.assert_allclose(inherited.demand, 2.0 * own.demand[:5])
+    assert inherited.controller_options["pi-gating"] == {"kp": 3.0, "ki": 0.02}
+
+
+def test_a_base_in_another_folder(base):
+    deeper = base.parent / "deep" / "other"
+    deeper.mkdir(parents=True)
+    (deeper / "scenario.toml").write_text('name = "deep"\nbase = "../../scenario"\n')
+    assert load_scenario(deeper).network.hash == load_scenario(base).network.hash
+
+
+@pytest.mark.parametrize("text, message", [
+    ('name = "x"\nbase = "../nowhere"\n', "nowhere/scenario.toml: no such file"),
+    ('name = "x"\nbase = "."\n', "base: the scenarios are each other's base"),
+    ('name = "x"\nbase = "../scenario"\ndemand_factor = -1.0\n', "demand_factor: expected a number in"),
+])
+def test_errors_of_a_base(base, text, message):
+    with pytest.raises(InputError, match=message):
+        load_scenario(beside(base, text))
+
+
+def test_a_controller_plans_with_the_model_that_it_names(base, tmp_path):
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 800.0"))
+    folder = beside(base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\nhorizon = 4\n')
+    scenario = load_scenario(folder)
+    planned = as_modelled(scenario, "mpc-pc")
+    assert planned.network.mfds[0].jam == 800.0 and planned.controller_options["mpc-pc"] == {"horizon": 4}
+    assert as_modelled(scenario, "mpc-pcrg").network.mfds[0].jam == 1000.0
+    assert registry.make("mpc-pc", scenario).options.horizon == 4
+
+
+def test_a_model_of_another_city_is_refused(base, tmp_path):
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "network.toml").write_text(tiny.row_network(3))
+    folder = beside(base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\n')
+    with pytest.raises(InputError, match="controllers.mpc-pc.model: network row3 has other regions"):
+        registry.make("mpc-pc", load_scenario(folder))
