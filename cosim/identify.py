@@ -246,8 +246,9 @@ def _options(network: Network, region: int) -> str:
     if network.exit_rates is not None:
         lines += f"exit_rates = [{', '.join(f'{value:.4g}' for value in network.exit_rates[region])}]\n"
     if network.capacity is not None:
+        passing = network.capacity[region, network.adjacency[region]]
         lines += (
-            f"capacity = [{', '.join(f'{value:.4g}' for value in network.capacity[region, network.adjacency[region]])}]\n"
+            f"capacity = [{', '.join(f'{value:.4g}' for value in passing)}]\n"
             f"storage = {network.storage[region]:.6g}\n")
     return lines
 

@@ -7,6 +7,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from cosim.importing.case import read_xml
+from cosim.importing.layers import area
 from cosim.importing.streets import Streets
 from nmfd.errors import InputError
 
@@ -68,14 +69,16 @@ def _assign(labels: np.ndarray, streets: Streets, edge: str, region: int, where:
 
 
 def _polygons(streets: Streets, path: Path) -> np.ndarray:
-    """An edge is in the region in which its middle lies; the first polygon counts where several do."""
+    """An edge is in the region in which its middle lies; the smallest polygon counts where several do."""
     from matplotlib.path import Path as Outline
 
-    labels, regions = np.full(len(streets.edges), -1), {}
+    labels, regions, found = np.full(len(streets.edges), -1), {}, []
     for polygon in read_xml(path).iter("poly"):
         region = regions.setdefault(polygon.get("id", "").partition(".")[0], len(regions))
-        inside = Outline(_corners(polygon, path, streets)).contains_points(streets.centre)
-        labels[inside & (labels < 0)] = region
+        corners = _corners(polygon, path, streets)
+        found.append((abs(area(corners)), len(found), region, corners))
+    for _, _, region, corners in sorted(found, key=lambda polygon: polygon[:2]):
+        labels[Outline(corners).contains_points(streets.centre) & (labels < 0)] = region
     if not regions:
         raise InputError(f"{path}: has no poly; give an additional file with one or more per region")
     return labels

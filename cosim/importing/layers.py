@@ -57,9 +57,9 @@ def outlines(streets: Streets, regions: np.ndarray) -> list[list[np.ndarray]]:
     found = []
     for region in range(int(regions.max()) + 1):
         rings = ax.contour(x, y, (label == region).astype(float), levels=[0.5]).allsegs[0]
-        rings = [ring for ring in rings if _area(ring) > 0]
-        rings.sort(key=lambda ring: -_area(ring))
-        found.append([ring for ring in rings if _area(ring) > 0.02 * _area(rings[0])])
+        rings.sort(key=lambda ring: -abs(area(ring)))
+        rings = [ring for ring in rings if area(ring) * area(rings[0]) > 0]  # the others run round holes
+        found.append([ring for ring in rings if area(ring) / area(rings[0]) > 0.02])
     return found
 
 
@@ -76,10 +76,10 @@ def sampled(streets: Streets, members: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return np.concatenate(points), np.concatenate(of)
 
 
-def _area(ring: np.ndarray) -> float:
-    """Signed the way that contours run: positive round what is inside."""
+def area(ring: np.ndarray) -> float:
+    """[m^2] of a polygon (n, 2) [m]; negative if it runs clockwise."""
     x, y = ring[:, 0], ring[:, 1]
-    return abs(float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2)
+    return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2
 
 
 def _rgb(region: int) -> str:
