@@ -147,8 +147,9 @@ def test_scenario_drives_the_original_vehicles(imported, config):
 
 
 @pytest.mark.parametrize("own", ["edges", "taz", "polygons"])
-def test_own_regions_come_back(imported, config, tmp_path, own):
-    network = imported[0] / "networks" / "tiny"
+def test_own_regions_come_back(config, tmp_path, own):
+    network = tmp_path / "networks" / "first"
+    good(cosim("import", config, "--regions", 3, "--method", "geometric", "--no-run", "--out", network))
     file = network / {"edges": "regions.csv", "taz": "regions.taz.xml", "polygons": "regions.poly.xml"}[own]
     good(cosim("import", config, f"--{own}", file, "--no-run", "--out", tmp_path / "networks" / "again"))
     before, after = (pd.read_csv(folder / "regions.csv") for folder in (network, tmp_path / "networks" / "again"))

@@ -71,7 +71,7 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
             baseline = _baseline(streets, case, clock, folder, files)
         left = left_alone(streets, traffic)
         tell("partition")
-        regions = partition(
+        regions, asked = partition(
             streets, baseline, regions=order.regions, method=order.method, given=order.given, seed=order.seed,
             left_alone=left)
         name = order.out.name
@@ -88,7 +88,7 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
             network, clock, case, name=order.scenario.name, files=files, leave=traffic.switched,
             network_path=os.path.relpath(order.out, order.scenario).replace(os.sep, "/"),
             protected=_protected(streets, regions, baseline, network)))
-        report = _report(order, case, streets, traffic, clock, network, city, found, left, baseline)
+        report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
         (net_folder / "import.txt").write_text(report + "\n")
     return report
 
@@ -231,7 +231,7 @@ def _notes(traffic: Traffic) -> str:
 
 
 def _report(order: Order, case: Case, streets: Streets, traffic: Traffic, clock: model.Clock, network: Network,
-            city: City, found: quality.Tables, left: Mapping[str, str], baseline: Baseline | None) -> str:
+            asked: int, city: City, found: quality.Tables, left: Mapping[str, str], baseline: Baseline | None) -> str:
     """What was found, what was left alone and what cannot be done, in a few lines."""
     usable, part = streets.drivable.sum(), streets.main_part.sum()
     signals = set(city.signals.values())
@@ -242,8 +242,8 @@ def _report(order: Order, case: Case, streets: Streets, traffic: Traffic, clock:
         + f"; {len(signals):,} signals that cars see; {len(traffic.vehicles):,} vehicles in {clock.steps} intervals of "
         f"{clock.step:g} s{_notes(traffic)}",
         f"{network.regions} regions by method {order.method}, seed {order.seed}"
-        + (f"; {order.regions} were asked for: the others could not be reached from the rest"
-           if order.regions and network.regions < order.regions else ""),
+        + (f"; {asked} were asked for: the others fell apart, or could not be reached from the rest"
+           if network.regions < asked else ""),
         quality.text(found)]
     at_gateways = {g["signal"] for g in found.gateways if g["signal"]}
     skipped = sorted(signal for signal in left if signal in at_gateways)

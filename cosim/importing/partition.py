@@ -28,15 +28,16 @@ GIVEN = ("edges", "taz", "polygons")
 def partition(
     streets: Streets, baseline: Baseline | None, *, regions: int | None, method: str, given: Path | None, seed: int,
     left_alone: Collection[str] = (),
-) -> np.ndarray:
-    """(E,) region of every edge, numbered from 0, by a method of METHODS; `given` is the file for those that read one.
+) -> tuple[np.ndarray, int]:
+    """(E,) region of every edge, numbered from 0, by a method of METHODS, and how many were asked for; `given` is the
+    file for those that read one.
 
     left_alone: signals that perimeter control cannot use. Regions of the user's own keep their order and edges, but
     edges without a region get one. Raises InputError where there are no two regions to be had.
     """
     if method in GIVEN:
         labels = read_given(streets, given, method)
-        found = finish(streets, labels, renumber=False)
+        found, regions = finish(streets, labels, renumber=False), int(labels.max()) + 1
     else:
         blocks = make_blocks(streets)
         if regions > len(blocks.weight):
@@ -58,4 +59,4 @@ def partition(
         raise InputError(
             f"{streets.path}: no two regions can be made that can be reached from each other; give a network with "
             "more streets, or other regions")
-    return found
+    return found, regions
