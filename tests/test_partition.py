@@ -56,6 +56,16 @@ def test_density_finds_the_congested_quarter(streets):
     assert within < 0.5 * density.var()
 
 
+@pytest.mark.parametrize("regions", [2, 3, 5, 8])
+def test_as_many_clusters_as_were_asked_for_none_tiny(streets, regions):
+    blocks = make_blocks(streets)
+    for seed in range(5):
+        density = np.random.default_rng(seed).exponential(0.03, len(streets.edges))
+        labels = agglomerate(blocks, features(blocks, blocks.mean(density, streets.lane_metres)), regions)
+        sizes = np.bincount(labels, blocks.weight) / blocks.weight.sum() * regions
+        assert len(sizes) == regions and sizes.min() > 0.15
+
+
 def test_refinement_moves_the_boundary_to_the_signals(streets):
     """Without densities a straight cut anywhere near the middle is as good; signals on one line decide."""
     blocks = make_blocks(streets)
