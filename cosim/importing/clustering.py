@@ -32,8 +32,8 @@ def features(blocks: Blocks, density: np.ndarray) -> np.ndarray:
 def agglomerate(blocks: Blocks, feature: np.ndarray, regions: int) -> np.ndarray:
     """(B,) region of every block, 0 to regions - 1 (fewer where there are not enough blocks of a size)."""
     merges = _merges(blocks, feature)
-    least = SMALLEST * blocks.core.sum() / regions
-    sizes = dict(enumerate(blocks.core.tolist()))  # plain numbers: two numpy booleans add up to one
+    least = SMALLEST * float(blocks.core.sum()) / regions
+    sizes = dict(enumerate(blocks.core.tolist()))  # plain floats: two numpy booleans add up to one
     history = []  # after n merges: how many clusters are large enough
     large = sum(size >= least for size in sizes.values())
     history.append(large)
