@@ -79,8 +79,10 @@ def draw(
     return sorted(drawn, key=lambda vehicle: vehicle[:2])
 
 
-def write_originals(originals: Originals, path: Path, *, seed: int, factor: float, jitter: float, begin: float) -> int:
-    """Write the vehicles of one run to a SUMO route file; returns how many. The same seed gives the same bytes."""
+def write_originals(
+    originals: Originals, path: Path, *, seed: int, factor: float, jitter: float, begin: float,
+) -> list[str]:
+    """Write the vehicles of one run to a SUMO route file; returns their ids. The same seed gives the same bytes."""
     drawn = draw(originals, seed=seed, factor=factor, jitter=jitter, begin=begin)
     lines = ["<routes>\n"]
     for depart, n, name in drawn:
@@ -90,4 +92,4 @@ def write_originals(originals: Originals, path: Path, *, seed: int, factor: floa
         lines.append(f"  {ElementTree.tostring(element, encoding='unicode').strip()}\n")
         element.attrib.update(before)
     runs.write_text(path, "".join([*lines, "</routes>\n"]))
-    return len(drawn)
+    return [name for _, _, name in drawn]
