@@ -97,7 +97,7 @@ class Guide:
         if self._splits is None:
             return
         for event in events:
-            if self._random.random() < self._compliance:
+            if event.free and self._random.random() < self._compliance:
                 taste, target = int(self._random.integers(TASTES)), self._index[event.edge]
                 here = self._index.get(self._session.road(event.vehicle))
                 if here is None or self._region[here] != event.region:  # on a junction already: too late to turn
