@@ -142,10 +142,17 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
 
 
 def _plain(chosen: Settings, folder: Path | None) -> dict:
-    """The settings; of the files that they name, fingerprints."""
-    files = {key: getattr(chosen, key) for key in ("routes", "background", "additional")}
-    return vars(chosen) | {key: [runs.file_hash(folder / name) for name in names] for key, names in files.items()} | {
-        "leave_signals": list(chosen.leave_signals)}
+    """The settings that are not the default ones; of the files that they name, fingerprints.
+
+    Only these, so that a new kind of setting does not make old runs another city's.
+    """
+    usual, found = vars(Settings()), {}
+    for key, value in vars(chosen).items():
+        if value != usual[key]:
+            found[key] = list(value) if isinstance(value, tuple) else value
+            if key in ("routes", "background", "additional"):
+                found[key] = [runs.file_hash(folder / name) for name in value]
+    return found
 
 
 def _finished(folder: runs.RunFolder) -> set[tuple[str, int]]:
