@@ -56,7 +56,7 @@ def run(
     for name in names:
         strategy.parse(name)
 
-    from cosim import experiment
+    from cosim import estimates, experiment
     from cosim.simulate import Task
 
     tasks = [
@@ -64,6 +64,10 @@ def run(
         for name in names]
     out, rows = _experiment(tasks, out)
     click.echo(experiment.table(rows))
+    if (out / "estimation.csv").is_file():
+        import pandas as pd
+
+        click.echo(estimates.table(pd.read_csv(out / "estimation.csv")))
     click.echo(f"Written to {out}: see total_accumulation.png and region_accumulation.png")
 
 

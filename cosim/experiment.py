@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from cosim import estimates
 from cosim.city import ensure_built
 from cosim.plant import settings
 from cosim.regions import check_adjacency, load_city
@@ -40,7 +41,9 @@ def experiment(
     """
     failures = perform([(out, task) for task in tasks], workers=workers, progress=progress, tell=tell)
     if (out / "summary.csv").is_file() and (kept := trajectories(out)):
-        draw_accumulations(out, scenario_of(tasks[0]), kept)
+        scenario = scenario_of(tasks[0])
+        draw_accumulations(out, scenario, kept)
+        estimates.write(out, scenario.network, kept)
     if failures:
         raise RunFailed("; ".join(f"{label(task)}: {reason}" for task, reason in failures))
     return overview(out)

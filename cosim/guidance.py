@@ -1,5 +1,9 @@
 """Route guidance to reroutes: every vehicle is given its next region once per region it enters, in shares theta.
 
+Drivers who are told travel times do not keep to the split ratios that they had without: what they would choose now is
+followed up, and theta shifts it as it shifts the drivers' own split ratios in the regional model (`shifted`). A
+controller that asks for these gets guidance by travel times alone; one that asks for everybody gets everybody.
+
 Who is sent where is not drawn by lot: a driver at the western edge of a region would be sent round its eastern end as
 often as the others, and trips get so much longer that guidance with the drivers' own split ratios jams a city that
 flows without it (measured on grid7). Instead everybody takes the next region that costs least, with a bonus for the
@@ -26,7 +30,18 @@ SPREAD = 0.15    # standard deviation of the logarithm of their travel times
 SLOWEST = 0.1    # m/s; slower is as good as standing
 BONUS = 30.0     # s per vehicle that a region is behind its share
 LOYALTY = 0.3    # a driver keeps his way if the best one does not save more than this share of its own time
-MEMORY = 0.9     # of the vehicles assigned before, per control interval
+MEMORY = 0.9     # of the vehicles assigned before and of their wishes, per control interval
+
+
+def shifted(wish: np.ndarray, own: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """Shares (n,) [-] that differ from `wish` as `theta` does from `own`.
+
+    A next region that theta lowers loses the same part of those who wish to go there, and what is freed goes to the
+    regions that theta raises, in proportion to by how much.
+    """
+    kept = wish * np.where(theta < own, theta / np.where(own > 0, own, 1.0), 1.0)
+    raised = np.maximum(theta - own, 0.0)
+    return kept + (wish.sum() - kept.sum()) * raised / max(raised.sum(), 1e-12)
 
 
 class Guide:
@@ -37,8 +52,11 @@ class Guide:
     """
 
     def __init__(
-        self, session: Session, city: City, *, compliance: float, most_detour: float, random: np.random.Generator,
+        self, session: Session, city: City, own: np.ndarray, *, compliance: float, most_detour: float,
+        random: np.random.Generator,
     ):
+        """own: (R, R, R) [-], the drivers' own split ratios, which controllers mean as well"""
+        self._own = own
         self._most_detour = most_detour
         self._session, self._city, self._compliance, self._random = session, city, compliance, random
         self._index = {edge: n for n, edge in enumerate(city.edges)}
@@ -54,7 +72,7 @@ class Guide:
         self._ways: dict[tuple[int, int], _Ways] = {}
         self._home: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         self._splits: np.ndarray | None = None
-        self._assigned = np.zeros((city.regions,) * 3)
+        self._assigned, self._wished = np.zeros((2, *(city.regions,) * 3))
         self.realised = np.zeros((city.regions,) * 3, dtype=int)
         self.refused = 0
 
@@ -71,6 +89,7 @@ class Guide:
                 self._time += SMOOTHING * (np.maximum(now, self._free) - self._time)
             self._ways, self._home = {}, {}
             self._assigned *= MEMORY
+            self._wished *= MEMORY
 
     def apply(self, events: list[Event]) -> None:
         """Guide the vehicles that departed or entered a region in the last step."""
@@ -106,8 +125,12 @@ class Guide:
         ways = self._ways_from(event.region, taste)
         cost = ways.cost(here, target)
         least = np.minimum.reduceat(cost, ways.begins)
+        if not np.isfinite(least).any():
+            return
         cell = event.region, ways.neighbours, event.destination
-        shares = self._splits[cell] * np.isfinite(least)
+        self._wished[event.region, ways.neighbours[np.argmin(least)], event.destination] += 1.0
+        wish = self._wished[cell] / self._wished[cell].sum()
+        shares = shifted(wish, self._own[cell], self._splits[cell]) * np.isfinite(least)
         if shares.sum() <= 0:
             return
         shares /= shares.sum()

@@ -66,7 +66,7 @@ def identify(
             "folder with --network")
     first, second = loading.stages
     found = _load(scenario, loading, first, {}, out, workers, progress)
-    network = static_model(loaded, found)
+    network = static_model(loaded, found, guided=loading.guided)
     set_point = tuple(network.mfds[region].critical for region in loaded.protected)
     found += _load(scenario, loading, second, {"set_point": set_point}, out, workers, progress)
     held_out = [result for result in found if len(loading.seeds) > 1 and result.trajectory.seed == loading.seeds[-1]]
@@ -111,12 +111,15 @@ def _load(
     return [experiment.read_run(folder, controller, task.seed) for folder, task in plan]
 
 
-def static_model(scenario: Scenario, results: Sequence[Result]) -> Network:
-    """The scenario's network with the published model: an MFD per region, fitted to outflow samples, and own splits."""
+def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> Network:
+    """The scenario's network with the published model: an MFD per region, fitted to outflow samples, and own splits,
+    if drivers were not guided."""
     network = replace(scenario.network, exit_rates=None, capacity=None, storage=None)
-    return replace(
-        network, mfds=tuple(_fit(cloud, scenario.step / scenario.substeps) for cloud in samples_of(network, results)),
-        own_splits=own_splits(network, [result.record for result in results]))
+    network = replace(
+        network, mfds=tuple(_fit(cloud, scenario.step / scenario.substeps) for cloud in samples_of(network, results)))
+    if guided:  # what theta is compared with stays what it is for the plant (cosim.guidance)
+        return network
+    return replace(network, own_splits=own_splits(network, [result.record for result in results]))
 
 
 def samples_of(network: Network, results: Sequence[Result]) -> list[dict[str, np.ndarray]]:

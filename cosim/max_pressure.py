@@ -27,10 +27,14 @@ PERMISSIVE = 0.3  # saturation flow of a movement that must give way (g), as a s
 class MaxPressure:
     """Max-pressure at `signals`; call `play` before every simulation step."""
 
-    def __init__(self, session: Session, city: City, signals: list[Signal], flows: Mapping[tuple[str, str], float]):
-        """flows: (edge, next edge) -> any measure of flow, for the turning shares."""
+    def __init__(
+        self, session: Session, city: City, signals: list[Signal], flows: Mapping[tuple[str, str], float], *,
+        others: list[Signal],
+    ):
+        """flows: (edge, next edge) -> any measure of flow, for the turning shares; others: signals that somebody else
+        controls, but whose queues count as well."""
         self._session = session
-        roads = Roads(city, signals, flows)
+        roads = Roads(city, [*signals, *others], flows)
         self._lanes, self._weights = roads.lanes, roads.weights
         self._gain, self._begins = roads.stages(signals)
         self._junctions = [Junction(signal, session.time) for signal in signals]
@@ -116,7 +120,7 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
 class Roads:
     """Vehicles by lane -> weights of the movements -> pressures of the stages, as two sparse matrices.
 
-    lanes: (L,) names; weights: (M, L) [-]
+    lanes: (L,) names; weights: (M, L) [-], of the movements at `signals`; roads that end at none of them are full too
     """
 
     def __init__(self, city: City, signals: Iterable[Signal], flows: Mapping[tuple[str, str], float]):
@@ -133,13 +137,12 @@ class Roads:
                 self._links.setdefault(link.from_edge, []).append(link)
         self._movements = sorted({(link.from_edge, link.to_edge) for links in self._links.values() for link in links})
         self._number = {movement: n for n, movement in enumerate(self._movements)}
-        queues = [self._queue(*movement) for movement in self._movements]
         rows = []
-        for (_, target), queue in zip(self._movements, queues, strict=True):
-            row = dict(queue)
+        for edge, target in self._movements:
+            row = self._queue(edge, target)
             end = self._chain(target)[-1]
-            for after, share in self._shares(end, sorted({link.to_edge for link in self._links.get(end, ())})).items():
-                for lane, part in queues[self._number[end, after]].items():
+            for after, share in self._shares(end, self._targets(end)).items():
+                for lane, part in self._queue(end, after).items():
                     row[lane] = row.get(lane, 0.0) - share * part
             rows.append(row)
         self.weights = _sparse(rows, len(self.lanes))
@@ -163,16 +166,22 @@ class Roads:
     def _queue(self, edge: str, to: str) -> dict[int, float]:
         """Lane -> share of its vehicles that want to go from `edge` to `to`."""
         queue = {}
+        share = self._shares(edge, self._targets(edge))[to]
         for lane in range(self._city.lanes[edge]):
-            if share := self._lane_shares(edge, lane).get(to):
-                queue[self._index[f"{edge}_{lane}"]] = share
-        share = self._shares(edge, sorted({link.to_edge for link in self._links[edge]}))[to]
+            if own := self._lane_shares(edge, lane).get(to) if edge in self._links else share:
+                queue[self._index[f"{edge}_{lane}"]] = own
         while (edge := self._upstream(edge)) is not None:
             queue |= {self._index[f"{edge}_{lane}"]: share for lane in range(self._city.lanes[edge])}
         return queue
 
     def _lane_shares(self, edge: str, lane: int) -> dict[str, float]:
         return self._shares(edge, sorted({link.to_edge for link in self._links[edge] if link.lane == lane}))
+
+    def _targets(self, edge: str) -> list[str]:
+        """Where vehicles may go at the end of `edge`, signal or not."""
+        if edge in self._links:
+            return sorted({link.to_edge for link in self._links[edge]})
+        return list(self._city.successors[edge])
 
     def _shares(self, edge: str, targets: list[str]) -> dict[str, float]:
         """Turning shares among `targets`; equal ones where nobody was expected."""

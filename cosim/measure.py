@@ -43,11 +43,12 @@ class Meter:
     `accumulation` looks at every vehicle. A teleporting vehicle counts where it was last seen.
 
     departures (R, R), arrivals (R,), crossings (R, R, R) [i, h, j], teleports, and entry_flow, (source region, first
-    edge behind the boundary) -> vehicles seen there: all since the beginning [veh].
+    edge behind the boundary) -> vehicles seen there: all since the beginning [veh]. probe_departures (R, R): those of
+    the vehicles `probes`.
     """
 
-    def __init__(self, session: Session, city: City):
-        self._session, self._city = session, city
+    def __init__(self, session: Session, city: City, probes: frozenset[str] = frozenset()):
+        self._session, self._city, self._probes = session, city, probes
         self._vehicles: dict[str, _Vehicle] = {}
         self._teleporting: set[str] = set()
         entries = sorted({g.to_edge for g in city.gateways})
@@ -59,7 +60,7 @@ class Meter:
         self._seen: dict[str, tuple[str, ...]] = dict.fromkeys(entries, ())
         self._running = np.zeros((city.regions, city.regions), dtype=int)
         self.teleports = 0
-        self.departures = np.zeros((city.regions, city.regions), dtype=int)
+        self.departures, self.probe_departures = np.zeros((2, city.regions, city.regions), dtype=int)
         self.arrivals = np.zeros(city.regions, dtype=int)
         self.crossings = np.zeros((city.regions,) * 3, dtype=int)
         self.entry_flow: Counter[tuple[int, str]] = Counter()
@@ -79,6 +80,7 @@ class Meter:
             known.region = known.announced = known.origin
             self._running[known.origin, known.destination] += 1
             self.departures[known.origin, known.destination] += 1
+            self.probe_departures[known.origin, known.destination] += vehicle in self._probes
             events.append(Event(
                 vehicle=vehicle, source=None, region=known.origin, destination=known.destination, edge=known.edge))
         self._steps += 1
@@ -122,6 +124,23 @@ class Meter:
         """(R, R) [veh]: due to depart from i for j, but not inserted yet."""
         waiting = np.zeros(self._running.shape)
         for vehicle in self._session.pending():
+            known = self._load(vehicle)
+            waiting[known.origin, known.destination] += 1
+        return waiting
+
+    def probes(self) -> np.ndarray:
+        """(R, R) [veh]: the probes among the accumulation, where it last counted them."""
+        counted = np.zeros(self._running.shape)
+        for vehicle in self._probes & self._vehicles.keys():
+            known = self._vehicles[vehicle]
+            if known.region is not None:
+                counted[known.region, known.destination] += 1
+        return counted
+
+    def probe_backlog(self) -> np.ndarray:
+        """(R, R) [veh]: the probes among the backlog."""
+        waiting = np.zeros(self._running.shape)
+        for vehicle in self._probes.intersection(self._session.pending()):
             known = self._load(vehicle)
             waiting[known.origin, known.destination] += 1
         return waiting

@@ -3,7 +3,7 @@
 import tempfile
 from collections import Counter
 from collections.abc import Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from cosim import webster
 from cosim.actuate import GREEN, Actuator, GatewaySignal
 from cosim.actuated import actuated_row
 from cosim.city import ensure_built
+from cosim.detectors import EVERY, Detectors, instruments, lay_out, probes, write_loops
 from cosim.flows import turning_flows
 from cosim.guidance import Guide
 from cosim.max_pressure import MaxPressure
@@ -24,9 +25,11 @@ from cosim.trip_facts import TripFacts, read_trip_facts, trip_options
 from cosim.trips import write_trips
 from nmfd import toml
 from nmfd.errors import InputError
+from nmfd.estimation import Estimator
 from nmfd.scenario import Scenario, read_tables
 from nmfd.types import Controls, Measurement
 
+EXACT, ESTIMATE = "exact", "estimate"
 SAMPLE_EVERY = 10.0  # s, between two samples of the production and of the queues
 # Equipped drivers take the fastest route by the mean speeds of the last 180 s (SUMO's default): when they depart, which
 # needs their route to be read no earlier, and every minute from then on, as drivers with navigation do.
@@ -44,6 +47,8 @@ class Settings:
     compliance: share of the decisions in which a driver follows the route guidance [-]
     most_detour: a driver does not follow route guidance into a next region that costs him more than this [s]
     rerouting: share of the drivers with SUMO's own rerouting device [-]
+    measurement: "exact", or "estimate": controllers see what detectors and probes tell (cosim/detectors.py)
+    detector_share: of the links, with loop detectors [-]; probe_share: of the vehicles [-]
     signals: one of cosim.strategy.SIGNALS; gateways_fixed (of the strategy, no key of the table): whether signals with
         a gateway movement stay fixed-time, for perimeter control, where the others are actuated or max-pressure
     """
@@ -56,6 +61,9 @@ class Settings:
     compliance: float = 1.0
     most_detour: float = 60.0
     rerouting: float = 0.0
+    measurement: str = EXACT
+    detector_share: float = 0.3
+    probe_share: float = 0.1
     signals: str = FIXED
     gateways_fixed: bool = True
 
@@ -76,8 +84,15 @@ def settings(scenario: Scenario) -> Settings:
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
         most_detour=table.number("most_detour", default.most_detour, low=0.0),
         rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0),
-        signals=table.text("signals", default.signals, SIGNALS))
+        signals=table.text("signals", default.signals, SIGNALS),
+        measurement=table.text("measurement", default.measurement, (EXACT, ESTIMATE)),
+        detector_share=table.number("detector_share", default.detector_share, low=0.0, high=1.0),
+        probe_share=table.number("probe_share", default.probe_share, low=0.0, high=1.0))
     table.close()
+    if chosen.measurement == ESTIMATE and chosen.detector_share == chosen.probe_share == 0:
+        raise InputError(
+            f"{path}: sumo.measurement: \"estimate\" needs detectors or probes, but sumo.detector_share and "
+            "sumo.probe_share are both 0; raise one of them")
     if abs(scenario.step / chosen.step_length - round(scenario.step / chosen.step_length)) > 1e-9:
         raise InputError(
             f"{path}: sumo.step_length: expected a divisor of the control interval {scenario.step:g} s, got "
@@ -135,6 +150,8 @@ class SumoPlant:
         self._upstream = sorted({g.from_edge for g in self.city.gateways})
         self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in self.city.gateways], dtype=int)
         self._net_file = files.net_file
+        self._layout = lay_out(self.city, self._settings.detector_share)
+        self._instruments = instruments(self.city, self._layout, self._settings.probe_share)
         self.simple_signals, self.other_signals = read_signals(self.city)
         if self._settings.signals != FIXED and not self.simple_signals:
             raise InputError(
@@ -152,26 +169,39 @@ class SumoPlant:
         self.trips = write_trips(self.city, scenario.demand, scenario.step, seed, routes)
         self._trip_file = routes.with_name("tripinfo.xml")
         steered = [s for s in self.simple_signals if not (chosen.gateways_fixed and s.id in self._gateway_ids)]
-        options = (*trip_options(self._trip_file), *self._signal_plan(steered))
+        options, additional = trip_options(self._trip_file), self._signal_plan(steered)
         if chosen.rerouting > 0:
             options += (*REROUTING, "--device.rerouting.probability", str(chosen.rerouting))
+        estimating = chosen.measurement == ESTIMATE
+        if estimating:
+            loops = Path(self._folder.name) / "loops.add.xml"
+            write_loops(self.city, self._layout, scenario.step, loops)
+            additional.append(loops)
+        if additional:
+            options += ("--additional-files", ",".join(map(str, additional)))
         self._session = Session(
             self._net_file, routes, seed=seed, step_length=chosen.step_length,
             time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action, options=options)
-        self._meter = Meter(self._session, self.city)
+        self._meter = Meter(
+            self._session, self.city, probes(self.trips, chosen.probe_share, seed) if estimating else frozenset())
+        self._detectors, self._estimator = None, None
+        if estimating:
+            self._detectors = Detectors(self._session, self.city, self._layout, self._meter, self._instruments)
+            self._estimator = Estimator(scenario, self._instruments)
         self._guide = Guide(
-            self._session, self.city, compliance=chosen.compliance, most_detour=chosen.most_detour,
-            random=np.random.default_rng([seed, 0x67756964]))
+            self._session, self.city, scenario.network.nominal_splits, compliance=chosen.compliance,
+            most_detour=chosen.most_detour, random=np.random.default_rng([seed, 0x67756964]))
         self._max_pressure, steered_ids = None, set()
         if chosen.signals == MAX_PRESSURE:
             flows = turning_flows(self.city, scenario.demand, scenario.step)
-            self._max_pressure = MaxPressure(self._session, self.city, steered, flows)
+            others = [signal for signal in self.simple_signals if signal not in steered]
+            self._max_pressure = MaxPressure(self._session, self.city, steered, flows, others=others)
             steered_ids = {signal.id for signal in steered}
         self._signals = self._gateway_signals(without=steered_ids)
         self._original_green = self._programmed_green()
         self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
         self._k, self._rows, self._speed = 0, [], None
-        return self._measurement()
+        return self._estimated(self._measurement()) if estimating else self._measurement()
 
     def step(self, controls: Controls) -> Measurement:
         network, session, meter = self._scenario.network, self._session, self._meter
@@ -179,7 +209,8 @@ class SumoPlant:
         self._actuator.command(controls.perimeter, network.u_min, network.u_max)
         self._guide.command(controls.splits, self._speed)
         begin, steps = session.time, round(self._scenario.step / session.step_length)
-        every = max(1, round(SAMPLE_EVERY / session.step_length))
+        every, often = (
+            min(max(1, round(time / session.step_length)), steps) for time in (SAMPLE_EVERY, EVERY))
         vehicles, metres = np.zeros((2, len(self.city.edges)))  # sums over the samples, by edge: n and n v
         queues = []
         for n in range(steps):
@@ -188,6 +219,8 @@ class SumoPlant:
                 self._max_pressure.play(session.time)
             session.step()
             self._guide.apply(meter.observe())
+            if self._detectors and n % often == often - 1:
+                self._detectors.sample()
             if n % every == every - 1:
                 counts, speeds = self._sample()
                 vehicles, metres = vehicles + counts, metres + counts * speeds
@@ -196,6 +229,10 @@ class SumoPlant:
         assert abs(session.time - begin - self._scenario.step) < 1e-6
         measurement = self._measurement()
         after = self._totals()
+        if self._estimator:
+            self._estimator.step(
+                controls, self._detectors.observation(after["gateway_flow"] - before["gateway_flow"]))
+            measurement = self._estimated(measurement)
         row = {key: after[key] - before[key] for key in after}
         with np.errstate(invalid="ignore"):
             self._speed = metres / vehicles
@@ -243,8 +280,8 @@ class SumoPlant:
             self._session.close()
             self._session = None
 
-    def _signal_plan(self, signals: list[Signal]) -> tuple[str, ...]:
-        """Options of SUMO with which it runs other programmes than those of the network file."""
+    def _signal_plan(self, signals: list[Signal]) -> list[Path]:
+        """Additional files with which SUMO runs other programmes than those of the network file."""
         if self._settings.signals == WEBSTER:
             path = webster.plan(
                 self.city, self.simple_signals, self._scenario.demand, self._scenario.step,
@@ -253,8 +290,8 @@ class SumoPlant:
             path = Path(self._folder.name) / "actuated.add.xml"
             write_programmes(path, [actuated_row(signal) for signal in signals])
         else:
-            return ()
-        return ("--additional-files", str(path))
+            return []
+        return [path]
 
     def _gateway_signals(self, *, without: Set[str]) -> dict[str, GatewaySignal]:
         movements: dict[str, dict[int, tuple[int, int]]] = {}
@@ -286,6 +323,10 @@ class SumoPlant:
         return Measurement(
             step=self._k, time=self._k * self._scenario.step, accumulation=self._meter.accumulation(),
             backlog=self._meter.backlog())
+
+    def _estimated(self, measurement: Measurement) -> Measurement:
+        return replace(
+            measurement, estimate=self._estimator.accumulation, estimated_backlog=self._detectors.backlog())
 
     def _sample(self) -> tuple[np.ndarray, np.ndarray]:
         """Vehicles (E,) [veh] and mean speed (E,) [m/s] by edge, now."""

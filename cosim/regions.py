@@ -37,6 +37,7 @@ class City:
     region_of: normal and junction-internal edge -> region; an internal edge has that of the edge it leads to, since
         a vehicle on it has left the edge before
     length [m], lanes, speed [m/s]: by normal edge
+    lane_ids: normal edge -> its lanes for cars
     successors: normal edge -> the edges that follow, sorted
     turn_time: (from_edge, to_edge) -> free-flow time on the junction between them [s]
     gateways: sorted by source, target, from_edge, to_edge
@@ -48,6 +49,7 @@ class City:
     edges: tuple[str, ...]
     length: Mapping[str, float]
     lanes: Mapping[str, int]
+    lane_ids: Mapping[str, tuple[str, ...]]
     speed: Mapping[str, float]
     successors: Mapping[str, tuple[str, ...]]
     turn_time: Mapping[tuple[str, str], float]
@@ -97,7 +99,8 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
         net_file=Path(net_file), regions=regions,
         region_of=region_of | _internal_regions(connections, region_of, internal), edges=edges,
         length={e: lanes_of[e][0][0] for e in edges}, lanes={e: len(lanes_of[e]) for e in edges},
-        speed={e: max(speed for _, speed in lanes_of[e]) for e in edges},
+        lane_ids={e: tuple(lane for _, _, lane in lanes_of[e]) for e in edges},
+        speed={e: max(speed for _, speed, _ in lanes_of[e]) for e in edges},
         successors={edge: tuple(after) for edge, after in successors.items()}, turn_time=times, gateways=gateways)
 
 
@@ -134,20 +137,20 @@ def edge_shapes(city: City) -> list[np.ndarray]:
 
 
 def _read_net(path: Path):
-    """(edge -> [(length, speed) of each car lane], internal edge -> free-flow time [s], connections)."""
-    lanes_of: dict[str, list[tuple[float, float]]] = {}
+    """(edge -> [(length, speed, id) of each car lane], internal edge -> free-flow time [s], connections)."""
+    lanes_of: dict[str, list[tuple[float, float, str]]] = {}
     internal: dict[str, float] = {}
     connections: list[_Connection] = []
     try:
         with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as stream:
             for _, element in ElementTree.iterparse(stream):
                 if element.tag == "edge":
-                    lanes = [(float(lane.get("length")), float(lane.get("speed")))
+                    lanes = [(float(lane.get("length")), float(lane.get("speed")), lane.get("id"))
                              for lane in element.iter("lane") if _for_cars(lane)]
                     if not element.get("function"):
                         lanes_of[element.get("id")] = lanes
                     else:
-                        internal[element.get("id")] = max((length / speed for length, speed in lanes), default=0.0)
+                        internal[element.get("id")] = max((length / speed for length, speed, _ in lanes), default=0.0)
                     element.clear()
                 elif element.tag == "connection":
                     connections.append(_Connection(

@@ -1,5 +1,6 @@
 """One closed-loop run in SUMO: a task that can be handed to another process, and all that came of it."""
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -15,8 +16,9 @@ from nmfd.types import Trajectory
 FACTS = (
     "controller", "seed", "trips", "departed_veh", "final_backlog_veh", "total_backlog_veh_s", "teleports",
     "mean_trip_time_s", "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh",
-    "gateway_queue_max_veh", "gateway_full_share", "late_decisions", "fallbacks", "leaking_share", "wall_time_s",
-    "sumo_time_s", "overhead_share", "setup_time_s")
+    "gateway_queue_max_veh", "gateway_full_share", "late_decisions", "fallbacks", "leaking_share",
+    "estimate_rmse_share", "estimate_cell_rmse_veh", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s",
+    "signals_left_alone")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,9 +85,20 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
             "teleports": int(record.teleports.sum()), **facts.trip_facts(plant.trip_facts()),
             **facts.queue_facts(record, plant.city), **facts.decision_facts(trajectory),
             "leaking_share": facts.leaking_share(record, plant.city, leaks),
-            "wall_time_s": trajectory.wall_time, "sumo_time_s": sumo_time,
+            **_estimation(scenario, trajectory), "wall_time_s": trajectory.wall_time, "sumo_time_s": sumo_time,
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
-            "setup_time_s": time.perf_counter() - begin - trajectory.wall_time}
+            "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
+            "signals_left_alone": len(plant.other_signals)}
     finally:
         plant.close()
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
+
+
+def _estimation(scenario: Scenario, trajectory: Trajectory) -> dict[str, float]:
+    """Errors of the estimate, over all regions; NaN where the controller saw the exact state."""
+    if trajectory.estimate is None:
+        return {"estimate_rmse_share": math.nan, "estimate_cell_rmse_veh": math.nan}
+    from cosim import estimates
+
+    whole = estimates.errors(scenario.network, trajectory)[-1]
+    return {"estimate_rmse_share": whole["rmse_share"], "estimate_cell_rmse_veh": whole["cell_rmse_veh"]}

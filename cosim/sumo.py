@@ -136,6 +136,9 @@ class Session:
     lane_vehicles = staticmethod(libsumo.lane.getLastStepVehicleNumber)
     lane_halting = staticmethod(libsumo.lane.getLastStepHaltingNumber)
 
+    # Loop detectors: the share of the last step in which a vehicle was on one [%].
+    loop_occupancy = staticmethod(libsumo.inductionloop.getLastStepOccupancy)
+
     # Signals.
 
     def programme(self, signal: str) -> Programme:

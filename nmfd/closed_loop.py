@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,8 +16,8 @@ def run(
 ) -> Trajectory:
     """Drive `plant` with `controller` for `scenario.steps` control intervals.
 
-    The controller sees every x_ij with Gaussian noise of `scenario.measurement_std`, drawn from `seed`; the
-    trajectory holds the exact state. `progress(done, steps)` is called after every interval.
+    The controller sees every x_ij with Gaussian noise of `scenario.measurement_std`, drawn from `seed`, or the plant's
+    estimate as it is; the trajectory holds the exact state. `progress(done, steps)` is called after every interval.
     """
     random = np.random.default_rng([seed, 0x6E6F6973])
     controller.reset(seed)
@@ -25,8 +26,7 @@ def run(
     begin = time.perf_counter()
     for k in range(scenario.steps):
         noise = scenario.measurement_std * random.standard_normal(states[-1].accumulation.shape)
-        seen = Measurement(
-            step=k, time=states[-1].time, accumulation=states[-1].accumulation + noise, backlog=states[-1].backlog)
+        seen = what_is_seen(states[-1], noise)
         before = time.perf_counter()
         controls.append(controller.act(seen))
         decision_time.append(time.perf_counter() - before)
@@ -40,4 +40,13 @@ def run(
         completed=np.array(completed), perimeter=np.stack([c.perimeter for c in controls]),
         splits=np.stack([scenario.network.nominal_splits if c.splits is None else c.splits for c in controls]),
         decision_time=np.array(decision_time),
-        status=tuple(c.status for c in controls), wall_time=time.perf_counter() - begin)
+        status=tuple(c.status for c in controls), wall_time=time.perf_counter() - begin,
+        estimate=None if states[0].estimate is None else np.stack([s.estimate for s in states]))
+
+
+def what_is_seen(state: Measurement, noise: np.ndarray) -> Measurement:
+    """The plant's estimate where it makes one, else the exact state with `noise` (R, R) [veh]."""
+    if state.estimate is None:
+        return replace(state, accumulation=state.accumulation + noise)
+    return Measurement(
+        step=state.step, time=state.time, accumulation=state.estimate, backlog=state.estimated_backlog)

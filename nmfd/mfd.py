@@ -35,6 +35,11 @@ class Mfd:
         grid = np.linspace(0.0, self.jam if np.isfinite(self.jam) else -self.c / self.b * 2, 20001)
         return float(grid[np.argmax(self.outflow(grid))])
 
+    def reaching(self, share: float) -> float:
+        """The smallest accumulation with `share` of the maximum outflow [veh]; the critical one for 1."""
+        grid = np.linspace(0.0, self.critical, 20001)
+        return float(grid[np.argmax(self.outflow(grid) >= share * self.capacity * (1.0 - 1e-12))])
+
     @property
     def capacity(self) -> float:
         """The maximum outflow [veh/s]."""

@@ -5,6 +5,7 @@
 
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from nmfd.types import Trajectory
 CONTROLLER_COLOURS = {
     "no-control": "#333333", "pi-gating": "#e69f00", "mpc-pc": "#56b4e9", "mpc-pcrg": "#0059a8",
     "dpc-pc": "#e377c2", "dpc-pcrg": "#882255", "dpc-pc-robust": "#b07aa1", "dpc-pcrg-robust": "#d62d20",
+    "route-guidance": "#8c6d31", "probing-pc": "#bcbd22", "probing-pcrg": "#637939",
     "dpc-pc-guarded": "#c9a0dc", "dpc-pcrg-guarded": "#6a3d9a", "bound-pc": "#9aa33c", "bound-pcrg": "#4d6600",
 }
 CITY_COLOURS = {  # what a city may do without a regional controller
@@ -32,7 +34,7 @@ CITY_COLOURS = {  # what a city may do without a regional controller
     "rerouting-100": "#b5a642",
 }
 OTHER_COLOURS = ("#17becf", "#5254a3", "#843c39", "#66c2a5", "#bc80bd", "#1b5e20", "#fb8072", "#556b2f")
-PLANT_LABELS = {"nmfd": "regional model", "acyclic": "acyclic model", "sumo": "SUMO"}
+PLANT_LABELS = {"nmfd": "regional model", "acyclic": "acyclic model", "sumo": "SUMO", "estimate": "estimate"}
 LINE_STYLES = ("-", "--", ":", "-.")
 GREEN, RED = "#2ca02c", "#d62728"
 ZONES = (  # of a region's accumulation: label, colour, opacity
@@ -128,6 +130,12 @@ def region_accumulation(
     ax.set_ylim(0.0, top)
     ax.set_title(_region_title(network, region), fontsize="medium")
     return ax
+
+
+def region_estimate(ax: Axes, network: Network, region: int, trajectory: Trajectory) -> Axes:
+    """Accumulation of one region over time, and the estimate of it that the controller saw."""
+    estimate = replace(trajectory, accumulation=trajectory.estimate, plant="estimate")
+    return region_accumulation(ax, network, region, [trajectory, estimate])
 
 
 def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> Axes:

@@ -65,7 +65,8 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
         np.savez_compressed(
             temporary, controller=np.array(trajectory.controller), plant=np.array(trajectory.plant),
             seed=np.array(trajectory.seed), step=np.array(trajectory.step), status=np.array(trajectory.status),
-            **{name: getattr(trajectory, name) for name in _ARRAYS})
+            **{name: getattr(trajectory, name) for name in _ARRAYS},
+            **({} if trajectory.estimate is None else {"estimate": trajectory.estimate}))
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -76,6 +77,7 @@ def read_trajectory(path: Path) -> Trajectory:
                 controller=str(file["controller"]), plant=str(file["plant"]), seed=int(file["seed"]),
                 step=float(file["step"]), status=tuple(str(s) for s in file["status"]),
                 decision_time=np.full(len(file["status"]), math.nan), wall_time=math.nan,
+                estimate=file["estimate"] if "estimate" in file.files else None,
                 **{name: file[name] for name in _ARRAYS})
     except FileNotFoundError:
         raise InputError(f"{path}: no such trajectory; run it again") from None

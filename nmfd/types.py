@@ -14,12 +14,15 @@ class Measurement:
     time: seconds since the start [s]
     accumulation: (R, R) [veh], [i, j] = in region i bound for j
     backlog: (R, R) [veh], [i, j] = waiting outside the network to enter region i, bound for j; zero in the NMFD
+    estimate, estimated_backlog: (R, R) [veh], what a controller sees instead where the plant only estimates them
     """
 
     step: int
     time: float
     accumulation: np.ndarray
     backlog: np.ndarray
+    estimate: np.ndarray | None = None
+    estimated_backlog: np.ndarray | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +83,7 @@ class Trajectory:
     decision_time: (T,) [s], wall time of `Controller.act`
     status: T strings, "ok" or the declared fallback
     wall_time: of the whole loop [s]
+    estimate: (T+1, R, R) [veh], the accumulation that the controller saw where the plant estimated it, else None
     """
 
     controller: str
@@ -94,3 +98,4 @@ class Trajectory:
     decision_time: np.ndarray
     status: tuple[str, ...] = field(repr=False)
     wall_time: float
+    estimate: np.ndarray | None = None

@@ -60,6 +60,19 @@ def test_every_controller_runs(small, tmp_path, controller):
     assert (out / "total_accumulation.png").stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("strategy, against", [
+    ("pi-gating+max-pressure+rerouting-30", "actuated"), ("dpc-pcrg+webster+redistribute+compliance-50", None)])
+def test_strategies_run_and_are_filed_under_their_names(small, tmp_path, strategy, against):
+    out, names = tmp_path / "run", {strategy, against} - {None}
+    other = ("--against", against) if against else ()
+    text = good(cosim("run", small, "--controller", strategy, *other, "--steps", STEPS, "--out", out))
+    facts = pd.read_csv(out / "sumo.csv")
+    assert set(pd.read_csv(out / "summary.csv")["controller"]) == set(facts["controller"]) == names
+    assert all(name in text and (out / f"{name}-0.record.npz").is_file() for name in names)
+    assert (facts["signals_left_alone"] == 0).all()
+    good(cosim("compare", out, "--controller", strategy))
+
+
 def test_run_against_and_compare(small, tmp_path):
     out = tmp_path / "run"
     arguments = ("run", small, "--controller", "pi-gating", "--against", "no-control", "--steps", STEPS, "--out", out)
@@ -107,6 +120,7 @@ def error_line(result):
     ("compliance = 1.0", "complience = 1.0", "sumo.complience: unknown key"),
     ("compliance = 1.0", "compliance = 2.0", "sumo.compliance: expected a number in [0, 1], got 2.0 instead"),
     ('actuation = "hold-back"', 'actuation = "hold"', "sumo.actuation: expected one of hold-back, redistribute"),
+    ('actuation = "hold-back"', 'signals = "green"', "sumo.signals: expected one of fixed, webster, actuated, max-pr"),
     ("step_length = 1.0", "step_length = 0.7", "sumo.step_length: expected a divisor of the control interval"),
     ("steps = 80", 'steps = "80"', "scenario.toml: steps: "),
     ("from = 2", "from = 9", "region 9 is unknown"),

@@ -8,7 +8,7 @@ import pytest
 import tiny
 import torch
 
-from nmfd import training
+from nmfd import dynamics, training
 from nmfd.controllers import dpc
 from nmfd.controllers.dpc import Architecture, DpcController, Policy, SoftExponential
 from nmfd.errors import InputError
@@ -262,3 +262,42 @@ def test_a_sparse_policy_is_the_dense_one_with_the_same_weights(guidance):
         np.testing.assert_allclose(both[0].splits, both[1].splits, atol=1e-7)
     stuck = DpcController(sparse).act(measurement(np.full((7, 7), np.nan)))
     np.testing.assert_allclose(stuck.perimeter, np.where(NETWORK.adjacency, NETWORK.u_max, 0.0))
+
+
+def test_every_rollout_has_a_model_of_its_own(scenario):
+    """Around the nominal one, always valid for the integration step; without a spread it is the nominal one again."""
+    limited = replace(scenario, network=tiny.limited(scenario.network))
+    rollout = training.Rollout(limited)
+    nominal = rollout.parameters
+    rollout.draw_model(4000, 0.2, torch.Generator().manual_seed(0))
+    p = rollout.parameters
+    assert torch.log(p.jam / nominal.jam).std().item() == pytest.approx(0.2, rel=0.15)  # cut at two deviations
+    assert torch.log(p.capacity / nominal.capacity)[:, 0, 1].std().item() == pytest.approx(0.1, rel=0.15)
+    torch.testing.assert_close(p.storage / nominal.storage, p.jam / nominal.jam)
+    fastest = (p.c.unsqueeze(-1) * p.exit_rates).max().item()
+    assert fastest * limited.step / limited.substeps <= 1.0 + 1e-6
+    x = 0.5 * p.jam  # the same curve along a stretched axis, and scaled by one factor
+    scale = torch.from_numpy(np.array([m.rate(0.5 * m.jam) / m.c for m in limited.network.mfds])).float()
+    torch.testing.assert_close(dynamics.rate(p, x) / p.c, scale.expand(4000, -1), rtol=1e-4, atol=0.0)
+    rollout.draw_model(4000, 0.0, torch.Generator().manual_seed(0))
+    assert rollout.parameters is nominal
+
+
+def test_detours_cost_what_they_divert(scenario):
+    """Everybody who leaves a region by another way than usual loses the time that a detour costs."""
+    torch.manual_seed(0)
+    made = Policy(scenario.network, Architecture(width=8, guidance=True))
+    plain, costly = (training.Rollout(scenario, dtype=torch.float32, detour_cost=cost) for cost in (0.0, 50.0))
+    generator = torch.Generator()
+    x, demand = plain.random_start(2, 0.2, 1.0, generator.manual_seed(0))
+    demand = demand[:3]
+
+    def total(rollout):
+        return rollout.total_time_spent(made, x, demand, generator.manual_seed(1))
+
+    exact, seen = plain.states(made, x, demand, generator.manual_seed(1))
+    _, splits = made(seen)
+    leaving = dynamics.rate(plain.parameters, exact.sum(-1)).unsqueeze(-1) * exact
+    diverted = 0.5 * (splits - plain.nominal_splits).abs().sum(-2) * leaving
+    torch.testing.assert_close(
+        total(costly) - total(plain), 50.0 * scenario.step * diverted.sum((0, -2, -1)), rtol=1e-3, atol=1.0)

@@ -99,3 +99,11 @@ def test_wrong_options(options, problem):
 def test_something_must_be_protected():
     with pytest.raises(InputError, match="protected: pi-gating needs at least one protected region, got none"):
         PiGating(replace(SCENARIO, protected=()))
+
+
+def test_the_set_point_by_a_share_of_the_maximum_outflow():
+    mfd = NETWORK.mfds[3]
+    for share in (0.5, 0.95, 1.0):
+        (point,) = PiGating(with_options(outflow_share=share)).set_point
+        assert point <= mfd.critical and mfd.outflow(point) == pytest.approx(share * mfd.capacity, rel=1e-3)
+    assert PiGating(with_options(outflow_share=0.5, set_point=[3000.0])).set_point == [3000.0]

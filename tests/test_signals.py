@@ -1,5 +1,6 @@
 """Signal plans: max-pressure, actuated and optimised fixed time. Known answers, and states second by second in SUMO."""
 
+import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from cosim.plant import Settings, SumoPlant
 from cosim.regions import load_city
 from cosim.signals import Link, Signal, read_signals
 from cosim.sumo import Phase
+from cosim.trips import make_trips
 from cosim.webster import LOST, SATURATION, optimised, plan
 from nmfd.errors import InputError
 from nmfd.scenario import load_scenario
@@ -225,6 +227,10 @@ def test_webster_in_sumo_and_under_perimeter_control(scenario, plant_of):
     plant = plant_of(signals="webster")
     plant.reset(1)
     plans = {name: plant.session.programme(name) for name in plant.session.signals()}
+    file = plant._signal_plan([])[1]
+    for logic in ElementTree.parse(file).getroot():  # a later offset is a later beginning
+        programme = plans[logic.get("id")]
+        assert programme.position == -float(logic.get("offset")) % programme.cycle
     shown, _, _ = drive(plant, scenario, 2)
     assert len({p.cycle for p in plans.values()}) == 1
     assert len({p.position for p in plans.values()}) > 5
@@ -249,17 +255,21 @@ def test_the_same_drivers_reroute(scenario, plant_of):
     for share, signals in ((0.3, "fixed"), (0.3, "max-pressure"), (0.6, "fixed")):
         plant = plant_of(rerouting=share, signals=signals)
         plant.reset(5)
+        planned = make_trips(plant.city, scenario.demand, scenario.step, 5).routes
         seen = {}
         step = plant.session.step
 
-        def watch(plant=plant, step=step, seen=seen):
+        def watch(plant=plant, step=step, seen=seen, planned=planned):
             step()
             for vehicle in plant.session.departed():
-                seen[vehicle] = plant.session.reroutes(vehicle)
+                own = plant.session.route(vehicle) == planned[int(vehicle[1:])]
+                seen[vehicle] = plant.session.reroutes(vehicle), own
 
         plant.session.step = watch
         plant.step(Controls(perimeter=np.full((7, 7), 0.9), splits=None))
-        equipped[share, signals] = {v for v, reroutes in seen.items() if reroutes}
+        equipped[share, signals] = {v for v, (reroutes, _) in seen.items() if reroutes}
+        assert all(own for reroutes, own in seen.values() if not reroutes)
+        assert sum(not own for reroutes, own in seen.values() if reroutes) > 10  # on the fastest way from the start
         assert abs(len(equipped[share, signals]) / len(seen) - share) < 0.15
         plant.close()
     assert equipped[0.3, "fixed"] == equipped[0.3, "max-pressure"] < equipped[0.6, "fixed"]

@@ -22,7 +22,9 @@ class PiGating:
     the integral cannot wind up. All other entries stay at u_max, and there is no route guidance.
 
     Options, in [controllers.pi-gating]:
-        set_point: n_set [veh], one per protected region; default the critical accumulation
+        set_point: n_set [veh], one per protected region; default from the MFD, see outflow_share
+        outflow_share: the set point is where the MFD first reaches this share of its maximum [-]; default 1, the
+            critical accumulation. Less of it leaves a margin where u below u_max does not hold back anybody yet
         kp [-], ki [1/s]: proportional and integral gain, per relative error; default KP and KI
     """
 
@@ -39,7 +41,9 @@ class PiGating:
         options = toml.Table(scenario.controller_options.get(self.name, {}), where, f"controllers.{self.name}.")
         self._regions = np.array(scenario.protected)
         self.critical = np.array([network.mfds[region].critical for region in self._regions])
-        set_point = options.numbers("set_point", tuple(self.critical), length=len(self._regions))
+        share = options.number("outflow_share", 1.0, low=0.1, high=1.0)
+        default = tuple(network.mfds[region].reaching(share) for region in self._regions)
+        set_point = options.numbers("set_point", default, length=len(self._regions))
         if min(set_point) <= 0:
             raise options.error("set_point", f"expected numbers above 0 [veh], got {list(set_point)} instead")
         self.set_point = np.array(set_point)

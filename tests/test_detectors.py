@@ -1,0 +1,162 @@
+"""Loop detectors and probes in SUMO: what they see of a small run, and the closed loop on estimates."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from cosim import estimates
+from cosim.city import ensure_built
+from cosim.detectors import instruments, lay_out, probes
+from cosim.plant import Settings, SumoPlant, settings
+from cosim.regions import load_city
+from nmfd import closed_loop, plots, runs
+from nmfd.controllers.gating import PiGating
+from nmfd.errors import InputError
+from nmfd.scenario import load_scenario
+from nmfd.types import Measurement
+
+SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
+INTERVALS = 4
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    """The peak from its middle on: the forecast is right, and the city fills."""
+    loaded = load_scenario(SCENARIO)
+    return replace(loaded, steps=INTERVALS, demand=loaded.demand[14 : 14 + INTERVALS])
+
+
+@pytest.fixture(scope="module")
+def city(scenario):
+    files = ensure_built(scenario.network)
+    return load_city(files.net_file, files.regions_csv, scenario.network.regions)
+
+
+def drive(scenario, **overrides):
+    plant = SumoPlant(scenario, overrides=Settings(**overrides))
+    try:
+        return closed_loop.run(plant, PiGating(scenario), scenario, seed=3)
+    finally:
+        plant.close()
+
+
+@pytest.fixture(scope="module")
+def run(scenario):
+    return drive(scenario, measurement="estimate")
+
+
+def test_layout(city):
+    few, many = lay_out(city, 0.1), lay_out(city, 0.3)
+    assert set(few.edges) < set(many.edges) and lay_out(city, 0.3).positions == many.positions
+    for edge, positions in zip(many.edges, many.positions, strict=True):
+        length = city.length[city.edges[edge]]
+        assert 0.0 < positions[0] and positions[-1] < length
+        assert len(positions) == (1 if length < 100.0 else 2 if length < 150.0 else 3)
+        assert np.allclose(np.diff(positions), length / len(positions))
+    per_region = np.bincount([city.region_of[city.edges[edge]] for edge in many.edges], minlength=city.regions)
+    links = np.bincount([city.region_of[edge] for edge in city.edges], minlength=city.regions)
+    assert (per_region == np.ceil(0.3 * links)).all()
+    known = instruments(city, many, 0.1)
+    assert ((0.15 < known.detector_share) & (known.detector_share < 0.45)).all()
+    assert (known.detector_error < instruments(city, few, 0.1).detector_error).all()
+    everything = instruments(city, lay_out(city, 1.0), 1.0)
+    assert (everything.detector_share == 1.0).all()
+    assert (everything.detector_error < known.detector_error).all()
+    assert (everything.counted_share.sum(axis=1) > 0).all() and set(np.unique(everything.counted_share)) == {0.0, 1.0}
+
+
+def test_probes_are_a_share_of_the_vehicles():
+    drawn = probes(10_000, 0.1, seed=4)
+    assert 900 < len(drawn) < 1100 and drawn == probes(10_000, 0.1, seed=4) != probes(10_000, 0.1, seed=5)
+    assert probes(100, 0.0, seed=4) == frozenset() and len(probes(100, 1.0, seed=4)) == 100
+
+
+def test_all_links_and_all_probes_see_everything(scenario):
+    """Loops on every link come close to the accumulations; probes are all vehicles."""
+    plant = SumoPlant(scenario, overrides=Settings(measurement="estimate", detector_share=1.0, probe_share=1.0))
+    seen = []
+    try:
+        state, controller = plant.reset(3), PiGating(scenario)
+        observation = plant._detectors.observation
+        plant._detectors.observation = lambda flow: (seen.append(observation(flow)), seen[-1])[1]
+        for _ in range(scenario.steps):
+            before, state = state, plant.step(controller.act(state))
+        crossings = plant.record().crossings[-1].sum(axis=2)
+    finally:
+        plant.close()
+    assert (seen[-1].probes == state.accumulation).all()
+    assert np.abs(state.estimate - state.accumulation).max() < 3.0
+    assert (state.estimated_backlog == state.backlog).all()
+    mean = 0.5 * (before.accumulation + state.accumulation).sum()
+    assert seen[-1].accumulation.sum() == pytest.approx(mean, rel=0.25)
+    there = np.isfinite(seen[-1].crossings)
+    assert (there == scenario.network.adjacency).all()
+    assert np.abs(seen[-1].crossings[there] - crossings[there]).max() <= 3.0  # on a junction: crossed, not yet counted
+
+
+def test_the_closed_loop_runs_on_estimates(scenario, run):
+    """The estimate is what the gate sees, the trajectory stays exact, and they are not far apart."""
+    assert run.estimate.shape == run.accumulation.shape and np.isfinite(run.estimate).all()
+    assert run.estimate.min() >= 0.0 and (run.estimate[0] == 0.0).all()
+    assert (run.accumulation == np.round(run.accumulation)).all()
+    assert (run.estimate[1:] != np.round(run.estimate[1:])).any()
+    rows = estimates.errors(scenario.network, run)
+    assert [row["region"] for row in rows] == [*range(7), "all"]
+    assert 0.0 < rows[-1]["rmse_share"] < 0.15 and 0.0 < rows[-1]["cell_rmse_veh"] < 10.0
+    vehicles = run.accumulation[-1].sum()
+    assert abs(run.estimate[-1].sum() - vehicles) < 0.2 * vehicles
+
+
+def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
+    """The same controls give the same city, with detectors or without."""
+    class Again:
+        name = "again"
+
+        def reset(self, seed=0):
+            pass
+
+        def act(self, measurement: Measurement):
+            from nmfd.types import Controls
+            return Controls(perimeter=run.perimeter[measurement.step], splits=None)
+
+    plant = SumoPlant(scenario, overrides=Settings())
+    try:
+        exact = closed_loop.run(plant, Again(), scenario, seed=3)
+    finally:
+        plant.close()
+    assert exact.estimate is None
+    assert (exact.accumulation == run.accumulation).all()
+
+
+def test_same_seed_same_bytes(scenario, run, tmp_path):
+    again = drive(scenario, measurement="estimate")
+    for name, trajectory in (("a", run), ("b", again)):
+        runs.write_trajectory(tmp_path / f"{name}.npz", trajectory)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert (runs.read_trajectory(tmp_path / "a.npz").estimate == run.estimate).all()
+
+
+def test_table_and_picture(scenario, run, tmp_path):
+    rows = estimates.write(tmp_path, scenario.network, [run, replace(run, seed=4, estimate=None)])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate-pi-gating-3.png", "estimation.csv"]
+    assert len(pd.read_csv(tmp_path / "estimation.csv")) == len(rows) == 8
+    assert "x_ij RMSE" in estimates.table(rows) and "mean of the regions" in estimates.table(rows)
+    ax = plots.region_estimate(plots.figure(4.0, 3.0).subplots(), scenario.network, 3, run)
+    lines = [line.get_ydata() for line in ax.get_lines()]
+    np.testing.assert_allclose(lines, [run.accumulation[:, 3].sum(axis=1), run.estimate[:, 3].sum(axis=1)])
+    assert estimates.write(tmp_path / "none", scenario.network, [replace(run, estimate=None)]).empty
+
+
+@pytest.mark.parametrize("lines, problem", [
+    ('measurement = "guess"', "sumo.measurement: expected one of exact, estimate, got 'guess' instead"),
+    ("detector_share = 1.2", r"sumo.detector_share: expected a number in \[0, 1\], got 1.2 instead"),
+    ("probe_share = -0.1", r"sumo.probe_share: expected a number in \[0, 1\]"),
+    ('measurement = "estimate"\ndetector_share = 0\nprobe_share = 0', "needs detectors or probes")])
+def test_wrong_settings(scenario, tmp_path, lines, problem):
+    (tmp_path / "scenario.toml").write_text(f"[sumo]\n{lines}\n")
+    with pytest.raises(InputError, match=problem) as caught:
+        settings(replace(scenario, folder=tmp_path))
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,222 @@
+"""The estimator against cities whose truth is known: whole vehicles that move by chance as the regional model says."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nmfd import dynamics, estimation
+from nmfd.estimation import Estimator, Instruments, Observation, bounded
+from nmfd.plant import NmfdPlant
+from nmfd.scenario import load_scenario
+from nmfd.types import Controls
+
+SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
+NETWORK = SCENARIO.network
+REGIONS = NETWORK.regions
+OPEN = Controls(perimeter=np.where(NETWORK.adjacency, NETWORK.u_max, 0.0), splits=None)
+
+
+def equipped(*, detectors=0.3, probes=0.1, error=0.15):
+    """Instruments that are alike in every region."""
+    return Instruments(
+        detector_share=np.full(REGIONS, detectors), detector_error=np.full(REGIONS, error),
+        counted_share=np.where(NETWORK.adjacency, detectors, 0.0),
+        counted_gateways=np.where(NETWORK.adjacency, 2, 0), probe_share=probes)
+
+
+def nothing():
+    unknown = np.full((REGIONS, REGIONS), np.nan)
+    return Observation(accumulation=unknown[0], crossings=unknown, probes=unknown, probe_departures=unknown)
+
+
+class Crowd:
+    """Whole vehicles in the regional model, every one of which moves by chance, and instruments with the errors that
+    the estimator reckons with: of outflow, demand, single flows and detectors. wrong: times those of the model."""
+
+    def __init__(self, seed, known, *, wrong=1.0):
+        self._random, self._known, self._wrong = np.random.default_rng(seed), known, wrong
+        self._parameters = dynamics.parameters(NETWORK)
+        self.groups = np.zeros((2, REGIONS, REGIONS), dtype=int)  # probes, others
+        self._factors = self._random.normal(0.0, 1.0, (2, REGIONS))
+        self._expansion = known.detector_error * self._random.normal(0.0, 1.0, REGIONS)
+
+    @property
+    def accumulation(self):
+        return self.groups.sum(axis=0).astype(float)
+
+    def step(self, k, controls=OPEN):
+        random, step = self._random, SCENARIO.step / SCENARIO.substeps
+        keep = np.exp(-SCENARIO.step / estimation.MEMORY)
+        outflow, wish = np.clip(1.0 + 0.3 * self._wrong * self._factors, 0.0, 2.0)
+        lasting = np.sqrt((1.0 + keep) / (1.0 - keep))
+        each = 1.0 + self._wrong * estimation.FLOW_ERROR * lasting * random.normal(size=(REGIONS,) * 3)
+        each = np.clip(each, 0.0, 3.0)
+        mean, crossings, departures = np.zeros(REGIONS), np.zeros((REGIONS, REGIONS)), np.zeros((REGIONS, REGIONS))
+        shares = np.array([self._known.probe_share, 1.0 - self._known.probe_share])
+        for _ in range(SCENARIO.substeps):
+            x = self.accumulation
+            before = x.sum(axis=1)
+            ends, transfers = (part.numpy() for part in dynamics.flows(
+                self._parameters, torch.from_numpy(x + 1e-9), torch.from_numpy(controls.perimeter),
+                torch.from_numpy(NETWORK.nominal_splits)))
+            change = np.zeros_like(self.groups)
+            for i, j in np.argwhere(x > 0):
+                ways = step * outflow[i] * each[i, :, j] * transfers[i, :, j] / x[i, j]
+                ways[i] = step * outflow[i] * each[i, i, j] * ends[i] / x[i, j] if i == j else 0.0
+                ways /= max(1.0, ways.sum())
+                for group in (0, 1):
+                    moved = random.multinomial(self.groups[group, i, j], [*ways, max(0.0, 1.0 - ways.sum())])[:-1]
+                    change[group, i, j] -= moved.sum()
+                    crossings[i] += np.where(np.arange(REGIONS) == i, 0, moved)
+                    moved[i] = 0
+                    change[group, :, j] += moved
+            entered = random.poisson(
+                shares[:, None, None] * step * SCENARIO.demand[k] * wish[:, None])
+            departures += entered[0]
+            self.groups += change + entered
+            mean += 0.5 * (before + self.accumulation.sum(axis=1)) / SCENARIO.substeps
+        self._factors = keep * self._factors + np.sqrt(1.0 - keep**2) * random.normal(size=(2, REGIONS))
+        known = self._known
+        slow = np.exp(-SCENARIO.step / estimation.EXPANSION_MEMORY)
+        self._expansion = slow * self._expansion + np.sqrt(1.0 - slow**2) * known.detector_error * random.normal(
+            size=REGIONS)
+        noise = np.sqrt(mean * (1.0 - known.detector_share) / known.detector_share) * random.normal(size=REGIONS)
+        share = np.where(NETWORK.adjacency, known.counted_share, 1.0)
+        uneven = np.sqrt(np.maximum(1.0 - share, 0.0)) * random.normal(size=share.shape) * np.sqrt(
+            crossings / share + estimation.COUNT_ERROR**2 * crossings**2 / np.maximum(known.counted_gateways, 1))
+        return Observation(
+            accumulation=np.maximum((1.0 + self._expansion) * mean + noise, 0.0),
+            crossings=np.where(NETWORK.adjacency, crossings + uneven, np.nan), probes=self.groups[0].astype(float),
+            probe_departures=departures)
+
+
+def watch(seed, known, *, steps=40, changed=lambda observation: observation, wrong=1.0):
+    """Truth and estimate (steps, R, R), what the detectors said (steps, R), and the surprises."""
+    crowd, estimator, rows = Crowd(seed, known, wrong=wrong), Estimator(SCENARIO, known), []
+    for k in range(steps):
+        observation = crowd.step(k)
+        estimate = estimator.step(OPEN, changed(observation))
+        rows.append((crowd.accumulation, estimate, observation.accumulation, estimator.belief.surprise))
+    return tuple(np.array(column) for column in zip(*rows, strict=True))
+
+
+def rmse(error):
+    return float(np.sqrt((error**2).mean()))
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """Truth, estimates and detectors of six cities, with and without the readings."""
+    known = equipped()
+    return [(*watch(seed, known), watch(seed, known, changed=lambda observation: nothing())[1]) for seed in range(6)]
+
+
+def test_beats_the_detectors_and_the_open_loop(runs):
+    off = []
+    for truth, estimate, detectors, _, open_loop in runs:
+        total = truth.sum(axis=2)
+        off.append([rmse(guess - total) for guess in (estimate.sum(axis=2), detectors, open_loop.sum(axis=2))])
+        assert off[-1][0] < off[-1][1] and off[-1][0] < 0.5 * off[-1][2]
+        assert rmse(estimate - truth) < 0.5 * rmse(open_loop - truth)
+    pooled = np.sqrt((np.array(off) ** 2).mean(axis=0))
+    assert pooled[0] < 0.5 * pooled[1] and pooled[0] < 0.1 * pooled[2]
+
+
+def test_unbiased_and_consistent(runs):
+    """Over cities, the errors of the totals cancel, and the innovations are about as large as the covariances say: a
+    little smaller, since vehicles that leave by lot vary less than the Poisson flows that the estimator reckons with.
+    """
+    bias = [float((estimate - truth).sum(axis=(1, 2)).mean()) for truth, estimate, *_ in runs]
+    scale = np.mean([rmse((estimate - truth).sum(axis=(1, 2))) for truth, estimate, *_ in runs])
+    assert abs(np.mean(bias)) < 0.6 * scale
+    assert abs(np.mean(bias)) < 0.02 * np.mean([truth.sum(axis=(1, 2)).mean() for truth, *_ in runs])
+    surprise = [float(surprise[3:].mean()) for *_, surprise, _ in runs]
+    assert all(0.5 < value < 1.2 for value in surprise), surprise
+
+
+def test_never_negative_nor_fewer_than_the_probes(runs):
+    for _, estimate, *_ in runs:
+        assert estimate.min() >= 0.0
+    random, estimator = np.random.default_rng(0), Estimator(SCENARIO, equipped())
+    for _ in range(30):  # readings that contradict one another
+        probes = random.integers(0, 40, (REGIONS, REGIONS)).astype(float)
+        observation = Observation(
+            accumulation=random.uniform(0.0, 300.0, REGIONS), probes=probes,
+            crossings=np.where(NETWORK.adjacency, random.uniform(0.0, 50.0, (REGIONS, REGIONS)), np.nan),
+            probe_departures=random.integers(0, 5, (REGIONS, REGIONS)).astype(float))
+        estimate = estimator.step(OPEN, observation)
+        assert np.isfinite(estimate).all() and (estimate >= probes - 1e-9).all()
+
+
+def test_everything_measured_is_the_state():
+    known = equipped(detectors=1.0, probes=1.0, error=0.0)
+    truth, estimate, *_ = watch(1, known, steps=20)
+    assert np.abs(estimate - truth).max() < 1.0 and rmse(estimate - truth) < 0.1
+
+
+def test_without_readings_it_is_the_regional_model():
+    """So it conserves vehicles as that does."""
+    plant, estimator = NmfdPlant(SCENARIO), Estimator(SCENARIO, equipped())
+    plant.reset(0)
+    for _ in range(30):
+        exact = plant.step(OPEN).accumulation
+        estimate = estimator.step(OPEN, nothing())
+        assert np.abs(estimate - exact).max() < 1e-6
+        assert np.isnan(estimator.belief.surprise)
+    assert exact.sum() > 500.0
+
+
+def test_detectors_tell_the_total_and_probes_the_destinations():
+    """Demand and outflow are other than the model has them: either instrument notices, and only probes tell apart."""
+    off = {}
+    for name, known, changed in (
+            ("detectors", equipped(), lambda o: replace(nothing(), accumulation=o.accumulation)),
+            ("probes", equipped(), lambda o: replace(o, accumulation=nothing().accumulation)),
+            ("nothing", equipped(), lambda o: nothing())):
+        truth, estimate, *_ = watch(2, known, changed=changed)
+        off[name] = rmse((estimate - truth).sum(axis=2)), rmse(estimate - truth)
+    assert max(off["detectors"][0], off["probes"][0]) < 0.5 * off["nothing"][0]
+    assert off["probes"][1] < off["detectors"][1] < off["nothing"][1]
+
+
+@pytest.mark.parametrize("broken", [np.nan, 40.0])
+def test_a_region_without_its_detector_is_predicted_on(broken):
+    """Missing, or stuck at a number: without probes there, it would follow a stuck one for ever."""
+    def without_region_0(observation):
+        accumulation = observation.accumulation.copy()
+        accumulation[0] = broken
+        return replace(observation, accumulation=accumulation)
+
+    truth, whole, *_ = watch(2, equipped())
+    _, partial, *_ = watch(2, equipped(), changed=without_region_0)
+    assert np.isfinite(partial).all()
+    error = [rmse((estimate - truth)[5:, 0].sum(axis=1)) for estimate in (whole, partial)]
+    assert error[1] < max(3.0 * error[0], 0.25 * truth[:, 0].sum(axis=1).max())
+    assert rmse((partial - truth)[:, 1:]) < 1.3 * rmse((whole - truth)[:, 1:])
+
+
+def test_the_same_readings_give_the_same_bytes():
+    first, second = (watch(3, equipped(), steps=8)[1] for _ in range(2))
+    assert first.tobytes() == second.tobytes()
+
+
+def test_reset_forgets():
+    estimator, crowd = Estimator(SCENARIO, equipped()), Crowd(0, equipped())
+    observations = [crowd.step(k) for k in range(4)]
+    runs = []
+    for _ in range(2):
+        estimator.reset()
+        runs.append([estimator.step(OPEN, observation).tolist() for observation in observations])
+    assert runs[0] == runs[1]
+
+
+def test_bounded_moves_what_correlates():
+    """Two cells of a region whose total is known: what one is raised by, the other loses."""
+    covariance = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    np.testing.assert_allclose(bounded(np.array([-2.0, 12.0]), covariance, np.zeros(2)), [0.0, 10.0], atol=1e-3)
+    np.testing.assert_allclose(bounded(np.array([-2.0, 12.0]), np.eye(2), np.zeros(2)), [0.0, 12.0], atol=1e-3)
+    inside = np.array([3.0, 4.0])
+    assert bounded(inside, covariance, np.zeros(2)) is inside
