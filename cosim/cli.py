@@ -197,17 +197,22 @@ def identify(
     A controller plans with a model other than the scenario's if its table says so, such as
     [controllers.dpc-pcrg] with model = "../../networks/grid7_guided".
 
+    Of an imported city the network's folder will do.
+
     \b
     Examples:
       cosim identify scenarios/grid7_peak --levels 0.6,0.8,1.0 --seeds 2
+      cosim identify networks/mycity
       cosim identify scenarios/grid7_peak --guided --network networks/grid7_guided
     """
     from cosim import identify
+    from cosim.importing import find
     from nmfd import runs
     from nmfd.progress import progress_line
     from nmfd.scenario import load_scenario
 
     factors = _levels("--levels", levels)
+    scenario = find.scenario_of(scenario)
     loaded = load_scenario(scenario)
     if out is None:
         out = Path("runs") / f"{runs.file_name(loaded.name)}-identify{'-guided' if guided else ''}"
@@ -219,6 +224,58 @@ def identify(
         raise Interrupted(f"interrupted; finished loading runs are in {out}: the same command goes on") from None
     click.echo(text)
     click.echo(f"Written to {(target or loaded.network.folder) / 'network.toml'}; samples and pictures to {out}")
+
+
+@main.command(name="import")
+@click.argument("source", type=FILE, metavar="SUMOCFG|NET")
+@click.option("--regions", type=click.IntRange(min=2), metavar="N", help="How many regions to cut the city into.")
+@click.option("--out", type=FOLDER, required=True, metavar="DIR", help="The network's folder, such as networks/mycity.")
+@click.option("--scenario", type=FOLDER, metavar="DIR", help="[default: scenarios/<name>, beside the networks]")
+@click.option("--method", type=click.Choice(["density", "geometric"]), default="density", show_default=True,
+              help="How: streets of similar density together, or k-means on the road graph.")
+@click.option("--edges", type=FILE, metavar="CSV", help="Or your own regions: a table with the columns edge,region,")
+@click.option("--taz", type=FILE, metavar="FILE", help="or a SUMO file with a TAZ per region,")
+@click.option("--polygons", type=FILE, metavar="FILE", help="or one with a polygon or more (id, id.1, ...) per region.")
+@click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak, for a city without demand.")
+@click.option("--level", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True,
+              help="Of --demand peak: times its usual number of trips.")
+@click.option("--begin", metavar="TIME", help="Instead of the sumocfg's, in seconds or as hours:minutes:seconds.")
+@click.option("--end", metavar="TIME", help="Later departures are left out.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--no-run", is_flag=True, help="Do not simulate the city first: no densities and no flows.")
+@click.option("--force", is_flag=True, help="Replace a network and scenario that are there.")
+def import_(
+    source: Path, regions: int | None, out: Path, scenario: Path | None, method: str, edges: Path | None,
+    taz: Path | None, polygons: Path | None, demand: str | None, level: float, begin: str | None, end: str | None,
+    seed: int, no_run: bool, force: bool,
+) -> None:
+    """Turn any SUMO city into a network and a scenario: regions, gateways, demand by pair of regions, map.
+
+    Its own vehicles stay as they are: routes, departures, types. The city is simulated without control first.
+
+    \b
+    Examples:
+      cosim import city.sumocfg --regions 5 --out networks/mycity
+      cosim import city.net.xml.gz --regions 6 --demand peak --out networks/mycity
+      cosim import city.sumocfg --taz districts.taz.xml --out networks/mycity --begin 7:00:00 --end 9:00:00
+    """
+    from cosim.importing.importer import Order, import_city, parse_time
+    from nmfd.progress import progress_line
+
+    own = {key: file for key, file in (("edges", edges), ("taz", taz), ("polygons", polygons)) if file}
+    if len(own) + (regions is not None) != 1:
+        raise InputError("--regions: give a number of regions, or else one of --edges, --taz and --polygons")
+    if no_run and method == "density" and not own:
+        raise InputError("--no-run: the densities come from that run; add --method geometric")
+    method, given = next(iter(own.items()), (method, None))
+    order = Order(
+        source=source, regions=regions, out=out, method=method, given=given, seed=seed, run=not no_run, force=force,
+        level=level if demand else None, scenario=scenario or out.parent.parent / "scenarios" / out.name,
+        begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"))
+    with progress_line("import") as progress:
+        report = import_city(order, (lambda stage: progress(0, 1, stage)) if progress else lambda stage: None)
+    click.echo(report)
+    click.echo(f"Written to {order.out} (see map.png, quality.csv, gateways.csv) and {order.scenario}")
 
 
 def _levels(option: str, text: str) -> list[float]:

@@ -12,6 +12,7 @@ destination are known at the end of every control interval, and, since they are 
 whether they wait to enter.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,10 +98,10 @@ def write_loops(city: City, layout: Layout, period: float, path: Path) -> None:
     path.write_text(f"<additional>\n{''.join(rows)}</additional>\n")
 
 
-def probes(trips: int, share: float, seed: int) -> frozenset[str]:
-    """The vehicles v0, v1, ... of `trips` that are probes."""
-    drawn = np.random.default_rng([seed, PROBES]).random(trips) < share
-    return frozenset(f"v{n}" for n in np.flatnonzero(drawn))
+def probes(vehicles: Sequence[str], share: float, seed: int) -> frozenset[str]:
+    """Those of the vehicles that are probes."""
+    drawn = np.random.default_rng([seed, PROBES]).random(len(vehicles)) < share
+    return frozenset(vehicles[n] for n in np.flatnonzero(drawn))
 
 
 class Detectors:

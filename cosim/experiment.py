@@ -12,7 +12,7 @@ import pandas as pd
 
 from cosim import estimates
 from cosim.city import ensure_built
-from cosim.plant import settings
+from cosim.plant import Settings, settings
 from cosim.regions import check_adjacency, load_city
 from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.strategy import parse
@@ -136,9 +136,16 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
         "steps": scenario.steps, "demand_factor": first.demand_factor,
         "demand_hash": hashlib.sha256(np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16],
         "net_file_hash": runs.file_hash(files.net_file), "regions_hash": runs.file_hash(files.regions_csv),
-        "measurement_std_veh": scenario.measurement_std, "sumo": vars(settings(scenario)),
+        "measurement_std_veh": scenario.measurement_std, "sumo": _plain(settings(scenario), scenario.folder),
         "libsumo": metadata.version("libsumo")}
     return configuration, controllers
+
+
+def _plain(chosen: Settings, folder: Path | None) -> dict:
+    """The settings; of the files that they name, fingerprints."""
+    files = {key: getattr(chosen, key) for key in ("routes", "background", "additional")}
+    return vars(chosen) | {key: [runs.file_hash(folder / name) for name in names] for key, names in files.items()} | {
+        "leave_signals": list(chosen.leave_signals)}
 
 
 def _finished(folder: runs.RunFolder) -> set[tuple[str, int]]:

@@ -70,6 +70,7 @@ class Guide:
         self._free = self._length / np.array([city.speed[edge] for edge in city.edges])
         self._time = self._free.copy()
         self._ways: dict[tuple[int, int], _Ways] = {}
+        self._inside: dict[tuple[int, int], tuple[np.ndarray, csr_array]] = {}
         self._home: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         self._splits: np.ndarray | None = None
         self._assigned, self._wished = np.zeros((2, *(city.regions,) * 3))
@@ -87,7 +88,7 @@ class Guide:
             if speed is not None:
                 now = np.where(np.isnan(speed), self._free, self._length / np.maximum(speed, SLOWEST))
                 self._time += SMOOTHING * (np.maximum(now, self._free) - self._time)
-            self._ways, self._home = {}, {}
+            self._ways, self._inside, self._home = {}, {}, {}
             self._assigned *= MEMORY
             self._wished *= MEMORY
 
@@ -96,7 +97,7 @@ class Guide:
         if self._splits is None:
             return
         for event in events:
-            if self._random.random() < self._compliance:
+            if event.free and self._random.random() < self._compliance:
                 taste, target = int(self._random.integers(TASTES)), self._index[event.edge]
                 here = self._index.get(self._session.road(event.vehicle))
                 if here is None or self._region[here] != event.region:  # on a junction already: too late to turn
@@ -108,9 +109,11 @@ class Guide:
 
     def _guide_home(self, event: Event, here: int, target: int, taste: int) -> None:
         """The fastest way inside the region of destination."""
-        time = self._time * self._taste[taste]
+        if (event.region, taste) not in self._inside:
+            time = self._time * self._taste[taste]
+            self._inside[event.region, taste] = time, self._graph(time, self._region == event.region, reverse=True)
+        time, inside = self._inside[event.region, taste]
         if (taste, target) not in self._home:
-            inside = self._graph(time, self._region == event.region, reverse=True)
             self._home[taste, target] = dijkstra(inside, indices=target, return_predecessors=True)
         cost, after = self._home[taste, target]
         if here == target or not np.isfinite(cost[here]) or self._keeps(event.vehicle, here, time, cost[here]):

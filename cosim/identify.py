@@ -226,12 +226,14 @@ def network_toml(network: Network, sumo: dict[str, str], comment: str) -> str:
         out.write("\n[sumo]\n" + "".join(f'{key} = "{value}"\n' for key, value in sumo.items()))
     for region in range(network.regions):
         x, y = network.positions[region]
-        adjacent = np.flatnonzero(network.adjacency[region])
+        adjacent = np.flatnonzero((network.adjacency | network.adjacency.T)[region])
+        one_way = ", ".join(str(h) for h in adjacent if not network.adjacency[region, h])
+        barred = f"no_way_to = [{one_way}]\n" if one_way else ""
         neighbours = ", ".join(str(h) for h in adjacent)
         curve = network.mfds[region]
         out.write(
             f'\n[[regions]]\nname = "{network.region_names[region]}"\nposition = [{x:.6g}, {y:.6g}]\n'
-            f"adjacent = [{neighbours}]\n{_options(network, region, adjacent)}\n"
+            f"adjacent = [{neighbours}]\n{barred}{_options(network, region)}\n"
             f"[regions.mfd]\na = {curve.a:.6g}\nb = {curve.b:.6g}\nc = {curve.c:.6g}\n"
             f"jam = {curve.jam:.6g}\n")
     for (i, j), shares in sorted(network.own_splits.items()):
@@ -241,14 +243,15 @@ def network_toml(network: Network, sumo: dict[str, str], comment: str) -> str:
     return out.getvalue()
 
 
-def _options(network: Network, region: int, adjacent: np.ndarray) -> str:
+def _options(network: Network, region: int) -> str:
     """exit_rates, capacity and storage of one region, as far as the network has them."""
     lines = ""
     if network.exit_rates is not None:
         lines += f"exit_rates = [{', '.join(f'{value:.4g}' for value in network.exit_rates[region])}]\n"
     if network.capacity is not None:
+        passing = network.capacity[region, network.adjacency[region]]
         lines += (
-            f"capacity = [{', '.join(f'{value:.4g}' for value in network.capacity[region, adjacent])}]\n"
+            f"capacity = [{', '.join(f'{value:.4g}' for value in passing)}]\n"
             f"storage = {network.storage[region]:.6g}\n")
     return lines
 

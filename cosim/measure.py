@@ -15,25 +15,29 @@ class LedgerError(RuntimeError):
 
 @dataclass
 class _Vehicle:
-    """origin, destination: regions; edge: the last edge of its route; region: where it is now, None before the
-    departure; announced: the region of its last Event (on a junction it may be ahead of that)."""
+    """origin, destination: regions; edge: the last edge of its route; free: guidance may reroute it; region: where it
+    is now, None before the departure; announced: the region of its last Event (on a junction it may be ahead of
+    that)."""
 
     origin: int
     destination: int
     edge: str
+    free: bool = True
     region: int | None = None
     announced: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """A vehicle is in a region for the first time since it was elsewhere. source: None at the departure."""
+    """A vehicle is in a region for the first time since it was elsewhere. source: None at the departure; free: its
+    driver may choose another way (no public transport, no stops to make)."""
 
     vehicle: str
     source: int | None
     region: int
     destination: int
     edge: str
+    free: bool = True
 
 
 class Meter:
@@ -82,7 +86,8 @@ class Meter:
             self.departures[known.origin, known.destination] += 1
             self.probe_departures[known.origin, known.destination] += vehicle in self._probes
             events.append(Event(
-                vehicle=vehicle, source=None, region=known.origin, destination=known.destination, edge=known.edge))
+                vehicle=vehicle, source=None, region=known.origin, destination=known.destination, edge=known.edge,
+                free=known.free))
         self._steps += 1
         for edge, region in self._entries.items() if self._steps % self._poll_every == 0 else ():
             present = session.vehicles_on(edge)
@@ -94,6 +99,8 @@ class Meter:
         for vehicle in session.arrived():
             self._teleporting.discard(vehicle)
             known = self._vehicles.pop(vehicle)
+            if known.region is None:  # given up before it departed
+                continue
             self._cross(known, known.destination)
             self._running[known.destination, known.destination] -= 1
             self.arrivals[known.destination] += 1
@@ -107,7 +114,7 @@ class Meter:
         on_road = self._session.running()
         for vehicle in on_road:
             known = self._vehicles[vehicle]
-            region = self._city.region_of[self._session.road(vehicle)]
+            region = self._city.region_of.get(self._session.road(vehicle), known.region)
             self._cross(known, region)
             counted[region, known.destination] += 1
         for vehicle in self._teleporting.difference(on_road):
@@ -149,7 +156,8 @@ class Meter:
         if vehicle not in self._vehicles:
             route, region_of = self._session.route(vehicle), self._city.region_of
             self._vehicles[vehicle] = _Vehicle(
-                origin=region_of[route[0]], destination=region_of[route[-1]], edge=route[-1])
+                origin=region_of.get(route[0], 0), destination=region_of.get(route[-1], 0), edge=route[-1],
+                free=self._session.is_free(vehicle))
         return self._vehicles[vehicle]
 
     def _enter(self, vehicle: str, edge: str, region: int) -> Event | None:
@@ -161,7 +169,8 @@ class Meter:
         known.announced = region
         self.entry_flow[source, edge] += 1
         return Event(
-            vehicle=vehicle, source=source, region=region, destination=known.destination, edge=known.edge)
+            vehicle=vehicle, source=source, region=region, destination=known.destination, edge=known.edge,
+            free=known.free)
 
     def _cross(self, known: _Vehicle, region: int) -> None:
         if region != known.region:

@@ -17,6 +17,7 @@ from cosim.flows import turning_flows
 from cosim.guidance import Guide
 from cosim.max_pressure import MaxPressure
 from cosim.measure import Meter
+from cosim.originals import Originals, read_originals, write_originals
 from cosim.regions import City, Gateway, check_adjacency, load_city
 from cosim.signals import Signal, read_signals, write_programmes
 from cosim.strategy import ACTUATED, FIXED, HOLD_BACK, MAX_PRESSURE, MODES, SIGNALS, WEBSTER
@@ -51,6 +52,17 @@ class Settings:
     detector_share: of the links, with loop detectors [-]; probe_share: of the vehicles [-]
     signals: one of cosim.strategy.SIGNALS; gateways_fixed (of the strategy, no key of the table): whether signals with
         a gateway movement stay fixed-time, for perimeter control, where the others are actuated or max-pressure
+
+    Of a city with vehicles of its own (cosim import), files relative to the scenario's folder:
+    routes: their route files; without any, trips are drawn from the scenario's demand
+    background: route files of what is no demand and is left alone: public transport, persons
+    additional: SUMO's additional files: vehicle types, stops, signal programmes
+    begin: simulation time at which interval 0 begins [s]
+    departure_jitter: departures are moved by up to this, either way, by the seed [s]
+    leave_signals: signals that perimeter control leaves alone
+
+    mesoscopic: SUMO's queue model instead of its car-following, for quick studies: no lanes and no positions on them,
+        queues hold the vehicles that fit on an edge, signals cap the flow by their green share. About ten times as fast
     """
 
     step_length: float = 1.0
@@ -66,6 +78,13 @@ class Settings:
     probe_share: float = 0.1
     signals: str = FIXED
     gateways_fixed: bool = True
+    routes: tuple[str, ...] = ()
+    background: tuple[str, ...] = ()
+    additional: tuple[str, ...] = ()
+    begin: float = 0.0
+    departure_jitter: float = 10.0
+    leave_signals: tuple[str, ...] = ()
+    mesoscopic: bool = False
 
 
 def settings(scenario: Scenario) -> Settings:
@@ -87,7 +106,15 @@ def settings(scenario: Scenario) -> Settings:
         signals=table.text("signals", default.signals, SIGNALS),
         measurement=table.text("measurement", default.measurement, (EXACT, ESTIMATE)),
         detector_share=table.number("detector_share", default.detector_share, low=0.0, high=1.0),
-        probe_share=table.number("probe_share", default.probe_share, low=0.0, high=1.0))
+        probe_share=table.number("probe_share", default.probe_share, low=0.0, high=1.0),
+        routes=table.texts("routes", ()), background=table.texts("background", ()),
+        additional=table.texts("additional", ()), begin=table.number("begin", 0.0, low=0.0),
+        departure_jitter=table.number("departure_jitter", default.departure_jitter, low=0.0),
+        leave_signals=table.texts("leave_signals", ()), mesoscopic=table.flag("mesoscopic", False))
+    for key in ("routes", "background", "additional"):
+        for name in getattr(chosen, key):
+            if not (scenario.folder / name).is_file():
+                raise table.error(key, f"no such file: {scenario.folder / name}; give the path of an existing one")
     table.close()
     if chosen.measurement == ESTIMATE and chosen.detector_share == chosen.probe_share == 0:
         raise InputError(
@@ -141,7 +168,7 @@ class SumoPlant:
 
     def __init__(self, scenario: Scenario, *, overrides: Settings | None = None):
         """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network."""
-        self._scenario = scenario
+        self._scenario, self._originals = scenario, None
         self._settings = overrides or settings(scenario)
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
@@ -166,24 +193,34 @@ class SumoPlant:
         self._end_session()
         scenario, chosen = self._scenario, self._settings
         routes = Path(self._folder.name) / "trips.rou.xml"
-        self.trips = write_trips(self.city, scenario.demand, scenario.step, seed, routes)
+        self._vehicles, files = self._write_vehicles(routes, seed), [routes]
         self._trip_file = routes.with_name("tripinfo.xml")
-        steered = [s for s in self.simple_signals if not (chosen.gateways_fixed and s.id in self._gateway_ids)]
-        options, additional = trip_options(self._trip_file), self._signal_plan(steered)
+        steered = [s for s in self.simple_signals if s.id not in chosen.leave_signals and not (
+            chosen.gateways_fixed and s.id in self._gateway_ids)]
+        options = [
+            *trip_options(self._trip_file), "--begin", str(chosen.begin), "--ignore-route-errors",
+            str(bool(chosen.routes)).lower()]
         if chosen.rerouting > 0:
-            options += (*REROUTING, "--device.rerouting.probability", str(chosen.rerouting))
+            options += [*REROUTING, "--device.rerouting.probability", str(chosen.rerouting)]
+        if chosen.mesoscopic:
+            options += ["--mesosim", "true", "--meso-junction-control", "true"]
+        additional = self._signal_plan(steered)
+        if scenario.folder is not None:
+            files += [scenario.folder / name for name in chosen.background]
+            additional = [scenario.folder / name for name in chosen.additional] + additional
         estimating = chosen.measurement == ESTIMATE
         if estimating:
             loops = Path(self._folder.name) / "loops.add.xml"
             write_loops(self.city, self._layout, scenario.step, loops)
             additional.append(loops)
         if additional:
-            options += ("--additional-files", ",".join(map(str, additional)))
+            options += ["--additional-files", ",".join(map(str, additional))]
         self._session = Session(
-            self._net_file, routes, seed=seed, step_length=chosen.step_length,
-            time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action, options=options)
+            self._net_file, files, seed=seed, step_length=chosen.step_length,
+            time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action,
+            options=tuple(options))
         self._meter = Meter(
-            self._session, self.city, probes(self.trips, chosen.probe_share, seed) if estimating else frozenset())
+            self._session, self.city, probes(self._vehicles, chosen.probe_share, seed) if estimating else frozenset())
         self._detectors, self._estimator = None, None
         if estimating:
             self._detectors = Detectors(self._session, self.city, self._layout, self._meter, self._instruments)
@@ -275,6 +312,24 @@ class SumoPlant:
         """Gateways that no fixed-time signal controls: perimeter control does not reach them."""
         return [g for g in self.city.gateways if g.signal not in self._signals]
 
+    @property
+    def trips(self) -> int:
+        """Vehicles of the run: those drawn from the demand, or of a city's own those that were due so far."""
+        if not self._settings.routes:
+            return len(self._vehicles)
+        return int(self._meter.departures.sum() + self._meter.backlog().sum())
+
+    def _write_vehicles(self, path: Path, seed: int) -> list[str]:
+        """The route file of one run; the ids of its vehicles."""
+        scenario, chosen = self._scenario, self._settings
+        if not chosen.routes:
+            return [f"v{n}" for n in range(write_trips(self.city, scenario.demand, scenario.step, seed, path))]
+        if self._originals is None:
+            self._originals: Originals | None = read_originals([scenario.folder / name for name in chosen.routes])
+        return write_originals(
+            self._originals, path, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
+            begin=chosen.begin)
+
     def _end_session(self) -> None:
         if self._session is not None:
             self._session.close()
@@ -301,6 +356,8 @@ class SumoPlant:
                     movements.setdefault(gateway.signal, {})[link] = (gateway.source, gateway.target)
         signals = {}
         for signal in sorted(movements):
+            if signal in self._settings.leave_signals:
+                continue
             programme = self._session.programme(signal)
             if programme.static:
                 signals[signal] = GatewaySignal(

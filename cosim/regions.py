@@ -19,6 +19,8 @@ class Gateway:
 
     signal: the traffic light that controls it, or None where it leaks
     links: its indices in the light's state string
+    lanes: of the edge it comes from, numbered as SUMO does
+    shared: those of them on which other vehicles go elsewhere, which a red of this movement holds too
     """
 
     source: int
@@ -27,20 +29,23 @@ class Gateway:
     to_edge: str
     signal: str | None
     links: tuple[int, ...]
+    lanes: tuple[int, ...] = ()
+    shared: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class City:
-    """A SUMO network cut into regions 0 .. regions - 1; only what cars may use.
+    """A SUMO network cut into regions 0 .. regions - 1; only what cars may use, but for region_of.
 
     edges: the normal edges, sorted
     region_of: normal and junction-internal edge -> region; an internal edge has that of the edge it leads to, since
-        a vehicle on it has left the edge before
+        a vehicle on it has left the edge before. Edges closed to cars are there as far as their region was given
     length [m], lanes, speed [m/s]: by normal edge
     lane_ids: normal edge -> its lanes for cars
     successors: normal edge -> the edges that follow, sorted
     turn_time: (from_edge, to_edge) -> free-flow time on the junction between them [s]
     gateways: sorted by source, target, from_edge, to_edge
+    signals: edge -> the signal at its end, as far as it has links for cars
     """
 
     net_file: Path
@@ -54,6 +59,7 @@ class City:
     successors: Mapping[str, tuple[str, ...]]
     turn_time: Mapping[tuple[str, str], float]
     gateways: tuple[Gateway, ...]
+    signals: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -63,6 +69,8 @@ class _Connection:
     via: str | None
     signal: str | None
     link: int
+    lane: int
+    to_lane: int
 
 
 def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
@@ -71,7 +79,7 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
     Raises InputError for a missing or broken file, an edge that the network does not have, an edge without a region,
     a region that is not in 0 .. regions - 1 and a region without edges.
     """
-    lanes_of, internal, connections = _read_net(Path(net_file))
+    lanes_of, cars, internal, connections = _read_net(Path(net_file))
     given = _read_regions(Path(regions_csv), regions)
     edges = tuple(sorted(lanes_of))
     for edge in given:
@@ -86,8 +94,7 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
     if empty:
         raise InputError(
             f"{regions_csv}: region {min(empty)} has no edges; every region from 0 to {regions - 1} needs one")
-    usable = set(edges)
-    links = [c for c in connections if c.source in usable and c.target in usable]
+    links = [c for c in connections if (c.source, c.lane) in cars and (c.target, c.to_lane) in cars]
     turns = sorted({(c.source, c.target) for c in links})
     times = {(c.source, c.target): internal[c.via.rpartition("_")[0]] if c.via else 0.0 for c in links}
     successors: dict[str, list[str]] = {edge: [] for edge in edges}
@@ -95,13 +102,15 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
         successors[source].append(target)
     region_of = {edge: given[edge] for edge in edges}
     gateways = _gateways(links, region_of)
+    region_of |= {edge: region for edge, region in given.items() if not edge.startswith(":")}
     return City(
         net_file=Path(net_file), regions=regions,
         region_of=region_of | _internal_regions(connections, region_of, internal), edges=edges,
         length={e: lanes_of[e][0][0] for e in edges}, lanes={e: len(lanes_of[e]) for e in edges},
         lane_ids={e: tuple(lane for _, _, lane in lanes_of[e]) for e in edges},
         speed={e: max(speed for _, speed, _ in lanes_of[e]) for e in edges},
-        successors={edge: tuple(after) for edge, after in successors.items()}, turn_time=times, gateways=gateways)
+        successors={edge: tuple(after) for edge, after in successors.items()}, turn_time=times, gateways=gateways,
+        signals={c.source: c.signal for c in links if c.signal})
 
 
 def check_adjacency(city: City, network: Network) -> None:
@@ -109,15 +118,19 @@ def check_adjacency(city: City, network: Network) -> None:
     where = f"{network.folder}/network.toml: regions"
     joined = np.zeros((city.regions, city.regions), dtype=bool)
     for gateway in city.gateways:
-        if not network.adjacency[gateway.source, gateway.target]:
+        if not (network.adjacency | network.adjacency.T)[gateway.source, gateway.target]:
             raise InputError(
                 f"{where}[{gateway.source}].adjacent: region {gateway.target} is missing, although edge "
                 f"{gateway.from_edge} leads to {gateway.to_edge}; add it, or move the edges to other regions")
+        if not network.adjacency[gateway.source, gateway.target]:
+            raise InputError(
+                f"{where}[{gateway.source}].no_way_to: lists {gateway.target}, but edge {gateway.from_edge} leads to "
+                f"{gateway.to_edge} there; remove it, or move the edges to other regions")
         joined[gateway.source, gateway.target] = True
     for i, h in np.argwhere(network.adjacency & ~joined):
         raise InputError(
             f"{where}[{i}].adjacent: lists {h}, but no edge leads from region {i} to region {h} in {city.net_file}; "
-            "remove it, or change the regions of edges")
+            f"remove it, add no_way_to = [{h}], or change the regions of edges")
 
 
 def edge_shapes(city: City) -> list[np.ndarray]:
@@ -128,7 +141,7 @@ def edge_shapes(city: City) -> list[np.ndarray]:
             if element.tag == "edge":
                 lanes = [
                     np.array([point.split(",")[:2] for point in lane.get("shape").split()], dtype=float)
-                    for lane in element.iter("lane") if _for_cars(lane)]
+                    for lane in element.iter("lane") if for_cars(lane)]
                 if lanes:
                     same = len(lanes[0]) == len(lanes[-1])
                     shapes[element.get("id")] = (lanes[0] + lanes[-1]) / 2 if same else lanes[0]
@@ -137,7 +150,8 @@ def edge_shapes(city: City) -> list[np.ndarray]:
 
 
 def _read_net(path: Path):
-    """(edge -> [(length, speed, id) of each car lane], internal edge -> free-flow time [s], connections)."""
+    """(edge -> [(length, speed, id) of each car lane], the car lanes, internal edge -> free-flow time [s], links)."""
+    cars: set[tuple[str, int]] = set()
     lanes_of: dict[str, list[tuple[float, float, str]]] = {}
     internal: dict[str, float] = {}
     connections: list[_Connection] = []
@@ -146,16 +160,19 @@ def _read_net(path: Path):
             for _, element in ElementTree.iterparse(stream):
                 if element.tag == "edge":
                     lanes = [(float(lane.get("length")), float(lane.get("speed")), lane.get("id"))
-                             for lane in element.iter("lane") if _for_cars(lane)]
-                    if not element.get("function"):
+                             for lane in element.iter("lane") if for_cars(lane)]
+                    if element.get("function", "normal") in ("normal", "connector"):
                         lanes_of[element.get("id")] = lanes
+                        cars |= {(element.get("id"), int(lane.get("index")))
+                                 for lane in element.iter("lane") if for_cars(lane)}
                     else:
                         internal[element.get("id")] = max((length / speed for length, speed, _ in lanes), default=0.0)
                     element.clear()
                 elif element.tag == "connection":
                     connections.append(_Connection(
                         element.get("from"), element.get("to"), element.get("via"), element.get("tl"),
-                        int(element.get("linkIndex", -1))))
+                        int(element.get("linkIndex", -1)), int(element.get("fromLane")),
+                        int(element.get("toLane"))))
                     element.clear()
                 elif element.tag in ("junction", "tlLogic"):
                     element.clear()
@@ -165,10 +182,11 @@ def _read_net(path: Path):
         raise InputError(f"{path}: is not a SUMO network ({error}); build it with netconvert") from None
     if not lanes_of:
         raise InputError(f"{path}: has no edges; build it with netconvert")
-    return lanes_of, internal, connections
+    return lanes_of, cars, internal, connections
 
 
-def _for_cars(lane: ElementTree.Element) -> bool:
+def for_cars(lane: ElementTree.Element) -> bool:
+    """Whether cars may use a <lane>."""
     if lane.get("allow") is not None:
         return bool({"all", "passenger"} & set(lane.get("allow").split()))
     return not {"all", "passenger"} & set(lane.get("disallow", "").split())
@@ -217,11 +235,15 @@ def _internal_regions(connections, region_of: dict[str, int], internal: dict[str
 
 def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gateway, ...]:
     movements: dict[tuple, list[_Connection]] = {}
+    onward: dict[tuple[str, int], set[str]] = {}
     for link in links:
+        onward.setdefault((link.source, link.lane), set()).add(link.target)
         source, target = region_of[link.source], region_of[link.target]
         if source != target:
             movements.setdefault((source, target, link.source, link.target), []).append(link)
     return tuple(
         Gateway(source=key[0], target=key[1], from_edge=key[2], to_edge=key[3], signal=members[0].signal,
-                links=tuple(sorted(link.link for link in members if link.signal)))
+                links=tuple(sorted(link.link for link in members if link.signal)),
+                lanes=tuple(sorted({link.lane for link in members})),
+                shared=tuple(sorted({link.lane for link in members if len(onward[key[2], link.lane]) > 1})))
         for key, members in sorted(movements.items()))

@@ -49,7 +49,9 @@ def scenario_of(task: Task) -> Scenario:
     """The scenario with the horizon and demand of `task`. Raises InputError."""
     scenario = load_scenario(task.scenario)
     steps = scenario.steps if task.steps is None else min(task.steps, scenario.steps)
-    scenario = replace(scenario, steps=steps, demand=task.demand_factor * scenario.demand[:steps])
+    scenario = replace(
+        scenario, steps=steps, demand=task.demand_factor * scenario.demand[:steps],
+        demand_factor=task.demand_factor * scenario.demand_factor)
     if not task.options:
         return scenario
     controller = parse(task.controller).controller

@@ -1,11 +1,13 @@
 """The SUMO session: the only file that imports libsumo. At most one simulation per process."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import libsumo
 
+from cosim.originals import BOUND
 from nmfd.errors import InputError
 
 
@@ -42,23 +44,25 @@ class Session:
     _open = False
 
     def __init__(
-        self, net_file: Path, route_file: Path, *, seed: int, step_length: float = 1.0,
+        self, net_file: Path, route_file: Path | Sequence[Path], *, seed: int, step_length: float = 1.0,
         time_to_teleport: float = -1.0, collision_action: str = "warn", options: tuple[str, ...] = (),
     ):
         """Raises RuntimeError if another session is open in this process, InputError if SUMO refuses to start."""
         if Session._open:
             raise RuntimeError("a SUMO session is already open in this process; close it first")
-        self.sumo_time, self.time, self.step_length = 0.0, 0.0, step_length
+        self.sumo_time, self.step_length = 0.0, step_length
+        routes = ",".join(map(str, [route_file] if isinstance(route_file, Path) else route_file))
         self.command = [
-            "sumo", "--net-file", str(net_file), "--route-files", str(route_file), "--seed", str(seed),
+            "sumo", "--net-file", str(net_file), "--route-files", routes, "--seed", str(seed),
             "--step-length", str(step_length), "--time-to-teleport", str(time_to_teleport), "--collision.action",
             collision_action, "--no-step-log", "true", "--no-warnings", "true", "--duration-log.disable", "true",
-            "--ignore-route-errors", "false", *options]
+            *options]
         try:
             libsumo.start(self.command)
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-            raise InputError(f"{net_file}: SUMO cannot run it with {route_file}: {_one_line(error)}") from None
+            raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {_one_line(error)}") from None
         Session._open = True
+        self.time = libsumo.simulation.getTime()
 
     def close(self) -> None:
         if Session._open:
@@ -106,6 +110,12 @@ class Session:
     # road(vehicle), the edge it is on, normal or internal; route(vehicle), its edges.
     road = staticmethod(libsumo.vehicle.getRoadID)
     route = staticmethod(libsumo.vehicle.getRoute)
+
+    def is_free(self, vehicle: str) -> bool:
+        """Whether its driver may choose another way: no public transport, and nothing to do on the way."""
+        return (
+            libsumo.vehicle.getVehicleClass(vehicle) not in BOUND and not libsumo.vehicle.getLine(vehicle)
+            and not libsumo.vehicle.getStops(vehicle, 1))
 
     def route_index(self, vehicle: str) -> int:
         """Where on its route a vehicle is."""

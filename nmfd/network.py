@@ -28,7 +28,8 @@ class Network:
     name
     region_names: R names
     positions: (R, 2), where a region is drawn on the map [any unit]
-    adjacency: (R, R) bool, symmetric, false on the diagonal
+    adjacency: (R, R) bool, [i, h] = vehicles can go from i to h; false on the diagonal, and symmetric but for the
+        neighbours that only one-way streets join
     mfds: one outflow MFD per region
     u_min, u_max: bounds of the perimeter control [-]
     own_splits: {(i, j): {h: share}}, what drivers do by themselves where it was measured; elsewhere they follow the
@@ -62,8 +63,7 @@ class Network:
     @cached_property
     def hops(self) -> np.ndarray:
         """(R, R) int: boundaries to cross on a shortest way; -1 where there is none."""
-        hops = csgraph.shortest_path(self.adjacency, unweighted=True)
-        return np.where(np.isfinite(hops), hops, -1).astype(int)
+        return _hops(self.adjacency)
 
     @cached_property
     def split_mask(self) -> np.ndarray:
@@ -75,8 +75,7 @@ class Network:
         for i in range(self.regions):
             without_i = self.adjacency.copy()
             without_i[i, :] = without_i[:, i] = False
-            part = csgraph.connected_components(without_i, directed=False)[1]
-            mask[i] = self.adjacency[i][:, None] & (part[:, None] == part)
+            mask[i] = self.adjacency[i][:, None] & (_hops(without_i) >= 0)
             mask[i, :, i] = False
         return mask
 
@@ -108,6 +107,11 @@ class Network:
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
+def _hops(adjacency: np.ndarray) -> np.ndarray:
+    hops = csgraph.shortest_path(adjacency, unweighted=True)
+    return np.where(np.isfinite(hops), hops, -1).astype(int)
+
+
 def load_network(folder: Path | str) -> Network:
     """Read `folder`/network.toml.
 
@@ -127,27 +131,35 @@ def load_network(folder: Path | str) -> Network:
     rows = root.tables("regions")
     if not rows:
         raise root.error("regions", "empty; add at least one [[regions]] table")
-    names, positions, neighbours, mfds, boundaries = [], [], [], [], []
+    names, positions, neighbours, barred, onward, mfds, boundaries = [], [], [], [], [], [], []
     for number, row in enumerate(rows):
         names.append(row.text("name", str(number)))
         positions.append(row.numbers("position", length=2))
         neighbours.append(row.integers("adjacent", high=len(rows) - 1))
+        barred.append(row.integers("no_way_to", (), high=len(rows) - 1))
+        if unknown := sorted(set(barred[-1]) - set(neighbours[-1])):
+            raise row.error(
+                "no_way_to", f"expected some of the adjacent regions {list(neighbours[-1])}, got {unknown[0]} instead")
         mfds.append(_mfd(row.table("mfd")) if default_mfd is None or row.has("mfd") else default_mfd)
-        boundaries.append(_boundary(row, len(rows), neighbours[-1]))
+        onward.append(tuple(h for h in neighbours[-1] if h not in barred[-1]))
+        boundaries.append(_boundary(row, len(rows), onward[-1]))
         row.close()
     own_splits = {}
     for row in root.tables("own_splits", ()):
         here, to = row.integer("region", high=len(rows) - 1), row.integer("destination", high=len(rows) - 1)
-        own_splits[here, to] = _shares(row, neighbours[here])
+        own_splits[here, to] = _shares(row, onward[here])
         row.close()
     root.raw_table("sumo")
     root.close()
     adjacency = np.zeros((len(rows), len(rows)), dtype=bool)
     for i, regions in enumerate(neighbours):
         adjacency[i, list(regions)] = True
+    _check_symmetry(adjacency, root)
+    for i, regions in enumerate(barred):
+        adjacency[i, list(regions)] = False
     network = Network(
         name=name, region_names=tuple(names), positions=np.array(positions), adjacency=adjacency, mfds=tuple(mfds),
-        u_min=u_min, u_max=u_max, own_splits=own_splits, folder=folder, **_boundaries(root, neighbours, boundaries))
+        u_min=u_min, u_max=u_max, own_splits=own_splits, folder=folder, **_boundaries(root, onward, boundaries))
     _check_graph(network, root)
     for i, j in own_splits:
         for h in own_splits[i, j]:
@@ -166,7 +178,7 @@ def _shares(row: toml.Table, neighbours: tuple[int, ...]) -> dict[int, float]:
 
 
 def _boundary(row: toml.Table, regions: int, adjacent: tuple[int, ...]) -> dict:
-    """The options of one region: exit_rates (R,), capacity (one per adjacent region), storage; None if absent."""
+    """The options of one region: exit_rates (R,), capacity (one per region it leads to), storage; None if absent."""
     found = {
         "exit_rates": row.numbers("exit_rates", length=regions) if row.has("exit_rates") else None,
         "capacity": row.numbers("capacity", length=len(adjacent)) if row.has("capacity") else None,
@@ -203,14 +215,18 @@ def _mfd(table: toml.Table) -> Mfd:
     return mfd
 
 
-def _check_graph(network: Network, root: toml.Table) -> None:
-    for i in range(network.regions):
-        if network.adjacency[i, i]:
+def _check_symmetry(adjacency: np.ndarray, root: toml.Table) -> None:
+    for i in range(len(adjacency)):
+        if adjacency[i, i]:
             raise root.error(f"regions[{i}].adjacent", f"region {i} is listed as adjacent to itself; remove it")
-        for h in np.flatnonzero(network.adjacency[i] & ~network.adjacency[:, i]):
+        for h in np.flatnonzero(adjacency[i] & ~adjacency[:, i]):
             raise root.error(
                 f"regions[{i}].adjacent",
-                f"not symmetric: region {i} lists {h}, but region {h} does not list {i}; add or remove one of them")
+                f"not symmetric: region {i} lists {h}, but region {h} does not list {i}; add or remove one of them "
+                "(no_way_to lists the adjacent regions into which no road leads)")
+
+
+def _check_graph(network: Network, root: toml.Table) -> None:
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
         raise root.error("regions", f"region {j} cannot be reached from region {i}; connect them with adjacent")

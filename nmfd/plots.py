@@ -283,7 +283,7 @@ def _tones(count: int) -> list:
 
 
 def _pairs(adjacency: np.ndarray):
-    return np.argwhere(np.triu(adjacency))
+    return np.argwhere(np.triu(adjacency | adjacency.T))
 
 
 def _region_title(network: Network, region: int) -> str:

@@ -120,6 +120,8 @@ def scenario_hash(scenario: Scenario) -> str:
     settings = [
         scenario.network.hash, scenario.step, scenario.steps, scenario.measurement_std, scenario.integrator,
         scenario.substeps, scenario.protected, scenario.controller_options]
+    if scenario.forecast_error:
+        settings.append([scenario.forecast_error, scenario.forecast_seed])
     text = json.dumps(settings, sort_keys=True, default=str)
     return hashlib.sha256(text.encode() + np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16]
 

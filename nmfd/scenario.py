@@ -1,13 +1,16 @@
 """Demand, noise, horizon: loaded from scenario.toml and checked."""
 
+import csv
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from nmfd import toml
+from nmfd.errors import InputError
 from nmfd.network import Network, check_step, load_network
 
 
@@ -23,6 +26,9 @@ class Scenario:
     integrator: "euler" or "rk4", of the regional model
     substeps: integration steps of the regional model per control interval
     protected: the regions that gating protects
+    demand_factor: what the demand was multiplied by already, for a city that drives vehicles of its own
+    forecast_error: standard deviation of the logarithm of what a controller is told of the demand, over the truth [-]
+    forecast_seed: of that error
     controller_options: controller name -> its table in [controllers], checked by that controller
     folder: where scenario.toml was, or None
     """
@@ -37,7 +43,24 @@ class Scenario:
     substeps: int = 1
     protected: tuple[int, ...] = ()
     controller_options: Mapping[str, dict] = field(default_factory=dict)
+    demand_factor: float = 1.0
+    forecast_error: float = 0.0
+    forecast_seed: int = 0
     folder: Path | None = None
+
+    @cached_property
+    def forecast(self) -> np.ndarray:
+        """(T, R, R) [veh/s]: the demand as controllers that look ahead know it.
+
+        Each pair is off by a factor for the whole run and one per interval, lognormal with mean 1, which share the
+        variance equally: a forecast is wrong about the day, and about the quarter of an hour.
+        """
+        if not self.forecast_error:
+            return self.demand
+        random = np.random.default_rng([self.forecast_seed, 0x666F72])
+        spread = self.forecast_error / np.sqrt(2.0)
+        normal = random.standard_normal((1, *self.demand.shape[1:])) + random.standard_normal(self.demand.shape)
+        return self.demand * np.exp(spread * normal - spread**2)
 
 
 def trapezoid(time: np.ndarray, *, start: float, peak: float, ramp_up: float, flat: float, ramp_down: float):
@@ -60,14 +83,27 @@ def read_tables(folder: Path) -> toml.Table:
         if folder.resolve() in folders:
             raise table.error("base", "the scenarios are each other's base; remove one of the keys")
         folders.append(folder.resolve())
-        if isinstance(own.get("network"), str):  # relative to the file that says it
-            own["network"] = os.path.relpath(folder / own["network"], path.parent)
+        _name_from(own, folder, path.parent)
         content = _completed(content, own)
         base = table.text("base", None)
         if base is None:
             content.pop("base", None)
             return toml.Table(content, path)
         folder = folder / base
+
+
+def _name_from(own: dict, folder: Path, here: Path) -> None:
+    """Files that a scenario.toml names are relative to it: rewrite them as seen from the folder `here`."""
+    def seen(name: str) -> str:
+        return os.path.relpath(folder / name, here)
+
+    for key in ("network", "demand_file"):
+        if isinstance(own.get(key), str):
+            own[key] = seen(own[key])
+    sumo = own.get("sumo")
+    for key in ("routes", "background", "additional") if isinstance(sumo, dict) else ():
+        if isinstance(sumo.get(key), list) and all(isinstance(name, str) for name in sumo[key]):
+            sumo[key] = [seen(name) for name in sumo[key]]
 
 
 def _completed(content: dict, base: dict) -> dict:
@@ -94,7 +130,7 @@ def load_scenario(folder: Path | str) -> Scenario:
     factor = root.number("demand_factor", 1.0, low=0.0)
     demand = np.zeros((steps, network.regions, network.regions))
     time = step * np.arange(steps)
-    for row in root.tables("demand"):
+    for row in root.tables("demand", () if root.has("demand_file") else ...):
         pair = [_region(row, key, network) for key in ("from", "to")]
         rate = trapezoid(
             time, start=row.number("start", low=0.0), peak=row.number("peak", low=0.0),
@@ -104,6 +140,11 @@ def load_scenario(folder: Path | str) -> Scenario:
         if row.flag("both_ways", False):
             demand[:, pair[1], pair[0]] += rate
         row.close()
+    if root.has("demand_file"):
+        demand += _demand_file(folder / root.text("demand_file"), steps, network.regions)
+    forecast = root.table("forecast", None)
+    forecast_error, forecast_seed = forecast.number("error", 0.0, low=0.0, high=2.0), forecast.integer("seed", 0)
+    forecast.close()
     controller_options = root.raw_table("controllers")
     root.raw_table("sumo")
     root.close()
@@ -111,7 +152,38 @@ def load_scenario(folder: Path | str) -> Scenario:
     return Scenario(
         name=name, network=network, step=step, steps=steps, demand=factor * demand, measurement_std=measurement_std,
         integrator=integrator, substeps=substeps, protected=protected, controller_options=controller_options,
-        folder=folder)
+        demand_factor=factor, forecast_error=forecast_error, forecast_seed=forecast_seed, folder=folder)
+
+
+def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
+    """(T, R, R) [veh/s] of a csv with the columns interval, from, to, veh_s; intervals beyond T are left out.
+
+    Raises InputError.
+    """
+    demand = np.zeros((steps, regions, regions))
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.reader(stream))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give a table with the columns interval,from,to,veh_s") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read ({error}); give a csv file") from None
+    if not rows or rows[0] != ["interval", "from", "to", "veh_s"]:
+        found = ",".join(rows[0]) if rows else "nothing"
+        raise InputError(f"{path}: line 1: expected interval,from,to,veh_s, got {found} instead")
+    for number, row in enumerate(rows[1:], start=2):
+        try:
+            k, i, j, rate = int(row[0]), int(row[1]), int(row[2]), float(row[3])
+            good = len(row) == 4 and k >= 0 and 0 <= i < regions and 0 <= j < regions and 0.0 <= rate < np.inf
+        except (ValueError, IndexError):
+            good = False
+        if not good:
+            raise InputError(
+                f"{path}: line {number}: expected an interval from 0 up, two regions from 0 to {regions - 1} and "
+                f"veh/s >= 0, got {','.join(row)} instead")
+        if k < steps:
+            demand[k, i, j] += rate
+    return demand
 
 
 def as_modelled(scenario: Scenario, controller: str) -> Scenario:

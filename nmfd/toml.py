@@ -97,6 +97,14 @@ class Table:
             raise self.error(key, f"expected a list of {length or ''} numbers, got {value!r} instead")
         return tuple(float(v) for v in value)
 
+    def texts(self, key: str, default=...) -> tuple[str, ...]:
+        """Distinct texts."""
+        value = self._take(key, default, '["...", ...]')
+        good = isinstance(value, (list, tuple)) and all(isinstance(v, str) for v in value)
+        if not good or len(set(value)) != len(value):
+            raise self.error(key, f"expected a list of distinct texts in quotes, got {value!r} instead")
+        return tuple(value)
+
     def integers(self, key: str, default=..., *, high: int) -> tuple[int, ...]:
         """Distinct whole numbers from 0 to `high`."""
         value = self._take(key, default, "[<region>, ...]")

@@ -14,7 +14,7 @@ from cosim.cli import main
 from nmfd.controllers.dpc import Architecture, Policy, checkpoint
 from nmfd.network import load_network
 from nmfd.runs import COLUMNS
-from nmfd.scenario import load_scenario
+from nmfd.scenario import as_modelled, load_scenario
 
 ROOT = Path(__file__).parents[1]
 GRID = ROOT / "networks" / "grid7"
@@ -34,7 +34,8 @@ def good(result):
 def small(tmp_path_factory):
     """A copy of grid7_peak and its network, so that tests may change them, with the peak at the beginning."""
     folder = tmp_path_factory.mktemp("small")
-    shutil.copytree(GRID, folder / "networks" / "grid7")
+    for network in (GRID, GRID.with_name("grid7_guided")):
+        shutil.copytree(network, folder / "networks" / network.name)
     source = ROOT / "scenarios" / "grid7_peak" / "scenario.toml"
     text = re.sub(r"ramp_up = [\d.]+", "ramp_up = 90.0", source.read_text())
     text = text.replace("steps = 64", "steps = 80")
@@ -43,8 +44,9 @@ def small(tmp_path_factory):
     scenario = load_scenario(folder / "scenarios" / "small")
     for name, guidance in (("dpc-pc", False), ("dpc-pcrg", True)):
         torch.manual_seed(0)
-        policy = Policy(scenario.network, Architecture(width=8, guidance=guidance))
-        torch.save(checkpoint(policy, scenario.network, {}), scenario.folder / f"{name}.pt")
+        network = as_modelled(scenario, name).network
+        policy = Policy(network, Architecture(width=8, guidance=guidance))
+        torch.save(checkpoint(policy, network, {}), scenario.folder / f"{name}.pt")
     return scenario.folder
 
 

@@ -69,9 +69,10 @@ def test_layout(city):
 
 
 def test_probes_are_a_share_of_the_vehicles():
-    drawn = probes(10_000, 0.1, seed=4)
-    assert 900 < len(drawn) < 1100 and drawn == probes(10_000, 0.1, seed=4) != probes(10_000, 0.1, seed=5)
-    assert probes(100, 0.0, seed=4) == frozenset() and len(probes(100, 1.0, seed=4)) == 100
+    names = [f"v{n}" for n in range(10_000)]
+    drawn = probes(names, 0.1, seed=4)
+    assert 900 < len(drawn) < 1100 and drawn == probes(names, 0.1, seed=4) != probes(names, 0.1, seed=5)
+    assert probes(names, 0.0, seed=4) == frozenset() and probes(names, 1.0, seed=4) == set(names)
 
 
 def test_all_links_and_all_probes_see_everything(scenario):

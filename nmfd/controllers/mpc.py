@@ -136,9 +136,9 @@ class EconomicMpc:
         self.name = "mpc-pcrg" if guidance else "mpc-pc"
         self.options = options(scenario, self.name)
         network, horizon = scenario.network, self.options.horizon
-        used = np.flatnonzero(scenario.demand.sum(axis=(0, 1)) > 0)
+        used = np.flatnonzero(scenario.forecast.sum(axis=(0, 1)) > 0)
         self._used = used if len(used) else np.arange(network.regions)
-        self._demand, self._step, self._steps = scenario.demand, scenario.step, scenario.steps
+        self._demand, self._step, self._steps = scenario.forecast, scenario.step, scenario.steps
         # With one Euler step per interval, the last controls move vehicles that the horizon does not see arrive.
         blind = scenario.integrator == "euler" and scenario.substeps == 1
         self._moves = horizon - 1 if blind else horizon

@@ -1,0 +1,1 @@
+"""Any SUMO city -> networks/NAME and scenarios/NAME: `cosim import`."""

@@ -1,0 +1,135 @@
+"""One no-control run of the imported city by SUMO's own program: densities of its streets, and who crossed what."""
+
+import subprocess
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cosim.importing.streets import Streets
+from nmfd.errors import InputError
+
+INTERVAL = 300.0  # s, of the densities
+PEAK = 3          # such intervals, one after the other: those with the most vehicles count for the partition
+
+
+@dataclass(frozen=True, kw_only=True)
+class Baseline:
+    """What a no-control run showed.
+
+    presence: (K, E) [veh s] on every edge during intervals of INTERVAL
+    ways: the edges that vehicles drove to the end, one after the other, and the last edge of their route, alike ones
+        together -> how many
+    teleports; waiting: vehicles not inserted at the end; running: on the road at the end
+    """
+
+    presence: np.ndarray
+    ways: Mapping[tuple[tuple[int, ...], int], int]
+    teleports: int
+    waiting: int
+    running: int
+
+    def density(self, streets: Streets) -> np.ndarray:
+        """(E,) [veh/m of lane] in the quarter of an hour with the most vehicles; 0 on edges without car lanes."""
+        total = self.presence.sum(axis=1)
+        sums = np.convolve(total, np.ones(min(PEAK, len(total))), mode="valid")
+        first = int(np.argmax(sums))
+        mean = self.presence[first : first + PEAK].sum(axis=0) / (INTERVAL * min(PEAK, len(total)))
+        return np.where(streets.lane_metres > 0, mean / np.maximum(streets.lane_metres, 1.0), 0.0)
+
+    def moves(self) -> Counter:
+        """(edge, next edge) -> vehicles that went from one to the other."""
+        found: Counter[tuple[int, int]] = Counter()
+        for (way, _), count in self.ways.items():
+            for pair in zip(way, way[1:], strict=False):
+                found[pair] += count
+        return found
+
+    def crossings(self, regions: np.ndarray) -> np.ndarray:
+        """(R, R, R) [veh], [i, h, j]: from region i to h on the way to j."""
+        count = int(regions.max()) + 1
+        found = np.zeros((count,) * 3)
+        for (way, last), vehicles in self.ways.items():
+            seen = regions[list(way)]
+            for n in np.flatnonzero(np.diff(seen)):
+                found[seen[n], seen[n + 1], regions[last]] += vehicles
+        return found
+
+    def metres_per_visit(self, streets: Streets, regions: np.ndarray) -> np.ndarray:
+        """(R,) [m] that a vehicle drives in a region from entry or departure to exit or arrival; NaN if none did."""
+        count = int(regions.max()) + 1
+        metres, visits = np.zeros(count), np.zeros(count)
+        for (way, _), vehicles in self.ways.items():
+            if way:
+                seen = regions[list(way)]
+                np.add.at(metres, seen, vehicles * streets.length[list(way)])
+                np.add.at(visits, seen[np.flatnonzero(np.diff(seen, prepend=-1))], vehicles)
+        return np.where(visits > 0, metres / np.maximum(visits, 1.0), np.nan)
+
+
+def run_baseline(
+    streets: Streets, *, routes: Sequence[Path], additional: Sequence[Path], begin: float, end: float,
+    options: Sequence[str] = (),
+) -> Baseline:
+    """Simulate without control. Raises InputError with SUMO's own words if it refuses."""
+    with tempfile.TemporaryDirectory(prefix="cosim-import-") as name:
+        folder = Path(name)
+        edges = folder / "edges.xml"
+        (folder / "measure.add.xml").write_text(
+            f'<additional><edgeData id="all" freq="{INTERVAL:g}" file="{edges}" excludeEmpty="true"/></additional>')
+        run_sumo(
+            "sumo", "--net-file", str(streets.path), "--route-files", ",".join(map(str, routes)),
+            "--additional-files", ",".join(map(str, [*additional, folder / "measure.add.xml"])), "--begin", str(begin),
+            "--end", str(end), "--seed", "0", "--no-step-log", "true", "--no-warnings", "true",
+            "--ignore-route-errors", "true", "--vehroute-output", str(folder / "ways.xml"),
+            "--vehroute-output.exit-times", "true", "--vehroute-output.last-route", "true",
+            "--vehroute-output.write-unfinished", "true", "--statistic-output", str(folder / "statistic.xml"),
+            *options, where=str(streets.path))
+        statistic = ElementTree.parse(folder / "statistic.xml").getroot()
+        vehicles = statistic.find("vehicles")
+        return Baseline(
+            presence=_presence(edges, streets, begin, end), ways=_ways(folder / "ways.xml", streets),
+            teleports=int(statistic.find("teleports").get("total")), waiting=int(vehicles.get("waiting")),
+            running=int(vehicles.get("running")))
+
+
+def run_sumo(program: str, *arguments: str, where: str) -> None:
+    """Run one of SUMO's programs. Raises InputError with the first line of its complaint."""
+    import sumo
+
+    done = subprocess.run(
+        [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments], capture_output=True, text=True, check=False)
+    if done.returncode:
+        lines = [line for line in (done.stderr + done.stdout).splitlines() if "rror" in line] or ["no reason given"]
+        raise InputError(f"{where}: {program} cannot run it: {' '.join(lines[0].split())}; correct the input")
+
+
+def _presence(path: Path, streets: Streets, begin: float, end: float) -> np.ndarray:
+    presence = np.zeros((max(1, int(np.ceil((end - begin) / INTERVAL))), len(streets.edges)))
+    for _, element in ElementTree.iterparse(path):
+        if element.tag == "interval":
+            k = int((float(element.get("begin")) - begin) / INTERVAL + 0.5)
+            for edge in element:
+                if (n := streets.number.get(edge.get("id"))) is not None and k < len(presence):
+                    presence[k, n] += float(edge.get("sampledSeconds"))
+            element.clear()
+    return presence
+
+
+def _ways(path: Path, streets: Streets) -> Counter:
+    ways: Counter[tuple[tuple[int, ...], int]] = Counter()
+    for _, element in ElementTree.iterparse(path):
+        if element.tag == "vehicle":
+            route = element.find("route")
+            if route is not None and route.get("edges"):
+                edges = [streets.number.get(edge, -1) for edge in route.get("edges").split()]
+                left = [float(time) >= 0 for time in route.get("exitTimes", "").split()] or [False] * len(edges)
+                driven = tuple(n for n, gone in zip(edges, left, strict=False) if gone and n >= 0)
+                if edges[-1] >= 0:
+                    ways[driven, edges[-1]] += 1
+            element.clear()
+    return ways

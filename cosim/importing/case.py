@@ -1,0 +1,110 @@
+"""What the user gives: a sumocfg with all it names, or a bare network."""
+
+import gzip
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from nmfd.errors import InputError
+
+# Names that SUMO gives the same option.
+FILES = {
+    "net-file": ("net-file", "net", "n"), "route-files": ("route-files", "routes", "r"),
+    "additional-files": ("additional-files", "additional", "a"), "begin": ("begin", "b"), "end": ("end", "e")}
+FOREVER = 1e9  # s; a later end is none
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A simulation as its owner set it up.
+
+    source: the file that was given; net; routes and additional in SUMO's order
+    begin, end: [s]; end is None where it is open
+    options: all other options of the sumocfg
+    """
+
+    source: Path
+    net: Path
+    routes: tuple[Path, ...] = ()
+    additional: tuple[Path, ...] = ()
+    begin: float = 0.0
+    end: float | None = None
+    options: Mapping[str, str] = field(default_factory=dict)
+
+
+def read_case(path: Path) -> Case:
+    """Read a sumocfg, or take a net.xml(.gz) as a case without demand. Raises InputError, also for a file it names
+    that is missing."""
+    root = root_of(path)
+    if root.tag == "net":
+        return Case(source=path, net=path)
+    if root.tag not in ("configuration", "sumoConfiguration"):
+        raise InputError(f"{path}: expected a sumocfg or a net.xml, got a file of <{root.tag}> instead")
+    given = {}
+    for element in read_xml(path).iter():
+        if element.get("value") is not None:
+            given[element.tag] = element.get("value")
+    options = {}
+    for name, alike in FILES.items():
+        options[name] = next((given.pop(other) for other in alike if other in given), "")
+    if not options["net-file"]:
+        raise InputError(f"{path}: net-file: missing; add <net-file value=\"city.net.xml\"/> to its <input>")
+    end = seconds(options["end"] or "-1", f"{path}: end")
+    return Case(
+        source=path, net=_files(path, "net-file", options["net-file"])[0],
+        routes=_files(path, "route-files", options["route-files"]),
+        additional=_files(path, "additional-files", options["additional-files"]),
+        begin=seconds(options["begin"] or "0", f"{path}: begin"), end=end if 0 < end < FOREVER else None,
+        options=given)
+
+
+def _files(config: Path, key: str, value: str) -> tuple[Path, ...]:
+    found = []
+    for name in value.replace(";", ",").split(","):
+        if name := name.strip():
+            file = config.parent / name
+            if not file.is_file():
+                raise InputError(f"{config}: {key}: no such file: {file}; correct the name or add the file")
+            found.append(file)
+    return tuple(found)
+
+
+def seconds(text: str, where: str) -> float:
+    """A SUMO time, in seconds or as [days:]hours:minutes:seconds, in seconds. InputError names `where`."""
+    try:
+        parts = [float(part) for part in text.split(":")]
+        if not 1 <= len(parts) <= 4 or len(parts) == 2 or any(part != part for part in parts):
+            raise ValueError
+    except ValueError:
+        raise InputError(f"{where}: expected seconds or hours:minutes:seconds, got {text!r} instead") from None
+    size = sum(abs(part) * unit for part, unit in zip(reversed(parts), (1.0, 60.0, 3600.0, 86400.0), strict=False))
+    return -size if text.startswith("-") else size
+
+
+def read_xml(path: Path) -> ElementTree.Element:
+    """The root of an XML file, gzipped or not. Raises InputError."""
+    try:
+        with opened(path) as stream:
+            return ElementTree.parse(stream).getroot()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give the path of an existing one") from None
+    except (OSError, EOFError, ElementTree.ParseError) as error:
+        raise InputError(f"{path}: is not an XML file that SUMO could read ({error}); correct or replace it") from None
+
+
+def root_of(path: Path) -> ElementTree.Element:
+    """The root element of an XML file, with its attributes only. Raises InputError."""
+    try:
+        with opened(path) as stream:
+            for _, element in ElementTree.iterparse(stream, events=("start",)):
+                return element
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give the path of an existing one") from None
+    except (OSError, EOFError, ElementTree.ParseError) as error:
+        raise InputError(f"{path}: is not an XML file that SUMO could read ({error}); correct or replace it") from None
+
+
+def opened(path: Path):
+    """A binary stream of a file, unzipped if its name ends in .gz."""
+    return (gzip.open if path.suffix == ".gz" else open)(path, "rb")

@@ -1,0 +1,249 @@
+"""What drives in the city: its private vehicles one by one, and all that is left alone."""
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from cosim.importing.case import Case, read_xml, seconds
+from cosim.importing.streets import Streets
+from cosim.originals import BOUND
+from nmfd.errors import InputError
+
+DRIVERS = ("vehicle", "trip", "flow")
+OTHERS = ("person", "personFlow", "container", "containerFlow")
+DROPPED = ("poly", "poi", "edgeData", "laneData", "timedEvent", "routeProbe", "vTypeProbe")  # only draw or write
+FLOW = ("begin", "end", "number", "period", "vehsPerHour", "perHour", "probability")
+ENDS = {"from": ("fromTaz", "fromJunction"), "to": ("toTaz", "toJunction")}
+OPEN_END = 3600.0  # s, of a flow that never ends in a simulation that never ends
+
+
+@dataclass(frozen=True, kw_only=True)
+class Traffic:
+    """vehicles: the demand, `vehicle` and `trip` elements by departure
+    depart: (N,) [s]; origin, destination: (N,) edges, numbers of Streets
+    background: public transport, persons and whatever departs at no fixed time, by begin
+    shared: what these refer to, and the contents of the additional files: types, routes, stops, programmes
+    switched: signals whose programme a timetable (WAUT) changes
+    notes: what was found and left out, in words -> how often
+    """
+
+    vehicles: tuple[Element, ...]
+    depart: np.ndarray
+    origin: np.ndarray
+    destination: np.ndarray
+    background: tuple[Element, ...] = ()
+    shared: tuple[Element, ...] = ()
+    switched: tuple[str, ...] = ()
+    notes: Mapping[str, int] = field(default_factory=dict)
+
+
+def read_traffic(case: Case, streets: Streets, seed: int) -> Traffic:
+    """All route and additional files of the case. Flows become single vehicles, and TAZ and junctions the edges drawn
+    for them (by `seed`); all else stays as it is. Raises InputError for a file that is no XML or a broken time."""
+    return _Reader(case, streets, np.random.default_rng([seed, 0x696D70])).read()
+
+
+class _Reader:
+    def __init__(self, case: Case, streets: Streets, random: np.random.Generator):
+        self._case, self._streets, self._random = case, streets, random
+        self._moves = set(map(tuple, streets.all_links))
+        self._classes: dict[str, str] = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_PEDTYPE": "pedestrian"}
+        self._routes: dict[str, list[str]] = {}
+        self._zones: dict[str, dict[str, list[tuple[str, float]]]] = {}
+        self._notes: Counter[str] = Counter()
+
+    def read(self) -> Traffic:
+        shared, drivers, others, switched = [], [], [], []
+        for path in (*self._case.additional, *self._case.routes):
+            for element in read_xml(path):
+                if element.tag in DRIVERS:
+                    drivers.append((element, path))
+                elif element.tag in OTHERS:
+                    others.append(element)
+                elif element.tag not in DROPPED:
+                    self._learn(element)
+                    switched += [e.get("junctionID") for e in element.iter("wautJunction")]
+                    shared.append(_silent(element))
+        vehicles, background = [], others
+        for element, path in drivers:
+            if element.get("line") or self._classes.get(element.get("type", ""), "passenger") in BOUND:
+                background.append(element)
+                self._notes[f"public transport and other classes left alone ({element.tag})"] += 1
+            elif element.tag == "flow":
+                vehicles += [(single, path) for single in self._expand(element, path)]
+            else:
+                vehicles.append((element, path))
+        return self._checked(vehicles, background, shared, switched)
+
+    def _learn(self, element: Element) -> None:
+        """Types, routes and zones that vehicles refer to."""
+        if element.tag == "vType":
+            self._classes[element.get("id")] = element.get("vClass", "passenger")
+        elif element.tag == "vTypeDistribution":
+            members = [e.get("vClass", "passenger") for e in element.iter("vType")]
+            members += [self._classes.get(name, "passenger") for name in element.get("vTypes", "").split()]
+            self._classes[element.get("id")] = members[0] if members else "passenger"
+            for member in element.iter("vType"):
+                self._classes[member.get("id")] = member.get("vClass", "passenger")
+        elif element.tag in ("route", "routeDistribution"):
+            for route in element.iter("route"):
+                if route.get("edges"):
+                    self._routes[route.get("id", "")] = route.get("edges").split()
+            if element.tag == "routeDistribution":
+                self._routes[element.get("id")] = self._likeliest(element)
+        for zone in element.iter("taz"):
+            members = [(edge, 1.0) for edge in zone.get("edges", "").split()]
+            self._zones[zone.get("id")] = {
+                key: members + [(e.get("id"), float(e.get("weight", 1.0))) for e in zone.iter(tag)]
+                for key, tag in (("from", "tazSource"), ("to", "tazSink"))}
+
+    def _likeliest(self, distribution: Element) -> list[str]:
+        """The edges of the route in a distribution that is driven most."""
+        routes = [(float(r.get("probability", 1.0)), r.get("edges", "").split() or self._routes.get(
+            r.get("refId", ""), [])) for r in distribution.iter("route")]
+        names = distribution.get("routes", "").split()
+        shares = [float(p) for p in distribution.get("probabilities", "").split()] or [1.0] * len(names)
+        routes += [(p, self._routes.get(name, [])) for p, name in zip(shares, names, strict=False)]
+        return max(routes, key=lambda route: route[0], default=(0.0, []))[1]
+
+    def _expand(self, flow: Element, path) -> list[Element]:
+        """The single vehicles of a flow."""
+        where = f"{path}: flow {flow.get('id')}"
+        begin = seconds(flow.get("begin", str(self._case.begin)), f"{where}: begin")
+        end = seconds(flow.get("end"), f"{where}: end") if flow.get("end") else None
+        stop = min(end if end is not None else self._case.end or begin + OPEN_END, self._case.end or np.inf)
+        number = int(flow.get("number")) if flow.get("number") else None
+        per_hour, period = flow.get("vehsPerHour") or flow.get("perHour"), flow.get("period")
+        try:
+            if match := re.fullmatch(r"exp\((.+)\)", period or ""):
+                rate = float(match[1])
+                gaps = self._random.exponential(1.0 / rate, size=number or int(3 * rate * (stop - begin) + 30))
+                times = begin + np.cumsum(gaps) - (gaps[0] if number else 0.0)
+            elif flow.get("probability"):
+                seconds_of = np.arange(begin, stop)
+                times = seconds_of[self._random.random(len(seconds_of)) < float(flow.get("probability"))]
+            else:
+                if per_hour or period:
+                    gap = 3600.0 / float(per_hour) if per_hour else float(period)
+                else:
+                    gap = ((end if end is not None else stop) - begin) / number
+                times = begin + gap * np.arange(int(np.ceil((stop - begin) / gap - 1e-9)))
+        except (TypeError, ValueError, ZeroDivisionError):
+            raise InputError(
+                f"{where}: expected a number, period, vehsPerHour or probability above 0; correct it") from None
+        times = times[times < stop][:number]
+        tag = "vehicle" if flow.get("route") or flow.find("route") is not None else "trip"
+        kept = {key: value for key, value in flow.attrib.items() if key not in FLOW}
+        singles = []
+        for n, time in enumerate(times):
+            single = Element(tag, kept | {"id": f"{flow.get('id')}.{n}", "depart": f"{time:.2f}"})
+            single.extend(flow)
+            singles.append(single)
+        self._notes["vehicles from flows"] += len(singles)
+        return singles
+
+    def _checked(self, vehicles, background, shared, switched) -> Traffic:
+        """Only what can be driven from its first to its last edge within the simulation."""
+        kept, number = [], self._streets.number
+        begin, end = self._case.begin, np.inf if self._case.end is None else self._case.end
+        for element, path in vehicles:
+            try:
+                depart = seconds(element.get("depart", ""), "")
+            except InputError:
+                background.append(element)
+                self._notes["vehicles without a time of departure, left alone"] += 1
+                continue
+            if not begin <= depart < end:
+                self._notes["vehicles outside the simulated time, left out"] += 1
+                continue
+            edges, driven = self._edges(element, path)
+            if not edges or any(edge not in number for edge in edges):
+                self._notes["vehicles with unknown edges or none, left out"] += 1
+            elif driven and any((number[a], number[b]) not in self._moves
+                                for a, b in zip(edges, edges[1:], strict=False)):
+                self._notes["vehicles on routes with gaps, left out"] += 1
+            else:
+                element.set("depart", f"{depart:.2f}")
+                kept.append((depart, number[edges[0]], number[edges[-1]], driven, element))
+        kept.sort(key=lambda row: row[0])
+        kept = self._reachable(kept)
+        background.sort(key=_begin)
+        if background:
+            self._notes["persons, containers and vehicles left alone, in all"] = len(background)
+        columns = (np.array([row[n] for row in kept], dtype=kind) for n, kind in ((0, float), (1, int), (2, int)))
+        depart, origin, destination = columns
+        return Traffic(
+            vehicles=tuple(row[4] for row in kept), depart=depart, origin=origin, destination=destination,
+            background=tuple(background), shared=tuple(shared), switched=tuple(sorted(set(switched))),
+            notes=dict(self._notes))
+
+    def _edges(self, element: Element, path) -> tuple[list[str], bool]:
+        """(the edges of a vehicle's route, True), or (those that a trip must pass, False)."""
+        nested = element.find("routeDistribution")
+        route = element.find("route") if nested is None else None
+        if nested is not None:
+            return self._likeliest(nested), True
+        if route is not None:
+            route.attrib.pop("id", None)
+            return route.get("edges", "").split(), True
+        if element.get("route"):
+            return self._routes.get(element.get("route"), []), True
+        for key, alike in ENDS.items():
+            if not element.get(key):
+                chosen = self._draw(element, key, alike)
+                for other in alike:
+                    element.attrib.pop(other, None)
+                if chosen is None:
+                    return [], False
+                element.set(key, chosen)
+        return [element.get("from"), *element.get("via", "").split(), element.get("to")], False
+
+    def _draw(self, element: Element, key: str, alike: tuple[str, str]) -> str | None:
+        """An edge of the zone, or at the junction, where a trip begins or ends."""
+        zone, junction = (element.get(name) for name in alike)
+        if zone in self._zones:
+            options = [(edge, weight) for edge, weight in self._zones[zone][key] if edge in self._streets.number]
+        else:
+            place = self._streets.places.get(junction or "", -1)
+            at = self._streets.junctions[:, 0 if key == "from" else 1] == place
+            options = [(self._streets.edges[n], 1.0) for n in np.flatnonzero(at & self._streets.drivable)]
+        weights = np.cumsum([weight for _, weight in options])
+        if not options or weights[-1] <= 0:
+            return None
+        return options[int(np.searchsorted(weights, self._random.random() * weights[-1], side="right"))][0]
+
+    def _reachable(self, kept: list[tuple]) -> list[tuple]:
+        """Without trips whose end cannot be reached from their beginning by any vehicle."""
+        pairs = {row[1:3] for row in kept if not row[3]}
+        apart = {pair for pair, ok in self._streets.connected(pairs).items() if not ok}
+        good = [row for row in kept if row[3] or row[1:3] not in apart]
+        if len(good) < len(kept):
+            self._notes["trips without a way to their end, left out"] += len(kept) - len(good)
+        return good
+
+
+def _silent(element: Element) -> Element:
+    """The element; what a detector or calibrator writes goes nowhere."""
+    for part in element.iter():
+        if part.tag.endswith(("Detector", "Loop", "calibrator")):
+            for key in {"file", "output"} & set(part.keys()):
+                part.set(key, "NUL")
+    return element
+
+
+def _begin(element: Element) -> float:
+    try:
+        return seconds(element.get("depart") or element.get("begin") or "0", "")
+    except InputError:
+        return 0.0
+
+
+def wrapped(elements: Iterable[Element], tag: str) -> Element:
+    """The elements under a common root."""
+    root = Element(tag)
+    root.extend(elements)
+    return root

@@ -1,0 +1,28 @@
+"""The scenario that belongs to a network: `cosim identify networks/mycity` loads the city with it."""
+
+from pathlib import Path
+
+from nmfd import toml
+from nmfd.errors import InputError
+
+
+def scenario_of(target: Path) -> Path:
+    """`target` if it is a scenario's folder; for a network's, the scenario on it in the folder scenarios beside the
+    networks: that of the same name, or the only one. Raises InputError."""
+    if (target / "scenario.toml").exists() or not (target / "network.toml").exists():
+        return target
+    scenarios = target.resolve().parent.parent / "scenarios"
+    found = sorted(file.parent for file in scenarios.glob("*/scenario.toml") if _is_on(file, target))
+    same = [folder for folder in found if folder.name == target.resolve().name]
+    if len(same or found) == 1:
+        return (same or found)[0]
+    names = ", ".join(folder.name for folder in found) or "none"
+    raise InputError(f"{target}: which scenario loads this network? In {scenarios} are on it: {names}; name one")
+
+
+def _is_on(file: Path, network: Path) -> bool:
+    try:
+        name = toml.read(file).text("network", None)
+    except InputError:
+        return False
+    return bool(name) and (file.parent / name).resolve() == network.resolve()

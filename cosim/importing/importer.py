@@ -1,0 +1,265 @@
+"""`cosim import`: from a sumocfg to networks/NAME and scenarios/NAME."""
+
+import csv
+import gzip
+import io
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from cosim.importing import atlas, layers, model, quality
+from cosim.importing.baseline import Baseline, run_baseline
+from cosim.importing.case import Case, read_case, seconds
+from cosim.importing.demand import Traffic, read_traffic, wrapped
+from cosim.importing.generated import morning_peak
+from cosim.importing.partition import partition
+from cosim.importing.regions import positions
+from cosim.importing.streets import Streets, read_streets
+from cosim.regions import City, load_city
+from nmfd.errors import InputError
+from nmfd.network import Network
+
+NET = "city.net.xml.gz"
+FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz", "additional": "city.add.xml.gz"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """What the user asked for.
+
+    method: see partition.METHODS; given: the file of regions of a method that reads one
+    run: simulate the city without control first
+    level: of a generated morning peak, instead of route files
+    begin, end [s]: instead of the sumocfg's
+    """
+
+    source: Path
+    regions: int | None
+    out: Path
+    scenario: Path
+    method: str
+    given: Path | None = None
+    seed: int = 0
+    run: bool = True
+    level: float | None = None
+    force: bool = False
+    begin: float | None = None
+    end: float | None = None
+
+
+def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) -> str:
+    """Write the network and the scenario; returns what was found, for the terminal. Raises InputError, before anything
+    is written. tell: called with what is going on."""
+    _check_free(order)
+    tell("reading")
+    case = _windowed(read_case(order.source), order)
+    streets = read_streets(case.net, case.additional)
+    traffic = _traffic(case, streets, order)
+    clock = model.clock(case, streets, traffic)
+    with _folders(order) as (net_folder, folder):
+        files = _write_traffic(folder, traffic)
+        baseline = None
+        if order.run:
+            tell("simulating without control")
+            baseline = _baseline(streets, case, clock, folder, files)
+        left = left_alone(streets, traffic)
+        tell("partition")
+        regions, asked = partition(
+            streets, baseline, regions=order.regions, method=order.method, given=order.given, seed=order.seed,
+            left_alone=left)
+        name = order.out.name
+        network = model.network_of(streets, regions, name, baseline)
+        _write_net(case.net, net_folder / NET)
+        _write_csv(net_folder / "regions.csv", ("edge", "region"), zip(streets.edges, regions, strict=True))
+        city = load_city(net_folder / NET, net_folder / "regions.csv", network.regions)
+        found = quality.tables(streets, regions, network.region_names, city, baseline, left)
+        tell("writing")
+        _write_network(net_folder, streets, regions, network, found, baseline, order)
+        demand = model.region_demand(traffic, regions, clock)
+        _write_demand(folder / "demand.csv", demand)
+        (folder / "scenario.toml").write_text(model.scenario_text(
+            network, clock, case, name=order.scenario.name, files=files, leave=traffic.switched,
+            network_path=os.path.relpath(order.out, order.scenario).replace(os.sep, "/"),
+            protected=_protected(streets, regions, baseline, network)))
+        report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
+        (net_folder / "import.txt").write_text(report + "\n")
+    return report
+
+
+def _traffic(case: Case, streets: Streets, order: Order) -> Traffic:
+    """The city's own vehicles, or a generated demand beside what else its files hold."""
+    traffic = read_traffic(case, streets, order.seed)
+    if order.level is None:
+        if not len(traffic.depart):
+            raise InputError(
+                f"{order.source}: names no vehicles for the streets of cars{_notes(traffic)}; give a sumocfg with "
+                "route-files, or add --demand peak")
+        return traffic
+    if len(traffic.depart):
+        raise InputError(
+            f"--demand: {order.source} has {len(traffic.depart):,} vehicles of its own; leave --demand away, or give "
+            "the network alone")
+    peak = morning_peak(streets, level=order.level, begin=case.begin, seed=order.seed)
+    return replace(
+        peak, background=traffic.background, shared=traffic.shared + peak.shared, switched=traffic.switched,
+        notes={**traffic.notes, **peak.notes})
+
+
+def left_alone(streets: Streets, traffic: Traffic) -> dict[str, str]:
+    """Signal -> why perimeter control leaves it alone: only fixed-time programmes that always run are changed."""
+    found = {
+        signal: f"{logics[-1].kind} signal" for signal, logics in streets.logics.items()
+        if logics[-1].kind != "static"}
+    found |= {signal: "programme follows a timetable" for signal in traffic.switched}
+    return found
+
+
+def _check_free(order: Order) -> None:
+    for folder, file, option in ((order.out, "network.toml", "--out"), (order.scenario, "scenario.toml", "--scenario")):
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{option}: {folder}: is not a folder; choose another name")
+        if (folder / file).exists() and not order.force:
+            raise InputError(f"{option}: {folder / file} exists; choose another folder, or --force to replace it")
+
+
+def _windowed(case: Case, order: Order) -> Case:
+    """The case from --begin to --end, where these are given."""
+    begin = case.begin if order.begin is None else order.begin
+    end = case.end if order.end is None else order.end
+    if end is not None and end <= begin:
+        raise InputError(f"--end: expected a time after the beginning at {begin:g} s, got {end:g} instead")
+    return replace(case, begin=begin, end=end)
+
+
+@contextmanager
+def _folders(order: Order):
+    """Temporary folders for network and scenario, which take their places together at the end."""
+    made: list[tuple[Path, Path]] = []
+    try:
+        for folder in (order.out, order.scenario):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            made.append((Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent)), folder))
+        yield tuple(temporary for temporary, _ in made)
+        for temporary, folder in made:
+            temporary.chmod(0o755)
+            folder.mkdir(exist_ok=True)
+            for file in sorted(temporary.iterdir()):
+                os.replace(file, folder / file.name)
+    finally:
+        for temporary, _ in made:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _baseline(streets: Streets, case: Case, clock: model.Clock, folder: Path, files: Mapping) -> Baseline:
+    options = ["--step-length", case.options.get("step-length", "1"),
+               "--time-to-teleport", case.options.get("time-to-teleport", "300")]
+    return run_baseline(
+        streets, routes=[folder / name for key in ("routes", "background") for name in files[key]],
+        additional=[folder / name for name in files["additional"]], begin=clock.begin, end=clock.end, options=options)
+
+
+def _protected(streets: Streets, regions: np.ndarray, baseline: Baseline | None, network: Network) -> int:
+    """The densest region; without a run, the one nearest to the middle."""
+    if baseline is not None:
+        load = np.bincount(regions, baseline.density(streets) * streets.lane_metres, network.regions)
+        return int(np.argmax(load / np.bincount(regions, streets.lane_metres, network.regions)))
+    middle = np.average(streets.centre, axis=0, weights=streets.lane_metres)
+    return int(((positions(streets, regions) - middle) ** 2).sum(axis=1).argmin())
+
+
+def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
+    """The vehicles, what is left alone and what both refer to; returns the file names by key of [sumo]."""
+    contents = {"routes": (traffic.vehicles, "routes"), "background": (traffic.background, "routes"),
+                "additional": (traffic.shared, "additional")}
+    files: dict[str, list[str]] = {}
+    for key, (elements, tag) in contents.items():
+        files[key] = [FILES[key]] if len(elements) else []
+        if len(elements):
+            root = wrapped(elements, tag)
+            ElementTree.indent(root)
+            _zip(folder / FILES[key], ElementTree.tostring(root))
+    return files
+
+
+def _write_net(net: Path, target: Path) -> None:
+    """A gzipped copy."""
+    _zip(target, gzip.decompress(net.read_bytes()) if net.suffix == ".gz" else net.read_bytes())
+
+
+def _zip(path: Path, content: bytes) -> None:
+    """Without a date, so that the same content gives the same bytes."""
+    with path.open("wb") as stream, gzip.GzipFile(fileobj=stream, mode="wb", filename="", mtime=0) as packed:
+        packed.write(content)
+
+
+def _write_csv(path: Path, header: Sequence[str], rows) -> None:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    path.write_text(out.getvalue(), encoding="utf-8")
+
+
+def _write_demand(path: Path, demand: np.ndarray) -> None:
+    _write_csv(path, ("interval", "from", "to", "veh_s"), (
+        (k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)))
+
+
+def _write_network(folder: Path, streets: Streets, regions: np.ndarray, network: Network, found: quality.Tables,
+                   baseline: Baseline | None, order: Order) -> None:
+    (folder / "network.toml").write_text(model.network_text(
+        network, {"net": NET, "regions": "regions.csv"}, order.source.name))
+    for name, columns, rows in (("quality.csv", quality.QUALITY, found.quality),
+                                ("gateways.csv", quality.GATEWAYS, found.gateways)):
+        _write_csv(folder / name, columns, ([row[column] for column in columns] for row in rows))
+    names = network.region_names
+    (folder / "regions.taz.xml").write_text(layers.taz_xml(streets, regions, names))
+    (folder / "regions.poly.xml").write_text(layers.polygons_xml(streets, regions, names))
+    density = None if baseline is None else 1000.0 * baseline.density(streets)
+    atlas.draw_map(folder / "map.png", streets, regions, names, network.positions, found, density)
+
+
+def _notes(traffic: Traffic) -> str:
+    return "".join(f"; {note}: {count:,}" for note, count in sorted(traffic.notes.items()))
+
+
+def _report(order: Order, case: Case, streets: Streets, traffic: Traffic, clock: model.Clock, network: Network,
+            asked: int, city: City, found: quality.Tables, left: Mapping[str, str], baseline: Baseline | None) -> str:
+    """What was found, what was left alone and what cannot be done, in a few lines."""
+    usable, part = streets.drivable.sum(), streets.main_part.sum()
+    signals = set(city.signals.values())
+    lines = [
+        f"{case.source.name}: {len(streets.edges):,} edges, {usable:,} for cars"
+        + (f" ({usable - part:,} of them cut off from the rest)" if part < usable else "")
+        + (", left-hand traffic" if streets.left_hand else "")
+        + f"; {len(signals):,} signals that cars see; {len(traffic.vehicles):,} vehicles in {clock.steps} intervals of "
+        f"{clock.step:g} s{_notes(traffic)}",
+        f"{network.regions} regions by method {order.method}, seed {order.seed}"
+        + (f"; {asked} were asked for: the others fell apart, or could not be reached from the rest"
+           if network.regions < asked else ""),
+        quality.text(found)]
+    at_gateways = {g["signal"] for g in found.gateways if g["signal"]}
+    skipped = sorted(signal for signal in left if signal in at_gateways)
+    if skipped:
+        lines.append(f"left alone at boundaries: {len(skipped)} of {len(at_gateways)} signals, such as {skipped[0]} "
+                     f"({left[skipped[0]]}); see gateways.csv")
+    if several := sum(len(logics) > 1 for logics in streets.logics.values()):
+        lines.append(f"{several} signals have several programmes: the last that is loaded runs, as in SUMO")
+    if not any(g["control"] == "controlled" for g in found.gateways):
+        lines.append("no gateway has a signal that perimeter control can use: only route guidance can do anything here")
+    if baseline is not None and (baseline.teleports or baseline.waiting):
+        lines.append(f"without control: {baseline.teleports} teleports, {baseline.running} vehicles on the road and "
+                     f"{baseline.waiting} waiting to enter at the end")
+    return "\n".join(lines)
+
+
+def parse_time(text: str | None, option: str) -> float | None:
+    """A time of the command line, in seconds or as hours:minutes:seconds."""
+    return None if text is None else seconds(text, option)

@@ -1,0 +1,128 @@
+"""The regional model and the scenario of an imported city, as text for network.toml and scenario.toml."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cosim.identify import network_toml, own_splits
+from cosim.importing.baseline import Baseline
+from cosim.importing.case import Case, seconds
+from cosim.importing.demand import Traffic
+from cosim.importing.regions import digraph, names, positions
+from cosim.importing.streets import Streets
+from nmfd.mfd import Mfd
+from nmfd.network import Network
+
+# The shape of the published MFD, g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam, for want of anything measured.
+ALPHA, BETA = 0.98405, -1.97190
+JAM_SPACING = 7.5      # m of lane per standing vehicle
+JAM_SHARE = 0.6        # of the lanes that can fill up
+SIGNAL_DELAY = 0.5     # speed with signals over the speed limit
+DEFAULT_CYCLE = 90.0   # s
+CYCLES = (60.0, 180.0)  # s; shorter cycles are taken several times
+RECOVERY = 1800.0      # s after the last departure, for the network to empty
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clock:
+    """begin [s] of SUMO's time; step: control interval [s]; steps: their number."""
+
+    begin: float
+    step: float
+    steps: int
+
+    @property
+    def end(self) -> float:
+        return self.begin + self.steps * self.step
+
+
+def clock(case: Case, streets: Streets, traffic: Traffic) -> Clock:
+    """Control intervals of the most common signal cycle, until RECOVERY after the last departure."""
+    running = [found[-1] for found in streets.logics.values() if found[-1].cycle > 0]
+    cycles = Counter(round(logic.cycle) for logic in running if logic.kind == "static")
+    cycle = float(max(sorted(cycles), key=cycles.get)) if cycles else DEFAULT_CYCLE
+    step = cycle * np.ceil(CYCLES[0] / cycle)
+    if step > CYCLES[1]:
+        step = DEFAULT_CYCLE
+    last = traffic.depart[-1] if len(traffic.depart) else case.begin
+    return Clock(begin=case.begin, step=float(step), steps=int(np.ceil((last - case.begin + RECOVERY) / step)))
+
+
+def region_demand(traffic: Traffic, regions: np.ndarray, clock: Clock) -> np.ndarray:
+    """(T, R, R) [veh/s]: departures by interval and pair of regions."""
+    count = int(regions.max()) + 1
+    demand = np.zeros((clock.steps, count, count))
+    k = np.minimum(((traffic.depart - clock.begin) / clock.step).astype(int), clock.steps - 1)
+    np.add.at(demand, (k, regions[traffic.origin], regions[traffic.destination]), 1.0 / clock.step)
+    return demand
+
+
+def network_of(streets: Streets, regions: np.ndarray, name: str, baseline: Baseline | None) -> Network:
+    """The regional model: adjacency from the streets, own splits from the baseline, MFDs from lanes and speeds."""
+    network = Network(
+        name=name, region_names=names(streets, regions), positions=positions(streets, regions).round(1),
+        adjacency=digraph(streets, regions) > 0, mfds=_placeholders(streets, regions, baseline), u_min=0.1, u_max=0.9)
+    if baseline is None:
+        return network
+    return replace(network, own_splits=own_splits(network, [{"crossings": baseline.crossings(regions)[None]}]))
+
+
+def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline | None) -> tuple[Mfd, ...]:
+    """Free-flow rate: speed limit, halved by signals, over the metres that a visit takes; jam: how many fit in."""
+    count = int(regions.max()) + 1
+    lanes = np.bincount(regions, streets.lane_metres, count)
+    speed = np.bincount(regions, streets.lane_metres * streets.speed, count) / np.maximum(lanes, 1.0)
+    across = np.array([np.sqrt(np.ptp(streets.centre[regions == r], axis=0).prod()) for r in range(count)])
+    visit = 0.7 * np.maximum(across, 100.0)
+    if baseline is not None:
+        measured = baseline.metres_per_visit(streets, regions)
+        visit = np.where(np.isnan(measured), visit, np.maximum(measured, 50.0))
+    found = []
+    for region in range(count):
+        rate, jam = SIGNAL_DELAY * speed[region] / visit[region], max(JAM_SHARE * lanes[region] / JAM_SPACING, 10.0)
+        found.append(Mfd(a=rate * ALPHA / jam**2, b=rate * BETA / jam, c=rate, jam=jam))
+    return tuple(found)
+
+
+def network_text(network: Network, sumo: Mapping[str, str], source: str) -> str:
+    return network_toml(
+        network, sumo,
+        f"Imported from {source}. The MFDs are PLACEHOLDERS from lane length and speed limits:\n"
+        "# cosim identify replaces them by measured ones.")
+
+
+def scenario_text(
+    network: Network, clock: Clock, case: Case, *, name: str, network_path: str, protected: int, files: Mapping,
+    leave: Sequence[str],
+) -> str:
+    """scenario.toml; files: routes, background, additional -> file names beside it."""
+    fastest = max(mfd.c for mfd in network.mfds)
+    substeps = int(np.ceil(clock.step / min(30.0, 0.5 / fastest)))
+    teleport = case.options.get("time-to-teleport", "300")
+    lines = [
+        f"# Imported from {case.source.name}: its own vehicles, with their routes, departures and types.",
+        f'name = "{name}"', f'network = "{network_path}"',
+        f"step = {clock.step:.1f}                 # s, control interval = most common signal cycle",
+        f"steps = {clock.steps}", f"substeps = {substeps}",
+        f"protected = [{protected}]             # the densest region; {network.region_names[protected]}",
+        'demand_file = "demand.csv"  # veh/s by interval and pair of regions, counted from the vehicles', "",
+        "[forecast]", "error = 0.0                 # of what controllers are told of the demand, std of its logarithm",
+        "", "[sumo]", f"begin = {clock.begin:.1f}", f"step_length = {_step_length(case, clock):g}",
+        f"time_to_teleport = {seconds(teleport, 'time-to-teleport'):g}      # s; every table counts the teleports",
+        "departure_jitter = 10.0     # s, either way: what seeds differ in, beside SUMO's own randomness",
+        *(f"{key} = [{', '.join(_quoted(value) for value in values)}]" for key, values in files.items() if values)]
+    if leave:
+        lines.append(f"leave_signals = [{', '.join(_quoted(signal) for signal in leave)}]")
+    return "\n".join(lines) + "\n"
+
+
+def _step_length(case: Case, clock: Clock) -> float:
+    """The city's own step where the control interval is a multiple of it, else 1 s."""
+    own = seconds(case.options.get("step-length", "1"), f"{case.source}: step-length")
+    return own if 0.0 < own <= 1.0 and abs(clock.step / own - round(clock.step / own)) < 1e-9 else 1.0
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -1,0 +1,117 @@
+"""How good a partition is, region by region, and what perimeter control can reach of its boundaries."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from cosim.importing.baseline import Baseline
+from cosim.importing.streets import Streets, graph
+from cosim.regions import City
+
+QUALITY = (
+    "region", "name", "edges", "lane_km", "signals", "pieces", "mean_density_veh_km", "variance_before",
+    "variance_within", "gateways", "controlled_gateways", "boundary_flow_veh", "uncontrolled_share")
+GATEWAYS = (
+    "source", "target", "from_edge", "to_edge", "lanes", "shared_lanes", "signal", "links", "signal_serves", "control",
+    "flow_veh")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tables:
+    """quality: a row of QUALITY per region and one for "all"; gateways: a row of GATEWAYS per boundary crossing."""
+
+    quality: Sequence[Mapping]
+    gateways: Sequence[Mapping]
+
+    @property
+    def uncontrolled(self) -> float:
+        """Share of the boundary flow that no controlled signal sees; NaN without flow."""
+        return self.quality[-1]["uncontrolled_share"]
+
+
+def tables(
+    streets: Streets, regions: np.ndarray, names: Sequence[str], city: City, baseline: Baseline | None,
+    left_alone: Mapping[str, str],
+) -> Tables:
+    """left_alone: signal -> why perimeter control does not touch it."""
+    moves = Counter() if baseline is None else baseline.moves()
+    pairs: dict[str, set[tuple[int, int]]] = {}
+    for gateway in city.gateways:
+        if gateway.signal is not None:
+            pairs.setdefault(gateway.signal, set()).add((gateway.source, gateway.target))
+    gateways = [{
+        "source": g.source, "target": g.target, "from_edge": g.from_edge, "to_edge": g.to_edge,
+        "lanes": " ".join(map(str, g.lanes)), "shared_lanes": " ".join(map(str, g.shared)), "signal": g.signal or "",
+        "links": " ".join(map(str, g.links)),
+        "signal_serves": " ".join(f"{i}-{h}" for i, h in sorted(pairs.get(g.signal, ()))),
+        "control": "no signal" if g.signal is None else left_alone.get(g.signal, "controlled"),
+        "flow_veh": moves[streets.number[g.from_edge], streets.number[g.to_edge]]} for g in city.gateways]
+    density = np.zeros(len(regions)) if baseline is None else 1000.0 * baseline.density(streets)
+    everywhere = _variance(density, streets, streets.drivable)[1]
+    signals = _signals(streets, regions, city)
+    rows = [
+        _row(streets, regions == region, str(region), name, signals[region], density, everywhere,
+             [g for g in gateways if region in (g["source"], g["target"])]) for region, name in enumerate(names)]
+    total = _row(streets, regions >= 0, "all", "all regions", signals.sum(), density, everywhere, gateways)
+    weight = np.array([row["lane_km"] for row in rows])
+    total["variance_within"] = round(float(np.average([row["variance_within"] for row in rows], weights=weight)), 2)
+    total["pieces"] = sum(row["pieces"] for row in rows)
+    return Tables(quality=[*rows, total], gateways=gateways)
+
+
+def _row(streets: Streets, members: np.ndarray, region: str, name: str, signals: int, density: np.ndarray,
+         everywhere: float, gateways: Sequence[Mapping]) -> dict:
+    usable = members & streets.drivable
+    mean, variance = _variance(density, streets, usable)
+    flow = sum(g["flow_veh"] for g in gateways)
+    free = sum(g["flow_veh"] for g in gateways if g["control"] != "controlled")
+    return dict(zip(QUALITY, (
+        region, name, int(usable.sum()), round(float(streets.lane_metres[usable].sum()) / 1000.0, 2), int(signals),
+        pieces(streets, usable & streets.main_part), round(mean, 2), round(everywhere, 2), round(variance, 2),
+        len(gateways), sum(g["control"] == "controlled" for g in gateways), flow,
+        round(free / flow, 3) if flow else float("nan")), strict=True))
+
+
+def _variance(density: np.ndarray, streets: Streets, members: np.ndarray) -> tuple[float, float]:
+    """Mean and variance of the density over the lanes of some edges."""
+    weight = streets.lane_metres[members]
+    mean = float(np.average(density[members], weights=weight))
+    return mean, float(np.average((density[members] - mean) ** 2, weights=weight))
+
+
+def pieces(streets: Streets, members: np.ndarray) -> int:
+    """The parts into which some edges fall by the connections between them; 1 is connected."""
+    numbers = np.cumsum(members) - 1
+    links = streets.links[members[streets.links].all(axis=1)]
+    return int(connected_components(graph(numbers[links], int(members.sum())), directed=False)[0])
+
+
+def _signals(streets: Streets, regions: np.ndarray, city: City) -> np.ndarray:
+    """(R,): every signal that cars see counts for the region in which most of its approaches lie."""
+    votes: dict[str, Counter[int]] = {}
+    for edge, signal in city.signals.items():
+        votes.setdefault(signal, Counter())[int(regions[streets.number[edge]])] += 1
+    count = np.zeros(int(regions.max()) + 1, dtype=int)
+    for found in votes.values():
+        count[max(sorted(found), key=found.get)] += 1
+    return count
+
+
+def text(tables: Tables) -> str:
+    """The quality table for the terminal."""
+    head = (
+        "region", "lane-km", "signals", "density", "var. before", "within", "gateways", "controlled", "uncontrolled")
+    lines = [f"{head[0]:<18}" + "".join(f"{column:>13}" for column in head[1:])]
+    for row in tables.quality:
+        share = "-" if np.isnan(row["uncontrolled_share"]) else f"{100 * row['uncontrolled_share']:.0f} %"
+        cells = (row["lane_km"], row["signals"], row["mean_density_veh_km"], row["variance_before"],
+                 row["variance_within"], row["gateways"], row["controlled_gateways"], share)
+        title = row["name"] if row["region"] == "all" else f"{row['region']} {row['name']}"
+        lines.append(f"{title:<18}" + "".join(f"{cell:>13}" for cell in cells))
+    lines.append(
+        "density: vehicles per lane-km in the busiest quarter of an hour without control; its variance over lanes;\n"
+        "uncontrolled: share of the flow over the region's boundary that no controlled signal sees")
+    return "\n".join(lines)

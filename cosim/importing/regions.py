@@ -1,0 +1,140 @@
+"""From labels to regions that can be used: connected, reachable from each other, every edge in one, in order."""
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from cosim.importing.streets import Streets, graph
+
+DIRECTIONS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
+
+
+def finish(streets: Streets, labels: np.ndarray, *, renumber: bool = True) -> np.ndarray:
+    """(E,) region of every edge, from `labels` (E,) of the edges for cars, -1 where none is known yet.
+
+    Every region is made connected by the connections between its edges, and all regions can be reached from each
+    other: pieces and regions that fail go to a neighbour, so that fewer regions may be left than were asked for.
+    Numbered from north to south, or with renumber = False in the order of the labels. Edges closed to cars, and parts
+    of the network that nothing joins to the rest, belong to a region that they adjoin, or to the nearest.
+    """
+    regions = labels.copy()
+    regions[~streets.drivable] = -1
+    regions = _spread(streets, regions, streets.links, streets.drivable)
+    while True:
+        regions = connect(streets, regions)
+        if (victim := _not_reachable(streets, regions)) is None:
+            break
+        regions = _merged(streets, regions, victim)
+    everywhere = np.ones(len(streets.edges), dtype=bool)
+    regions = _spread(streets, regions, streets.all_links, everywhere)
+    return _numbered(streets, regions) if renumber else np.unique(regions, return_inverse=True)[1]
+
+
+def connect(streets: Streets, regions: np.ndarray) -> np.ndarray:
+    """Leave of every region in the main part its largest connected piece; the others go to the neighbour that most
+    connections join them to. Edges outside the main part (`regions` anything) stay as they are."""
+    regions, inside = regions.copy(), streets.main_part
+    links = streets.links[inside[streets.links].all(axis=1)]
+    for _ in range(len(regions)):
+        kept = links[regions[links[:, 0]] == regions[links[:, 1]]]
+        _, piece = connected_components(graph(kept, len(regions)), directed=False)
+        weight = np.bincount(piece, streets.lane_metres)
+        loose = np.zeros(len(regions), dtype=bool)
+        for region in np.unique(regions[inside]):
+            members = np.flatnonzero(inside & (regions == region))
+            pieces = np.unique(piece[members])
+            largest = pieces[np.argmax(weight[pieces])]
+            loose[members] = piece[members] != largest
+        if not loose.any():
+            return regions
+        # A piece may adjoin loose pieces only: then it waits for the next round.
+        votes: dict[int, dict[int, int]] = {}
+        for a, b in np.concatenate([links, links[:, ::-1]]):
+            if loose[a] and not loose[b]:
+                votes.setdefault(piece[a], {}).setdefault(int(regions[b]), 0)
+                votes[piece[a]][int(regions[b])] += 1
+        for number, found in votes.items():
+            regions[loose & (piece == number)] = max(sorted(found), key=found.get)
+    return regions
+
+
+def digraph(streets: Streets, regions: np.ndarray) -> np.ndarray:
+    """(R, R) int: the connections from an edge of region i to one of region h, i != h."""
+    count = int(regions[streets.drivable].max()) + 1
+    crossing = np.zeros((count, count), dtype=int)
+    pairs = regions[streets.links]
+    np.add.at(crossing, (pairs[:, 0], pairs[:, 1]), 1)
+    np.fill_diagonal(crossing, 0)
+    return crossing
+
+
+def _not_reachable(streets: Streets, regions: np.ndarray) -> int | None:
+    """A region that the largest set of regions, which can all be reached from each other, leaves out."""
+    inside = streets.main_part
+    used, numbers = np.unique(regions[inside], return_inverse=True)
+    if len(used) == 1:
+        return None
+    compact = np.zeros(len(regions), dtype=int)
+    compact[inside] = numbers
+    links = streets.links[inside[streets.links].all(axis=1)]
+    _, part = connected_components(
+        graph(np.unique(compact[links], axis=0), len(used)), directed=True, connection="strong")
+    size = np.bincount(numbers, streets.lane_metres[inside])
+    total = np.bincount(part, size)
+    outside = np.flatnonzero(part != np.argmax(total))
+    return None if not len(outside) else int(used[outside[np.argmin(size[outside])]])
+
+
+def _merged(streets: Streets, regions: np.ndarray, victim: int) -> np.ndarray:
+    """`victim` joined to the neighbour with which it has the most connections."""
+    pairs = regions[streets.links]
+    beyond = np.concatenate([pairs[pairs[:, 0] == victim, 1], pairs[pairs[:, 1] == victim, 0]])
+    numbers, count = np.unique(beyond[(beyond != victim) & (beyond >= 0)], return_counts=True)
+    return np.where(regions == victim, numbers[np.argmax(count)], regions)
+
+
+def _spread(streets: Streets, regions: np.ndarray, links: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Give the `wanted` edges without a region that of an edge that a link joins them to, else of the nearest."""
+    regions, both = regions.copy(), np.concatenate([links, links[:, ::-1]])
+    while True:
+        reach = both[wanted[both[:, 0]] & (regions[both[:, 0]] < 0) & (regions[both[:, 1]] >= 0)]
+        if not len(reach):
+            break
+        edges, first = np.unique(reach[:, 0], return_index=True)
+        regions[edges] = regions[reach[first, 1]]
+    missing, known = np.flatnonzero(wanted & (regions < 0)), np.flatnonzero(regions >= 0)
+    if len(missing):
+        regions[missing] = regions[known[cKDTree(streets.centre[known]).query(streets.centre[missing])[1]]]
+    return regions
+
+
+def _numbered(streets: Streets, regions: np.ndarray) -> np.ndarray:
+    """The same regions as 0, 1, ... from north to south, and from west to east where that is a tie."""
+    used = np.unique(regions)
+    middle = {region: _gravity(streets, regions == region) for region in used}
+    order = sorted(used, key=lambda region: (-round(middle[region][1], 1), middle[region][0]))
+    place = {region: n for n, region in enumerate(order)}
+    return np.array([place[region] for region in regions])
+
+
+def positions(streets: Streets, regions: np.ndarray) -> np.ndarray:
+    """(R, 2) [m]: where each region's lanes are on average."""
+    return np.array([_gravity(streets, regions == region) for region in range(regions.max() + 1)])
+
+
+def _gravity(streets: Streets, members: np.ndarray) -> np.ndarray:
+    weight = streets.lane_metres[members] + 1e-6
+    return np.average(streets.centre[members], axis=0, weights=weight)
+
+
+def names(streets: Streets, regions: np.ndarray) -> tuple[str, ...]:
+    """A name for each region by its place: centre, north, south-west 2, ..."""
+    places, middle = positions(streets, regions), _gravity(streets, regions >= 0)
+    radius = np.sqrt((((streets.centre - middle) ** 2).sum(axis=1) * streets.lane_metres).sum() / (
+        streets.lane_metres.sum()))
+    found: list[str] = []
+    for x, y in places - middle:
+        central = np.hypot(x, y) < 0.35 * radius
+        found.append("centre" if central else DIRECTIONS[round(np.arctan2(y, x) / (np.pi / 4)) % 8])
+    return tuple(
+        name if found.count(name) == 1 else f"{name} {found[:n + 1].count(name)}" for n, name in enumerate(found))

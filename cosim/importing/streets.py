@@ -1,0 +1,199 @@
+"""The road graph of a SUMO network as arrays, with shapes and signal programmes: what an import needs to know of it."""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from cosim.importing.case import opened, read_xml, seconds
+from cosim.regions import for_cars
+from nmfd.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Logic:
+    """A signal programme. kind: SUMO's type, "static" or "actuated" and so on; cycle [s]; links: their number."""
+
+    signal: str
+    programme: str
+    kind: str
+    cycle: float
+    links: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Streets:
+    """E normal edges, sorted by id; those that cars may not use too.
+
+    drivable: (E,) bool, at least one lane for cars
+    length [m], lanes (those for cars), speed [m/s]: (E,)
+    shapes: E arrays (n, 2) [m]; centre: (E, 2) [m], half way along
+    junctions: (E, 2), numbers of the junctions where the edge begins and ends; places: junction -> its number
+    links: (L, 2) edges that a connection joins, both drivable, by lanes for cars; all_links: for any vehicle
+    link_signals: L signals, of each of the links, None without one
+    roundabouts: lists of edges
+    logics: signal -> its programmes, the one that runs last
+    left_hand: the traffic keeps left
+    """
+
+    path: Path
+    edges: tuple[str, ...]
+    drivable: np.ndarray
+    length: np.ndarray
+    lanes: np.ndarray
+    speed: np.ndarray
+    shapes: tuple[np.ndarray, ...]
+    centre: np.ndarray
+    junctions: np.ndarray
+    places: Mapping[str, int]
+    links: np.ndarray
+    all_links: np.ndarray
+    link_signals: tuple[str | None, ...]
+    roundabouts: tuple[tuple[int, ...], ...]
+    logics: Mapping[str, tuple[Logic, ...]]
+    left_hand: bool
+
+    @cached_property
+    def number(self) -> dict[str, int]:
+        """Edge -> its place in `edges`."""
+        return {edge: n for n, edge in enumerate(self.edges)}
+
+    @property
+    def lane_metres(self) -> np.ndarray:
+        """(E,) [m]: length times lanes for cars."""
+        return self.length * self.lanes
+
+    @cached_property
+    def main_part(self) -> np.ndarray:
+        """(E,) bool: the drivable edges of the part, connected somehow, with the most lane metres."""
+        return self._largest("weak")
+
+    @cached_property
+    def core(self) -> np.ndarray:
+        """(E,) bool: the largest set of edges of which each can be reached from each."""
+        return self._largest("strong")
+
+    def connected(self, pairs: Iterable[tuple[int, int]]) -> dict[tuple[int, int], bool]:
+        """Whether a way leads from the first edge of each pair to its second, for a vehicle that may use every lane."""
+        onward = graph(self.all_links, len(self.edges))
+        wanted: dict[int, list[int]] = {}
+        for first, last in sorted(set(pairs)):
+            wanted.setdefault(first, []).append(last)
+        found = {}
+        for first, ends in wanted.items():
+            reached = np.zeros(len(self.edges), dtype=bool)
+            reached[breadth_first_order(onward, first, return_predecessors=False)] = True
+            found |= {(first, last): bool(reached[last]) for last in ends}
+        return found
+
+    def _largest(self, kind: str) -> np.ndarray:
+        count, part = connected_components(graph(self.links, len(self.edges)), directed=True, connection=kind)
+        weight = np.bincount(part, self.lane_metres * self.drivable, count)
+        return (part == np.argmax(weight)) & self.drivable
+
+
+def graph(pairs: np.ndarray, size: int) -> csr_array:
+    """(size, size) with a one for every pair (n, 2)."""
+    return csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
+
+
+def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
+    """Read a net.xml(.gz), and the signal programmes of additional files, which replace those of the network.
+
+    Raises InputError for a file that is no network, or one without any edge for cars.
+    """
+    rows: dict[str, tuple] = {}
+    junctions: dict[str, tuple[float, float]] = {}
+    links: list[tuple] = []
+    roundabouts: list[list[str]] = []
+    logics: dict[str, list[Logic]] = {}
+    left_hand = False
+    try:
+        with opened(net) as stream:
+            depth, root = 0, None
+            for event, element in ElementTree.iterparse(stream, events=("start", "end")):
+                if event == "start":
+                    depth += 1
+                    if root is None:
+                        root = element
+                        if element.tag != "net":
+                            raise InputError(f"{net}: expected a SUMO network, got a file of <{element.tag}> instead")
+                        left_hand = element.get("lefthand") == "true"
+                    continue
+                depth -= 1
+                if depth != 1:
+                    continue
+                if element.tag == "edge" and element.get("function", "normal") in ("normal", "connector"):
+                    rows[element.get("id")] = _edge(element)
+                elif element.tag == "connection" and not element.get("from").startswith(":"):
+                    links.append((element.get("from"), element.get("to"), int(element.get("fromLane")),
+                                  int(element.get("toLane")), element.get("tl")))
+                elif element.tag == "junction" and element.get("type") != "internal":
+                    junctions[element.get("id")] = float(element.get("x")), float(element.get("y"))
+                elif element.tag == "roundabout":
+                    roundabouts.append(element.get("edges", "").split())
+                elif element.tag == "tlLogic":
+                    logics.setdefault(element.get("id"), []).append(_logic(element, net))
+                element.clear()
+                root.clear()
+    except (OSError, EOFError, ElementTree.ParseError, AttributeError, TypeError, ValueError) as error:
+        raise InputError(f"{net}: is not a SUMO network ({error}); build it with netconvert") from None
+    for path in additional:
+        for element in read_xml(path).iter("tlLogic"):
+            logics.setdefault(element.get("id"), []).append(_logic(element, path))
+    if not any(row[0] for row in rows.values()):
+        raise InputError(f"{net}: has no edge that cars may use; give a road network")
+    return _streets(net, rows, junctions, links, roundabouts, logics, left_hand)
+
+
+def _edge(element: ElementTree.Element) -> tuple:
+    """(car lanes, length, speed, shape, from, to)"""
+    lanes = list(element.iter("lane"))
+    cars = {int(lane.get("index")): lane for lane in lanes if for_cars(lane)}
+    lane = next(iter(cars.values()), lanes[0])
+    shape = element.get("shape") or lanes[len(lanes) // 2].get("shape")
+    points = np.array([[float(x) for x in point.split(",")[:2]] for point in shape.split()])
+    speed = max(float(lane.get("speed")) for lane in cars.values() or lanes)
+    return frozenset(cars), float(lane.get("length")), speed, points, element.get("from"), element.get("to")
+
+
+def _logic(element: ElementTree.Element, path: Path) -> Logic:
+    phases = list(element.iter("phase"))
+    where = f"{path}: tlLogic {element.get('id')}: phase duration"
+    return Logic(
+        signal=element.get("id"), programme=element.get("programID", "0"), kind=element.get("type", "static"),
+        cycle=sum(seconds(phase.get("duration", "0"), where) for phase in phases),
+        links=max((len(phase.get("state", "")) for phase in phases), default=0))
+
+
+def _streets(net, rows, junctions, links, roundabouts, logics, left_hand) -> Streets:
+    edges = tuple(sorted(rows))
+    number = {edge: n for n, edge in enumerate(edges)}
+    places: dict[str, int] = {}
+    ends = np.array([[places.setdefault(name, len(places)) for name in rows[edge][4:6]] for edge in edges])
+    known = [link for link in links if link[0] in number and link[1] in number]
+    every = sorted({(number[a], number[b]) for a, b, *_ in known})
+    signal_of = {(number[a], number[b]): tl for a, b, m, n, tl in known if m in rows[a][0] and n in rows[b][0]}
+    cars = sorted(signal_of)
+    shapes = tuple(rows[edge][3] for edge in edges)
+    return Streets(
+        path=net, edges=edges, drivable=np.array([bool(rows[edge][0]) for edge in edges]),
+        length=np.array([rows[edge][1] for edge in edges]), lanes=np.array([len(rows[edge][0]) for edge in edges]),
+        speed=np.array([rows[edge][2] for edge in edges]), shapes=shapes,
+        centre=np.array([_middle(shape) for shape in shapes]), junctions=ends, places=places,
+        links=np.array(cars, dtype=int).reshape(-1, 2), all_links=np.array(every, dtype=int).reshape(-1, 2),
+        link_signals=tuple(signal_of[pair] for pair in cars),
+        roundabouts=tuple(tuple(number[e] for e in ring if e in number) for ring in roundabouts),
+        logics={signal: tuple(found) for signal, found in sorted(logics.items())}, left_hand=left_hand)
+
+
+def _middle(shape: np.ndarray) -> np.ndarray:
+    """The point half way along a line (n, 2)."""
+    steps = np.hypot(*np.diff(shape, axis=0).T) if len(shape) > 1 else np.zeros(0)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    return np.array([np.interp(along[-1] / 2, along, shape[:, axis]) for axis in (0, 1)]) if along[-1] else shape[0]

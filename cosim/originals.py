@@ -1,0 +1,95 @@
+"""The city's own vehicles, as its route file has them: read once, then varied by seed and by demand factor."""
+
+import gzip
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nmfd import runs
+from nmfd.errors import InputError
+
+STREAM = 7102  # keeps these random numbers apart from others of the same seed
+# Vehicle classes that keep to their lines, or do not use the road as cars do.
+BOUND = frozenset({
+    "bus", "coach", "tram", "rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car", "ship",
+    "aircraft", "bicycle", "pedestrian", "scooter", "wheelchair", "container", "drone"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Originals:
+    """N vehicles or trips. depart: (N,) [s]; elements: their XML, without anything that another one repeats."""
+
+    depart: np.ndarray
+    elements: tuple[ElementTree.Element, ...]
+
+
+def read_originals(paths: Sequence[Path]) -> Originals:
+    """The `vehicle` and `trip` elements of SUMO route files. Raises InputError.
+
+    Every one must have a time as its depart; types and routes that several share belong to an additional file.
+    """
+    elements = []
+    for path in paths:
+        try:
+            with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as stream:
+                elements += [(path, element) for element in ElementTree.parse(stream).getroot()]
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file; give an existing SUMO route file in sumo.routes") from None
+        except (OSError, EOFError, ElementTree.ParseError) as error:
+            raise InputError(f"{path}: is not a SUMO route file ({error}); write it with cosim import") from None
+    departs = np.empty(len(elements))
+    for n, (path, element) in enumerate(elements):
+        if element.tag not in ("vehicle", "trip"):
+            raise InputError(
+                f"{path}: expected vehicle and trip elements only, got {element.tag} instead; move it to a file in "
+                "sumo.background or sumo.additional, or let cosim import do so")
+        try:
+            departs[n] = float(element.get("depart"))
+        except (TypeError, ValueError):
+            raise InputError(
+                f"{path}: vehicle {element.get('id')}: depart: expected a time in seconds, got "
+                f"{element.get('depart')!r} instead; move it to a file in sumo.background") from None
+    order = np.argsort(departs, kind="stable")
+    return Originals(depart=departs[order], elements=tuple(elements[n][1] for n in order))
+
+
+def draw(
+    originals: Originals, *, seed: int, factor: float, jitter: float, begin: float,
+) -> list[tuple[float, int, str]]:
+    """(departure [s], number of the vehicle, its id) sorted by departure, for one run.
+
+    factor: the demand is multiplied by it. Vehicles are left out, or driven twice or more (ids with .1, .2 and so on),
+    by seeded choice; 1 is every vehicle once.
+    jitter: every departure is moved by up to this [s], either way, but not before `begin` [s].
+    """
+    rng = np.random.default_rng([seed, STREAM])
+    count = len(originals.depart)
+    chosen = np.full(count, int(factor))
+    chosen[rng.permutation(count)[: round((factor - int(factor)) * count)]] += 1
+    shifts = rng.uniform(-jitter, jitter, size=(max(int(chosen.max(initial=0)), 1), count))
+    drawn = []
+    for n, times in enumerate(chosen):
+        name = originals.elements[n].get("id")
+        for copy in range(times):
+            depart = max(float(originals.depart[n] + shifts[copy, n]), min(begin, float(originals.depart[n])))
+            drawn.append((round(depart, 2), n, f"{name}.{copy}" if copy else name))
+    return sorted(drawn, key=lambda vehicle: vehicle[:2])
+
+
+def write_originals(
+    originals: Originals, path: Path, *, seed: int, factor: float, jitter: float, begin: float,
+) -> list[str]:
+    """Write the vehicles of one run to a SUMO route file; returns their ids. The same seed gives the same bytes."""
+    drawn = draw(originals, seed=seed, factor=factor, jitter=jitter, begin=begin)
+    lines = ["<routes>\n"]
+    for depart, n, name in drawn:
+        element = originals.elements[n]
+        before = dict(element.attrib)
+        element.attrib.update(id=name, depart=f"{depart:.2f}")
+        lines.append(f"  {ElementTree.tostring(element, encoding='unicode').strip()}\n")
+        element.attrib.update(before)
+    runs.write_text(path, "".join([*lines, "</routes>\n"]))
+    return [name for _, _, name in drawn]

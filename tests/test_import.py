@@ -1,0 +1,226 @@
+"""cosim import: from a sumocfg to a network and a scenario that run, on a small city of everything."""
+
+import csv
+import gzip
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import tiny_city
+from click.testing import CliRunner
+
+from cosim.cli import main
+from cosim.importing.case import read_case
+from cosim.importing.demand import read_traffic
+from cosim.importing.streets import graph, read_streets
+from cosim.plant import SumoPlant, settings
+from cosim.regions import load_city
+from nmfd.scenario import load_scenario
+from nmfd.types import Controls
+
+
+def cosim(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def good(result):
+    assert result.exit_code == 0, result.output + result.stderr + str(result.exception)
+    return result.stdout
+
+
+def error_line(result):
+    assert result.exit_code == 2, result.output + str(result.exception)
+    assert result.stderr.startswith("cosim: error: ") and result.stderr.count("\n") == 1, result.stderr
+    return result.stderr
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    return tiny_city.city(tmp_path_factory.mktemp("city"))
+
+
+@pytest.fixture(scope="module")
+def imported(config, tmp_path_factory):
+    """(project folder, what the import printed)."""
+    project = tmp_path_factory.mktemp("project")
+    text = good(cosim("import", config, "--regions", 3, "--out", project / "networks" / "tiny"))
+    return project, text
+
+
+def test_traffic_keeps_cars_and_leaves_the_rest_alone(config):
+    case = read_case(config)
+    assert case.begin == 600.0 and case.end == 1500.0
+    traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
+    ids = [vehicle.get("id") for vehicle in traffic.vehicles]
+    assert len(set(ids)) == len(ids) and {"round", "stops", "short"} <= set(ids)
+    assert not {"early", "astray", "gap", "bus"} & set(ids)
+    assert sum(name.startswith("zones.") for name in ids) == 30
+    assert sum(name.startswith("across.") for name in ids) == 75
+    assert sum(name.startswith("back.") for name in ids) == 60
+    assert 30 <= sum(name.startswith("chance.") for name in ids) <= 90
+    assert 30 <= sum(name.startswith("down.") for name in ids) <= 90
+    assert (np.diff(traffic.depart) >= 0).all() and traffic.depart.min() >= 600.0
+    assert [element.get("id") for element in traffic.background] == ["line2", "bus", "walker"]
+    assert "edgeData" not in [element.tag for element in traffic.shared]
+    detector = next(element for element in traffic.shared if element.tag == "inductionLoop")
+    assert detector.get("file") == "NUL"  # a run writes nothing into the user's folders
+    zones = [vehicle for vehicle in traffic.vehicles if vehicle.get("id").startswith("zones.")]
+    assert {vehicle.get("to") for vehicle in zones} == {"D1D2"}
+    assert {vehicle.get("from") for vehicle in zones} == {"A0A1", "A1A2"}
+
+
+def test_import_gives_every_edge_one_region_and_connected_regions(imported, config):
+    project, text = imported
+    network = project / "networks" / "tiny"
+    assert "3 regions" in text and (network / "map.png").stat().st_size > 10_000
+    streets = read_streets(network / "city.net.xml.gz")
+    with (network / "regions.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["edge"] for row in rows] == list(streets.edges)
+    region = np.array([int(row["region"]) for row in rows])
+    assert set(region) == {0, 1, 2}
+    from scipy.sparse.csgraph import connected_components
+    inside = streets.links[region[streets.links[:, 0]] == region[streets.links[:, 1]]]
+    assert connected_components(graph(inside, len(region)), directed=False)[0] == 3
+    city = load_city(network / "city.net.xml.gz", network / "regions.csv", 3)
+    with gzip.open(network / "city.net.xml.gz") as stream:
+        internal = [e.get("id") for e in ElementTree.parse(stream).iter("edge") if e.get("function") == "internal"]
+    assert set(internal) <= set(city.region_of)
+
+
+def test_gateways_and_quality_add_up(imported):
+    network = imported[0] / "networks" / "tiny"
+    gateways, quality = pd.read_csv(network / "gateways.csv"), pd.read_csv(network / "quality.csv")
+    regions = dict(pd.read_csv(network / "regions.csv").itertuples(index=False))
+    assert all(regions[g.from_edge] == g.source and regions[g.to_edge] == g.target for g in gateways.itertuples())
+    streets = read_streets(network / "city.net.xml.gz")
+    crossing = {(streets.edges[a], streets.edges[b]) for a, b in streets.links
+                if regions[streets.edges[a]] != regions[streets.edges[b]]}
+    assert crossing == set(zip(gateways.from_edge, gateways.to_edge, strict=True))
+    assert set(gateways.control) <= {"controlled", "no signal"} and (gateways.control == "controlled").any()
+    whole = quality.iloc[-1]
+    assert whole.boundary_flow_veh == gateways.flow_veh.sum() > 0
+    free = gateways.flow_veh[gateways.control != "controlled"].sum() / gateways.flow_veh.sum()
+    assert whole.uncontrolled_share == pytest.approx(free, abs=1e-3)
+    assert quality.lane_km[:-1].sum() == pytest.approx(whole.lane_km, abs=0.02)
+    assert (quality.pieces[:-1] == 1).all() and whole.variance_within <= whole.variance_before
+
+
+def test_import_is_deterministic_and_atomic(imported, config, tmp_path):
+    project = imported[0]
+    good(cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / "tiny"))
+    for folder in ("networks", "scenarios"):
+        here, there = (sorted((root / folder).rglob("*")) for root in (project, tmp_path))
+        assert [file.name for file in here] == [file.name for file in there]
+        for one, other in zip(here, there, strict=True):
+            assert one.is_dir() or one.read_bytes() == other.read_bytes(), one.name
+    line = error_line(cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / "tiny"))
+    assert "network.toml exists" in line and "--force" in line
+
+
+def test_scenario_drives_the_original_vehicles(imported, config):
+    scenario = load_scenario(imported[0] / "scenarios" / "tiny")
+    case = read_case(config)
+    traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
+    assert scenario.demand.sum() * scenario.step == pytest.approx(len(traffic.vehicles), rel=1e-4)
+    assert settings(scenario).begin == 600.0
+    scenario = replace(scenario, steps=10)
+    network = scenario.network
+    plant = SumoPlant(scenario)
+    try:
+        plant.reset(0)
+        for _ in range(scenario.steps):  # the ledger is checked in every one
+            measurement = plant.step(Controls(
+                perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=network.nominal_splits))
+        record, due = plant.record(), plant.trips
+        # every car, and the buses: one, and one per 200 s in ten minutes
+        assert due == (traffic.depart < 600.0 + scenario.steps * scenario.step - 10).sum() + 1 + 3
+        assert record.departures.sum() == due - measurement.backlog.sum()
+        assert record.arrivals.sum() + measurement.accumulation.sum() == record.departures.sum()
+        free = plant.session.is_free
+        assert not any(free(v) for v in plant.session.running() if v.startswith(("line2", "bus", "stops")))
+        assert record.guided.sum() > 0
+    finally:
+        plant.close()
+
+
+@pytest.mark.parametrize("own", ["edges", "taz", "polygons"])
+def test_own_regions_come_back(config, tmp_path, own):
+    network = tmp_path / "networks" / "first"
+    good(cosim("import", config, "--regions", 3, "--method", "geometric", "--no-run", "--out", network))
+    file = network / {"edges": "regions.csv", "taz": "regions.taz.xml", "polygons": "regions.poly.xml"}[own]
+    good(cosim("import", config, f"--{own}", file, "--no-run", "--out", tmp_path / "networks" / "again"))
+    before, after = (pd.read_csv(folder / "regions.csv") for folder in (network, tmp_path / "networks" / "again"))
+    same = (before.region == after.region).mean()
+    assert same == 1.0 if own != "polygons" else same > 0.85
+
+
+def test_networks_as_they_are(tmp_path):
+    """Left-hand traffic; two signals; none at all: a working result, with a demand that is generated."""
+    for name, options, expected in (
+            ("left", ("--lefthand", "true", "--tls.set", "B1,C2"), "left-hand traffic; 2 signals"),
+            ("none", ("--default-junction-type", "priority"), "no gateway has a signal")):
+        net = tiny_city.network(tmp_path, *options, name=f"{name}.net.xml")
+        text = good(cosim("import", net, "--regions", 2, "--demand", "peak", "--level", 0.5, "--method", "geometric",
+                          "--no-run", "--out", tmp_path / "networks" / name))
+        assert expected in text, text
+        scenario = replace(load_scenario(tmp_path / "scenarios" / name), steps=3)
+        plant = SumoPlant(scenario)
+        try:
+            plant.reset(0)
+            for _ in range(3):
+                plant.step(Controls(perimeter=np.where(scenario.network.adjacency, 0.1, 0.0), splits=None))
+            assert plant.record().departures.sum() > 0
+        finally:
+            plant.close()
+
+
+def test_signals_that_are_left_alone(config, tmp_path):
+    """Actuated ones, and those that a timetable switches."""
+    for file in config.parent.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    net = tmp_path / "city.net.xml"
+    text = net.read_text().replace('id="B1" type="static"', 'id="B1" type="actuated"')
+    net.write_text(text)
+    timetable = ('<WAUT id="day" startProg="0" refTime="0"><wautSwitch time="900" to="0"/></WAUT>'
+                 '<wautJunction wautID="day" junctionID="C2"/></additional>')
+    additional = tmp_path / "city.add.xml"
+    additional.write_text(additional.read_text().replace("</additional>", timetable))
+    good(cosim("import", tmp_path / "city.sumocfg", "--regions", 4, "--method", "geometric", "--no-run", "--out",
+               tmp_path / "networks" / "mixed"))
+    control = pd.read_csv(tmp_path / "networks" / "mixed" / "gateways.csv").set_index("signal").control.to_dict()
+    scenario = load_scenario(tmp_path / "scenarios" / "mixed")
+    assert control.get("B1", "actuated signal") == "actuated signal"
+    assert control.get("C2", "programme follows a timetable") == "programme follows a timetable"
+    assert settings(scenario).leave_signals == ("C2",)
+
+
+def test_mesoscopic_keeps_the_ledger(imported):
+    scenario = replace(load_scenario(imported[0] / "scenarios" / "tiny"), steps=4)
+    plant = SumoPlant(scenario, overrides=replace(settings(scenario), mesoscopic=True))
+    try:
+        plant.reset(0)
+        for _ in range(scenario.steps):
+            plant.step(Controls(perimeter=np.where(scenario.network.adjacency, 0.5, 0.0), splits=None))
+        assert plant.record().crossings.sum() > 0
+    finally:
+        plant.close()
+
+
+@pytest.mark.parametrize("change, expected", [
+    (lambda folder: (folder / "buses.rou.xml").unlink(), "route-files: no such file"),
+    (lambda folder: (folder / "city.net.xml").write_text("<net><edge"), "is not a"),
+    (lambda folder: (folder / "city.net.xml").write_text("<net></net>"), "has no edge that cars may use"),
+    (lambda folder: (folder / "city.sumocfg").write_text("<routes/>"), "expected a sumocfg or a net.xml"),
+    (lambda folder: (folder / "city.sumocfg").write_text(
+        '<configuration><net-file value="city.net.xml"/></configuration>'), "add --demand peak"),
+])
+def test_one_clear_line(config, tmp_path, change, expected):
+    for file in config.parent.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    change(tmp_path)
+    line = error_line(cosim("import", tmp_path / "city.sumocfg", "--regions", 3, "--out", tmp_path / "networks" / "x"))
+    assert expected in line
+    assert not (tmp_path / "networks").exists() or not list((tmp_path / "networks").iterdir())

@@ -1,0 +1,123 @@
+"""A city's own vehicles: what seeds and demand factors do to them; demand files, forecasts, one-way neighbours."""
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+
+from cosim.originals import draw, read_originals, write_originals
+from nmfd.errors import InputError
+from nmfd.network import load_network
+from nmfd.scenario import load_scenario
+
+VEHICLES = "<routes>" + "".join(
+    f'<vehicle id="v{n}" type="lorry" depart="{100 + 2 * n}"><route edges="a b"/><stop lane="a_0" duration="5"/>'
+    "</vehicle>" for n in range(200)) + "</routes>"
+
+
+@pytest.fixture
+def originals(tmp_path):
+    (tmp_path / "cars.rou.xml").write_text(VEHICLES)
+    return read_originals([tmp_path / "cars.rou.xml"])
+
+
+def test_seed_moves_departures_and_nothing_else(originals, tmp_path):
+    def written(name, **options):
+        path = tmp_path / name
+        write_originals(originals, path, **{"seed": 1, "factor": 1.0, "jitter": 10.0, "begin": 100.0} | options)
+        return path.read_bytes()
+
+    assert written("a") == written("b") != written("c", seed=2)
+    plain = ElementTree.fromstring(written("d", jitter=0.0))
+    assert [ElementTree.tostring(e).strip() for e in plain] == [
+        ElementTree.tostring(replaced).strip() for replaced in _with_cents(originals.elements)]
+    departs = {e.get("id"): float(e.get("depart")) for e in ElementTree.fromstring(written("e"))}
+    shift = np.array([departs[f"v{n}"] - (100 + 2 * n) for n in range(200)])
+    assert np.abs(shift).max() <= 10.01 and shift.std() > 3.0 and min(departs.values()) >= 100.0
+
+
+def _with_cents(elements):
+    for element in elements:
+        element.set("depart", f"{float(element.get('depart')):.2f}")
+    return elements
+
+
+@pytest.mark.parametrize("factor, count", [(0.0, 0), (0.8, 160), (1.0, 200), (1.3, 260), (2.5, 500)])
+def test_factor_thins_and_duplicates(originals, factor, count):
+    drawn = draw(originals, seed=3, factor=factor, jitter=5.0, begin=0.0)
+    names = [name for _, _, name in drawn]
+    assert len(drawn) == count == len(set(names)) and [t for t, _, _ in drawn] == sorted(t for t, _, _ in drawn)
+    copies = np.bincount([n for _, n, _ in drawn], minlength=200)
+    assert copies.max(initial=0) <= np.ceil(factor) and copies.min() >= np.floor(factor)
+
+
+@pytest.mark.parametrize("text, expected", [
+    ("<routes><flow id='f'/></routes>", "expected vehicle and trip elements only, got flow"),
+    ("<routes><trip id='t' depart='triggered'/></routes>", "expected a time in seconds, got 'triggered'"),
+    ("<routes><trip", "is not a SUMO route file"),
+])
+def test_route_files_that_are_none(tmp_path, text, expected):
+    (tmp_path / "cars.rou.xml").write_text(text)
+    with pytest.raises(InputError, match=expected):
+        read_originals([tmp_path / "cars.rou.xml"])
+
+
+def with_demand_file(folder, rows):
+    scenario = tiny.write(folder, scenario=tiny.SCENARIO.split("[[demand]]")[0].replace(
+        "protected", 'demand_file = "demand.csv"\nprotected'))
+    (scenario / "demand.csv").write_text("interval,from,to,veh_s\n" + rows)
+    return scenario
+
+
+def test_demand_file_and_forecast(tmp_path):
+    folder = with_demand_file(tmp_path, "0,0,1,2.5\n3,1,0,1.0\n3,1,0,0.5\n99,0,1,7\n")
+    scenario = load_scenario(folder)
+    assert scenario.demand[0, 0, 1] == 2.5 and scenario.demand[3, 1, 0] == 1.5 and scenario.demand.sum() == 4.0
+    assert scenario.forecast is scenario.demand
+    many = replace(scenario, demand=np.ones((2000, 12, 12)), forecast_error=0.3, forecast_seed=1)
+    error = np.log(many.forecast)
+    assert error.std() == pytest.approx(0.3, rel=0.1) and many.forecast.mean() == pytest.approx(1.0, abs=0.06)
+    assert error.mean(axis=0).std() == pytest.approx(0.3 / np.sqrt(2), rel=0.2)  # wrong about the day
+    assert (many.forecast == replace(many, name="again").forecast).all()
+
+
+@pytest.mark.parametrize("row", ["0,0,2,1.0", "0,0,1,-1", "0,0,1", "x,0,1,1", "0,0,1,nan"])
+def test_demand_file_errors_name_the_line(tmp_path, row):
+    with pytest.raises(InputError, match="demand.csv: line 2: expected an interval"):
+        load_scenario(with_demand_file(tmp_path, row + "\n"))
+
+
+def test_scenario_on_a_base_finds_its_files(tmp_path):
+    folder = with_demand_file(tmp_path, "0,0,1,2.5\n")
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more" / "scenario.toml").write_text('base = "../scenario"\ndemand_factor = 2.0\n')
+    assert load_scenario(tmp_path / "more").demand.sum() == 2.0 * load_scenario(folder).demand.sum() == 5.0
+
+
+def ring(barred=""):
+    """Regions 0, 1, 2, each adjacent to the others; `barred` is a line for region 0."""
+    text = tiny.NETWORK.format(name="ring") + "".join(
+        tiny.REGION.format(position=n, adjacent=[h for h in range(3) if h != n]) for n in range(3))
+    return text.replace("adjacent = [1, 2]\n", f"adjacent = [1, 2]\n{barred}\n", 1)
+
+
+def test_one_way_neighbours(tmp_path):
+    tiny.write(tmp_path, network=ring("no_way_to = [1]"))
+    network = load_network(tmp_path / "network")
+    assert not network.adjacency[0, 1] and network.adjacency[1, 0] and network.hops[0, 1] == 2
+    assert network.split_mask[0, :, 1].tolist() == [False, False, True]
+    assert (network.nominal_splits.sum(axis=1)[~np.eye(3, dtype=bool)] > 0).all()
+    full = tmp_path / "full"
+    tiny.write(full, network=ring())
+    assert load_network(full / "network").adjacency[0, 1]
+
+
+@pytest.mark.parametrize("barred, expected", [
+    ("no_way_to = [2, 1]", "cannot be reached from region 0"), ("no_way_to = [0]", "expected some of the adjacent"),
+])
+def test_one_way_errors(tmp_path, barred, expected):
+    tiny.write(tmp_path, network=ring(barred))
+    with pytest.raises(InputError, match=expected):
+        load_network(tmp_path / "network")

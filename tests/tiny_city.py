@@ -1,0 +1,69 @@
+"""A small SUMO city with everything that a real one brings: buses, flows, zones, persons, several files."""
+
+import gzip
+import subprocess
+from pathlib import Path
+
+import sumo
+
+CONFIG = """<configuration>
+  <input><net-file value="city.net.xml"/><route-files value="cars.rou.xml.gz,buses.rou.xml"/>
+  <additional-files value="city.add.xml"/></input>
+  <time><begin value="0:10:00"/><end value="1500"/></time>
+</configuration>"""
+ADDITIONAL = """<additional>
+  <vType id="lorry" vClass="truck" length="9"/><vType id="citybus" vClass="bus"/>
+  <vTypeDistribution id="mixed"><vType id="small" vClass="passenger" probability="0.7"/>
+    <vType id="large" vClass="delivery" probability="0.3"/></vTypeDistribution>
+  <route id="loop" edges="A0A1 A1B1 B1B0 B0A0 A0A1"/>
+  <busStop id="stop" lane="B1C1_0" startPos="20" endPos="40"/>
+  <inductionLoop id="loop" lane="A0A1_0" pos="5" freq="60" file="counts.xml"/>
+  <edgeData id="all" file="edges.xml"/>
+  <taz id="west" edges="A0A1 A1A2"/>
+  <taz id="east"><tazSink id="D1D2" weight="1"/><tazSource id="D2D1" weight="1"/></taz>
+</additional>"""
+CARS = """<routes>
+  <vehicle id="round" depart="610" type="mixed" route="loop"/>
+  <vehicle id="stops" depart="612" type="lorry"><route edges="A1B1 B1C1 C1D1"/>
+    <stop lane="B1C1_0" endPos="60" duration="20"/></vehicle>
+  <trip id="early" depart="5" from="A0A1" to="D1D2"/>
+  <trip id="astray" depart="620" from="A0A1" to="nowhere"/>
+  <vehicle id="gap" depart="620"><route edges="A0A1 D1D2"/></vehicle>
+  <trip id="short" depart="0:10:30" from="B1C1" to="B1C1"/>
+  <flow id="zones" begin="600" end="1200" number="30" fromTaz="west" toTaz="east"/>
+  <flow id="across" begin="600" end="1200" period="8" from="A1B1" to="C1D1" type="mixed"/>
+  <flow id="back" begin="600" end="1200" vehsPerHour="360" from="D2C2" to="B2A2"/>
+  <flow id="chance" begin="600" end="1200" probability="0.1" from="B3C3" to="C0B0"/>
+  <flow id="down" begin="600" end="1200" period="exp(0.1)" from="C3C2" to="C1C0"/>
+</routes>"""
+BUSES = """<routes>
+  <vehicle id="bus" type="citybus" line="1" depart="605"><route edges="A1B1 B1C1 C1D1 D1D2"/>
+    <stop busStop="stop" duration="15"/></vehicle>
+  <flow id="line2" type="citybus" begin="600" end="1200" period="200" from="A2B2" to="C2D2"/>
+  <person id="walker" depart="615"><walk edges="B1C1 C1D1"/></person>
+</routes>"""
+
+
+def run(program: str, *arguments) -> None:
+    done = subprocess.run(
+        [str(Path(sumo.SUMO_HOME) / "bin" / program), *map(str, arguments)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def network(folder: Path, *options: str, name: str = "city.net.xml") -> Path:
+    """A grid of 4 x 4 junctions A0 to D3, 200 m apart, with signals at all inner ones unless told otherwise."""
+    options = options or ("--tls.set", "B1,B2,C1,C2,B3,C0")
+    run("netgenerate", "--grid", "--grid.number", 4, "--grid.length", 200, "--default.lanenumber", 2,
+        "--no-turnarounds", "true", "--seed", 1, "--output-file", folder / name, *options)
+    return folder / name
+
+
+def city(folder: Path, *options: str) -> Path:
+    """The sumocfg of a city with demand."""
+    network(folder, *options)
+    (folder / "city.add.xml").write_text(ADDITIONAL)
+    (folder / "buses.rou.xml").write_text(BUSES)
+    with gzip.open(folder / "cars.rou.xml.gz", "wt") as stream:
+        stream.write(CARS)
+    (folder / "city.sumocfg").write_text(CONFIG)
+    return folder / "city.sumocfg"
