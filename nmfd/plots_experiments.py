@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import StrMethodFormatter
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullLocator, ScalarFormatter, StrMethodFormatter
 
 from nmfd import plots
 
@@ -50,9 +50,14 @@ def training_curves(ax: Axes, rows: Sequence[Mapping]) -> Axes:
         steps = list(next(iter(seeds.values())))
         best = np.stack([np.minimum.accumulate(list(values.values())) for values in seeds.values()])
         ax.plot(steps, best.mean(axis=0), color=METHOD_COLOURS[method], linewidth=1.6,
-                label=f"{method}, {len(best)} seed{'s' * (len(best) > 1)}")
+                label=f"{method}, mean and range of {len(best)} seed{'s' * (len(best) > 1)}")
         ax.fill_between(steps, best.min(axis=0), best.max(axis=0), color=METHOD_COLOURS[method], alpha=0.2, linewidth=0)
+    ax.set_xscale("log")  # most is gained early
     ax.set_yscale("log")
+    ax.xaxis.set_major_formatter(ScalarFormatter())
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.yaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(2.0, 0.5)))
     ax.set_xlabel("Adam steps")
     ax.set_ylabel("best total time spent in validation [veh s]")
     ax.spines[["top", "right"]].set_visible(False)
