@@ -186,9 +186,12 @@ def compare(target: Path, controller: str, seed: int, steps: int | None, out: Pa
 @click.option("--guided", is_flag=True, help="With route guidance: the model of a city whose drivers are guided.")
 @click.option("--network", "target", type=FOLDER, metavar="DIR",
               help="The folder whose network.toml is written. [default: the scenario's network]")
+@click.option("--iterations", type=click.IntRange(min=1), default=600, show_default=True, metavar="N",
+              help="Of the fit.")
 @click.option("--out", type=FOLDER, metavar="DIR", help="Samples and pictures. [default: runs/<scenario>-identify]")
 def identify(
-    scenario: Path, levels: str, seeds: int, workers: int, guided: bool, target: Path | None, out: Path | None,
+    scenario: Path, levels: str, seeds: int, workers: int, guided: bool, target: Path | None, iterations: int,
+    out: Path | None,
 ) -> None:
     """Fit the regional model and the drivers' own split ratios of a SUMO city; writes a network.toml.
 
@@ -216,7 +219,8 @@ def identify(
     loaded = load_scenario(scenario)
     if out is None:
         out = Path("runs") / f"{runs.file_name(loaded.name)}-identify{'-guided' if guided else ''}"
-    loading = identify.Loading(levels=factors, seeds=range(1000, 1000 + seeds), guided=guided, network=target)
+    loading = identify.Loading(
+        levels=factors, seeds=range(1000, 1000 + seeds), guided=guided, network=target, iterations=iterations)
     try:
         with progress_line("identify") as progress:
             text = identify.identify(scenario, loading, out=out, workers=workers, progress=progress)

@@ -35,12 +35,14 @@ class Loading:
     """levels: multiples of the scenario's demand; seeds: of the runs at every level
     guided: with route guidance, first towards the drivers' own split ratios, then probing; else without
     network: the folder whose network.toml is written, None for the scenario's own
+    iterations: of the fit
     """
 
     levels: Sequence[float]
     seeds: Sequence[int]
     guided: bool = False
     network: Path | None = None
+    iterations: int = identification.ITERATIONS
 
     @property
     def stages(self) -> tuple[str, str]:
@@ -77,7 +79,8 @@ def identify(
             progress(done, total, f"{what}, {note}")
 
         return identification.fit(
-            network, [observed(result) for result in results], progress=tell if progress else None, **scheme)
+            network, [observed(result) for result in results], iterations=loading.iterations,
+            progress=tell if progress else None, **scheme)
 
     model = fitted(found, "fitting")
     samples = samples_of(network, found)

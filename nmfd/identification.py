@@ -19,6 +19,7 @@ from nmfd.mfd import Mfd
 from nmfd.network import Network
 
 HORIZON = 10         # control intervals
+ITERATIONS = 600
 BATCH = 256          # rollouts per Adam step
 LEARNING_RATE = 0.03
 OUTLIER = 0.3        # of the scale: from here on an error counts linearly (Huber)
@@ -86,7 +87,7 @@ class _Model(torch.nn.Module):
 
 def fit(
     network: Network, runs: Sequence[Observed], *, step: float, substeps: int = 1, integrator: str = "euler",
-    iterations: int = 600, seed: int = 0, progress: Callable[[int, int, str], None] | None = None,
+    iterations: int = ITERATIONS, seed: int = 0, progress: Callable[[int, int, str], None] | None = None,
 ) -> Network:
     """`network` with the MFDs, exit rates, capacities and storage that predict `runs` best.
 

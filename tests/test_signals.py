@@ -227,7 +227,7 @@ def test_webster_in_sumo_and_under_perimeter_control(scenario, plant_of):
     plant = plant_of(signals="webster")
     plant.reset(1)
     plans = {name: plant.session.programme(name) for name in plant.session.signals()}
-    file = plant._signal_plan([])[1]
+    file = plant._signal_plan([])[0]
     for logic in ElementTree.parse(file).getroot():  # a later offset is a later beginning
         programme = plans[logic.get("id")]
         assert programme.position == -float(logic.get("offset")) % programme.cycle

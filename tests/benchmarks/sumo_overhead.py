@@ -51,11 +51,12 @@ def closed(scenario: Scenario, controller: str, seed: int, folder: Path) -> tupl
     original_start, original_show = Session.__init__, Session.set_signal_state
     begin = [0.0, 0.0]
 
-    def start(self, net_file, route_file, **options):
+    def start(self, net_file, route_files, **options):
+        (route_file,) = route_files
         kept = folder / "trips.rou.xml"
         kept.write_bytes(Path(route_file).read_bytes())
         begin[:] = time.perf_counter(), _cpu(resource.RUSAGE_SELF)
-        original_start(self, net_file, route_file, **options)
+        original_start(self, net_file, route_files, **options)
         command[:] = [part.replace(str(route_file), str(kept)) for part in self.command]
 
     def show(self, signal, state):
