@@ -83,9 +83,10 @@ def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
         number[pair] += there
     return Instruments(
         detector_share=share,
-        # of a sample of links without replacement, weighted by lane length
-        detector_error=np.sqrt(
-            (SPREAD_OVER_LINKS**2 * (1.0 - share) + SPREAD_ALONG_LINK**2) * squares) / np.maximum(seen, 1e-9),
+        # Of samples of links, weighted by lane length. Which links are busy lasts (and a sample of all links is none),
+        # how far their queues reach changes with every cycle.
+        detector_error=SPREAD_OVER_LINKS * np.sqrt((1.0 - share) * squares) / np.maximum(seen, 1e-9),
+        detector_noise=SPREAD_ALONG_LINK * np.sqrt(squares) / np.maximum(seen, 1e-9),
         counted_share=counted / np.maximum(boundary, 1.0), counted_gateways=number, probe_share=probe_share)
 
 
