@@ -141,10 +141,14 @@ def over_demand(ax: Axes, ratios: Mapping[str, Mapping[float, tuple[float, float
     half of its 95 % interval (NaN of a single seed)."""
     ax.axhline(1.0, color=plots.CONTROLLER_COLOURS["no-control"], linewidth=1.0)
     tones = plots.colours(list(ratios))
+    levels = sorted({level for points in ratios.values() for level in points})
+    aside = 0.012 * max(levels[-1] - levels[0], 0.1)  # so that intervals do not hide each other
     for number, (controller, points) in enumerate(ratios.items()):
         mean, half = np.array(list(points.values())).reshape(-1, 2).T
-        ax.errorbar(list(points), mean, np.nan_to_num(half), color=tones[controller], linewidth=1.6, capsize=3,
-                    marker="o^sDv"[number % 5], markersize=4, label=controller)
+        ax.errorbar(np.array(list(points)) + aside * (number - (len(ratios) - 1) / 2), mean, np.nan_to_num(half),
+                    color=tones[controller], linewidth=1.6, capsize=3, marker="o^sDv"[number % 5], markersize=4,
+                    label=controller)
+    ax.set_xticks(levels, [f"{level:g}" for level in levels])
     ax.set_xlabel("demand, multiple of the scenario's")
     ax.set_ylabel("total time spent / that of no control")
     ax.set_ylim(bottom=0.0)

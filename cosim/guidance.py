@@ -1,7 +1,7 @@
 """Route guidance to reroutes: every vehicle is given its next region once per region it enters, in shares theta.
 
 Drivers who are told travel times do not keep to the split ratios that they had without: what they would choose now is
-followed up, and theta shifts it by as much as it differs from the drivers' own split ratios in the regional model. A
+followed up, and theta shifts it as it shifts the drivers' own split ratios in the regional model (`shifted`). A
 controller that asks for these gets guidance by travel times alone; one that asks for everybody gets everybody.
 
 Who is sent where is not drawn by lot: a driver at the western edge of a region would be sent round its eastern end as
@@ -31,6 +31,17 @@ SLOWEST = 0.1    # m/s; slower is as good as standing
 BONUS = 30.0     # s per vehicle that a region is behind its share
 LOYALTY = 0.3    # a driver keeps his way if the best one does not save more than this share of its own time
 MEMORY = 0.9     # of the vehicles assigned before and of their wishes, per control interval
+
+
+def shifted(wish: np.ndarray, own: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """Shares (n,) [-] that differ from `wish` as `theta` does from `own`.
+
+    A next region that theta lowers loses the same part of those who wish to go there, and what is freed goes to the
+    regions that theta raises, in proportion to by how much.
+    """
+    kept = wish * np.where(theta < own, theta / np.where(own > 0, own, 1.0), 1.0)
+    raised = np.maximum(theta - own, 0.0)
+    return kept + (wish.sum() - kept.sum()) * raised / max(raised.sum(), 1e-12)
 
 
 class Guide:
@@ -118,8 +129,8 @@ class Guide:
             return
         cell = event.region, ways.neighbours, event.destination
         self._wished[event.region, ways.neighbours[np.argmin(least)], event.destination] += 1.0
-        shares = self._wished[cell] / self._wished[cell].sum() + self._splits[cell] - self._own[cell]
-        shares = np.maximum(shares, 0.0) * np.isfinite(least)
+        wish = self._wished[cell] / self._wished[cell].sum()
+        shares = shifted(wish, self._own[cell], self._splits[cell]) * np.isfinite(least)
         if shares.sum() <= 0:
             return
         shares /= shares.sum()

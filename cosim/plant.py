@@ -209,7 +209,8 @@ class SumoPlant:
         self._actuator.command(controls.perimeter, network.u_min, network.u_max)
         self._guide.command(controls.splits, self._speed)
         begin, steps = session.time, round(self._scenario.step / session.step_length)
-        every, often = (max(1, round(time / session.step_length)) for time in (SAMPLE_EVERY, EVERY))
+        every, often = (
+            min(max(1, round(time / session.step_length)), steps) for time in (SAMPLE_EVERY, EVERY))
         vehicles, metres = np.zeros((2, len(self.city.edges)))  # sums over the samples, by edge: n and n v
         queues = []
         for n in range(steps):

@@ -26,19 +26,20 @@ def draw(folder: Path, scenario: Scenario, city: City, rows: pd.DataFrame) -> No
     seed = shown_seed(rows)
     order = list(dict.fromkeys(rows["controller"]))
     runs = sorted(experiment.trajectories(folder), key=lambda t: (order.index(t.controller), t.seed))
-    draw_accumulations(folder, scenario, runs, seed)
+    note = teleports(rows)
+    draw_accumulations(folder, scenario, runs, seed=seed, title=f"seed {seed}, shaded: all seeds; {note}")
     results = {name: experiment.read_run(folder, name, seed) for name in names if seed in set(
         rows.loc[rows["controller"] == name, "seed"])}
     best = next((name for name in names if name != REFERENCE and name in results), None)
     pair = {name: results[name] for name in (REFERENCE, best) if name in results}
-    link_maps(folder / "link_densities.png", city, pair)
-    gateway_queues(folder / "gateway_queues.png", city, pair)
+    link_maps(folder / "link_densities.png", city, pair, f"seed {seed}; {note}")
+    gateway_queues(folder / "gateway_queues.png", city, pair, f"seed {seed}; {note}")
     gating = next((name for name in names if name in results and acts(results[name], scenario.network)), None)
     if gating:
-        perimeter(folder / "perimeter.png", city, scenario.network, results[gating])
+        perimeter(folder / "perimeter.png", city, scenario.network, results[gating], note)
     guiding = next((name for name in names if name in results and results[name].record["guided"].sum() > 0), None)
     if guiding:
-        splits(folder / "splits.png", scenario.network, results[guiding])
+        splits(folder / "splits.png", scenario.network, results[guiding], note)
 
 
 def acts(result: Result, network: Network) -> bool:
@@ -64,25 +65,34 @@ def shown_seed(rows: pd.DataFrame) -> int:
     return int(counts.idxmax())
 
 
-def link_maps(path: Path, city: City, results: dict[str, Result]) -> None:
+def teleports(rows: pd.DataFrame) -> str:
+    """How many vehicles were teleported in the runs behind a picture."""
+    counts = rows.groupby("controller", sort=False)["teleports"].sum()
+    if not counts.any():
+        return "no teleport in any run"
+    return "teleports: " + ", ".join(f"{name} {count:.0f}" for name, count in counts.items())
+
+
+def link_maps(path: Path, city: City, results: dict[str, Result], note: str) -> None:
     """Maps of the link densities at MAPS times, one row per controller."""
     shapes, lanes = edge_shapes(city), np.array([city.lanes[edge] for edge in city.edges])
     km = np.array([city.length[edge] for edge in city.edges]) / 1000.0
     region = np.array([city.region_of[edge] for edge in city.edges])
     width, height = np.ptp(np.concatenate(shapes), axis=0)
-    drawing = plots.figure(3.6 * MAPS + 1.0, 0.3 + (0.3 + 3.6 * height / width) * len(results))
+    drawing = plots.figure(3.6 * MAPS + 1.0, 0.6 + (0.3 + 3.6 * height / width) * len(results))
     grid = drawing.subplots(len(results), MAPS, squeeze=False)
     for line, (name, result) in zip(grid, results.items(), strict=True):
         loads = result.record["edge_vehicles"].astype(float)
         for ax, k in zip(line, np.linspace(0, len(loads) - 1, MAPS + 1).round().astype(int)[1:], strict=True):
             figures.link_densities(ax, shapes, loads[k] / km / lanes, lanes, region)
             ax.set_title(f"{name}, {(k + 1) * result.trajectory.step / 60:.0f} min", fontsize="medium")
+    drawing.suptitle(note, fontsize="medium")
     bar = drawing.colorbar(figures.DENSITIES, ax=grid, shrink=0.8, aspect=30)
     bar.set_label("vehicles per km and lane,\nmean of the control interval")
     plots.save(drawing, path)
 
 
-def gateway_queues(path: Path, city: City, results: dict[str, Result]) -> None:
+def gateway_queues(path: Path, city: City, results: dict[str, Result], note: str) -> None:
     """Queues before gateways over time for each of `results`, and how long the edges were full."""
     upstream = facts.upstream_gateways(city)
     labels = [f"{city.gateways[n].source} > {city.gateways[n].target}" for n in upstream]
@@ -100,13 +110,14 @@ def gateway_queues(path: Path, city: City, results: dict[str, Result]) -> None:
         mesh = ax.collections[0]
     figures.time_full(axes[-1], full)
     axes[-1].set_title("edge full", fontsize="medium")
+    drawing.suptitle(note, fontsize="medium")
     bar = drawing.colorbar(mesh, ax=axes[:-1], location="bottom", shrink=0.5, aspect=40)
     bar.set_label("vehicles halting on the edge before the boundary (from > to) [veh]")
     plots.legend_below(drawing, [axes[-1]])
     plots.save(drawing, path)
 
 
-def perimeter(path: Path, city: City, network: Network, result: Result) -> None:
+def perimeter(path: Path, city: City, network: Network, result: Result, note: str) -> None:
     """Commanded u against green and flow: the boundaries that were closed most over time, and all in one cloud."""
     trajectory, record = result.trajectory, result.record
     pairs = {}
@@ -128,12 +139,12 @@ def perimeter(path: Path, city: City, network: Network, result: Result) -> None:
         axes[-1], np.concatenate([u for u, _, _ in pairs.values()]),
         np.concatenate([green for _, green, _ in pairs.values()]))
     axes[-1].set_title("all boundaries", fontsize="medium")
-    drawing.suptitle(f"{trajectory.controller}, seed {trajectory.seed}", fontsize="medium")
+    drawing.suptitle(f"{trajectory.controller}, seed {trajectory.seed}; {note}", fontsize="medium")
     plots.legend_below(drawing, axes)
     plots.save(drawing, path)
 
 
-def splits(path: Path, network: Network, result: Result) -> None:
+def splits(path: Path, network: Network, result: Result, note: str) -> None:
     """Commanded theta against the shares that went there: the busiest choices over time, and all in one cloud."""
     trajectory, crossings = result.trajectory, result.record["crossings"].astype(float)
     leaving = crossings.sum(axis=2)  # (T, R, R), from i bound for j
@@ -160,7 +171,7 @@ def splits(path: Path, network: Network, result: Result) -> None:
     axes[-1].set_title("all", fontsize="medium")
     drawing.suptitle(
         f"{trajectory.controller}, seed {trajectory.seed}: commanded θ (lines), shares that went there (dots, over "
-        f"{WINDOW} intervals)", fontsize="medium")
+        f"{WINDOW} intervals); {note}", fontsize="medium")
     plots.legend_below(drawing, axes, columns=8)
     plots.save(drawing, path)
 
@@ -183,6 +194,7 @@ def demand_levels(path: Path, rows: pd.DataFrame) -> None:
         return
     drawing = plots.figure(7.5, 4.8)
     ax = figures.over_demand(drawing.subplots(), ratios)
+    drawing.suptitle(f"paired by seed, 95 % intervals; {teleports(rows)}", fontsize="medium")
     plots.legend_below(drawing, [ax])
     plots.save(drawing, path)
 

@@ -17,12 +17,13 @@ GREEN = frozenset("Gg")
 
 @dataclass(frozen=True, kw_only=True)
 class Link:
-    """One index of a state string: from a lane to an edge."""
+    """One index of a state string: from a lane to an edge. turn: SUMO's direction, s, l, r and others."""
 
     index: int
     from_edge: str
     lane: int
     to_edge: str
+    turn: str = "s"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +61,7 @@ def read_signals(city: City) -> tuple[list[Signal], list[str]]:
         if connection.get("tl") is not None and set(ends) <= city.lanes.keys():
             links.setdefault(connection.get("tl"), []).append(Link(
                 index=int(connection.get("linkIndex")), from_edge=ends[0], lane=int(connection.get("fromLane")),
-                to_edge=ends[1]))
+                to_edge=ends[1], turn=connection.get("dir", "s").lower()))
     simple, others = [], []
     for logic in root.iter("tlLogic"):
         phases = tuple(Phase(duration=float(p.get("duration")), state=p.get("state")) for p in logic.iter("phase"))

@@ -28,7 +28,8 @@ from nmfd.errors import InputError
 CYCLES = (40, 50, 60, 70, 80, 90, 100, 110, 120)  # s
 MIN_GREEN = 5.0           # s
 STEP = 1.0                # s, of the splits
-SATURATION = 0.5          # veh/s and lane: 1,800 an hour
+SATURATION = 0.5          # veh/s and lane: 1,800 an hour, straight on
+TURNING = {"l": 0.95, "r": 0.85}  # of that in turns (HCM)
 LOST = 1.0                # s of every green window, more than what is used of the yellow
 GAP, FOLLOW_UP = 4.5, 2.5  # s, critical gap and follow-up time of permitted left turns (HCM)
 SNEAKERS = 1.0            # veh per lane, which wait on the junction and turn when the green ends
@@ -38,11 +39,12 @@ LEAST = 1e-4              # veh/s, so that a capacity is never zero
 
 @dataclass(frozen=True, kw_only=True)
 class _Lane:
-    """A lane before a signal. flow: [veh/s]; shares: ((link index, share of the flow), ...); edge: its own."""
+    """A lane before a signal. edge: its own; flow: [veh/s]; shares: ((link index, share of the flow, saturation flow
+    [veh/s]), ...)"""
 
     edge: str
     flow: float
-    shares: tuple[tuple[int, float], ...]
+    shares: tuple[tuple[int, float, float], ...]
 
 
 def optimised(city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, str], float]) -> list[Signal]:
@@ -66,7 +68,7 @@ def optimised(city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, s
 def plan(
     city: City, signals: Sequence[Signal], demand: np.ndarray, step: float, *, folder: Path,
 ) -> Path:
-    """The additional file for SUMO with `signals` optimised for the busiest hour of `demand` (T, R, R) [veh/s].
+    """The additional file for SUMO with `signals` optimised for the peak of `demand` (T, R, R) [veh/s].
 
     Kept in `folder` under a name that changes with all that it depends on. InputError if it cannot be written there.
     """
@@ -94,14 +96,17 @@ def _lanes(signal: Signal, flows: Mapping[tuple[str, str], float]) -> list[_Lane
     serving: dict[tuple[str, str], set[int]] = {}
     for edge, lane, to in links:
         serving.setdefault((edge, to), set()).add(lane)
-    found: dict[tuple[str, int], list[tuple[int, float]]] = {}
+    found: dict[tuple[str, int], list[tuple[int, float, float]]] = {}
     for (edge, lane, to), link in sorted(links.items()):
         if flow := flows.get((edge, to), 0.0) / len(serving[edge, to]):
-            found.setdefault((edge, lane), []).append((link.index, flow))
-    return [
-        _Lane(edge=edge, flow=sum(flow for _, flow in parts),
-              shares=tuple((index, flow / sum(flow for _, flow in parts)) for index, flow in parts))
-        for (edge, _), parts in found.items()]
+            rate = SATURATION * TURNING.get(link.turn, 1.0)
+            found.setdefault((edge, lane), []).append((link.index, flow, rate))
+    lanes = []
+    for (edge, _), parts in found.items():
+        total = sum(flow for _, flow, _ in parts)
+        lanes.append(_Lane(
+            edge=edge, flow=total, shares=tuple((index, flow / total, rate) for index, flow, rate in parts)))
+    return lanes
 
 
 def _split(signal: Signal, lanes: list[_Lane], cycle: float) -> tuple[Signal, float] | None:
@@ -132,7 +137,7 @@ def _opposing(signal: Signal, lanes: list[_Lane]) -> dict[tuple[int, str], tuple
     for n in signal.stages:
         state = signal.phases[n].state
         for edge in {lane.edge for lane in lanes}:
-            flows = [lane.flow * sum(share for index, share in lane.shares if state[index] == "G")
+            flows = [lane.flow * sum(share for index, share, _ in lane.shares if state[index] == "G")
                      for lane in lanes if lane.edge != edge]
             found[n, edge] = sum(flows), max(flows, default=0.0)
     return found
@@ -145,13 +150,13 @@ def _delay(signal: Signal, durations: list[float], lanes: list[_Lane], opposing,
         served, served_before = 0.0, math.inf  # veh per cycle that could pass; headway in the phase before
         for n, phase in enumerate(signal.phases):
             headway = 0.0
-            for index, share in lane.shares:
+            for index, share, rate in lane.shares:
                 light = phase.state[index]
                 if light == "G":
-                    headway += share / SATURATION
+                    headway += share / rate
                 elif light == "g":
                     against = opposing.get((n, lane.edge), (SATURATION, SATURATION))
-                    headway += share / _permitted(*against, durations[n], cycle)
+                    headway += share / min(_permitted(*against, durations[n], cycle), rate)
                 else:
                     headway = math.inf
             if headway < math.inf:

@@ -117,22 +117,25 @@ def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -
 
 
 def draw_accumulations(
-    folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory], seed: int | None = None,
+    folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory], *, seed: int | None = None,
+    title: str | None = None,
 ) -> None:
     """Total and regional accumulation over time, as png files in `folder`.
 
-    seed: shown instead of the mean over seeds.
+    seed: shown instead of the mean over seeds; title: above both pictures.
     """
     from nmfd import plots  # workers import this module, and none of them draws
 
     drawing = plots.figure(8.0, 4.6)
     ax = plots.total_accumulation(drawing.subplots(), trajectories, seed)
+    drawing.suptitle(title, fontsize="medium")
     plots.legend_below(drawing, [ax], columns=6)
     plots.save(drawing, folder / "total_accumulation.png")
     network = scenario.network
     drawing, axes = plots.panels(network.regions)
     for region, ax in enumerate(axes):
         plots.region_accumulation(ax, network, region, trajectories, seed)
+    drawing.suptitle(title, fontsize="medium")
     plots.legend_below(drawing, axes, columns=3)
     plots.save(drawing, folder / "region_accumulation.png")
 

@@ -88,7 +88,7 @@ def benchmark(
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True,
               help="auto: a GPU where there is one. The CPU gives the same weights every time.")
 @click.option("--compile/--no-compile", "compiled", default=None,
-              help="Compile the rollout: a minute or two first, then several times as fast. [default: from 200 Adam "
+              help="Compile the rollout: a minute or two first, then about twice as fast. [default: from 200 Adam "
                    "steps up, where there is a C++ compiler]")
 def train(
     scenario: Path, controller: str, seed: int, steps: int | None, out: Path | None, resume: bool, device: str,
@@ -110,14 +110,19 @@ def train(
     loaded = load_scenario(scenario)
     device = training.available(device)
     chosen = training.settings(loaded, controller, steps)  # complains of the name before a file is named after it
-    default = compiled is None
-    if default:
-        compiled = chosen.steps >= training.WORTH_COMPILING and rollout.can_compile()
-    elif compiled and not rollout.can_compile():
-        raise InputError("--compile: needs a C++ compiler, and none was found; install g++ or leave it out")
     file = scenario / f"{controller}.pt" if out is None else out
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the policy; make it or choose another --out")
+    default = compiled is None
+    if default:
+        compiled = chosen.steps >= training.WORTH_COMPILING
+    if compiled and not rollout.can_compile(device):
+        if not default:
+            raise InputError("--compile: does not work here, most likely for want of a C++ compiler; install g++ or "
+                             "leave it out")
+        compiled = False
+        click.echo("nmfd: cannot compile here, most likely for want of a C++ compiler; training goes on uncompiled, "
+                   "about half as fast", err=True)
     state = file.with_name(file.name + ".resume")
     before = _stamp(state)
     notes = ["no validation yet"]

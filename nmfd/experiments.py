@@ -128,7 +128,7 @@ def _sigmas(text: str) -> list[float]:
               help="horizon: control intervals that MPC looks ahead.")
 @click.option("--controllers", default="mpc-pc,mpc-pcrg", show_default=True, metavar="A,B", help="horizon: which MPC.")
 @click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="acyclic", show_default=True,
-              help="horizon: the model that MPC acts on.")
+              help="The model that MPC and the trained policies act on.")
 @click.option("--workers", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
               help="Runs at a time, each on one core. Timings are cleanest with 1.")
 @click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
@@ -138,9 +138,12 @@ def ablation(
 ) -> None:
     """Vary one thing and draw its effect: the training of DPC with route guidance, or the horizon of MPC.
 
-    training: the two decoders in turn (alternating) against both at once (joint), the same Adam steps.
-    horizon: total time spent and time of a decision over the horizon. Finished runs are kept: the same command with
-    the same --out goes on where it was interrupted.
+    training: the two decoders in turn (alternating) against both at once (joint), with the same Adam steps; the
+    validations on the way, and the total time spent of every trained policy on the plant.
+    horizon: total time spent and time of a decision over the horizon.
+
+    The run folder holds csv files, a figure and manifest.json. Finished runs are kept: the same command with the same
+    --out goes on where it was interrupted, and seeds or horizons can be added.
 
     \b
     Examples:
@@ -160,7 +163,7 @@ def ablation(
         with progress_line(f"ablation {what}") as progress:
             if what == "training":
                 rows = method.alternating_or_joint(
-                    loaded, range(seeds), out=out, controller=controller, steps=steps, workers=workers,
+                    loaded, range(seeds), plant=plant, out=out, controller=controller, steps=steps, workers=workers,
                     progress=progress)
             else:
                 rows = method.horizons(
@@ -170,7 +173,7 @@ def ablation(
             raise Interrupted("interrupted before a run was finished; nothing is kept") from None
         raise Interrupted(
             f"interrupted; finished runs are in {out}: the same command with --out {quoted(out)} goes on") from None
-    click.echo(method.table(what, rows))
+    click.echo(method.table(rows))
     click.echo(f"Written to {out}")
 
 

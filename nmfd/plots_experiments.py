@@ -40,7 +40,7 @@ def trips(ax: Axes, counts: Mapping[float, float]) -> Axes:
 def training_curves(ax: Axes, rows: Sequence[Mapping]) -> Axes:
     """The best validation so far [veh s] against Adam steps: mean over seeds and their range, one curve per method.
 
-    rows: of training.csv (nmfd.ablation)
+    rows: of validation.csv (nmfd.ablation)
     """
     for method in dict.fromkeys(row["method"] for row in rows):
         seeds: dict[int, dict[int, float]] = {}
@@ -55,6 +55,24 @@ def training_curves(ax: Axes, rows: Sequence[Mapping]) -> Axes:
     ax.set_yscale("log")
     ax.set_xlabel("Adam steps")
     ax.set_ylabel("best total time spent in validation [veh s]")
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
+def trained(ax: Axes, rows: Sequence[Mapping]) -> Axes:
+    """Total time spent [veh s] of every finished policy on the plant, one column per method, with the mean over seeds.
+
+    rows: of training.csv (nmfd.ablation)
+    """
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    for place, method in enumerate(methods):
+        totals = [row["total_time_spent_veh_s"] for row in rows if row["method"] == method]
+        across = place + np.linspace(-0.12, 0.12, len(totals)) if len(totals) > 1 else [place]
+        ax.plot(across, totals, "o", color=METHOD_COLOURS[method], markersize=5)
+        ax.hlines(np.mean(totals), place - 0.3, place + 0.3, color=METHOD_COLOURS[method], linewidth=1.6)
+    ax.set_xticks(range(len(methods)), methods)
+    ax.set_xlim(-0.6, len(methods) - 0.4)
+    ax.set_ylabel("total time spent on the plant [veh s]")
     ax.spines[["top", "right"]].set_visible(False)
     return ax
 

@@ -34,9 +34,12 @@ class Rollout:
         self.jam = tensor([m.jam for m in network.mfds])
         self.bound = (self.demand.sum((0, 1)) > 0).to(dtype)
 
-    def random_start(self, batch: int, spread: float, share: float, generator) -> tuple[torch.Tensor, torch.Tensor]:
+    def random_start(
+        self, batch: int, spread: float, share: float, generator, levels: tuple[float, float] = (1.0, 1.0),
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Initial states (B, R, R) [veh] and demands (T, B, R, R) [veh/s].
 
+        levels: the demand of a whole rollout is multiplied by a number between these
         A share of the rollouts starts at a random time of the scenario from a random state, which fills the regions
         up to between nothing and 80 % of their jam accumulation with vehicles for the destinations in use.
         """
@@ -53,6 +56,8 @@ class Rollout:
         weight = uniform(batch, regions, regions) ** 2 * self.bound
         total = uniform(batch, regions) * uniform(batch, 1) * 0.8 * self.jam
         x = total.unsqueeze(-1) * weight / weight.sum(-1, keepdim=True).clamp(min=1e-6)
+        if levels[0] < levels[1]:
+            demand = demand * (levels[0] + (levels[1] - levels[0]) * uniform(batch, 1, 1))
         return x * (rollout < share * batch)[:, None, None], demand
 
     def draw_model(self, batch: int, spread: float, generator) -> None:
@@ -133,9 +138,19 @@ class Rollout:
         return 0.5 * (splits - self.nominal_splits).abs().sum(-2) * leaving
 
 
-def can_compile() -> bool:
-    """Whether there is a C++ compiler, which torch.compile needs."""
-    return shutil.which(os.environ.get("CXX", "g++")) is not None
+def can_compile(device: str = "cpu") -> bool:
+    """Whether torch.compile works on `device`, found out with one small function.
+
+    It needs a C++ compiler, but also Python's headers and OpenMP, and on a GPU Triton.
+    """
+    if shutil.which(os.environ.get("CXX", "g++")) is None:
+        return False
+    try:
+        with warnings.catch_warnings():
+            compiled_step(torch.neg)(torch.ones(1, device=device))
+    except Exception:  # of the compiler, its tools, or a cache that cannot be written: all the same here
+        return False
+    return True
 
 
 def compiled_step(step: Callable) -> Callable:

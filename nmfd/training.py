@@ -37,6 +37,7 @@ class Training:
     learning_rate: of Adam at the start; falls to a tenth along a cosine
     alternating: with route guidance, train the two decoders in turn (the backbone always)
     demand_spread: every flow is scaled by a factor drawn from 1 +- demand_spread, per rollout
+    demand_low, demand_high: every flow is scaled, besides, by one factor drawn from between these, per rollout
     initial_share: share of the rollouts that start from a random state, at a random time of the scenario
     noise: largest sigma [veh/s] of the Gaussian noise on the demand of the pairs that have any, at every step; every
         rollout has its own sigma, evenly between 0 and `noise` (demand_noise.WHERE, "pairs")
@@ -53,17 +54,24 @@ class Training:
     learning_rate: float = 1e-3
     alternating: bool = True
     demand_spread: float = 0.2
+    demand_low: float = 1.0
+    demand_high: float = 1.0
     initial_share: float = 0.5
     noise: float = 0.0
     noise_all: float = 0.0
     mfd_spread: float = 0.0
     detour_cost: float = 0.0
 
+    @property
+    def levels(self) -> tuple[float, float]:
+        return self.demand_low, self.demand_high
+
 
 def settings(scenario: Scenario, controller: str, steps: int | None = None) -> Training:
     """The training settings of `controller` in `scenario`, checked; `steps` overrides."""
     if controller not in NAMES:
         raise InputError(f"--controller: {controller!r} cannot be trained; choose one of {', '.join(NAMES)}")
+    scenario = as_modelled(scenario, controller)
     default = Training(noise=ROBUST_NOISE if controller.endswith("-robust") else 0.0)
     table = toml.Table(
         scenario.controller_options.get(controller, {}), scenario.folder / "scenario.toml" if scenario.folder else
@@ -75,6 +83,8 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         learning_rate=table.number("learning_rate", default.learning_rate, above=0.0),
         alternating=table.flag("alternating", default.alternating),
         demand_spread=table.number("demand_spread", default.demand_spread, low=0.0, high=1.0),
+        demand_low=table.number("demand_low", default.demand_low, above=0.0, high=1.0),
+        demand_high=table.number("demand_high", default.demand_high, low=1.0),
         initial_share=table.number("initial_share", default.initial_share, low=0.0, high=1.0),
         noise=table.number("noise", default.noise, low=0.0),
         noise_all=table.number("noise_all", default.noise_all, low=0.0),
@@ -100,7 +110,7 @@ def train(
 
     `out` holds the best policy so far after every validation; `out`.resume beside it holds what `resume` needs and
     goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done, TTS)` after
-    every validation. `compiled` makes a step several times as fast, after up to a minute or two of compilation; the
+    every validation. `compiled` makes a step about twice as fast, after up to a minute or two of compilation; the
     weights differ by rounding.
     """
     scenario = as_modelled(scenario, controller)
@@ -125,7 +135,8 @@ def train(
             cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
             group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
         rollout.draw_model(chosen.batch, chosen.mfd_spread, generator)
-        x, demand = rollout.random_start(chosen.batch, chosen.demand_spread, chosen.initial_share, generator)
+        x, demand = rollout.random_start(
+            chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
         demand = rollout.perturb(
             demand, torch.rand(chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
         # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
@@ -165,11 +176,16 @@ def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> f
     If training perturbs demand or model: also of VALIDATIONS perturbed ones, whose sigma rises to that of `chosen`.
     """
     generator = torch.Generator().manual_seed(seed)
-    count = 2 + (VALIDATIONS if chosen.noise or chosen.noise_all or chosen.mfd_spread else 0)
+    perturbed = chosen.noise or chosen.noise_all or chosen.mfd_spread or chosen.demand_low < chosen.demand_high
+    count = 2 + (VALIDATIONS if perturbed else 0)
     rollout.draw_model(count, chosen.mfd_spread, generator)
     level = torch.linspace(0.0, 1.0, count // 2).repeat_interleave(2)  # in twos: one of each kind of noise
     nominal = rollout.demand.unsqueeze(1).expand(-1, count, -1, -1)
     demand = rollout.perturb(nominal, level, chosen.noise, chosen.noise_all, generator)
+    if chosen.demand_low < chosen.demand_high:
+        low, high = chosen.levels
+        demand = demand * (low + (high - low) * level[torch.randperm(count, generator=generator)]).to(
+            demand)[:, None, None]
     with torch.no_grad():
         total = rollout.total_time_spent(policy, torch.zeros_like(demand[0]), demand, generator)
     return torch.log(total).mean().exp().item()
@@ -179,7 +195,8 @@ def visited(policy: Policy, rollout: Rollout, chosen: Training, seed: int) -> np
     """States (N, R*R) [-], as a share of the policy's scale, that `policy` sees in rollouts like those in training."""
     generator = torch.Generator().manual_seed(seed)
     rollout.draw_model(4 * chosen.batch, chosen.mfd_spread, generator)
-    x, demand = rollout.random_start(4 * chosen.batch, chosen.demand_spread, chosen.initial_share, generator)
+    x, demand = rollout.random_start(
+        4 * chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
     demand = rollout.perturb(
         demand, torch.rand(4 * chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
     with torch.no_grad():

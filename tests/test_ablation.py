@@ -17,20 +17,65 @@ def nmfd(*arguments):
     return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
-def test_training_compares_both_methods_and_goes_on(folder, tmp_path, monkeypatch):
+@pytest.fixture
+def training_command(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "VALIDATE_EVERY", 1)
+    return ["ablation", "training", folder, "--steps", 2, "--seeds", 1, "--out", tmp_path / "out"]
+
+
+def test_training_compares_both_methods_on_the_plant(training_command, tmp_path):
     out = tmp_path / "out"
-    command = ["ablation", "training", folder, "--steps", 2, "--seeds", 1, "--out", out]
-    result = nmfd(*command)
+    result = nmfd(*training_command)
     assert result.exit_code == 0, result.stderr
-    rows = runs.read_rows(out / "training.csv", ablation.TRAINING_COLUMNS)
-    assert [(row["method"], row["adam_step"]) for row in rows] == [
+    curve = runs.read_rows(out / "validation.csv", ablation.VALIDATION_COLUMNS)
+    assert [(row["method"], row["adam_step"]) for row in curve] == [
         ("alternating", 1), ("alternating", 2), ("joint", 1), ("joint", 2)]
-    assert rows[1]["total_time_spent_veh_s"] != rows[3]["total_time_spent_veh_s"]
-    monkeypatch.setattr(training, "train", None)  # nothing is left to train
-    assert nmfd(*command).stdout == result.stdout
-    assert {path.name for path in out.iterdir()} == {"training.csv", "training.png", "manifest.json"}
-    assert nmfd(*command[:3], "--steps", 3, "--out", out).exit_code == 2
+    assert curve[1]["total_time_spent_veh_s"] != curve[3]["total_time_spent_veh_s"]
+    rows = runs.read_rows(out / "training.csv", ablation.TRAINING_COLUMNS)
+    assert [(row["method"], row["seed"], row["adam_steps"]) for row in rows] == [("alternating", 0, 2), ("joint", 0, 2)]
+    for row in rows:
+        points = [point["total_time_spent_veh_s"] for point in curve if point["method"] == row["method"]]
+        assert row["best_validation_veh_s"] == min(points)
+        # In a row of regions there is one way only: the acyclic plant and the regional model do not differ.
+        assert row["total_time_spent_veh_s"] == pytest.approx(min(points), rel=1e-2)
+    assert {path.name for path in out.iterdir()} == {"validation.csv", "training.csv", "training.png", "manifest.json"}
+    assert result.stdout.count("seed 0") == 2 and result.stdout.count("mean") == 2
+
+
+def test_training_is_not_repeated_and_seeds_can_be_added(training_command, tmp_path, monkeypatch):
+    result = nmfd(*training_command)
+    trained, original = [], training.train
+
+    def train(*args, **kwargs):
+        trained.append(kwargs["seed"])
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(training, "train", train)
+    assert nmfd(*training_command).stdout == result.stdout and not trained
+    assert nmfd(*training_command, "--seeds", 2).exit_code == 0
+    assert trained == [1, 1]
+    assert len(runs.read_rows(tmp_path / "out" / "validation.csv", ablation.VALIDATION_COLUMNS)) == 8
+    refused = nmfd(*training_command, "--steps", 3)
+    assert refused.exit_code == 2 and "adam_steps: 2 there, 3 asked for" in refused.stderr
+
+
+def test_an_interrupted_training_keeps_the_finished_ones(training_command, tmp_path, monkeypatch):
+    whole = nmfd(*training_command[:-1], tmp_path / "whole")
+    trained, original = [], training.train
+
+    def train(*args, **kwargs):
+        trained.append(kwargs["seed"])
+        if len(trained) == 2:
+            raise KeyboardInterrupt
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(training, "train", train)
+    result = nmfd(*training_command)
+    assert result.exit_code == 130 and result.stderr.count("\n") == 1 and "goes on" in result.stderr
+    assert nmfd(*training_command).stdout.splitlines()[:-1] == whole.stdout.splitlines()[:-1]
+    assert len(trained) == 3
+    for name in ("validation.csv", "training.csv"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
 def test_horizon_runs_every_length_and_can_be_extended(folder, tmp_path):
@@ -58,8 +103,17 @@ def test_wrong_arguments_are_one_line(folder, tmp_path, arguments, fragment):
 
 def test_curves_show_the_best_so_far_of_every_seed():
     rows = [
-        dict(zip(ablation.TRAINING_COLUMNS, ("joint", seed, step, total), strict=True))
+        dict(zip(ablation.VALIDATION_COLUMNS, ("joint", seed, step, total), strict=True))
         for seed, totals in enumerate(([4.0, 5.0, 2.0], [8.0, 1.0, 3.0])) for step, total in enumerate(totals)]
     ax = plots_experiments.training_curves(plots.figure(4, 3).subplots(), rows)
     assert list(ax.lines[0].get_ydata()) == [6.0, 2.5, 1.5] and "2 seeds" in ax.lines[0].get_label()
     assert "veh s" in ax.get_ylabel()
+
+
+def test_every_trained_policy_has_its_point():
+    rows = [{"method": method, "total_time_spent_veh_s": total} for method, total in (
+        ("alternating", 3.0), ("alternating", 5.0), ("joint", 2.0))]
+    ax = plots_experiments.trained(plots.figure(4, 3).subplots(), rows)
+    assert [list(line.get_ydata()) for line in ax.lines] == [[3.0, 5.0], [2.0]]
+    assert [text.get_text() for text in ax.get_xticklabels()] == ["alternating", "joint"]
+    assert ax.collections[0].get_segments()[0][0][1] == 4.0

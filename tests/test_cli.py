@@ -2,9 +2,9 @@
 
 import importlib
 import json
+import os
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ import tiny
 import torch
 from click.testing import CliRunner
 
-from nmfd import benchmarks, closed_loop, runs, training
+from nmfd import benchmarks, closed_loop, rollout, runs, training
 from nmfd.cli import main
 from nmfd.controllers import registry
 from nmfd.controllers.gating import PiGating
@@ -45,19 +45,25 @@ def timeless(folder):
     return rows, {path.name: path.read_bytes() for path in folder.glob("*.npz")}
 
 
-@pytest.mark.parametrize("package, commands", [
-    ("nmfd", [[], ["benchmark"], ["train"], ["show"]]), ("cosim", [[]])])
-def test_help_is_quick_and_shows_an_example(package, commands):
-    for command in commands:
+def commands(package):
+    """The command line itself and every command of `package`."""
+    group = importlib.import_module(f"{package}.cli").main
+    return [[], *([command] for command in group.commands)]
+
+
+@pytest.mark.parametrize("package", ["nmfd", "cosim"])
+def test_help_is_quick_and_shows_an_example(package):
+    for command in commands(package):
         call = [sys.executable, "-c", f"from {package}.cli import main; main()", *command, "--help"]
         durations = []
-        for _ in range(4):  # the least of them: the machine has other work
-            begin = time.perf_counter()
+        for _ in range(4):  # the least of them, and processor time: the machine has other work
+            begin = os.times()
             text = subprocess.run(call, capture_output=True, text=True, check=True).stdout
-            durations.append(time.perf_counter() - begin)
+            end = os.times()
+            durations.append(end.children_user + end.children_system - begin.children_user - begin.children_system)
             if durations[-1] < 0.5:
                 break
-        assert min(durations) < 0.5
+        assert min(durations) < 0.5, command
         assert "Example" in text and "Usage: " + " ".join([package, *command]) in text
 
 
@@ -65,13 +71,6 @@ def test_help_is_quick_and_shows_an_example(package, commands):
 def test_importing_the_command_line_imports_nothing_heavy(package):
     code = f"import sys, {package}.cli; print(*[name for name in {HEAVY} if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "\n"
-
-
-@pytest.mark.parametrize("package", ["nmfd", "cosim"])
-def test_every_command_shows_an_example(package):
-    group = importlib.import_module(f"{package}.cli").main
-    for name in ([], *([command] for command in group.commands)):
-        assert "Example" in CliRunner().invoke(group, [*name, "--help"]).stdout
 
 
 def test_without_arguments_the_help_is_shown():
@@ -213,6 +212,44 @@ def test_training_interrupted_at_once_keeps_nothing(scenario, monkeypatch):
     assert (result.exit_code, result.stderr) == (
         130, "nmfd: interrupted before the first validation; nothing is kept\n")
     assert [path.name for path in scenario.iterdir()] == ["scenario.toml"]
+
+
+@pytest.fixture
+def no_compiler(tmp_path, monkeypatch):
+    (tmp_path / "bin").mkdir()
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setattr(training, "WORTH_COMPILING", 2)
+
+
+def test_without_a_compiler_training_goes_on_uncompiled(no_compiler, scenario):
+    result = nmfd("train", scenario, "--controller", "dpc-pc", "--steps", 2)
+    assert result.exit_code == 0 and result.stderr.count("\n") == 1 and "training goes on uncompiled" in result.stderr
+    content = torch.load(scenario / "dpc-pc.pt", weights_only=True)
+    assert content["configuration"]["compiled"] is False
+
+
+def test_asking_for_compilation_without_a_compiler_is_one_line(no_compiler, scenario):
+    result = nmfd("train", scenario, "--controller", "dpc-pc", "--steps", 2, "--compile")
+    assert result.exit_code == 2 and result.stderr.count("\n") == 1 and "install g++" in result.stderr
+    assert [path.name for path in scenario.iterdir()] == ["scenario.toml"]
+
+
+def test_a_compiler_that_does_not_work_counts_as_none(monkeypatch):
+    def compiled_step(step):
+        def compiled(x):
+            raise RuntimeError("Python.h: no such file")
+
+        return compiled
+
+    monkeypatch.setattr(rollout, "compiled_step", compiled_step)
+    assert not rollout.can_compile()
+
+
+def test_a_gpu_that_is_not_there_is_one_line(scenario, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    result = nmfd("train", scenario, "--controller", "dpc-pc", "--steps", 1, "--device", "cuda")
+    assert (result.exit_code, result.stderr.count("\n")) == (2, 1) and "finds no GPU here" in result.stderr
 
 
 def test_show_draws_the_scenario(scenario, tmp_path):

@@ -213,6 +213,26 @@ def test_resume_needs_something_to_resume_and_the_same_settings(tmp_path, scenar
         training.train(scenario, "dpc-pc", seed=1, out=out, steps=4, resume=True)
 
 
+@pytest.mark.parametrize("controller", training.NAMES)
+def test_every_tensor_of_a_training_step_is_on_the_device(scenario, controller):
+    """On the device "meta", which like a GPU refuses tensors of another."""
+    guidance = training.NAMES[controller]
+    made = Policy(scenario.network, Architecture(width=8, guidance=guidance)).to("meta")
+    rollout, generator = training.Rollout(scenario, device="meta", detour_cost=1.0), torch.Generator().manual_seed(0)
+    rollout.draw_model(4, 0.1, generator)
+    x, demand = rollout.random_start(4, 0.2, 0.5, generator)
+    demand = rollout.perturb(demand, torch.rand(4, generator=generator), 1.0, 1.0, generator)
+    total = rollout.total_time_spent(made, x, demand, generator)
+    torch.log(total).mean().backward()
+    assert total.device.type == "meta" and all(weights.grad.device.type == "meta" for weights in made.parameters())
+
+
+def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
+    for there, expected in ((True, "cuda"), (False, "cpu")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        assert training.available("auto") == expected and training.available("cpu") == "cpu"
+
+
 @pytest.mark.parametrize("options, problem", [
     ({"widht": 3}, "widht: unknown key"), ({"activation": "sine"}, "activation: expected one of"),
     ({"steps": 0}, "steps: expected a whole number from 1"), ({"batch": 1.5}, "batch: expected a whole number")])

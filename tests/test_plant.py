@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from test_actuate import MIN_GREEN, check
 
+from cosim.guidance import shifted
 from cosim.measure import LedgerError
 from cosim.plant import Settings, SumoPlant
 from cosim.sumo import Session
@@ -136,6 +137,14 @@ def test_guided_vehicles_go_where_theta_sends_them(scenario, plant_of):
     crossings, guided = sent_round(scenario, plant_of(most_detour=1e9))
     assert guided > 15
     assert crossings[0] >= 10 and crossings[0] > 0.9 * crossings.sum()
+
+
+def test_theta_shifts_what_drivers_wish():
+    wish, own = np.array([0.7, 0.3, 0.0]), np.array([0.2, 0.5, 0.3])
+    np.testing.assert_allclose(shifted(wish, own, own), wish)
+    np.testing.assert_allclose(shifted(wish, own, np.array([0.0, 0.0, 1.0])), [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(shifted(wish, own, np.array([0.1, 0.5, 0.4])), [0.35, 0.3, 0.35])
+    np.testing.assert_allclose(shifted(wish, own, np.array([0.2, 0.8, 0.0])), wish)  # nobody wished what it lowers
 
 
 def test_nobody_follows_on_a_long_detour(scenario, plant_of):

@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,12 +12,16 @@ from click.testing import CliRunner
 
 from nmfd import closed_loop, robustness, training
 from nmfd.cli import main
-from nmfd.controllers import guarded, registry
+from nmfd.controllers import dpc, guarded, registry
 from nmfd.controllers.dpc import Architecture, Policy, checkpoint
 from nmfd.controllers.gating import PiGating
 from nmfd.demand_noise import WHERE, entries, perturbed
+from nmfd.metrics import total_time_spent
+from nmfd.plant import NmfdPlant
 from nmfd.scenario import load_scenario
 from nmfd.types import Measurement
+
+BENCHMARK = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
 
 
 @pytest.fixture
@@ -138,9 +143,16 @@ def test_a_folder_of_another_noise_is_refused(folder, tmp_path):
     assert result.exit_code == 2 and 'where: "pairs" there, "all" asked for' in result.stderr
 
 
+def constant_policy(scenario, logit):
+    made = Policy(scenario.network, Architecture(width=4))
+    with torch.no_grad():
+        made.perimeter_decoder.bias.fill_(logit)
+        made.perimeter_decoder.weight.fill_(0.0)
+    return made
+
+
 def guard(scenario, spread=0.1):
-    torch.manual_seed(0)
-    policy = Policy(scenario.network, Architecture(width=4))
+    policy = constant_policy(scenario, 20.0)
     states = 0.5 + spread * np.random.default_rng(0).standard_normal((5000, 4))
     return guarded.Guarded(policy, guarded.statistics(states), scenario)
 
@@ -151,7 +163,8 @@ def at(scenario, value, step=0):
         step=step, time=30.0 * step, accumulation=np.full((2, 2), value * critical), backlog=np.zeros((2, 2)))
 
 
-def test_the_guard_takes_over_outside_and_hands_back_inside(scenario):
+def test_the_guard_takes_over_outside_and_hands_back_inside(scenario, monkeypatch):
+    monkeypatch.setattr(guarded, "MOST_ERROR", np.inf)  # the states here jump
     watched, gating = guard(scenario), PiGating(scenario)
     assert watched.act(at(scenario, 0.5)).status == "ok"
     gating.reset()
@@ -161,6 +174,37 @@ def test_the_guard_takes_over_outside_and_hands_back_inside(scenario):
         np.testing.assert_array_equal(controls.perimeter, gating.act(at(scenario, 2.0, step)).perimeter)
     statuses = [watched.act(at(scenario, 0.5, step)).status for step in range(3, 3 + guarded.PATIENCE)]
     assert all(status != "ok" for status in statuses[:-1]) and statuses[-1] == "ok"
+
+
+def wrong_policy(scenario):
+    """All perimeters as good as closed, whatever the state."""
+    return constant_policy(scenario, -20.0)
+
+
+def test_a_wrong_policy_does_not_make_it_worse_in_silence():
+    """Closed gates in an empty city: the states are those of its own training, and still it is found out."""
+    benchmark = load_scenario(BENCHMARK)
+    scenario = replace(benchmark, measurement_std=0.0, steps=120, demand=0.4 * benchmark.demand)
+    made = wrong_policy(scenario)
+    alone = closed_loop.run(NmfdPlant(scenario), dpc.DpcController(made), scenario, seed=0)
+    states = (alone.accumulation[:-1] / made.scale.numpy()).reshape(-1, 49)
+    watched = guarded.Guarded(made, guarded.statistics(np.repeat(states, 4, axis=0)), scenario)
+    kept = closed_loop.run(NmfdPlant(scenario), watched, scenario, seed=0)
+    nobody = closed_loop.run(NmfdPlant(scenario), registry.make("no-control", scenario), scenario, seed=0)
+    assert total_time_spent(alone) > 1.2 * total_time_spent(nobody)
+    assert total_time_spent(kept) <= total_time_spent(nobody)
+    assert any("more time than no control, pi-gating in control" in status for status in kept.status)
+
+
+def test_a_city_that_the_model_does_not_predict_is_noticed(scenario):
+    """It is told once that nothing has changed, where the model has seen everybody leave."""
+    watched = guard(scenario)
+    assert watched.act(at(scenario, 0.5, 0)).status == "ok"
+    watched._predicted = watched._predicted + 0.5 * scenario.network.mfds[0].critical
+    status = watched.act(at(scenario, 0.5, 1)).status
+    assert "predictions miss by" in status and "pi-gating in control" in status
+    watched.reset()
+    assert watched.act(at(scenario, 0.5, 0)).status == "ok"
 
 
 def test_the_limit_lets_the_training_states_pass(scenario):
@@ -173,7 +217,7 @@ def test_the_limit_lets_the_training_states_pass(scenario):
 def test_the_guard_reads_the_statistics_of_a_trained_policy(folder, scenario, tmp_path):
     file = training.train(scenario, "dpc-pc", seed=0, out=tmp_path / "p.pt", steps=1)
     controller = registry.make("dpc-pc-guarded", scenario, policy=file)
-    assert controller.name == "dpc-pc-guarded" and controller.act(at(scenario, 0.0)).status == "ok"
+    assert controller.name == "dpc-pc-guarded" and controller.distance(at(scenario, 0.0).accumulation) < 1.0
     torch.save(checkpoint(Policy(scenario.network, Architecture(width=4)), scenario.network, {}), tmp_path / "old.pt")
     result = nmfd("benchmark", folder, "--controllers", "dpc-pc-guarded", "--policy",
                   f"dpc-pc-guarded={tmp_path / 'old.pt'}", "--out", tmp_path / "out")

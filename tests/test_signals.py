@@ -1,5 +1,6 @@
 """Signal plans: max-pressure, actuated and optimised fixed time. Known answers, and states second by second in SUMO."""
 
+import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -226,6 +227,10 @@ def test_webster_in_sumo_and_under_perimeter_control(scenario, plant_of):
     plant = plant_of(signals="webster")
     plant.reset(1)
     plans = {name: plant.session.programme(name) for name in plant.session.signals()}
+    file = plant._signal_plan([])[1]
+    for logic in ElementTree.parse(file).getroot():  # a later offset is a later beginning
+        programme = plans[logic.get("id")]
+        assert programme.position == -float(logic.get("offset")) % programme.cycle
     shown, _, _ = drive(plant, scenario, 2)
     assert len({p.cycle for p in plans.values()}) == 1
     assert len({p.position for p in plans.values()}) > 5

@@ -1,0 +1,50 @@
+"""Figures of an evaluation: data that arrives in them, distinct colours, every seed told apart."""
+
+import numpy as np
+import pytest
+from test_runs import trajectory
+
+from cosim import figures
+from nmfd import plots
+
+
+@pytest.fixture
+def ax():
+    return plots.figure(5, 4).subplots()
+
+
+def test_one_seed_is_shown_and_all_are_shaded(ax):
+    runs = [trajectory("dpc-pc", seed) for seed in (0, 1, 2)]
+    plots.total_accumulation(ax, runs, seed=1)
+    shown = runs[1].accumulation.sum(axis=(1, 2)) + runs[1].backlog.sum(axis=(1, 2))
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), shown)
+    assert len(ax.collections) == 1
+
+
+def test_strategies_get_colours_of_their_own():
+    names = ["no-control", "max-pressure", *(f"dpc-pc+rerouting-{n}" for n in range(10, 90, 10))]
+    colours = plots.colours(names)
+    assert len({colours[name] for name in names}) == len(names) and colours["no-control"] == plots.colour("no-control")
+
+
+def test_link_map_colours_by_density_and_parts_the_directions(ax):
+    shapes = [np.array([[0.0, 0.0], [100.0, 0.0]]), np.array([[100.0, 0.0], [0.0, 0.0]])]
+    figures.link_densities(ax, shapes, np.array([0.0, 120.0]), np.array([1, 2]), np.array([0, 0]))
+    lines = ax.collections[0]
+    assert [tuple(colour) for colour in lines.get_colors()] == [
+        tuple(figures.DENSITIES.to_rgba(density)) for density in (0.0, 120.0)]
+    there, back = (segment[0][1] for segment in lines.get_segments())
+    assert there < 0 < back  # each to the right of its direction
+
+
+def test_gateway_queues_name_each_boundary_once(ax):
+    queue = np.array([[1.0, 0.0, 5.0], [2.0, 0.0, 6.0]])
+    figures.gateway_queues(ax, 90.0, queue, ["0 > 1", "0 > 1", "2 > 1"], most=6.0)
+    assert [text.get_text() for text in ax.texts] == ["0 > 1", "2 > 1"]
+    np.testing.assert_allclose(np.ma.filled(ax.collections[0].get_array(), 0.0), queue.T)
+
+
+def test_demand_figure_has_the_levels_as_ticks(ax):
+    figures.over_demand(ax, {"dpc-pc": {0.8: (0.9, 0.1), 1.3: (0.5, np.nan)}, "pi-gating": {0.8: (0.7, 0.1)}})
+    assert [tick.get_text() for tick in ax.get_xticklabels()] == ["0.8", "1.3"]
+    assert ax.get_ylim()[0] == 0.0 and len(ax.containers) == 2
