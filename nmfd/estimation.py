@@ -47,7 +47,8 @@ class Instruments:
     """What is known of the instruments.
 
     detector_share: (R,) [-], share of the lane length of the region that loop detectors stand for; 0: none there
-    detector_error: (R,) [-], standard deviation of a lasting relative error of the expanded accumulation
+    detector_error, detector_noise: (R,) [-], standard deviations of the relative error of the expanded accumulation, of
+        the part that lasts and of that which is another one in every interval
     counted_share: (R, R) [-], [i, h] = share of the lanes over that boundary that are counted
     counted_gateways: (R, R), their number
     probe_share: of all vehicles [-]
@@ -55,6 +56,7 @@ class Instruments:
 
     detector_share: np.ndarray
     detector_error: np.ndarray
+    detector_noise: np.ndarray
     counted_share: np.ndarray
     counted_gateways: np.ndarray
     probe_share: float
@@ -151,6 +153,8 @@ class _Model:
         kept = np.exp(-self._step / MEMORY)
         self._lasting = float((1.0 + kept) / (1.0 - kept))  # variance of white noise over that of what lasts
         self._turns = np.argwhere(network.split_mask)
+        self._from = torch.from_numpy(np.concatenate([  # the cell, of every event but departures
+            self._turns[:, 0] * regions + self._turns[:, 2], np.arange(regions) * (regions + 1)]))
         vehicle, probe = (torch.from_numpy(part) for part in self._effects())
         self._pairs = [_pairs(vehicle, vehicle), _pairs(vehicle, probe), _pairs(probe, probe)]
         self._half = vehicle[cells : cells + regions]
@@ -182,9 +186,9 @@ class _Model:
 
     def advance(self, belief: Belief, demand, perimeter, splits, observation: Observation, loops) -> Belief:
         """The belief one control interval later. loops: (R,) [veh], the accumulations that are to be trusted."""
-        z, covariance = self._predicted(belief, demand, perimeter, splits)
+        z, covariance, leaving = self._predicted(belief, demand, perimeter, splits)
         mean, posterior, surprise = z[: self._states], covariance[: self._states, : self._states], np.nan
-        reading, expected, noise = self._readings(z, observation, loops)
+        reading, expected, noise = self._readings(z, leaving, observation, loops)
         there = np.flatnonzero(np.isfinite(reading))
         if len(there):
             ahead = self._rows(z, covariance)[there]
@@ -207,8 +211,8 @@ class _Model:
         probes = np.minimum(probes, mean[self._x].reshape(known.shape))
         return Belief(mean=mean, covariance=posterior, probes=probes, surprise=surprise)
 
-    def _predicted(self, belief: Belief, demand, perimeter, splits) -> tuple[np.ndarray, torch.Tensor]:
-        """Z (size,) and its covariance."""
+    def _predicted(self, belief: Belief, demand, perimeter, splits) -> tuple[np.ndarray, torch.Tensor, np.ndarray]:
+        """Z (size,), its covariance, and what leaves every cell (R^2,) [veh]."""
         mean, errors, first = torch.from_numpy(belief.mean), self._x.start, self._expansion.start
         # Of the flows: all inputs but the expansion.
         inputs = torch.cat([torch.arange(first), torch.arange(errors, self._states)])
@@ -220,8 +224,10 @@ class _Model:
         jacobian[errors:, inputs] = (outputs[1:] - outputs[0]).T / DIFFERENCE
         covariance = jacobian @ torch.from_numpy(belief.covariance) @ jacobian.T
         covariance.diagonal()[:errors] += (1.0 - self._kept**2) * self._spread**2
-        covariance[errors:, errors:] += self._flow_noise(belief, moves, seen)
-        return torch.cat([self._kept * mean[:errors], outputs[0]]).numpy(), covariance
+        leaving = torch.zeros(self._cells, dtype=torch.float64).index_add_(
+            0, self._from, moves[: len(self._from)])  # the turns and ends of trips
+        covariance[errors:, errors:] += self._flow_noise(belief, moves, seen, leaving)
+        return torch.cat([self._kept * mean[:errors], outputs[0]]).numpy(), covariance, leaving.numpy()
 
     def _rollout(self, points, probes, demand, perimeter, splits) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """All of Z but the relative errors at `points` (B, 2 R + R^2); and the events of the first one, (events,)
@@ -260,12 +266,11 @@ class _Model:
         every = events[0].clamp(min=0.0)
         return outputs, every, events[1].clamp(min=0.0).minimum(every)
 
-    def _flow_noise(self, belief: Belief, moves: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
+    def _flow_noise(self, belief: Belief, moves, seen, leaving) -> torch.Tensor:
         """The covariance of Z without its relative errors that comes from the flows (events,) [veh] of which `seen` are
         probes: whole vehicles, so Poisson, and other flows than modelled, for probes and others alike."""
         x, turns = torch.from_numpy(belief.mean[self._x]), len(self._turns)
-        cell = torch.from_numpy(self._turns[:, 0] * self._regions + self._turns[:, 2])
-        leaving = torch.zeros_like(x).index_add_(0, cell, moves[:turns])
+        cell = self._from[:turns]
         error = FLOW_ERROR * moves
         error[:turns] += STRAY * leaving[cell]
         share = seen / moves.clamp(min=1e-9)
@@ -280,11 +285,11 @@ class _Model:
         parts[0].diagonal()[self._cells : self._cells + self._regions] += self._half**2 @ moves / 3.0
         return torch.cat([torch.cat(parts[:2], dim=1), torch.cat([parts[1].T, parts[2]], dim=1)])
 
-    def _readings(self, z: np.ndarray, observation: Observation, loops: np.ndarray) -> tuple:
+    def _readings(self, z: np.ndarray, leaving: np.ndarray, observation: Observation, loops: np.ndarray) -> tuple:
         """All readings (m,), NaN where there is none, their expectation and the variance of their own noise (m,).
 
         The last R^2 are no measurements, but keep a wrong model from going astray: that the probes are a share of the
-        vehicles. A draw of probes lasts as long as they are on the way, so each time it is told, it counts little.
+        vehicles. A draw of probes lasts until they leave, MEMORY at most, so the longer, the less it counts each time.
         """
         known, here, to = self._instruments, *self._boundaries.T
         mean, expansion, counts = z[self._mean], z[self._expansion], z[self._crossings]
@@ -292,10 +297,13 @@ class _Model:
         boundary, gateways = (
             np.maximum(part[here, to], low) for part, low in ((known.counted_share, 1e-6), (known.counted_gateways, 1)))
         cells, p = np.full(self._cells, FLOOR), self._probe_share
-        thinning = p * (1.0 - p) * np.maximum(z[self._x], 1.0) * self._lasting + FLOOR
+        there = np.maximum(z[self._x], 1.0)
+        kept = np.minimum(np.exp(-leaving / there), np.exp(-self._step / MEMORY))
+        thinning = p * (1.0 - p) * there * (1.0 + kept) / (1.0 - kept) + FLOOR
         parts = (
             # a share of the links sees a share of the vehicles; the lasting part of the error is a state
-            (loops, (1.0 + expansion) * mean, np.maximum(mean, 1.0) * (1.0 - share) / share + FLOOR),
+            (loops, (1.0 + expansion) * mean,
+             np.maximum(mean, 1.0) * (1.0 - share) / share + (known.detector_noise * mean) ** 2 + FLOOR),
             (observation.crossings[here, to], counts,
              (1.0 - boundary) * (np.maximum(counts, 1.0) / boundary + COUNT_ERROR**2 * counts**2 / gateways) + FLOOR),
             (observation.probes.ravel(), z[self._probes], cells),

@@ -19,7 +19,7 @@ from nmfd.scenario import load_scenario
 from nmfd.types import Measurement
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
-INTERVALS = 4
+INTERVALS = 3
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +65,7 @@ def test_layout(city):
     everything = instruments(city, lay_out(city, 1.0), 1.0)
     assert (everything.detector_share == 1.0).all()
     assert (everything.detector_error < known.detector_error).all()
+    assert (everything.detector_noise < known.detector_noise).all()
     assert (everything.counted_share.sum(axis=1) > 0).all() and set(np.unique(everything.counted_share)) == {0.0, 1.0}
 
 

@@ -23,6 +23,7 @@ def equipped(*, detectors=0.3, probes=0.1, error=0.15):
     """Instruments that are alike in every region."""
     return Instruments(
         detector_share=np.full(REGIONS, detectors), detector_error=np.full(REGIONS, error),
+        detector_noise=np.full(REGIONS, error),
         counted_share=np.where(NETWORK.adjacency, detectors, 0.0),
         counted_gateways=np.where(NETWORK.adjacency, 2, 0), probe_share=probes)
 
@@ -83,7 +84,8 @@ class Crowd:
         slow = np.exp(-SCENARIO.step / estimation.EXPANSION_MEMORY)
         self._expansion = slow * self._expansion + np.sqrt(1.0 - slow**2) * known.detector_error * random.normal(
             size=REGIONS)
-        noise = np.sqrt(mean * (1.0 - known.detector_share) / known.detector_share) * random.normal(size=REGIONS)
+        noise = random.normal(size=REGIONS) * np.sqrt(
+            mean * (1.0 - known.detector_share) / known.detector_share + (known.detector_noise * mean) ** 2)
         share = np.where(NETWORK.adjacency, known.counted_share, 1.0)
         uneven = np.sqrt(np.maximum(1.0 - share, 0.0)) * random.normal(size=share.shape) * np.sqrt(
             crossings / share + estimation.COUNT_ERROR**2 * crossings**2 / np.maximum(known.counted_gateways, 1))

@@ -26,7 +26,8 @@ def test_estimator_step(benchmark):
     network, plant = SCENARIO.network, NmfdPlant(SCENARIO)
     inner = network.adjacency
     estimator = Estimator(SCENARIO, Instruments(
-        detector_share=np.full(7, 0.3), detector_error=np.full(7, 0.4), counted_share=np.where(inner, 0.3, 0.0),
+        detector_share=np.full(7, 0.3), detector_error=np.full(7, 0.3), detector_noise=np.full(7, 0.3),
+        counted_share=np.where(inner, 0.3, 0.0),
         counted_gateways=np.where(inner, 2, 0), probe_share=0.1))
     controls = Controls(perimeter=np.where(inner, network.u_max, 0.0), splits=None)
     plant.reset(0)
