@@ -29,7 +29,7 @@ VEHICLE_LENGTH = 5.0  # m, SUMO's passenger car
 STATIONS, SPACING = 3, 50.0  # loops of a lane at most; m, a shorter link has one, one of twice the length two
 # Standard deviation over mean [-] of the density over the links of a region, and of what the loops of one link make of
 # its density: a queue here and none there, and before or behind a loop. Measured in a run of grid7 that locked: over
-# the links 1.3 that lasts and 1.1 that passes; with loops on all links, regions at 76 to 144 % of their accumulation.
+# the links 1.3 that lasts and 1.1 that passes; with loops on all links, regions at 76 to 144 % of the truth.
 SPREAD_OVER_LINKS, SPREAD_ALONG_LINK = 1.3, 1.0
 EVERY = 3.0           # s, between two readings of a loop
 
