@@ -4,6 +4,7 @@
     no-control+rerouting-30  nobody controls, 30 % of the drivers reroute; `rerouting-30` for short
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from nmfd.controllers import registry
@@ -16,7 +17,9 @@ HOLD_BACK, REDISTRIBUTE = "hold-back", "redistribute"
 MODES = (HOLD_BACK, REDISTRIBUTE)
 
 # Option -> (field of cosim.plant.Settings, its value).
-_WORDS = {name: ("signals", name) for name in SIGNALS[1:]} | {name: ("actuation", name) for name in MODES}
+_WORDS = {
+    **{name: ("signals", name) for name in SIGNALS[1:]}, **{name: ("actuation", name) for name in MODES},
+    "estimate": ("measurement", "estimate")}
 # Option with a number -> (field of cosim.plant.Settings, least percentage); at most 100.
 _PERCENTAGES = {"rerouting": ("rerouting", 1), "compliance": ("compliance", 0)}
 OPTIONS = (*_WORDS, *(f"{name}-N" for name in _PERCENTAGES))
@@ -56,6 +59,16 @@ def parse(name: str) -> Strategy:
             raise InputError(f"strategy {name!r}: {chosen[key]} and {word} exclude each other; leave one of them out")
         chosen[key], overrides[key] = word, value
     return Strategy(name=name, controller=controller, overrides=overrides)
+
+
+def configured(name: str, tables: Iterable[str]) -> str:
+    """The controller of the strategy `name`, with as many of its options as one of the `tables` has in its name.
+
+    tables: names CONTROLLER+OPTION... of tables in [controllers], each with a regional model or a policy for that city
+    """
+    controller, words = parse(name).controller, set(name.split("+"))
+    fitting = [table for table in tables if table.startswith(f"{controller}+") and set(table.split("+")) <= words]
+    return max(fitting, key=lambda table: table.count("+"), default=controller)
 
 
 def _option(word: str) -> tuple[str, object] | None:

@@ -93,6 +93,7 @@ def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Pa
 
     InputError for an unknown name, for a `policy` that the controller has no use for, and for a missing file.
     """
+    variant, name = name, name.partition("+")[0]
     check(name)
     if name in _WITHOUT_POLICY:
         if policy is not None:
@@ -103,7 +104,7 @@ def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Pa
     if policy is None and scenario.folder is None:
         raise InputError(f"controller {name}: scenario {scenario.name} has no folder with policies; give a file")
     kind, verb, suffix = ("plan", "compute", "npz") if name in _WITH_PLAN else ("policy", "train", "pt")
-    owner = _GUARDED.get(name, name)
+    owner = _owner(variant)
     path = scenario.folder / f"{owner}.{suffix}" if policy is None else Path(policy)
     if not path.is_file():
         scenario_text = "SCENARIO" if scenario.folder is None else scenario.folder
@@ -113,15 +114,22 @@ def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Pa
     return path
 
 
+def _owner(name: str) -> str:
+    """Whose policy and options `name` uses."""
+    name, plus, rest = name.partition("+")
+    return _GUARDED.get(name, name) + plus + rest
+
+
 def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Controller:
     """The controller `name` for `scenario`; `policy` is the file of a policy or plan instead of the scenario's own.
 
-    Raises InputError as `policy_path` does, and what the controller itself finds wrong with its options or policy.
+    A name "NAME+..." stands for NAME with options and a policy of its own (nmfd.scenario.as_modelled). Raises
+    InputError as `policy_path` does, and what the controller itself finds wrong with its options or policy.
     """
     from nmfd.scenario import as_modelled
 
     path = policy_path(name, scenario, policy)
-    scenario = as_modelled(scenario, _GUARDED.get(name, name))
+    scenario, name = as_modelled(scenario, _owner(name)), name.partition("+")[0]
     if path is None:
         return _WITHOUT_POLICY[name](scenario)
     if name in _WITH_PLAN:
