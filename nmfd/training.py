@@ -16,6 +16,7 @@ from nmfd import toml
 from nmfd.controllers import guarded
 from nmfd.controllers.dpc import ACTIVATIONS, Architecture, Policy, checkpoint
 from nmfd.errors import InputError
+from nmfd.network import Network
 from nmfd.rollout import Rollout, compiled_step
 from nmfd.runs import atomic
 from nmfd.scenario import Scenario, as_modelled
@@ -23,6 +24,7 @@ from nmfd.scenario import Scenario, as_modelled
 VALIDATE_EVERY = 20  # Adam steps
 ROBUST_NOISE = 3.0     # veh/s, of the policies whose name ends in -robust
 WORTH_COMPILING = 200  # Adam steps
+WEAK, OPEN, RARE = 0.1, 3.0, 1e-3  # of the first policy from no control: factor of weights, logit of u, least theta
 VALIDATIONS = 16       # perturbed scenarios in a validation, if training perturbs the demand
 NAMES = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
 
@@ -43,6 +45,7 @@ class Training:
         rollout has its own sigma, evenly between 0 and `noise` (demand_noise.WHERE, "pairs")
     detour_cost: what a vehicle loses that is guided off the drivers' own split ratios, in the objective [s]
     mfd_spread: of the regional model that every rollout has for itself (Rollout.draw_model) [-]
+    from_no_control: the first policy is nearly no control, so that what training finds no reason to change stays open
     noise_all: the same of the noise on every pair of regions ("all"), in every other rollout, instead of `noise`
     """
 
@@ -61,6 +64,7 @@ class Training:
     noise_all: float = 0.0
     mfd_spread: float = 0.0
     detour_cost: float = 0.0
+    from_no_control: bool = False
 
     @property
     def levels(self) -> tuple[float, float]:
@@ -77,8 +81,8 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         raise InputError(f"--controller: {controller!r} cannot be trained; choose one of {', '.join(NAMES)}")
     if variant and controller not in scenario.controller_options:
         raise InputError(
-            f"--controller: {controller!r} needs a table [controllers.\"{controller}\"] in {scenario.folder}/scenario.toml "
-            f"that says what is different from {name}; add one, or train {name}")
+            f"--controller: {controller!r} needs a table [controllers.\"{controller}\"] in {scenario.folder}/"
+            f"scenario.toml that says what is different from {name}; add one, or train {name}")
     scenario = as_modelled(scenario, controller)
     default = Training(noise=ROBUST_NOISE if name.endswith("-robust") else 0.0)
     table = toml.Table(
@@ -97,7 +101,8 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         noise=table.number("noise", default.noise, low=0.0),
         noise_all=table.number("noise_all", default.noise_all, low=0.0),
         mfd_spread=table.number("mfd_spread", default.mfd_spread, low=0.0, high=1.0),
-        detour_cost=table.number("detour_cost", default.detour_cost, low=0.0))
+        detour_cost=table.number("detour_cost", default.detour_cost, low=0.0),
+        from_no_control=table.flag("from_no_control", default.from_no_control))
     table.close()
     return chosen if steps is None else Training(**{**asdict(chosen), "steps": steps})
 
@@ -128,9 +133,13 @@ def train(
     torch.set_num_threads(1)  # the matrices are small: more threads only wait for one another
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
+    guidance = NAMES[controller.partition("+")[0]]
     architecture = Architecture(
-        width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=NAMES[controller.partition("+")[0]])
-    policy = Policy(scenario.network, architecture).to(device)
+        width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=guidance)
+    policy = Policy(scenario.network, architecture)
+    if chosen.from_no_control:
+        begin_as_no_control(policy, scenario.network)
+    policy = policy.to(device)
     rollout = Rollout(scenario, device=device, detour_cost=chosen.detour_cost)
     advance = compiled_step(rollout.step) if compiled else rollout.step
     optimizer = torch.optim.Adam(policy.parameters(), lr=chosen.learning_rate)
@@ -176,6 +185,17 @@ def train(
         raise RuntimeError(f"{controller}: every validation of {chosen.steps} steps diverged; lower the learning rate")
     state_file.unlink(missing_ok=True)
     return out
+
+
+def begin_as_no_control(policy: Policy, network: Network) -> None:
+    """Let `policy` hardly depend on the state, with nearly open gateways and nearly the drivers' own split ratios."""
+    with torch.no_grad():
+        policy.perimeter_decoder.weight.mul_(WEAK)
+        policy.perimeter_decoder.bias.fill_(OPEN)
+        if policy.architecture.guidance:
+            own = torch.tensor(network.nominal_splits[np.arange(network.regions)[:, None], policy.onward.numpy()])
+            policy.splits_decoder.weight.mul_(WEAK)
+            policy.splits_decoder.bias.copy_(own.clamp(min=RARE).log().flatten())
 
 
 def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> float:
