@@ -17,7 +17,7 @@ from cosim.guidance import Guide
 from cosim.max_pressure import MaxPressure
 from cosim.measure import Meter
 from cosim.originals import Originals, read_originals, write_originals
-from cosim.regions import City, Gateway, check_adjacency, load_city
+from cosim.regions import City, Gateway, check_adjacency, gateway_room_taken, load_city
 from cosim.signals import Signal, read_signals, write_programmes
 from cosim.strategy import ACTUATED, FIXED, HOLD_BACK, MAX_PRESSURE, MODES, SIGNALS, WEBSTER
 from cosim.sumo import Session
@@ -44,6 +44,8 @@ class Settings:
 
     step_length: of SUMO [s]; time_to_teleport: [s], -1 for never; collision_action: SUMO's
     actuation: "hold-back" or "redistribute"; min_green: of a gateway movement [s]
+    queue_override: a gateway whose edge held this share of its room in the last control interval is left open, 0 for
+        never [-]
     compliance: share of the decisions in which a driver follows the route guidance [-]
     most_detour: a driver does not follow route guidance into a next region that costs him more than this [s]
     rerouting: share of the drivers with SUMO's own rerouting device [-]
@@ -69,6 +71,7 @@ class Settings:
     collision_action: str = "warn"
     actuation: str = HOLD_BACK
     min_green: float = 5.0
+    queue_override: float = 0.0
     compliance: float = 1.0
     most_detour: float = 60.0
     rerouting: float = 0.0
@@ -99,6 +102,7 @@ def settings(scenario: Scenario) -> Settings:
             "collision_action", default.collision_action, ("none", "warn", "teleport", "remove")),
         actuation=table.text("actuation", default.actuation, MODES),
         min_green=table.number("min_green", default.min_green, low=1.0),
+        queue_override=table.number("queue_override", default.queue_override, low=0.0, high=1.0),
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
         most_detour=table.number("most_detour", default.most_detour, low=0.0),
         rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0),
@@ -236,16 +240,16 @@ class SumoPlant:
         self._signals = self._gateway_signals()
         self._original_green = self._programmed_green()
         self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
-        self._k, self._rows, self._speed = 0, [], None
+        self._k, self._rows, self._speed, self._opened = 0, [], None, {}
         return self._estimated(self._measurement()) if estimating else self._measurement()
 
     def step(self, controls: Controls) -> Measurement:
         network, session, meter = self._scenario.network, self._session, self._meter
         before = self._totals()
         share = np.clip((controls.perimeter - network.u_min) / (network.u_max - network.u_min), 0.0, 1.0)
-        self._actuator.command(share)
+        self._actuator.command(share, self._opened)
         if self._max_pressure is not None:
-            self._max_pressure.command(share)
+            self._max_pressure.command(share, self._opened)
         self._guide.command(controls.splits, self._speed)
         begin, steps = session.time, round(self._scenario.step / session.step_length)
         every, often = (
@@ -277,6 +281,7 @@ class SumoPlant:
             self._speed = metres / vehicles
         row["production"], row["mean_accumulation"] = (
             np.bincount(self._edge_region, amount, network.regions) / len(queues) for amount in (metres, vehicles))
+        self._opened = self._overridden(vehicles / len(queues))
         row["edge_vehicles"] = (vehicles / len(queues)).astype(np.float16)  # to 0.1 % and as small as an integer
         queues = np.array(queues).reshape(len(queues), len(self._upstream))
         row["gateway_queue"], row["gateway_queue_max"] = (
@@ -366,6 +371,14 @@ class SumoPlant:
                     programme, movements[signal], min_green=self._settings.min_green,
                     mode=self._settings.actuation, start=self._session.time)
         return signals
+
+    def _overridden(self, edge_vehicles: np.ndarray) -> dict[str, set[int]]:
+        """Signal -> links of the gateways that stay open because of their queue. edge_vehicles: (E,) [veh], mean."""
+        limit, links = self._settings.queue_override, {}
+        for n in np.flatnonzero(gateway_room_taken(edge_vehicles, self.city) >= limit) if limit else ():
+            gateway = self.city.gateways[n]
+            links.setdefault(gateway.signal, set()).update(gateway.links)
+        return links
 
     def _programmed_green(self) -> np.ndarray:
         """(G,) [s] per control interval, as Record.gateway_original_green."""

@@ -21,7 +21,8 @@ _WORDS = {
     **{name: ("signals", name) for name in SIGNALS[1:]}, **{name: ("actuation", name) for name in MODES},
     "estimate": ("measurement", "estimate")}
 # Option with a number -> (field of cosim.plant.Settings, least percentage); at most 100.
-_PERCENTAGES = {"rerouting": ("rerouting", 1), "compliance": ("compliance", 0)}
+_PERCENTAGES = {
+    "rerouting": ("rerouting", 1), "compliance": ("compliance", 0), "queue-override": ("queue_override", 1)}
 OPTIONS = (*_WORDS, *(f"{name}-N" for name in _PERCENTAGES))
 
 
