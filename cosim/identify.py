@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim import experiment
+from cosim import bands, experiment
 from cosim.compare import HELD_UP, draw_mfds, outflow_samples
 from cosim.simulate import Result, Task
 from nmfd import identification, mfd, runs, toml
@@ -93,7 +93,9 @@ def identify(
         text += "\n" + prediction_table(
             fitted(kept, "fitting without the last seed"), [observed(result) for result in held_out], scheme)
     _write_samples(out / "samples.csv", samples)
-    draw_mfds(out / "mfd.png", model, samples)
+    by_run = [[own_points(cloud) for cloud in samples_of(network, [result])] for result in found]
+    draw_mfds(out / "mfd.png", model, samples, [bands.band(runs) for runs in zip(*by_run, strict=True)])
+    bands.draw_production(out / "production.png", model, [result.record for result in found])
     levels, seeds = ", ".join(f"{level:g}" for level in loading.levels), f"{min(loading.seeds)} to {max(loading.seeds)}"
     target.mkdir(parents=True, exist_ok=True)
     runs.write_text(target / "network.toml", network_toml(
