@@ -1,14 +1,14 @@
 """The finished runs in a folder of `cosim run` or `cosim evaluate`, with the city that they ran in."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 
 from cosim import evaluate, experiment
-from cosim.city import ensure_built
+from cosim.city import SumoFiles, ensure_built
 from cosim.regions import City, load_city
 from cosim.simulate import FACTS
 from nmfd import runs
@@ -70,21 +70,35 @@ def read(path: Path, scenario: Path | None = None) -> Finished:
         if not (path / "summary.csv").is_file() or not (path / "sumo.csv").is_file():
             raise InputError(f"{path}: holds no finished runs in SUMO; finish one with `cosim run` or `cosim evaluate`")
         folders = {_manifest(path)["configuration"]["demand_factor"]: path}
-    levels = tuple(_level(demand, folder) for demand, folder in folders.items())
+    levels = tuple(_level(demand, folder, _order(path)) for demand, folder in folders.items())
+    configuration = levels[0].manifest["configuration"]
     loaded = load_scenario(scenario or _scenario_folder(levels[0]))
+    if configuration.get("scenario") != loaded.name:
+        raise InputError(
+            f"--scenario: the runs are of {configuration.get('scenario')}, not of {loaded.name}; give its folder")
     files = ensure_built(loaded.network)
-    changed = _changed(levels[0].manifest["configuration"], loaded, files)
+    changed = _changed(configuration, files)
     return Finished(
         path=path, levels=levels, evaluation=evaluation, scenario=loaded, changed=changed,
         city=None if changed else load_city(files.net_file, files.regions_csv, loaded.network.regions))
 
 
-def _level(demand: float, folder: Path) -> Level:
+def _order(path: Path) -> list[str]:
+    """The controllers as `cosim evaluate` shows them; others follow as they come."""
+    table = path / "runs.csv"
+    return list(dict.fromkeys(pd.read_csv(table, usecols=["controller"])["controller"])) if table.is_file() else []
+
+
+def _level(demand: float, folder: Path, order: Sequence[str]) -> Level:
     rows = experiment.overview(folder)
     if rows.empty:
         raise InputError(f"{folder}: holds no finished runs; run the command that began it again")
     rows = rows.reindex(columns=[*rows.columns, *(name for name in FACTS if name not in rows.columns)])
     rows.insert(0, "demand", float(demand))
+    names = list(dict.fromkeys([*order, *rows["controller"]]))
+    rows = rows.sort_values(
+        ["controller", "seed"], ignore_index=True,
+        key=lambda column: column.map(names.index) if column.name == "controller" else column)
     return Level(demand=float(demand), folder=folder, rows=rows, manifest=_manifest(folder))
 
 
@@ -109,12 +123,8 @@ def _scenario_folder(level: Level) -> Path:
     raise InputError(f"{level.folder / 'manifest.json'}: scenario_folder: there is no {name}; give it with --scenario")
 
 
-def _changed(configuration: Mapping, scenario: Scenario, files) -> str:
-    """Why the city of `scenario` is not the one of the runs; empty if it is."""
-    if configuration.get("scenario") != scenario.name:
-        raise InputError(
-            f"--scenario: the runs are of {configuration.get('scenario')}, not of {scenario.name}; give the folder of "
-            "that one")
+def _changed(configuration: Mapping, files: SumoFiles) -> str:
+    """Why the city is not the one of the runs; empty if it is."""
     for key, file in (("net_file_hash", files.net_file), ("regions_hash", files.regions_csv)):
         if configuration.get(key) not in (None, runs.file_hash(file)):
             return f"{file} has changed since the runs were made"

@@ -2,6 +2,7 @@
 
 import base64
 import math
+import re
 import struct
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -24,7 +25,7 @@ p, ul { max-width: 78ch; margin: .5em 0; } ul { padding-left: 1.2em; } li { marg
 .note { color: var(--soft); font-size: .875rem; }
 a { color: var(--accent); }
 nav ul { list-style: none; padding: 0; display: flex; flex-wrap: wrap; gap: .2em 1.2em; max-width: none; }
-.scroll { overflow-x: auto; max-width: 100%; border: 1px solid var(--line); border-radius: 6px; }
+.scroll { overflow-x: auto; max-width: 100%; margin: .8em 0 .4em; border: 1px solid var(--line); border-radius: 6px; }
 .scroll:focus-visible { outline: 2px solid var(--accent); }
 table { border-collapse: collapse; font-size: .875rem; font-variant-numeric: tabular-nums; min-width: 100%; }
 th, td { padding: .38em .75em; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
@@ -32,9 +33,10 @@ thead th { background: var(--tint); font-weight: 600; }
 tbody tr:last-child > * { border-bottom: 0; }
 tbody th, thead th:first-child { text-align: left; position: sticky; left: 0; background: #fff; font-weight: 600; }
 thead th:first-child { background: var(--tint); }
+table.words th { text-align: left; }
 table.words td { text-align: left; white-space: normal; overflow-wrap: anywhere; min-width: 12em; }
 table.words tbody th { white-space: normal; vertical-align: top; }
-figure { margin: 1em 0 1.6em; } figure img { display: block; height: auto; margin: 0 auto; }
+figure { margin: .4em 0 1.6em; } figure img { display: block; height: auto; margin: 0 auto; }
 figcaption, .caption { color: var(--soft); font-size: .875rem; margin-top: .4em; max-width: 95ch; }
 details { margin: .9em 0; } summary { cursor: pointer; color: var(--accent); }
 @media (max-width: 600px) {
@@ -55,7 +57,12 @@ def text(name: str, content: object, **attributes: str | int) -> str:
 
 
 def items(sentences: Iterable[str]) -> str:
-    return tag("ul", *(text("li", sentence) for sentence in sentences))
+    return tag("ul", *(text("li", typeset(sentence)) for sentence in sentences))
+
+
+def typeset(sentence: str) -> str:
+    """With true minus signs, and units that stay on the line of their number."""
+    return re.sub(r"(?<![\w.])-(?=\d)", "\N{MINUS SIGN}", sentence).replace(" %", "\N{NO-BREAK SPACE}%")
 
 
 def fold(summary: str, *children: str) -> str:
@@ -83,7 +90,7 @@ def cell(value: object) -> str:
     """A value as text: seven digits, a dash where there is none."""
     if isinstance(value, float):
         return "–" if math.isnan(value) else f"{value:.7g}"
-    return "–" if value is None or str(value) in ("", "nan") else str(value)
+    return "–" if value is None or value == "" or "nan" in str(value).split() else str(value)
 
 
 def picture(path: Path, caption: str) -> str:

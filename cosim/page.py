@@ -9,7 +9,7 @@ import pandas as pd
 
 from cosim import report, story, tables
 from cosim.finished import Finished, Level
-from cosim.markup import cell, fold, items, page, picture, table, tag, text
+from cosim.markup import cell, fold, items, page, picture, table, tag, text, typeset
 from nmfd import runs
 from nmfd.benchmarks import REFERENCE
 
@@ -62,7 +62,7 @@ def write(
         tag("li", text("a", run.name, href=f"#run-{number}")) for number, run in enumerate(found))))
     names = ", ".join(dict.fromkeys(run.scenario.name for run in found))
     header = text("h1", f"Traffic control in SUMO: {names}") + text("p", WORDS, class_="note")
-    version = found[-1].levels[-1].manifest["sessions"][-1]["versions"].get("perimeter-cosim", "")
+    version = found[-1].levels[-1].manifest["sessions"][-1].get("versions", {}).get("perimeter-cosim", "")
     runs.write_text(path, page(
         f"{names}: report", header + (contents if len(found) > 1 else ""), "\n".join(parts),
         text("p", f"Made by cosim report from {', '.join(map(str, (run.path for run in found)))}; perimeter-cosim "
@@ -74,8 +74,8 @@ def _run(run: Finished, anchor: str, levels: Sequence[str]) -> str:
     configuration, rows = run.levels[0].manifest["configuration"], run.rows
     first = story.opening(
         run.scenario.name, configuration["steps"], configuration["step_s"], len(run.levels), rows)
-    lead = [tag("p", *(text("span", f"{sentence} ") for sentence in (
-        first, *(_at(run, level) + story.best(level.rows) for level in run.levels))))]
+    lead = [text("p", typeset(sentence)) for sentence in (
+        first, *(_at(run, level) + story.head(level.rows) for level in run.levels))]
     with tempfile.TemporaryDirectory(prefix="cosim-report-") as scratch:
         folder = Path(scratch)
         if run.city is not None:
@@ -94,13 +94,13 @@ def _at(run: Finished, level: Level) -> str:
 
 
 def _level(run: Finished, level: Level, reference: str | None) -> str:
-    rows = level.rows
-    if reference not in set(rows["controller"]):
+    rows, names = level.rows, set(level.rows["controller"])
+    if reference not in names:
         reference = None
     first, second = tables.shown(tables.statistics(rows, reference), reference)
     title = f"Demand times {level.demand:g}"
     parts = [
-        text("h3", title), items(story.sentences(rows)),
+        text("h3", title), items(story.details(rows)),
         _frame(f"What came of it, {title.lower()}", first),
         _frame(f"How, {title.lower()}", second), text("p", " ".join(tables.CAPTION.split()), class_="caption"),
         fold("Every strategy against every other, paired by seed", _numbers(
@@ -121,7 +121,7 @@ def _level(run: Finished, level: Level, reference: str | None) -> str:
         why = run.changed or "there was nothing of the kind in these runs, or an older version did not record it"
         parts.append(text("p", f"Without pictures of {', '.join(missing)}: {why}.", class_="note"))
     pair = [name for name in report.ranked(rows) if name != REFERENCE][:1]
-    both = f" and, where two are compared, {REFERENCE} and {pair[0]}" if pair else ""
+    both = f" and, where two are compared, {REFERENCE} and {pair[0]}" if len(pair) and REFERENCE in names else ""
     parts.insert(2, text("p", f"Pictures of single runs show seed {report.shown_seed(rows)}{both}.", class_="note"))
     return tag("div", *parts)
 

@@ -14,15 +14,19 @@ def opening(name: str, steps: int, step: float, levels: int, rows: pd.DataFrame)
     at = "one demand level" if levels == 1 else f"{levels} demand levels"
     return (
         f"{_count(len(controllers), 'strategy', 'strategies')} for the signals and routes of a simulated city were run "
-        f"in the microsimulation SUMO on the scenario {name}, at {at} and with the random seeds {seeds(rows['seed'])}, "
+        f"in the microsimulation SUMO on the scenario {name}, at {at} and with {_seeds(rows)}, "
         f"for {_count(steps, 'control interval')} of {step:g} s each ({steps * step / 60:.0f} min). With the same seed "
         f"every strategy meets the same trips.")
 
 
-def sentences(rows: pd.DataFrame) -> list[str]:
-    """Besides `best`; `rows` of one demand level, as in cosim.tables."""
-    return [text for text in (
-        _beyond_chance(rows), _uneven(rows), _unfinished(rows), _teleports(rows), _decisions(rows)) if text]
+def head(rows: pd.DataFrame) -> str:
+    """What matters most; `rows` of one demand level, as in cosim.tables."""
+    return f"{best(rows)} {_unfinished(rows)} {_teleports(rows)}"
+
+
+def details(rows: pd.DataFrame) -> list[str]:
+    """What else is to know; `rows` as in `head`."""
+    return [text for text in (_beyond_chance(rows), _uneven(rows), _decisions(rows)) if text]
 
 
 def best(rows: pd.DataFrame) -> str:
@@ -35,8 +39,8 @@ def best(rows: pd.DataFrame) -> str:
     pair = tables.paired(
         tables.by_seed(rows, level, first), tables.by_seed(rows, level, REFERENCE))
     if not pair.seeds:
-        return (f"The lowest total time spent was that of {first}, {_time(rows, first)}; there are no runs of "
-                f"{REFERENCE} with the same seeds to compare it with.")
+        return (f"The lowest total time spent was that of {first}, {_time(rows, first)}; there is no run of "
+                f"{REFERENCE} with the same seed to compare it with.")
     if pair.percent < 0:
         text = (f"The best strategy was {first}: total time spent {_time(rows, first)}, {-pair.percent:.1f} % less "
                 "than without control.")
@@ -45,7 +49,7 @@ def best(rows: pd.DataFrame) -> str:
                 f"{_time(rows, first)} is {pair.percent:.1f} % more.")
     text += " " + _certainty(pair)
     if len(others) > 1:
-        text += (f" It was chosen among {len(others)} on these very seeds ({seeds(rows['seed'])}), so its lead is "
+        text += (f" It was chosen among {len(others)} on these very runs ({_seeds(rows)}), so its lead is "
                  "flattered; only other seeds would tell its true size.")
         second = others[1]
         lead = tables.paired(tables.by_seed(rows, level, first), tables.by_seed(rows, level, second))
@@ -94,12 +98,11 @@ def _unfinished(rows: pd.DataFrame) -> str:
     for name, part in rows.groupby("controller", sort=False):
         trips, done = part["trips"].mean(), part["completed_veh"].mean()
         if trips - done >= 0.5:
-            left.append(f"{name} {trips - done:,.0f} of {trips:,.0f} ({part['final_backlog_veh'].mean():,.0f} still "
-                        "waiting to enter)")
+            left.append(f"{name} {trips - done:,.0f} of {trips:,.0f}")
     if not left:
         return "Every trip was completed in every run."
     others = " The others completed all." if len(left) < rows["controller"].nunique() else ""
-    return f"Not completed at the end, mean per run: {'; '.join(left)}.{others}"
+    return f"Trips not completed at the end, mean per run: {'; '.join(left)}.{others}"
 
 
 def _teleports(rows: pd.DataFrame) -> str:
@@ -123,6 +126,10 @@ def _decisions(rows: pd.DataFrame) -> str:
 def _time(rows: pd.DataFrame, name: str) -> str:
     mean = rows.loc[rows["controller"] == name, tables.TTS].mean()
     return f"{mean / 3600:,.0f} vehicle hours ({mean:.3e} veh s)"
+
+
+def _seeds(rows: pd.DataFrame) -> str:
+    return f"seed{'s' if rows['seed'].nunique() > 1 else ''} {seeds(rows['seed'])}"
 
 
 def seeds(values: Sequence[int]) -> str:

@@ -87,6 +87,10 @@ class Session:
             else:
                 _start(window, self.command)
         except (*REFUSALS, *FATAL) as error:
+            if window is not None:
+                raise InputError(
+                    f"{window.program} cannot show {net_file}: {_one_line(error)}; check DISPLAY, or use `cosim run` "
+                    "and `cosim video`") from None
             raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {_one_line(error)}") from None
         Session._open = True
         self.time = sumo.simulation.getTime()
