@@ -20,7 +20,7 @@ from cosim.originals import Originals, read_originals, write_originals
 from cosim.regions import City, Gateway, check_adjacency, gateway_room_taken, load_city
 from cosim.signals import Signal, read_signals, write_programmes
 from cosim.strategy import ACTUATED, FIXED, HOLD_BACK, MAX_PRESSURE, MODES, SIGNALS, WEBSTER
-from cosim.sumo import Session
+from cosim.sumo import Session, Window
 from cosim.trip_facts import TripFacts, read_trip_facts, trip_options
 from cosim.trips import write_trips
 from nmfd import toml
@@ -169,9 +169,12 @@ class SumoPlant:
     since the reset.
     """
 
-    def __init__(self, scenario: Scenario, *, overrides: Settings | None = None):
-        """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network."""
-        self._scenario, self._originals = scenario, None
+    def __init__(self, scenario: Scenario, *, overrides: Settings | None = None, window: Window | None = None):
+        """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network.
+
+        window: to watch; the simulation is the same, only slower.
+        """
+        self._scenario, self._originals, self._window = scenario, None, window
         self._settings = overrides or settings(scenario)
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
@@ -216,12 +219,13 @@ class SumoPlant:
             loops = Path(self._folder.name) / "loops.add.xml"
             write_loops(self.city, self._layout, scenario.step, loops)
             additional.append(loops)
+        additional += self._window.additional if self._window else ()
         if additional:
             options += ["--additional-files", ",".join(map(str, additional))]
         self._session = Session(
             self._net_file, files, seed=seed, step_length=chosen.step_length,
             time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action,
-            options=tuple(options))
+            options=tuple(options), window=self._window)
         self._meter = Meter(
             self._session, self.city, probes(self._vehicles, chosen.probe_share, seed) if estimating else frozenset())
         self._detectors, self._estimator = None, None
