@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.strategy import parse
+from cosim.strategy import Strategy, parse
 from nmfd.scenario import Scenario, load_scenario
-from nmfd.types import Trajectory
+from nmfd.types import Controller, Trajectory
 
 # Columns of sumo.csv, beside those of summary.csv.
 FACTS = (
@@ -63,26 +63,39 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
     """Run `task` in this process, which must hold no other SUMO session. Raises InputError."""
     import torch
 
-    from cosim import facts
-    from cosim.plant import SumoPlant, settings
-    from nmfd import closed_loop, runs
     from nmfd.controllers import registry
 
     torch.set_num_threads(1)  # runs stand side by side, one core each
     begin = time.perf_counter()
     scenario, strategy = scenario_of(task), parse(task.controller)
     controller = registry.make(strategy.controller, scenario, policy=task.policy)
+    return drive(scenario, strategy, controller, seed=task.seed, progress=progress, begin=begin)
+
+
+def drive(
+    scenario: Scenario, strategy: Strategy, controller: Controller, *, seed: int,
+    progress: Callable[[int, int], None] | None = None, begin: float | None = None,
+) -> Result:
+    """The closed loop of `controller` in SUMO, filed under `strategy.name`, whose options the city takes.
+
+    begin: when the setting up began (time.perf_counter). Raises InputError.
+    """
+    from cosim import facts
+    from cosim.plant import SumoPlant, settings
+    from nmfd import closed_loop, runs
+
+    begin = time.perf_counter() if begin is None else begin
     plant = SumoPlant(scenario, overrides=replace(settings(scenario), **strategy.overrides))
     try:
         trajectory = runs.labelled(
-            closed_loop.run(plant, controller, scenario, seed=task.seed, progress=progress),
-            controller=task.controller, plant="sumo")
+            closed_loop.run(plant, controller, scenario, seed=seed, progress=progress),
+            controller=strategy.name, plant="sumo")
         record = plant.record()
         departed = int(record.departures.sum())
         backlog = trajectory.backlog.sum(axis=(1, 2))
         sumo_time, leaks = plant.sumo_time, set(plant.leaks())
         row = {
-            "controller": task.controller, "seed": task.seed, "trips": plant.trips, "departed_veh": departed,
+            "controller": strategy.name, "seed": seed, "trips": plant.trips, "departed_veh": departed,
             "final_backlog_veh": int(backlog[-1]), "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
             "teleports": int(record.teleports.sum()), **facts.trip_facts(plant.trip_facts()),
             **facts.queue_facts(record, plant.city), **facts.decision_facts(trajectory),
