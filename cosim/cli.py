@@ -12,7 +12,8 @@ FOLDER = click.Path(path_type=Path, file_okay=False)
 FILE = click.Path(path_type=Path, dir_okay=False)
 CONTROLLER_HELP = (
     "no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc or dpc-pcrg; what else the city does is joined by +: webster, "
-    "actuated or max-pressure signals, rerouting-N (percent of the drivers), hold-back or redistribute, compliance-N.")
+    "actuated or max-pressure signals, rerouting-N (percent of the drivers), hold-back or redistribute, compliance-N. "
+    "A controller of your own: file.py:Class (see nmfd new-controller).")
 
 
 @click.group(name="cosim", cls=Commands)
@@ -158,6 +159,7 @@ def compare(target: Path, controller: str, seed: int, steps: int | None, out: Pa
 
     from cosim import compare, experiment
     from cosim.simulate import Task, scenario_of
+    from nmfd import runs
 
     if (target / "manifest.json").is_file():
         if out is not None:
@@ -173,7 +175,8 @@ def compare(target: Path, controller: str, seed: int, steps: int | None, out: Pa
     result = experiment.read_run(out, controller, seed)
     rows = compare.write(out, scenario_of(task), result)
     click.echo(compare.table(rows))
-    click.echo(f"Written to {out}: see compare-{controller}-{seed}-accumulation.png and ...-mfd.png")
+    name = runs.run_name(controller, seed)
+    click.echo(f"Written to {out}: see compare-{name}-accumulation.png and ...-mfd.png")
 
 
 @main.command()

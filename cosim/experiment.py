@@ -119,7 +119,7 @@ def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> d
     model = json.dumps([network.hash, scenario.integrator, scenario.substeps, scenario.protected])
     return {
         "options": options,
-        "policy_hash": None if path is None else runs.file_hash(path),
+        "policy_hash": None, **registry.fingerprint(controller, path),
         "model_hash": hashlib.sha256(model.encode()).hexdigest()[:16], "torch": metadata.version("torch")}
 
 
@@ -175,7 +175,7 @@ def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress) -> Iter
 
 
 def record_path(folder: Path, controller: str, seed: int) -> Path:
-    return folder / f"{controller}-{seed}.record.npz"
+    return folder / f"{runs.run_name(controller, seed)}.record.npz"
 
 
 def write_record(path: Path, result: Result) -> None:
@@ -194,14 +194,14 @@ def read_run(folder: Path, controller: str, seed: int) -> Result:
         raise InputError(f"{path}: no such run; choose a controller and seed of {folder / 'sumo.csv'}") from None
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"{path}: is no record of a run ({error}); delete it and run again") from None
-    trajectory = runs.read_trajectory(folder / f"{controller}-{seed}.npz")
+    trajectory = runs.read_trajectory(folder / f"{runs.run_name(controller, seed)}.npz")
     return Result(trajectory=trajectory, record=record, facts={})
 
 
 def trajectories(folder: Path) -> list[Trajectory]:
     """The finished runs of the run folder. Raises InputError."""
     return [
-        runs.read_trajectory(folder / f"{row['controller']}-{row['seed']}.npz")
+        runs.read_trajectory(folder / f"{runs.run_name(row['controller'], row['seed'])}.npz")
         for row in runs.read_summary(folder / "summary.csv")]
 
 

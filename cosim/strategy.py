@@ -2,8 +2,10 @@
 
     dpc-pc+max-pressure      DPC at the gateways, max-pressure at the other signals
     no-control+rerouting-30  nobody controls, 30 % of the drivers reroute; `rerouting-30` for short
+    mine.py:Gate+actuated    a controller of one's own (nmfd.controllers.own), actuated signals elsewhere
 """
 
+import re
 from dataclasses import dataclass, field
 
 from nmfd.controllers import registry
@@ -19,6 +21,7 @@ MODES = (HOLD_BACK, REDISTRIBUTE)
 _WORDS = {name: ("signals", name) for name in SIGNALS[1:]} | {name: ("actuation", name) for name in MODES}
 # Option with a number -> (field of cosim.plant.Settings, least percentage); at most 100.
 _PERCENTAGES = {"rerouting": ("rerouting", 1), "compliance": ("compliance", 0)}
+_OWN = re.compile(r".+\.py:\w+(?=\+|$)")
 OPTIONS = (*_WORDS, *(f"{name}-N" for name in _PERCENTAGES))
 
 
@@ -39,11 +42,12 @@ class Strategy:
 
 def parse(name: str) -> Strategy:
     """The strategy `name`. InputError for a controller or option that there is not, and for contradictory ones."""
-    first, *words = name.split("+")
+    own = _OWN.match(name)  # a path may hold a + too
+    first, *words = [own[0], *name[own.end():].split("+")[1:]] if own else name.split("+")
     controller = first
     if _option(first) is not None:
         controller, words = ALONE, [first, *words]
-    elif first not in registry.names():
+    elif not registry.known(first):
         raise _unknown(name, first, controllers=True)
     overrides: dict[str, object] = {"gateways_fixed": controller != ALONE}
     chosen: dict[str, str] = {}
@@ -72,5 +76,5 @@ def _option(word: str) -> tuple[str, object] | None:
 def _unknown(name: str, word: str, *, controllers: bool) -> InputError:
     where = f"controller {name!r}" if word == name else f"strategy {name!r}: {word!r}"
     ranges = ", ".join(f"{stem}-N from {least} to 100" for stem, (_, least) in _PERCENTAGES.items())
-    first = f"{', '.join(registry.names())}, with options joined by +: " if controllers else ""
+    first = f"{', '.join(registry.choice())} or file.py:Class, with options joined by +: " if controllers else ""
     return InputError(f"{where} is unknown; choose from {first}{', '.join(OPTIONS)} (in whole percent, {ranges})")

@@ -1,4 +1,7 @@
-"""Controllers by name. The module behind a name is imported only when that controller is made."""
+"""Controllers by name. The module behind a name is imported only when that controller is made.
+
+Besides those here there are controllers of the user's own (nmfd.controllers.own), by entry point or file.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +76,7 @@ _WITH_PLAN = {"bound-pc": False, "bound-pcrg": True}
 
 
 def names() -> tuple[str, ...]:
-    """Every controller."""
+    """Every controller that is built in."""
     return (*_WITHOUT_POLICY, *_WITH_POLICY, *_GUARDED, *_WITH_PLAN)
 
 
@@ -84,8 +87,43 @@ def policy_names() -> tuple[str, ...]:
 
 def check(name: str) -> None:
     """InputError unless `name` is a controller."""
-    if name not in names():
-        raise InputError(f"controller {name!r} is unknown; choose from {', '.join(names())}")
+    if not known(name):
+        raise InputError(f"controller {name!r} is unknown; choose from {', '.join(choice())}, or file.py:Class")
+
+
+def known(name: str) -> bool:
+    """Whether `name` is a controller. InputError for a file that is not there."""
+    if name in names():
+        return True
+    from nmfd.controllers import own
+
+    if own.is_file(name):
+        own.check(name)
+        return True
+    return name in own.entry_points()
+
+
+def choice() -> tuple[str, ...]:
+    """Every controller that has a name of its own, built in or installed."""
+    from nmfd.controllers import own
+
+    return (*names(), *(name for name in own.entry_points() if name not in names()))
+
+
+def is_own(name: str) -> bool:
+    """Whether `name`, which must be known, is a controller of the user's own."""
+    return name not in names()
+
+
+def fingerprint(name: str, policy: Path | None) -> dict[str, object]:
+    """What the runs of `name` depend on in files: its own source, or its `policy_path`."""
+    if is_own(name):
+        from nmfd.controllers import own
+
+        return own.fingerprint(name)
+    from nmfd.runs import file_hash
+
+    return {} if policy is None else {"policy_hash": file_hash(policy)}
 
 
 def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Path | None:
@@ -94,7 +132,7 @@ def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Pa
     InputError for an unknown name, for a `policy` that the controller has no use for, and for a missing file.
     """
     check(name)
-    if name in _WITHOUT_POLICY:
+    if name in _WITHOUT_POLICY or is_own(name):
         if policy is not None:
             raise InputError(
                 f"{policy}: controller {name} reads no policy; only {', '.join((*policy_names(), *_WITH_PLAN))} do: "
@@ -121,6 +159,10 @@ def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Contro
     from nmfd.scenario import as_modelled
 
     path = policy_path(name, scenario, policy)
+    if is_own(name):
+        from nmfd.controllers import own
+
+        return own.make(name, scenario)
     scenario = as_modelled(scenario, _GUARDED.get(name, name))
     if path is None:
         return _WITHOUT_POLICY[name](scenario)
