@@ -187,21 +187,24 @@ def compare(target: Path, controller: str, seed: int, steps: int | None, out: Pa
               help="Loading runs per level, with seeds 1000 to 1000 + N - 1.")
 @click.option("--workers", type=click.IntRange(min=1), default=2, show_default=True, metavar="N")
 @click.option("--guided", is_flag=True, help="With route guidance: the model of a city whose drivers are guided.")
+@click.option("--with", "options", metavar="OPTION[+...]",
+              help="Of a city with such signals or drivers: max-pressure, rerouting-30, ... as in a strategy's name.")
 @click.option("--network", "target", type=FOLDER, metavar="DIR",
               help="The folder whose network.toml is written. [default: the scenario's network]")
 @click.option("--iterations", type=click.IntRange(min=1), default=600, show_default=True, metavar="N",
               help="Of the fit.")
 @click.option("--out", type=FOLDER, metavar="DIR", help="Samples and pictures. [default: runs/<scenario>-identify]")
 def identify(
-    scenario: Path, levels: str, seeds: int, workers: int, guided: bool, target: Path | None, iterations: int,
-    out: Path | None,
+    scenario: Path, levels: str, seeds: int, workers: int, guided: bool, options: str | None, target: Path | None,
+    iterations: int, out: Path | None,
 ) -> None:
     """Fit the regional model and the drivers' own split ratios of a SUMO city; writes a network.toml.
 
     The city is loaded with multiples of the scenario's demand, first without perimeter control, then under a controller
     that probes it. Policies that were trained on the network as it was before do not fit the new one: train them again.
     A controller plans with a model other than the scenario's if its table says so, such as
-    [controllers.dpc-pcrg] with model = "../../networks/grid7_guided".
+    [controllers.dpc-pcrg] with model = "../../networks/grid7_guided"; one for a strategy with options has a table of
+    its own, such as [controllers."dpc-pcrg+max-pressure"].
 
     Of an imported city the network's folder will do.
 
@@ -210,6 +213,7 @@ def identify(
       cosim identify scenarios/grid7_peak --levels 0.6,0.8,1.0 --seeds 2
       cosim identify networks/mycity
       cosim identify scenarios/grid7_peak --guided --network networks/grid7_guided
+      cosim identify scenarios/grid7_peak --guided --with max-pressure --network networks/grid7_max_pressure
     """
     from cosim import identify
     from cosim.importing import find
@@ -221,9 +225,11 @@ def identify(
     scenario = find.scenario_of(scenario)
     loaded = load_scenario(scenario)
     if out is None:
-        out = Path("runs") / f"{runs.file_name(loaded.name)}-identify{'-guided' if guided else ''}"
+        kind = f"{'-guided' if guided else ''}{f'-{options}' if options else ''}"
+        out = Path("runs") / f"{runs.file_name(loaded.name)}-identify{kind}"
     loading = identify.Loading(
-        levels=factors, seeds=range(1000, 1000 + seeds), guided=guided, network=target, iterations=iterations)
+        levels=factors, seeds=range(1000, 1000 + seeds), guided=guided,
+        options=options.split("+") if options else (), network=target, iterations=iterations)
     try:
         with progress_line("identify") as progress:
             text = identify.identify(scenario, loading, out=out, workers=workers, progress=progress)

@@ -15,7 +15,7 @@ from cosim.city import ensure_built
 from cosim.plant import Settings, settings
 from cosim.regions import check_adjacency, load_city
 from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
-from cosim.strategy import parse
+from cosim.strategy import configured, parse
 from nmfd import runs
 from nmfd.benchmarks import REFERENCE, draw_accumulations, interval
 from nmfd.controllers import registry
@@ -106,16 +106,20 @@ def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> d
     on none of these, and loading runs only on their options and the split ratios that they start from. Raises
     InputError for a controller that cannot be made.
     """
-    controller = parse(name).controller
-    registry.make(controller, scenario, policy=policy)
+    controller, variant = parse(name).controller, configured(name, scenario.controller_options)
+    registry.make(variant, scenario, policy=policy)
     if controller == REFERENCE:
         return {}
-    options = scenario.controller_options.get(controller, {})
+    tables = scenario.controller_options
+    options = {**tables.get(controller, {}), **tables.get(variant, {})}
     if controller in LOADING:
         splits = scenario.network.nominal_splits if LOADING[controller] else np.empty(0)
         return {"options": options, "splits_hash": hashlib.sha256(splits.round(9).tobytes()).hexdigest()[:16]}
-    path = registry.policy_path(controller, scenario, policy)
-    network = as_modelled(scenario, controller).network
+    path = registry.policy_path(variant, scenario, policy)
+    if registry.is_own(controller):
+        variant = registry.table_name(controller)
+        options = tables.get(variant, {})
+    network = as_modelled(scenario, variant).network
     model = json.dumps([network.hash, scenario.integrator, scenario.substeps, scenario.protected])
     return {
         "options": options,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.strategy import Strategy, parse
+from cosim.strategy import Strategy, configured, parse
 from nmfd.scenario import Scenario, load_scenario
 from nmfd.types import Controller, Trajectory
 
@@ -68,7 +68,7 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
     torch.set_num_threads(1)  # runs stand side by side, one core each
     begin = time.perf_counter()
     scenario, strategy = scenario_of(task), parse(task.controller)
-    controller = registry.make(strategy.controller, scenario, policy=task.policy)
+    controller = registry.make(configured(task.controller, scenario.controller_options), scenario, policy=task.policy)
     return drive(scenario, strategy, controller, seed=task.seed, progress=progress, begin=begin)
 
 

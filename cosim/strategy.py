@@ -1,11 +1,11 @@
 """Strategies by name: CONTROLLER[+OPTION...], a regional controller and what else the city does.
 
-    dpc-pc+max-pressure      DPC at the gateways, max-pressure at the other signals
+    dpc-pc+max-pressure      max-pressure at all signals, DPC limits the green of the gateways
     no-control+rerouting-30  nobody controls, 30 % of the drivers reroute; `rerouting-30` for short
     mine.py:Gate+actuated    a controller of one's own (nmfd.controllers.own), actuated signals elsewhere
 """
 
-import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from nmfd.controllers import registry
@@ -18,10 +18,11 @@ HOLD_BACK, REDISTRIBUTE = "hold-back", "redistribute"
 MODES = (HOLD_BACK, REDISTRIBUTE)
 
 # Option -> (field of cosim.plant.Settings, its value).
-_WORDS = {name: ("signals", name) for name in SIGNALS[1:]} | {name: ("actuation", name) for name in MODES}
+_WORDS = {
+    **{name: ("signals", name) for name in SIGNALS[1:]}, **{name: ("actuation", name) for name in MODES},
+    "estimate": ("measurement", "estimate")}
 # Option with a number -> (field of cosim.plant.Settings, least percentage); at most 100.
 _PERCENTAGES = {"rerouting": ("rerouting", 1), "compliance": ("compliance", 0)}
-_OWN = re.compile(r".+\.py:\w+(?=\+|$)")
 OPTIONS = (*_WORDS, *(f"{name}-N" for name in _PERCENTAGES))
 
 
@@ -42,8 +43,7 @@ class Strategy:
 
 def parse(name: str) -> Strategy:
     """The strategy `name`. InputError for a controller or option that there is not, and for contradictory ones."""
-    own = _OWN.match(name)  # a path may hold a + too
-    first, *words = [own[0], *name[own.end():].split("+")[1:]] if own else name.split("+")
+    first, words = registry.split(name)
     controller = first
     if _option(first) is not None:
         controller, words = ALONE, [first, *words]
@@ -60,6 +60,16 @@ def parse(name: str) -> Strategy:
             raise InputError(f"strategy {name!r}: {chosen[key]} and {word} exclude each other; leave one of them out")
         chosen[key], overrides[key] = word, value
     return Strategy(name=name, controller=controller, overrides=overrides)
+
+
+def configured(name: str, tables: Iterable[str]) -> str:
+    """The controller of the strategy `name`, with as many of its options as one of the `tables` has in its name.
+
+    tables: names CONTROLLER+OPTION... of tables in [controllers], each with a regional model or a policy for that city
+    """
+    controller, words = parse(name).controller, set(name.split("+"))
+    fitting = [table for table in tables if table.startswith(f"{controller}+") and set(table.split("+")) <= words]
+    return max(fitting, key=lambda table: table.count("+"), default=controller)
 
 
 def _option(word: str) -> tuple[str, object] | None:

@@ -68,13 +68,21 @@ class Training:
 
 
 def settings(scenario: Scenario, controller: str, steps: int | None = None) -> Training:
-    """The training settings of `controller` in `scenario`, checked; `steps` overrides."""
-    if controller not in NAMES:
+    """The training settings of `controller` in `scenario`, checked; `steps` overrides.
+
+    controller: one of NAMES, or "NAME+..." if the scenario has a table of that name (nmfd.scenario.as_modelled)
+    """
+    name, variant, _ = controller.partition("+")
+    if name not in NAMES:
         raise InputError(f"--controller: {controller!r} cannot be trained; choose one of {', '.join(NAMES)}")
+    if variant and controller not in scenario.controller_options:
+        raise InputError(
+            f"--controller: {controller!r} needs a table [controllers.\"{controller}\"] in {scenario.folder}/scenario.toml "
+            f"that says what is different from {name}; add one, or train {name}")
     scenario = as_modelled(scenario, controller)
-    default = Training(noise=ROBUST_NOISE if controller.endswith("-robust") else 0.0)
+    default = Training(noise=ROBUST_NOISE if name.endswith("-robust") else 0.0)
     table = toml.Table(
-        scenario.controller_options.get(controller, {}), scenario.folder / "scenario.toml" if scenario.folder else
+        scenario.controller_options.get(name, {}), scenario.folder / "scenario.toml" if scenario.folder else
         Path("scenario"), f"controllers.{controller}.")
     chosen = Training(
         width=table.integer("width", default.width, low=1), layers=table.integer("layers", default.layers, low=1),
@@ -106,22 +114,22 @@ def train(
     device: str = "cpu", compiled: bool = False, progress: Callable[[int, int, str], None] | None = None,
     log: Callable[[int, float], None] | None = None,
 ) -> Path:
-    """Train `controller`, one of NAMES, on the regional model and write the policy to `out`.
+    """Train `controller`, one that `settings` knows, on the regional model and write the policy to `out`.
 
     `out` holds the best policy so far after every validation; `out`.resume beside it holds what `resume` needs and
     goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done, TTS)` after
     every validation. `compiled` makes a step about twice as fast, after up to a minute or two of compilation; the
     weights differ by rounding.
     """
-    scenario = as_modelled(scenario, controller)
     chosen = settings(scenario, controller, steps)
+    scenario = as_modelled(scenario, controller)
     configuration = {
         "controller": controller, "scenario": scenario.name, "seed": seed, "compiled": compiled, **asdict(chosen)}
     torch.set_num_threads(1)  # the matrices are small: more threads only wait for one another
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     architecture = Architecture(
-        width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=NAMES[controller])
+        width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=NAMES[controller.partition("+")[0]])
     policy = Policy(scenario.network, architecture).to(device)
     rollout = Rollout(scenario, device=device, detour_cost=chosen.detour_cost)
     advance = compiled_step(rollout.step) if compiled else rollout.step

@@ -56,10 +56,14 @@ def fingerprint(name: str) -> dict[str, object]:
         f"{file.name}_hash": file_hash(file) if file.is_file() else None for file in beside}}
 
 
+def table_name(name: str) -> str:
+    """The `name` of the class: of its table in [controllers]."""
+    return str(getattr(_class(name), "name", name))
+
+
 def make(name: str, scenario: Scenario) -> "OwnController":
     """The controller `name`, tried once on an empty city. Raises InputError, on one line, for whatever is wrong."""
-    cls = _class(name)
-    scenario = as_modelled(scenario, getattr(cls, "name", name))
+    cls, scenario = _class(name), as_modelled(scenario, table_name(name))
     try:
         inspect.signature(cls).bind(scenario)
     except TypeError as error:
