@@ -1,11 +1,12 @@
 """What `cosim run` does, as a function of a few arguments; exported by the package `cosim`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from cosim.simulate import Result, drive
-from cosim.strategy import ALONE, parse
+from cosim.strategy import ALONE, configured, parse
+from cosim.sumo_output import check
 from nmfd.api import named
 from nmfd.errors import InputError
 from nmfd.scenario import Scenario, load_scenario
@@ -15,7 +16,7 @@ from nmfd.types import Controller
 def run(
     scenario: Scenario | Path | str, controller: str | Controller, *, seed: int = 0, steps: int | None = None,
     demand_factor: float = 1.0, policy: Path | str | None = None, city: str = "",
-    progress: Callable[[int, int], None] | None = None,
+    sumo_output: Mapping[str, Path | str] | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> Result:
     """One closed loop in SUMO, in this process and without a run folder.
 
@@ -29,6 +30,7 @@ def run(
     demand_factor: multiplies all flows
     policy: of a DPC controller by name, if not SCENARIO/NAME.pt
     city: what else the city does, with a controller that is an object: "max-pressure+rerouting-30"
+    sumo_output: files of SUMO's own outputs: {"tripinfo": "trips.xml"}, also summary, edgedata, emission
     progress: called as progress(done, steps) after every control interval
 
     The result holds `trajectory` (nmfd.Trajectory), `record` (arrays, see cosim.plant.Record) and `facts` (the row of
@@ -46,11 +48,13 @@ def run(
         demand_factor=demand_factor * scenario.demand_factor)
     if isinstance(controller, str):
         strategy = parse(f"{controller}+{city}" if city else controller)
-        _, acting = named(strategy.controller, scenario, policy)
+        _, acting = named(configured(strategy.name, scenario.controller_options), scenario, policy)
     else:
         name, acting = named(controller, scenario, policy)
         strategy = parse(city or ALONE)
         strategy = replace(
             strategy, name=f"{name}+{city}" if city else name, controller=name,
             overrides={**strategy.overrides, "gateways_fixed": name != ALONE})
-    return drive(scenario, strategy, acting, seed=seed, progress=progress)
+    outputs = {kind: Path(file) for kind, file in (sumo_output or {}).items()}
+    check(outputs)
+    return drive(scenario, strategy, acting, seed=seed, progress=progress, outputs=outputs)

@@ -35,10 +35,14 @@ def main() -> None:
               help="Of the trips, the drivers and the guidance.")
 @click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
 @click.option("--policy", type=FILE, metavar="FILE", help="Policy of a DPC controller, if not SCENARIO/NAME.pt.")
+@click.option("--sumo-output", metavar="A,B,...",
+              help="SUMO's own outputs in the run folder too: tripinfo, summary, edgedata (per control interval), "
+                   "emission (of every vehicle in every step, large).")
+@click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.frames).")
 @click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
 def run(
     scenario: Path, controller: str, against: str | None, seed: int, steps: int | None, policy: Path | None,
-    out: Path | None,
+    sumo_output: str | None, parquet: bool, out: Path | None,
 ) -> None:
     """Run a controller in the microsimulation; print a table and write a run folder.
 
@@ -50,9 +54,12 @@ def run(
       cosim run scenarios/grid7_peak --controller dpc-pcrg --against no-control
       cosim run scenarios/grid7_peak --controller pi-gating --seed 3 --out runs/gating
       cosim run scenarios/grid7_peak --controller dpc-pc+rerouting-30 --against rerouting-30
+      cosim run scenarios/grid7_peak --controller pi-gating --sumo-output tripinfo,edgedata --parquet
     """
     from cosim import strategy
+    from cosim import sumo_output as outputs
 
+    kinds = outputs.parse(sumo_output) if sumo_output is not None else ()
     names = [controller] + ([against] if against and against != controller else [])
     for name in names:
         strategy.parse(name)
@@ -63,8 +70,12 @@ def run(
     tasks = [
         Task(scenario=scenario, controller=name, seed=seed, policy=policy if name == controller else None, steps=steps)
         for name in names]
-    out, rows = _experiment(tasks, out)
+    out, rows = _experiment(tasks, out, kinds)
     click.echo(experiment.table(rows))
+    if parquet:
+        from nmfd import frames
+
+        frames.write(out, experiment.trajectories(out), {"summary": rows})
     if (out / "estimation.csv").is_file():
         import pandas as pd
 
@@ -308,14 +319,18 @@ def _tell(line: str) -> None:
     click.echo(f"cosim: {line}", err=True)
 
 
-def _experiment(tasks: list, out: Path | None) -> tuple:
-    """The run folder of the tasks, and its overview."""
+def _experiment(tasks: list, out: Path | None, sumo_output: tuple[str, ...] = ()) -> tuple:
+    """The run folder of the tasks, and its overview; SUMO's own outputs of these kinds are in it."""
+    from dataclasses import replace
+
     from cosim import experiment
+    from cosim.sumo_output import paths
     from nmfd import runs
     from nmfd.progress import progress_line
     from nmfd.scenario import load_scenario
 
     out = runs.default_folder(load_scenario(tasks[0].scenario)) if out is None else out
+    tasks = [replace(task, sumo_output=paths(sumo_output, out, task.controller, task.seed)) for task in tasks]
     try:
         with progress_line("cosim") as progress:
             return out, experiment.experiment(tasks, out=out, workers=2, progress=progress, tell=_tell)

@@ -80,7 +80,8 @@ def perform(
                 order=[(task.controller, task.seed) for task in tasks], renew=tell,
                 session={"scenario_folder": str(tasks[0].scenario), "workers": workers}))
         there = {path: _finished(folder) for path, folder in folders.items()}
-        todo = [task for task in where if (task.controller, task.seed) not in there[where[task]]]
+        todo = [task for task in where if (task.controller, task.seed) not in there[where[task]] or not all(
+            file.is_file() for _, file in task.sumo_output)]
         for task, outcome in _outcomes(todo, workers, fresh, progress):
             if isinstance(outcome, Failure):
                 failures.append((task, outcome.reason))

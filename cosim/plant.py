@@ -2,12 +2,13 @@
 
 import tempfile
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from cosim import webster
+from cosim import sumo_output, webster
 from cosim.actuate import GREEN, Actuator, GatewaySignal
 from cosim.actuated import actuated_row
 from cosim.city import ensure_built
@@ -165,9 +166,15 @@ class SumoPlant:
     since the reset.
     """
 
-    def __init__(self, scenario: Scenario, *, overrides: Settings | None = None):
-        """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network."""
+    def __init__(
+        self, scenario: Scenario, *, overrides: Settings | None = None, outputs: Mapping[str, Path] | None = None,
+    ):
+        """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network.
+
+        outputs: kind (cosim.sumo_output) -> file, of SUMO's own outputs; complete after `trip_facts` or `close`
+        """
         self._scenario, self._originals = scenario, None
+        self._outputs = dict(outputs or {})
         self._settings = overrides or settings(scenario)
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
@@ -193,12 +200,12 @@ class SumoPlant:
         scenario, chosen = self._scenario, self._settings
         routes = Path(self._folder.name) / "trips.rou.xml"
         self._vehicles, files = self._write_vehicles(routes, seed), [routes]
-        self._trip_file = routes.with_name("tripinfo.xml")
+        self._trip_file = self._outputs.get("tripinfo", routes.with_name("tripinfo.xml"))
         steered = [s for s in self.simple_signals if s.id not in chosen.leave_signals and not (
             chosen.gateways_fixed and chosen.signals == ACTUATED and s.id in self._gateway_ids)]
         options = [
-            *trip_options(self._trip_file), "--begin", str(chosen.begin), "--ignore-route-errors",
-            str(bool(chosen.routes)).lower()]
+            *trip_options(self._trip_file), *sumo_output.options(self._outputs), "--begin", str(chosen.begin),
+            "--ignore-route-errors", str(bool(chosen.routes)).lower()]
         if chosen.rerouting > 0:
             options += [*REROUTING, "--device.rerouting.probability", str(chosen.rerouting)]
         if chosen.mesoscopic:
@@ -212,6 +219,9 @@ class SumoPlant:
             loops = Path(self._folder.name) / "loops.add.xml"
             write_loops(self.city, self._layout, scenario.step, loops)
             additional.append(loops)
+        if "edgedata" in self._outputs:
+            additional.append(sumo_output.write_edge_data(
+                routes.with_name("edgedata.add.xml"), self._outputs["edgedata"], scenario.step))
         if additional:
             options += ["--additional-files", ",".join(map(str, additional))]
         self._session = Session(

@@ -2,7 +2,8 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -25,7 +26,8 @@ FACTS = (
 class Task:
     """scenario: its folder; controller: a strategy (cosim.strategy); policy: of a DPC controller, instead of the
     scenario's own; steps: control intervals, all if None; demand_factor: multiplies all flows;
-    options: of the controller, instead of those of the scenario."""
+    options: of the controller, instead of those of the scenario; sumo_output: kind (cosim.sumo_output) and file of
+    SUMO's own outputs."""
 
     scenario: Path
     controller: str
@@ -34,6 +36,7 @@ class Task:
     steps: int | None = None
     demand_factor: float = 1.0
     options: tuple[tuple[str, object], ...] = ()
+    sumo_output: tuple[tuple[str, Path], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,24 +72,29 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
     begin = time.perf_counter()
     scenario, strategy = scenario_of(task), parse(task.controller)
     controller = registry.make(configured(task.controller, scenario.controller_options), scenario, policy=task.policy)
-    return drive(scenario, strategy, controller, seed=task.seed, progress=progress, begin=begin)
+    return drive(
+        scenario, strategy, controller, seed=task.seed, progress=progress, begin=begin, outputs=dict(task.sumo_output))
 
 
 def drive(
     scenario: Scenario, strategy: Strategy, controller: Controller, *, seed: int,
     progress: Callable[[int, int], None] | None = None, begin: float | None = None,
+    outputs: Mapping[str, Path] | None = None,
 ) -> Result:
     """The closed loop of `controller` in SUMO, filed under `strategy.name`, whose options the city takes.
 
-    begin: when the setting up began (time.perf_counter). Raises InputError.
+    begin: when the setting up began (time.perf_counter); outputs: SUMO's own, kind (cosim.sumo_output) -> file, there
+    only if all goes well. Raises InputError.
     """
     from cosim import facts
     from cosim.plant import SumoPlant, settings
     from nmfd import closed_loop, runs
 
     begin = time.perf_counter() if begin is None else begin
-    plant = SumoPlant(scenario, overrides=replace(settings(scenario), **strategy.overrides))
-    try:
+    with ExitStack() as stack:
+        files = {kind: stack.enter_context(runs.atomic(path)) for kind, path in (outputs or {}).items()}
+        plant = SumoPlant(scenario, overrides=replace(settings(scenario), **strategy.overrides), outputs=files)
+        stack.callback(plant.close)
         trajectory = runs.labelled(
             closed_loop.run(plant, controller, scenario, seed=seed, progress=progress),
             controller=strategy.name, plant="sumo")
@@ -104,8 +112,6 @@ def drive(
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
             "signals_left_alone": len(plant.other_signals)}
-    finally:
-        plant.close()
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
 
 
