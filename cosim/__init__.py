@@ -18,12 +18,15 @@ if TYPE_CHECKING:
     from cosim.experiment import overview, read_run
     from cosim.plant import Settings, SumoPlant, settings
     from cosim.simulate import Result, Task
+    from cosim.sweeps import Sweep, sweep
 
-__all__ = ["Result", "Settings", "SumoPlant", "Task", "overview", "read_run", "run", "run_tasks", "settings"]
+__all__ = [
+    "Result", "Settings", "SumoPlant", "Sweep", "Task", "overview", "read_run", "run", "run_tasks", "settings", "sweep"]
 _PLACES = {
     "Result": "simulate.Result", "Settings": "plant.Settings", "SumoPlant": "plant.SumoPlant", "Task": "simulate.Task",
     "overview": "experiment.overview", "read_run": "experiment.read_run", "run": "api.run",
-    "run_tasks": "experiment.experiment", "settings": "plant.settings"}
+    "run_tasks": "experiment.experiment", "settings": "plant.settings", "Sweep": "sweeps.Sweep",
+    "sweep": "sweeps.sweep"}
 
 
 def __getattr__(name: str):

@@ -52,7 +52,8 @@ def experiment(
 def perform(
     plan: Sequence[tuple[Path, Task]], *, workers: int = 1, fresh: bool = False,
     progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
-    kept: Callable[[], None] | None = None,
+    kept: Callable[[], object] | None = None, failed: Callable[[Task, str], None] | None = None,
+    source: Callable[[Sequence[Task]], Iterator[tuple[Task, Result | Failure]]] | None = None,
 ) -> list[tuple[Task, str]]:
     """Run every task, in this order, that is not yet in its run folder; returns those that failed, and why.
 
@@ -63,7 +64,8 @@ def perform(
     fresh: every run in a process of its own
     progress: called with what is done and to do, and what is running
     tell: takes one line where the runs of a controller do not count any more because it changed; None: an InputError
-    kept: called after every run that was kept
+    kept: called after every run that was kept; failed: with every one that failed, and why
+    source: runs the tasks elsewhere and gives their outcomes as they finish, instead of `workers` processes here
 
     Raises InputError, before anything is written, for a city or controller that cannot be made, and for a folder that
     holds runs of another city or demand.
@@ -82,9 +84,12 @@ def perform(
         there = {path: _finished(folder) for path, folder in folders.items()}
         todo = [task for task in where if (task.controller, task.seed) not in there[where[task]] or not all(
             file.is_file() for _, file in task.sumo_output)]
-        for task, outcome in _outcomes(todo, workers, fresh, progress):
+        found = _outcomes(todo, workers, fresh, progress) if source is None else _reported(source, todo, progress)
+        for task, outcome in found:
             if isinstance(outcome, Failure):
                 failures.append((task, outcome.reason))
+                if failed:
+                    failed(task, outcome.reason)
                 continue
             folder = folders[where[task]]
             write_record(record_path(folder.path, task.controller, task.seed), outcome)
@@ -176,6 +181,15 @@ def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress) -> Iter
     report(0, len(todo), "")
     for done, (task, outcome) in enumerate(outcomes(simulate, todo, workers, fresh=fresh), start=1):
         report(done, len(todo), f"last {label(task)}")
+        yield task, outcome
+
+
+def _reported(source, todo: Sequence[Task], progress) -> Iterator[tuple]:
+    """What comes from `source`, with a word to `progress` of each."""
+    report = progress or (lambda done, total, note: None)
+    report(0, len(todo), "")
+    for done, (task, outcome) in enumerate(source(todo) if todo else (), start=1):
+        report(done, len(todo), f"{'failed' if isinstance(outcome, Failure) else 'last'} {label(task)}")
         yield task, outcome
 
 
