@@ -40,16 +40,19 @@ def _serve() -> None:
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print must not get between
     task = pickle.loads(sys.stdin.buffer.read(int.from_bytes(sys.stdin.buffer.read(HEADER))))
-    threading.Thread(target=_end_with_the_caller, daemon=True).start()
+    answered = threading.Event()
+    threading.Thread(target=_end_with_the_caller, args=[answered], daemon=True).start()
     outcome = pickle.dumps(attempt(simulate, task))
     answer.write(outcome)
-    answer.close()
+    answer.flush()
+    answered.set()
+    answer.close()  # with which the caller goes on
     os._exit(0)  # not by way of the interpreter's end, where the reading thread holds stdin
 
 
-def _end_with_the_caller() -> None:
+def _end_with_the_caller(answered: threading.Event) -> None:
     os.read(0, 1)  # nothing comes but the end
-    os._exit(1)
+    os._exit(0 if answered.is_set() else 1)
 
 
 if __name__ == "__main__":
