@@ -12,7 +12,8 @@ FOLDER = click.Path(path_type=Path, file_okay=False)
 FILE = click.Path(path_type=Path, dir_okay=False)
 CONTROLLER_HELP = (
     "no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc or dpc-pcrg; what else the city does is joined by +: webster, "
-    "actuated or max-pressure signals, rerouting-N (percent of the drivers), hold-back or redistribute, compliance-N.")
+    "actuated or max-pressure signals, rerouting-N (percent of the drivers), hold-back or redistribute, compliance-N. "
+    "A controller of your own: file.py:Class (see nmfd new-controller).")
 
 
 @click.group(name="cosim", cls=Commands)
@@ -34,10 +35,14 @@ def main() -> None:
               help="Of the trips, the drivers and the guidance.")
 @click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
 @click.option("--policy", type=FILE, metavar="FILE", help="Policy of a DPC controller, if not SCENARIO/NAME.pt.")
+@click.option("--sumo-output", metavar="A,B,...",
+              help="SUMO's own outputs in the run folder too: tripinfo, summary, edgedata (per control interval), "
+                   "emission (of every vehicle in every step, large).")
+@click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.frames).")
 @click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
 def run(
     scenario: Path, controller: str, against: str | None, seed: int, steps: int | None, policy: Path | None,
-    out: Path | None,
+    sumo_output: str | None, parquet: bool, out: Path | None,
 ) -> None:
     """Run a controller in the microsimulation; print a table and write a run folder.
 
@@ -49,9 +54,12 @@ def run(
       cosim run scenarios/grid7_peak --controller dpc-pcrg --against no-control
       cosim run scenarios/grid7_peak --controller pi-gating --seed 3 --out runs/gating
       cosim run scenarios/grid7_peak --controller dpc-pc+rerouting-30 --against rerouting-30
+      cosim run scenarios/grid7_peak --controller pi-gating --sumo-output tripinfo,edgedata --parquet
     """
     from cosim import strategy
+    from cosim import sumo_output as outputs
 
+    kinds = outputs.parse(sumo_output) if sumo_output is not None else ()
     names = [controller] + ([against] if against and against != controller else [])
     for name in names:
         strategy.parse(name)
@@ -62,8 +70,12 @@ def run(
     tasks = [
         Task(scenario=scenario, controller=name, seed=seed, policy=policy if name == controller else None, steps=steps)
         for name in names]
-    out, rows = _experiment(tasks, out)
+    out, rows = _experiment(tasks, out, kinds)
     click.echo(experiment.table(rows))
+    if parquet:
+        from nmfd import frames
+
+        frames.write(out, experiment.trajectories(out), {"summary": rows})
     if (out / "estimation.csv").is_file():
         import pandas as pd
 
@@ -138,6 +150,79 @@ def evaluate(
 
 
 @main.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--controllers", required=True, metavar="A,B,...", help="Separated by commas. " + CONTROLLER_HELP)
+@click.option("--seeds", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+              help="Runs per controller, demand level and compliance.")
+@click.option("--first-seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="S",
+              help="The seeds are S to S + N - 1.")
+@click.option("--demand", default="1.0", show_default=True, metavar="A,B,...",
+              help="Demand levels: multiples of the scenario's demand.")
+@click.option("--compliance", metavar="A,B,...",
+              help="Drivers who follow route guidance [%], such as 0,50,100. [default: the scenario's]")
+@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
+              help="Policy of a DPC controller, if not SCENARIO/NAME.pt. May be repeated.")
+@click.option("--workers", type=click.IntRange(min=1), metavar="N",
+              help="Runs at a time, each in a process of its own. [default: one per core]")
+@click.option("--scheduler", metavar="ADDRESS",
+              help="Of a Dask cluster that does the runs, such as tcp://host:8786 (extra dask). Its workers need this "
+                   "package, and the same files under the same paths.")
+@click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
+@click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-sweep]")
+def sweep(
+    scenario: Path, controllers: str, seeds: int, first_seed: int, demand: str, compliance: str | None,
+    policies: tuple[str, ...], workers: int | None, scheduler: str | None, steps: int | None, out: Path | None,
+) -> None:
+    """Run controllers x seeds x demand levels x compliance; write one table, sweep.parquet.
+
+    A run that fails is a row with its reason, and the others go on. Every run is kept as soon as it is finished: the
+    same command goes on where it was interrupted, tries failed runs again, and adds what is asked for besides.
+
+    \b
+    Examples:
+      cosim sweep scenarios/grid7_peak --controllers dpc-pcrg,rerouting-30 --compliance 0,50,100 --seeds 3
+      cosim sweep scenarios/grid7_peak --controllers no-control,pi-gating --demand 0.8,1.0,1.2 \\
+          --scheduler tcp://localhost:8786 --out runs/cluster
+    """
+    from cosim.strategy import parse
+    from nmfd.options import policy_files
+
+    names = [name.strip() for name in controllers.split(",")]
+    for name in names:
+        parse(name)
+    if repeated := [name for n, name in enumerate(names) if name in names[:n]]:
+        raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
+    if scheduler is not None and workers is not None:
+        raise InputError("--workers: is for processes here, and --scheduler has workers of its own; leave one away")
+    files = policy_files(policies, names)
+
+    import os
+
+    from cosim import sweeps
+    from nmfd import runs
+    from nmfd.progress import progress_line
+    from nmfd.scenario import load_scenario
+
+    order = sweeps.Sweep(
+        scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
+        levels=tuple(_levels("--demand", demand)), compliance=_compliance(compliance), steps=steps, policies=files,
+        out=Path("runs") / f"{runs.file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
+    workers = len(os.sched_getaffinity(0)) if workers is None else workers
+    try:
+        with progress_line("sweep") as progress:
+            rows = sweeps.sweep(order, workers=workers, scheduler=scheduler, progress=progress, tell=_tell)
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; finished runs are in {order.out}: the same command goes on") from None
+    click.echo(sweeps.text(rows))
+    click.echo(f"Written to {order.out / 'sweep.parquet'}")
+    failed = int((rows["status"] == sweeps.FAILED).sum())
+    if failed == len(rows):
+        raise RunFailed(f"all {failed} runs failed, the first with: {rows.loc[0, 'reason']}")
+    if failed:
+        _tell(f"{failed} of {len(rows)} runs failed, see the column reason; the same command tries them again")
+
+
+@main.command()
 @click.argument("target", type=FOLDER, metavar="SCENARIO|RUN")
 @click.option("--controller", default="no-control", show_default=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
@@ -158,6 +243,7 @@ def compare(target: Path, controller: str, seed: int, steps: int | None, out: Pa
 
     from cosim import compare, experiment
     from cosim.simulate import Task, scenario_of
+    from nmfd import runs
 
     if (target / "manifest.json").is_file():
         if out is not None:
@@ -173,7 +259,8 @@ def compare(target: Path, controller: str, seed: int, steps: int | None, out: Pa
     result = experiment.read_run(out, controller, seed)
     rows = compare.write(out, scenario_of(task), result)
     click.echo(compare.table(rows))
-    click.echo(f"Written to {out}: see compare-{controller}-{seed}-accumulation.png and ...-mfd.png")
+    name = runs.run_name(controller, seed)
+    click.echo(f"Written to {out}: see compare-{name}-accumulation.png and ...-mfd.png")
 
 
 @main.command()
@@ -404,18 +491,34 @@ def _levels(option: str, text: str) -> list[float]:
     return levels
 
 
+def _compliance(text: str | None) -> tuple[float, ...]:
+    """Shares, of whole percentages separated by commas. InputError for anything else."""
+    if text is None:
+        return ()
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isascii() and part.isdigit() and int(part) <= 100 for part in parts):
+        raise InputError(f"--compliance: expected whole percentages, such as 0,50,100, got {text!r} instead")
+    if len(set(map(int, parts))) < len(parts):
+        raise InputError(f"--compliance: {text!r} names a percentage twice; name every one once")
+    return tuple(int(part) / 100 for part in parts)
+
+
 def _tell(line: str) -> None:
     click.echo(f"cosim: {line}", err=True)
 
 
-def _experiment(tasks: list, out: Path | None) -> tuple:
-    """The run folder of the tasks, and its overview."""
+def _experiment(tasks: list, out: Path | None, sumo_output: tuple[str, ...] = ()) -> tuple:
+    """The run folder of the tasks, and its overview; SUMO's own outputs of these kinds are in it."""
+    from dataclasses import replace
+
     from cosim import experiment
+    from cosim.sumo_output import paths
     from nmfd import runs
     from nmfd.progress import progress_line
     from nmfd.scenario import load_scenario
 
     out = runs.default_folder(load_scenario(tasks[0].scenario)) if out is None else out
+    tasks = [replace(task, sumo_output=paths(sumo_output, out, task.controller, task.seed)) for task in tasks]
     try:
         with progress_line("cosim") as progress:
             return out, experiment.experiment(tasks, out=out, workers=2, progress=progress, tell=_tell)

@@ -158,7 +158,7 @@ def write(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
     """Compare, and add compare-<run>.csv and two pictures to the run folder; returns the rows of `errors`."""
     predicted = predict(scenario, result)
     rows = pd.DataFrame(errors(scenario, result, predicted), columns=COLUMNS)
-    name = f"{result.trajectory.controller}-{result.trajectory.seed}"
+    name = runs.run_name(result.trajectory.controller, result.trajectory.seed)
     with runs.atomic(folder / f"compare-{name}.csv") as temporary:
         rows.to_csv(temporary, index=False)
     drawing, axes = plots.panels(scenario.network.regions + 1)

@@ -2,12 +2,13 @@
 
 import tempfile
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from cosim import webster
+from cosim import sumo_output, webster
 from cosim.actuate import GREEN, Actuator, GatewaySignal
 from cosim.actuated import actuated_row
 from cosim.city import ensure_built
@@ -169,12 +170,17 @@ class SumoPlant:
     since the reset.
     """
 
-    def __init__(self, scenario: Scenario, *, overrides: Settings | None = None, window: Window | None = None):
+    def __init__(
+        self, scenario: Scenario, *, overrides: Settings | None = None, outputs: Mapping[str, Path] | None = None,
+        window: Window | None = None,
+    ):
         """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network.
 
-        window: to watch; the simulation is the same, only slower.
+        outputs: kind (cosim.sumo_output) -> file, of SUMO's own outputs; complete after `trip_facts` or `close`
+        window: to watch; the simulation is the same, only slower
         """
         self._scenario, self._originals, self._window = scenario, None, window
+        self._outputs = dict(outputs or {})
         self._settings = overrides or settings(scenario)
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
@@ -200,12 +206,12 @@ class SumoPlant:
         scenario, chosen = self._scenario, self._settings
         routes = Path(self._folder.name) / "trips.rou.xml"
         self._vehicles, files = self._write_vehicles(routes, seed), [routes]
-        self._trip_file = routes.with_name("tripinfo.xml")
+        self._trip_file = self._outputs.get("tripinfo", routes.with_name("tripinfo.xml"))
         steered = [s for s in self.simple_signals if s.id not in chosen.leave_signals and not (
             chosen.gateways_fixed and chosen.signals == ACTUATED and s.id in self._gateway_ids)]
         options = [
-            *trip_options(self._trip_file), "--begin", str(chosen.begin), "--ignore-route-errors",
-            str(bool(chosen.routes)).lower()]
+            *trip_options(self._trip_file), *sumo_output.options(self._outputs), "--begin", str(chosen.begin),
+            "--ignore-route-errors", str(bool(chosen.routes)).lower()]
         if chosen.rerouting > 0:
             options += [*REROUTING, "--device.rerouting.probability", str(chosen.rerouting)]
         if chosen.mesoscopic:
@@ -220,6 +226,9 @@ class SumoPlant:
             write_loops(self.city, self._layout, scenario.step, loops)
             additional.append(loops)
         additional += self._window.additional if self._window else ()
+        if "edgedata" in self._outputs:
+            additional.append(sumo_output.write_edge_data(
+                routes.with_name("edgedata.add.xml"), self._outputs["edgedata"], scenario.step))
         if additional:
             options += ["--additional-files", ",".join(map(str, additional))]
         self._session = Session(

@@ -2,6 +2,7 @@
 
     dpc-pc+max-pressure      max-pressure at all signals, DPC limits the green of the gateways
     no-control+rerouting-30  nobody controls, 30 % of the drivers reroute; `rerouting-30` for short
+    mine.py:Gate+actuated    a controller of one's own (nmfd.controllers.own), actuated signals elsewhere
 """
 
 from collections.abc import Iterable
@@ -43,11 +44,11 @@ class Strategy:
 
 def parse(name: str) -> Strategy:
     """The strategy `name`. InputError for a controller or option that there is not, and for contradictory ones."""
-    first, *words = name.split("+")
+    first, words = registry.split(name)
     controller = first
     if _option(first) is not None:
         controller, words = ALONE, [first, *words]
-    elif first not in registry.names():
+    elif not registry.known(first):
         raise _unknown(name, first, controllers=True)
     overrides: dict[str, object] = {"gateways_fixed": controller != ALONE}
     chosen: dict[str, str] = {}
@@ -86,5 +87,5 @@ def _option(word: str) -> tuple[str, object] | None:
 def _unknown(name: str, word: str, *, controllers: bool) -> InputError:
     where = f"controller {name!r}" if word == name else f"strategy {name!r}: {word!r}"
     ranges = ", ".join(f"{stem}-N from {least} to 100" for stem, (_, least) in _PERCENTAGES.items())
-    first = f"{', '.join(registry.names())}, with options joined by +: " if controllers else ""
+    first = f"{', '.join(registry.choice())} or file.py:Class, with options joined by +: " if controllers else ""
     return InputError(f"{where} is unknown; choose from {first}{', '.join(OPTIONS)} (in whole percent, {ranges})")
