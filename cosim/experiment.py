@@ -22,7 +22,7 @@ from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.scenario import Scenario, as_modelled
 from nmfd.types import Trajectory
-from nmfd.workers import Failure, RunFailed, attempt, outcomes
+from nmfd.workers import Failure, attempt, ended, outcomes
 
 # Of loading runs: whether they guide routes, and so depend on the drivers' own split ratios.
 LOADING = {"probing-pc": False, "probing-pcrg": True, "route-guidance": True}
@@ -45,7 +45,7 @@ def experiment(
         draw_accumulations(out, scenario, kept)
         estimates.write(out, scenario.network, kept)
     if failures:
-        raise RunFailed("; ".join(f"{label(task)}: {reason}" for task, reason in failures))
+        raise ended([(label(task), failure) for task, failure in failures])
     return overview(out)
 
 
@@ -53,7 +53,7 @@ def perform(
     plan: Sequence[tuple[Path, Task]], *, workers: int = 1, fresh: bool = False,
     progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
     kept: Callable[[], None] | None = None,
-) -> list[tuple[Task, str]]:
+) -> list[tuple[Task, Failure]]:
     """Run every task, in this order, that is not yet in its run folder; returns those that failed, and why.
 
     The tasks of one folder share scenario, steps and demand. Every finished run is kept at once, whatever happens to
@@ -83,7 +83,7 @@ def perform(
         todo = [task for task in where if (task.controller, task.seed) not in there[where[task]]]
         for task, outcome in _outcomes(todo, workers, fresh, progress):
             if isinstance(outcome, Failure):
-                failures.append((task, outcome.reason))
+                failures.append((task, outcome))
                 continue
             folder = folders[where[task]]
             write_record(record_path(folder.path, task.controller, task.seed), outcome)

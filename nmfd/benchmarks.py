@@ -14,7 +14,7 @@ from nmfd.controllers import registry
 from nmfd.plant import AcyclicPlant, NmfdPlant
 from nmfd.scenario import Scenario
 from nmfd.types import Trajectory
-from nmfd.workers import Failure, RunFailed, attempt, outcomes
+from nmfd.workers import Failure, attempt, ended, outcomes
 
 PLANTS = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
@@ -61,13 +61,13 @@ def benchmark(
         work = partial(run_one, scenario=scenario, plant=plant, policies=policies)
         for run, outcome in results(work, todo, workers, scenario.steps, progress, label=_label):
             if isinstance(outcome, Failure):
-                failures.append(f"controller {_label(run)}: {outcome.reason}")
+                failures.append((f"controller {_label(run)}", outcome))
             else:
                 folder.add(outcome)
         if folder.finished:
             draw(folder.path, scenario, folder.trajectories())
         if failures:
-            raise RunFailed("; ".join(failures))
+            raise ended(failures)
         return folder.rows()
 
 

@@ -14,13 +14,14 @@ import torch
 
 from nmfd import toml
 from nmfd.controllers import guarded
-from nmfd.controllers.dpc import ACTIVATIONS, Architecture, Policy, checkpoint
+from nmfd.controllers.dpc import ACTIVATIONS, DEEPEST, WIDEST, Architecture, Policy, checkpoint
 from nmfd.errors import InputError
 from nmfd.rollout import Rollout, compiled_step
 from nmfd.runs import atomic
 from nmfd.scenario import Scenario, as_modelled
 
 VALIDATE_EVERY = 20  # Adam steps
+MOST_STEPS = 10**7
 ROBUST_NOISE = 3.0     # veh/s, of the policies whose name ends in -robust
 WORTH_COMPILING = 200  # Adam steps
 VALIDATIONS = 16       # perturbed scenarios in a validation, if training perturbs the demand
@@ -77,19 +78,21 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         scenario.controller_options.get(controller, {}), scenario.folder / "scenario.toml" if scenario.folder else
         Path("scenario"), f"controllers.{controller}.")
     chosen = Training(
-        width=table.integer("width", default.width, low=1), layers=table.integer("layers", default.layers, low=1),
+        width=table.integer("width", default.width, low=1, high=WIDEST),
+        layers=table.integer("layers", default.layers, low=1, high=DEEPEST),
         activation=table.text("activation", default.activation, tuple(ACTIVATIONS)),
-        steps=table.integer("steps", default.steps, low=1), batch=table.integer("batch", default.batch, low=1),
-        learning_rate=table.number("learning_rate", default.learning_rate, above=0.0),
+        steps=table.integer("steps", default.steps, low=1, high=MOST_STEPS),
+        batch=table.integer("batch", default.batch, low=1, high=100_000),
+        learning_rate=table.number("learning_rate", default.learning_rate, above=0.0, high=1.0),
         alternating=table.flag("alternating", default.alternating),
         demand_spread=table.number("demand_spread", default.demand_spread, low=0.0, high=1.0),
         demand_low=table.number("demand_low", default.demand_low, above=0.0, high=1.0),
-        demand_high=table.number("demand_high", default.demand_high, low=1.0),
+        demand_high=table.number("demand_high", default.demand_high, low=1.0, high=100.0),
         initial_share=table.number("initial_share", default.initial_share, low=0.0, high=1.0),
-        noise=table.number("noise", default.noise, low=0.0),
-        noise_all=table.number("noise_all", default.noise_all, low=0.0),
+        noise=table.number("noise", default.noise, low=0.0, high=1e6),
+        noise_all=table.number("noise_all", default.noise_all, low=0.0, high=1e6),
         mfd_spread=table.number("mfd_spread", default.mfd_spread, low=0.0, high=1.0),
-        detour_cost=table.number("detour_cost", default.detour_cost, low=0.0))
+        detour_cost=table.number("detour_cost", default.detour_cost, low=0.0, high=1e6))
     table.close()
     return chosen if steps is None else Training(**{**asdict(chosen), "steps": steps})
 

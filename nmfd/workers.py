@@ -12,22 +12,33 @@ from dataclasses import dataclass
 from multiprocessing.connection import wait
 from pathlib import Path
 
+from nmfd.errors import InputError
+
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a task has no result, in one line."""
+    """Why a task has no result, in one line. mistake: the user can cure it (it was an InputError)."""
 
     reason: str
+    mistake: bool = False
 
 
 class RunFailed(Exception):
     """Some runs ended in an error. The message names them in one line."""
 
 
+def ended(failures: Sequence[tuple[str, Failure]]) -> Exception:
+    """What to raise for (run, Failure) pairs: an InputError if the user can cure them all, else RunFailed."""
+    text = "; ".join(f"{run}: {failure.reason}" for run, failure in failures)
+    return InputError(text) if all(failure.mistake for _, failure in failures) else RunFailed(text)
+
+
 def attempt(function: Callable, task):
     """`function(task)`, or the Failure that it ended in."""
     try:
         return function(task)
+    except InputError as error:
+        return Failure(str(error), mistake=True)
     except Exception as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
         return Failure(f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})")

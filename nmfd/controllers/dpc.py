@@ -19,6 +19,7 @@ from nmfd.scenario import Scenario
 from nmfd.types import Controls, Measurement
 
 FORMAT = 1
+WIDEST, DEEPEST = 10_000, 100  # units per layer, layers: of a policy that fits into memory
 
 
 class SoftExponential(nn.Module):
@@ -196,9 +197,14 @@ def load_policy(path: Path, network: Network) -> tuple[Policy, dict]:
             raise InputError(
                 f"{path}: network_hash: the policy was trained for network {content['network']!r} "
                 f"({content['network_hash']}), not for {network.name!r} ({network.hash}); train one with 'nmfd train'")
-        policy = Policy(network, Architecture(**content["architecture"]))
+        architecture = Architecture(**content["architecture"])
+        if not (0 < architecture.width <= WIDEST and 0 < architecture.layers <= DEEPEST):
+            raise KeyError("architecture")
+        policy = Policy(network, architecture)
         policy.load_state_dict(content["weights"])
-    except (KeyError, TypeError, RuntimeError, AttributeError):
+    except (KeyError, TypeError, RuntimeError, AttributeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: is damaged or of another version; train it again with 'nmfd train'") from None
     return policy, content
 

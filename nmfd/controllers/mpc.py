@@ -46,7 +46,8 @@ def options(scenario: Scenario, name: str) -> Options:
     where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
     table = toml.Table(scenario.controller_options.get(name, {}), where, f"controllers.{name}.")
     chosen = Options(
-        horizon=table.integer("horizon", 8, low=2), max_iterations=table.integer("max_iterations", 1000),
+        horizon=table.integer("horizon", 8, low=2, high=1000),
+        max_iterations=table.integer("max_iterations", 1000),
         time_limit=table.number("time_limit", scenario.step, above=0.0))
     table.close()
     return chosen
