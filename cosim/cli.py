@@ -6,10 +6,9 @@ import click
 
 from nmfd.command_line import Commands, Interrupted
 from nmfd.errors import InputError
+from nmfd.options import COUNT, FILE, FOLDER, POSITIVE, SEED
 from nmfd.workers import RunFailed
 
-FOLDER = click.Path(path_type=Path, file_okay=False)
-FILE = click.Path(path_type=Path, dir_okay=False)
 CONTROLLER_HELP = (
     "no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc or dpc-pcrg; what else the city does is joined by +: webster, "
     "actuated or max-pressure signals, rerouting-N (percent of the drivers), hold-back or redistribute, compliance-N.")
@@ -30,9 +29,9 @@ def main() -> None:
 @click.argument("scenario", type=FOLDER)
 @click.option("--controller", required=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
 @click.option("--against", metavar="NAME", help="Run this controller too, on the same trips, in a second process.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True,
+@click.option("--seed", type=SEED, default=0, show_default=True,
               help="Of the trips, the drivers and the guidance.")
-@click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
+@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
 @click.option("--policy", type=FILE, metavar="FILE", help="Policy of a DPC controller, if not SCENARIO/NAME.pt.")
 @click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
 def run(
@@ -74,18 +73,18 @@ def run(
 @main.command()
 @click.argument("scenario", type=FOLDER)
 @click.option("--controllers", required=True, metavar="A,B,...", help="Separated by commas. " + CONTROLLER_HELP)
-@click.option("--seeds", type=click.IntRange(min=1), default=10, show_default=True, metavar="N",
+@click.option("--seeds", type=COUNT, default=10, show_default=True, metavar="N",
               help="Runs per controller and demand level, on the same trips for all controllers.")
-@click.option("--first-seed", type=click.IntRange(min=0), default=2000, show_default=True, metavar="S",
+@click.option("--first-seed", type=SEED, default=2000, show_default=True, metavar="S",
               help="The seeds are S to S + N - 1. From 2000 on they were never used in development.")
 @click.option("--demand", default="1.0", show_default=True, metavar="A,B,...",
               help="Demand levels: multiples of the scenario's demand.")
 @click.option("--reference", metavar="NAME", help="Pair all controllers with this one too, besides no-control.")
 @click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
               help="Policy of a DPC controller, if not SCENARIO/NAME.pt. May be repeated.")
-@click.option("--workers", type=click.IntRange(min=1), metavar="N",
+@click.option("--workers", type=COUNT, metavar="N",
               help="Runs at a time, each in a process of its own. [default: one per core]")
-@click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
+@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
 @click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-evaluate]")
 def evaluate(
     scenario: Path, controllers: str, seeds: int, first_seed: int, demand: str, reference: str | None,
@@ -140,8 +139,8 @@ def evaluate(
 @main.command()
 @click.argument("target", type=FOLDER, metavar="SCENARIO|RUN")
 @click.option("--controller", default="no-control", show_default=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-@click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
+@click.option("--seed", type=SEED, default=0, show_default=True)
+@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
 @click.option("--out", type=FOLDER, metavar="DIR", help="Run folder of a SCENARIO. [default: runs/<scenario>-<time>]")
 def compare(target: Path, controller: str, seed: int, steps: int | None, out: Path | None) -> None:
     """Compare microsimulated accumulations with what the regional model predicts.
@@ -154,18 +153,21 @@ def compare(target: Path, controller: str, seed: int, steps: int | None, out: Pa
       cosim compare scenarios/grid7_peak --controller no-control
       cosim compare runs/gating --controller pi-gating --seed 3
     """
-    import json
-
     from cosim import compare, experiment
     from cosim.simulate import Task, scenario_of
+    from nmfd import runs
 
     if (target / "manifest.json").is_file():
         if out is not None:
             raise InputError(f"--out: {out}: a comparison is written into its run folder {target}; leave --out away")
-        manifest = json.loads((target / "manifest.json").read_text())
-        task = Task(
-            scenario=Path(manifest["sessions"][-1]["scenario_folder"]), controller=controller, seed=seed,
-            steps=manifest["configuration"]["steps"], demand_factor=manifest["configuration"]["demand_factor"])
+        manifest = runs.read_manifest(target / "manifest.json")
+        try:
+            task = Task(
+                scenario=Path(manifest["sessions"][-1]["scenario_folder"]), controller=controller, seed=seed,
+                steps=manifest["configuration"]["steps"], demand_factor=manifest["configuration"]["demand_factor"])
+        except (LookupError, TypeError):
+            raise InputError(
+                f"{target / 'manifest.json'}: is not that of a run in SUMO; choose another folder") from None
         out = target
     else:
         task = Task(scenario=target, controller=controller, seed=seed, steps=steps)
@@ -180,13 +182,13 @@ def compare(target: Path, controller: str, seed: int, steps: int | None, out: Pa
 @click.argument("scenario", type=FOLDER)
 @click.option("--levels", default="0.6,0.8,1.0", show_default=True, metavar="A,B,...",
               help="The loading runs: multiples of the scenario's demand.")
-@click.option("--seeds", type=click.IntRange(min=1), default=2, show_default=True, metavar="N",
+@click.option("--seeds", type=COUNT, default=2, show_default=True, metavar="N",
               help="Loading runs per level, with seeds 1000 to 1000 + N - 1.")
-@click.option("--workers", type=click.IntRange(min=1), default=2, show_default=True, metavar="N")
+@click.option("--workers", type=COUNT, default=2, show_default=True, metavar="N")
 @click.option("--guided", is_flag=True, help="With route guidance: the model of a city whose drivers are guided.")
 @click.option("--network", "target", type=FOLDER, metavar="DIR",
               help="The folder whose network.toml is written. [default: the scenario's network]")
-@click.option("--iterations", type=click.IntRange(min=1), default=600, show_default=True, metavar="N",
+@click.option("--iterations", type=COUNT, default=600, show_default=True, metavar="N",
               help="Of the fit.")
 @click.option("--out", type=FOLDER, metavar="DIR", help="Samples and pictures. [default: runs/<scenario>-identify]")
 def identify(
@@ -241,11 +243,11 @@ def identify(
 @click.option("--taz", type=FILE, metavar="FILE", help="or a SUMO file with a TAZ per region,")
 @click.option("--polygons", type=FILE, metavar="FILE", help="or one with a polygon or more (id, id.1, ...) per region.")
 @click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak, for a city without demand.")
-@click.option("--level", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True,
+@click.option("--level", type=POSITIVE, default=1.0, show_default=True,
               help="Of --demand peak: times its usual number of trips.")
 @click.option("--begin", metavar="TIME", help="Instead of the sumocfg's, in seconds or as hours:minutes:seconds.")
 @click.option("--end", metavar="TIME", help="Later departures are left out.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--seed", type=SEED, default=0, show_default=True)
 @click.option("--no-run", is_flag=True, help="Do not simulate the city first: no densities and no flows.")
 @click.option("--force", is_flag=True, help="Replace a network and scenario that are there.")
 def import_(

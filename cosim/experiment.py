@@ -12,10 +12,12 @@ import pandas as pd
 
 from cosim import estimates
 from cosim.city import ensure_built
-from cosim.plant import Settings, settings
+from cosim.plant import Settings, own_vehicles, settings
 from cosim.regions import check_adjacency, load_city
+from cosim.signals import read_signals
 from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.strategy import parse
+from cosim.xml_files import read_xml
 from nmfd import runs
 from nmfd.benchmarks import REFERENCE, draw_accumulations, interval
 from nmfd.controllers import registry
@@ -129,14 +131,20 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
     scenario = scenario_of(first)
     controllers = {task.controller: dependencies(task.controller, scenario_of(task), task.policy)
                    for task in {task.controller: task for task in tasks}.values()}
+    chosen = settings(scenario)
     files = ensure_built(scenario.network)
-    check_adjacency(load_city(files.net_file, files.regions_csv, scenario.network.regions), scenario.network)
+    city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
+    check_adjacency(city, scenario.network)
+    read_signals(city)
+    own_vehicles(scenario, chosen, city)
+    for name in (*chosen.background, *chosen.additional):
+        read_xml(scenario.folder / name)
     configuration = {
         "scenario": scenario.name, "network": scenario.network.name, "plant": "sumo", "step_s": scenario.step,
         "steps": scenario.steps, "demand_factor": first.demand_factor,
         "demand_hash": hashlib.sha256(np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16],
         "net_file_hash": runs.file_hash(files.net_file), "regions_hash": runs.file_hash(files.regions_csv),
-        "measurement_std_veh": scenario.measurement_std, "sumo": _plain(settings(scenario), scenario.folder),
+        "measurement_std_veh": scenario.measurement_std, "sumo": _plain(chosen, scenario.folder),
         "libsumo": metadata.version("libsumo")}
     return configuration, controllers
 
@@ -192,7 +200,7 @@ def read_run(folder: Path, controller: str, seed: int) -> Result:
             record = {name: file[name] for name in file.files}
     except FileNotFoundError:
         raise InputError(f"{path}: no such run; choose a controller and seed of {folder / 'sumo.csv'}") from None
-    except (OSError, ValueError, EOFError) as error:
+    except runs.DAMAGED as error:
         raise InputError(f"{path}: is no record of a run ({error}); delete it and run again") from None
     trajectory = runs.read_trajectory(folder / f"{controller}-{seed}.npz")
     return Result(trajectory=trajectory, record=record, facts={})
@@ -207,7 +215,7 @@ def trajectories(folder: Path) -> list[Trajectory]:
 
 def _write_facts(folder: runs.RunFolder, result: Result) -> None:
     path = folder.path / "sumo.csv"
-    rows = pd.read_csv(path) if path.is_file() else pd.DataFrame(columns=FACTS)
+    rows = read_facts(path) if path.is_file() else pd.DataFrame(columns=FACTS)
     same = (rows["controller"] == result.facts["controller"]) & (rows["seed"] == result.facts["seed"])
     rows = pd.DataFrame([*rows[~same].to_dict("records"), result.facts], columns=FACTS)
     with runs.atomic(path) as temporary:
@@ -217,7 +225,18 @@ def _write_facts(folder: runs.RunFolder, result: Result) -> None:
 def overview(folder: Path) -> pd.DataFrame:
     """summary.csv and sumo.csv joined, one row per finished run. Raises InputError."""
     return pd.DataFrame(runs.read_summary(folder / "summary.csv")).merge(
-        pd.read_csv(folder / "sumo.csv"), on=["controller", "seed"])
+        read_facts(folder / "sumo.csv"), on=["controller", "seed"])
+
+
+def read_facts(path: Path) -> pd.DataFrame:
+    """The rows of sumo.csv. Raises InputError."""
+    try:
+        rows = pd.read_csv(path)
+        return rows.astype({"controller": str, "seed": int})
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; delete the folder and run again") from None
+    except (OSError, ValueError, KeyError) as error:  # pandas' own errors are ValueErrors
+        raise InputError(f"{path}: is no table of runs ({error}); delete the folder and run again") from None
 
 
 def table(rows: pd.DataFrame) -> str:

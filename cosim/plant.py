@@ -17,7 +17,7 @@ from cosim.flows import turning_flows
 from cosim.guidance import Guide
 from cosim.max_pressure import MaxPressure
 from cosim.measure import Meter
-from cosim.originals import Originals, read_originals, write_originals
+from cosim.originals import Originals, check_edges, read_originals, write_originals
 from cosim.regions import City, Gateway, check_adjacency, load_city
 from cosim.signals import Signal, read_signals, write_programmes
 from cosim.strategy import ACTUATED, FIXED, HOLD_BACK, MAX_PRESSURE, MODES, SIGNALS, WEBSTER
@@ -125,6 +125,13 @@ def settings(scenario: Scenario) -> Settings:
             f"{path}: sumo.step_length: expected a divisor of the control interval {scenario.step:g} s, got "
             f"{chosen.step_length:g} instead")
     return chosen
+
+
+def own_vehicles(scenario: Scenario, chosen: Settings, city: City) -> Originals:
+    """The vehicles of the route files that [sumo] names. Raises InputError."""
+    originals = read_originals([scenario.folder / name for name in chosen.routes])
+    check_edges(originals, city, f"{scenario.folder / 'scenario.toml'}: sumo.routes")
+    return originals
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -325,7 +332,7 @@ class SumoPlant:
         if not chosen.routes:
             return [f"v{n}" for n in range(write_trips(self.city, scenario.demand, scenario.step, seed, path))]
         if self._originals is None:
-            self._originals: Originals | None = read_originals([scenario.folder / name for name in chosen.routes])
+            self._originals: Originals | None = own_vehicles(scenario, chosen, self.city)
         return write_originals(
             self._originals, path, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
             begin=chosen.begin)

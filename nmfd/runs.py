@@ -14,6 +14,7 @@ import platform
 import re
 import subprocess
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -34,6 +35,8 @@ COLUMNS = {
     "control_step_ms_median": float, "control_step_ms_max": float, "solver_failures": int,
 }
 PACKAGES = ("numpy", "torch", "casadi", "libsumo", "perimeter-cosim")
+# What NumPy raises for a file that is no .npz, cut off, changed, or without an array that it should have.
+DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 _ARRAYS = ("accumulation", "backlog", "completed", "perimeter", "splits")
 
 
@@ -81,7 +84,7 @@ def read_trajectory(path: Path) -> Trajectory:
                 **{name: file[name] for name in _ARRAYS})
     except FileNotFoundError:
         raise InputError(f"{path}: no such trajectory; run it again") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGED as error:
         raise InputError(f"{path}: is no trajectory ({error}); delete it and run it again") from None
 
 
@@ -95,19 +98,35 @@ def write_rows(path: Path, columns: Mapping[str, type], rows: Sequence[Mapping])
 
 def read_rows(path: Path, columns: Mapping[str, type]) -> list[dict]:
     """The rows of a csv file with `columns`: name -> type. Raises InputError."""
-    with Path(path).open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        if reader.fieldnames != list(columns):
-            raise InputError(f"{path}: expected the columns {', '.join(columns)}; delete the folder and run again")
-        try:
+    try:
+        with Path(path).open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            if reader.fieldnames != list(columns):
+                raise ValueError(f"expected the columns {', '.join(columns)}")
             return [{name: convert(row[name]) for name, convert in columns.items()} for row in reader]
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{path}: {error}; delete the folder and run again") from None
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; delete the folder and run again") from None
+    except (OSError, TypeError, ValueError, csv.Error) as error:
+        raise InputError(f"{path}: {error}; delete the folder and run again") from None
 
 
 def write_summary(path: Path, rows: list[dict]) -> None:
     """`rows` of metrics.summary as summary.csv, atomically."""
     write_rows(path, COLUMNS, rows)
+
+
+def read_manifest(path: Path) -> dict:
+    """manifest.json of a run folder: configuration, controllers, sessions. Raises InputError."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(content["configuration"], dict) or not isinstance(content["controllers"], dict):
+            raise TypeError
+        [session.keys() for session in content["sessions"]]
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give a folder that a run was written to") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise InputError(f"{path}: is no manifest of a run; choose another folder with --out") from None
+    return content
 
 
 def read_summary(path: Path) -> list[dict]:
@@ -285,9 +304,9 @@ def _continued(manifest_path: Path, configuration: dict, controllers: dict, *, r
 
     InputError where the configurations, or without `renewable` the controllers, do not agree.
     """
+    manifest = read_manifest(manifest_path)
+    sessions, known = manifest["sessions"], manifest["controllers"]
     try:
-        manifest = json.loads(manifest_path.read_text(encoding="utf-8"))
-        sessions, known = list(manifest["sessions"]), dict(manifest["controllers"])
         there = {**{name: known.get(name, controllers[name]) for name in controllers}, **manifest["configuration"]}
         changed = {
             name: ", ".join(key for key in {**known[name], **wanted} if known[name].get(key) != wanted.get(key))

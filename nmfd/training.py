@@ -220,15 +220,21 @@ def _restore(state_file: Path, configuration, policy, optimizer, generator) -> t
         raise InputError(f"{state_file}: nothing to resume; train without --resume") from None
     except Exception:
         raise InputError(f"{state_file}: is damaged; remove it and train without --resume") from None
-    for key, value in configuration.items():
-        if state["configuration"].get(key) != value:
-            raise InputError(
-                f"{state_file}: {key}: was {state['configuration'].get(key)!r}, now {value!r}; resume with the same "
-                "settings or train without --resume")
-    policy.load_state_dict(state["policy"])
-    optimizer.load_state_dict(state["optimizer"])
-    generator.set_state(state["generator"])
-    return state["step"], state["best"], state["history"]
+    try:
+        there = dict(state["configuration"])
+        for key, value in configuration.items():
+            if there.get(key) != value:
+                raise InputError(
+                    f"{state_file}: {key}: was {there.get(key)!r}, now {value!r}; resume with the same settings or "
+                    "train without --resume")
+        policy.load_state_dict(state["policy"])
+        optimizer.load_state_dict(state["optimizer"])
+        generator.set_state(state["generator"])
+        return int(state["step"]), float(state["best"]), list(state["history"])
+    except InputError:
+        raise
+    except Exception:
+        raise InputError(f"{state_file}: is damaged; remove it and train without --resume") from None
 
 
 def _write(content: dict, path: Path) -> None:

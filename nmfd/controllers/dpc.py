@@ -198,11 +198,12 @@ def load_policy(path: Path, network: Network) -> tuple[Policy, dict]:
                 f"{path}: network_hash: the policy was trained for network {content['network']!r} "
                 f"({content['network_hash']}), not for {network.name!r} ({network.hash}); train one with 'nmfd train'")
         architecture = Architecture(**content["architecture"])
-        if not (0 < architecture.width <= WIDEST and 0 < architecture.layers <= DEEPEST):
+        flags = {type(architecture.guidance), type(architecture.sparse)}
+        if not (0 < architecture.width <= WIDEST and 0 < architecture.layers <= DEEPEST and flags == {bool}):
             raise KeyError("architecture")
         policy = Policy(network, architecture)
         policy.load_state_dict(content["weights"])
-    except (KeyError, TypeError, RuntimeError, AttributeError, ValueError) as error:
+    except (LookupError, TypeError, RuntimeError, AttributeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: is damaged or of another version; train it again with 'nmfd train'") from None

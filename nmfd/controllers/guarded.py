@@ -142,4 +142,8 @@ def load(path: Path, scenario: Scenario, *, guidance: bool) -> Guarded:
     check_guidance(policy, path, guidance)
     if "states" not in content:
         raise InputError(f"{path}: holds no statistics of its training states; train it again with 'nmfd train'")
-    return Guarded(policy, content["states"], scenario)
+    try:
+        return Guarded(policy, content["states"], scenario)
+    except (KeyError, TypeError, AttributeError, RuntimeError):
+        raise InputError(
+            f"{path}: states: are damaged or of another version; train it again with 'nmfd train'") from None
