@@ -90,7 +90,8 @@ def test_every_key_of_a_scenario(tmp_path):
 
     def test(content):
         file.write_bytes(content)
-        check("nmfd", "benchmark", tmp_path, "--controllers", "no-control", "--out", out, names="scenario.toml" if b"xxx" not in content else "", out=out)
+        names = "" if b"xxx" in content else "scenario.toml"  # the network that it names is missing
+        check("nmfd", "benchmark", tmp_path, "--controllers", "no-control", "--out", out, names=names, out=out)
 
     assert every(toml_cases(text, 1, required), test) > 300
 
@@ -109,7 +110,8 @@ def test_every_key_of_a_network(tmp_path, source):
         (tmp_path / "network.toml").write_bytes(content)
         program, *command = ["cosim", "run", "--controller"] if what.startswith("sumo.") else [
             "nmfd", "benchmark", "--controllers"]
-        check(program, *command, "no-control", scenario, "--out", out, names="" if "xxx" in what else "network.toml", out=out)
+        names = "" if "xxx" in what else "network.toml"  # the recipe that it names is missing
+        check(program, *command, "no-control", scenario, "--out", out, names=names, out=out)
 
     assert every(((case[0], case) for case in toml_cases(text, 2, required)), test) > 100
 
