@@ -105,6 +105,7 @@ def _built(recipe_file: Path, network: Network) -> SumoFiles:
             files.regions_csv.is_file()):
         return files
     folder.mkdir(exist_ok=True)
+    stamp_file.unlink(missing_ok=True)  # nothing here counts until it is written again
     net, regions = build(recipe, str(recipe_file))
     # the stamp comes last: whoever sees it finds the files that belong to it
     for file, content in ((files.net_file, net), (files.regions_csv, regions), (stamp_file, stamp.encode())):

@@ -62,6 +62,11 @@ def perform(
     the others. A kept run stays valid as long as the city, its demand and what its own controller depends on
     (`dependencies`) stay as they are.
 
+    A run that was interrupted starts again from its beginning. SUMO's saved states are no way round that: they hold
+    neither the vehicles that are not loaded yet, nor what perimeter control shows at the signals, nor what is known
+    here of every vehicle (ledger, guidance, detectors) and in the controller; a run that was put together from all
+    these would have to be proven the same to the byte, to save the minute or two that it takes.
+
     fresh: every run in a process of its own
     progress: called with what is done and to do, and what is running
     tell: takes one line where the runs of a controller do not count any more because it changed; None: an InputError

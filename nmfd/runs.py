@@ -6,6 +6,8 @@
 """
 
 import csv
+import errno
+import fcntl
 import hashlib
 import json
 import math
@@ -15,7 +17,7 @@ import re
 import subprocess
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
@@ -34,6 +36,8 @@ COLUMNS = {
     "max_accumulation_veh": float, "completed_veh": float, "evaluation_time_s": float,
     "control_step_ms_median": float, "control_step_ms_max": float, "solver_failures": int,
 }
+LOCK = ".lock"  # of a run folder
+TEMPORARY = re.compile(r"\.(?P<stem>.+)-\d+\.tmp(\.\w+)?")  # names that `atomic` gives
 PACKAGES = ("numpy", "torch", "casadi", "libsumo", "perimeter-cosim")
 # What NumPy raises for a file that is no .npz, cut off, changed, or without an array that it should have.
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
@@ -44,16 +48,61 @@ _ARRAYS = ("accumulation", "backlog", "completed", "perimeter", "splits")
 def atomic(path: Path) -> Iterator[Path]:
     """A temporary name in the folder of `path` to write to; it becomes `path` if all goes well, else it goes.
 
-    The suffix of `path` is kept, because matplotlib and NumPy choose the format by it.
+    The suffix of `path` is kept, because matplotlib and NumPy choose the format by it. A process that is killed leaves
+    the temporary file behind; `sweep` removes it.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem}-{os.getpid()}{path.suffix}")
+    temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def sweep(folder: Path, stems: Collection[str] | None = None) -> None:
+    """Remove what killed processes left half-written in `folder`, of files with these stems, or of all.
+
+    To be called by whoever has the folder or the files to himself (`locked`).
+    """
+    for path in folder.iterdir():
+        name = TEMPORARY.fullmatch(path.name)
+        if name and (stems is None or name["stem"] in stems):
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
+def locked(file: Path, what: Path) -> Iterator[None]:
+    """`what` to oneself: InputError if another process has it.
+
+    file: the lock, which holds process and host. The system lets go of it when the process ends, however it ends.
+    """
+    while True:
+        handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.read(handle, 200).decode(errors="replace") or "another process"
+            os.close(handle)
+            raise InputError(
+                f"{what}: {holder} is writing to it; wait for its end, or choose another name with --out") from None
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+                os.close(handle)
+                raise
+        with suppress(FileNotFoundError):  # whoever had it may have removed it meanwhile
+            if os.path.samestat(os.fstat(handle), os.stat(file)):
+                break
+        os.close(handle)
+    try:
+        os.ftruncate(handle, 0)
+        os.write(handle, f"process {os.getpid()} on {platform.node()}".encode())
+        yield
+    finally:
+        with suppress(OSError):
+            os.unlink(file)
+        os.close(handle)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -270,33 +319,41 @@ def manifest(
     renew: takes the controllers that changed, and what of them, before the manifest says so; without it they are an
         error
     results: the file in `path` that holds what is finished. If the body fails at the first opening before this file
-    is there, everything made here is removed again. Raises InputError as `open_folder`.
+    is there, everything made here is removed again. Raises InputError as `open_folder`, and while another process has
+    the folder.
     """
     path = Path(path)
     configuration, controllers = json.loads(json.dumps([configuration, controllers or {}]))
     file, sessions = path / "manifest.json", []
-    if file.is_file():
-        sessions, controllers, changed = _continued(file, configuration, controllers, renewable=renew is not None)
-        if changed:
-            renew(changed)
-    elif path.exists() and not path.is_dir():
+    if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; choose another folder with --out")
-    elif path.is_dir() and any(path.iterdir()):
+    if path.is_dir() and not file.is_file() and any(
+            found.name != LOCK and not TEMPORARY.fullmatch(found.name) for found in path.iterdir()):
         raise InputError(f"{path}: is not empty and holds no manifest.json; choose another folder with --out")
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
-    sessions.append({**provenance(), **(session or {})})
-    content = {"configuration": configuration, "controllers": controllers, "sessions": sessions}
     try:
         path.mkdir(parents=True, exist_ok=True)
-        write_text(file, json.dumps(content, indent=2) + "\n")
-        yield
+        with locked(path / LOCK, path):
+            sweep(path)
+            if file.is_file():
+                sessions, controllers, changed = _continued(
+                    file, configuration, controllers, renewable=renew is not None)
+                if changed:
+                    renew(changed)
+            first = not sessions
+            sessions.append({**provenance(), **(session or {})})
+            content = {"configuration": configuration, "controllers": controllers, "sessions": sessions}
+            try:
+                write_text(file, json.dumps(content, indent=2) + "\n")
+                yield
+            finally:
+                if not results.exists() and first:
+                    with suppress(OSError):
+                        file.unlink()
     finally:
-        if not results.exists() and len(sessions) == 1:
+        for parent in made:  # those that are empty
             with suppress(OSError):
-                file.unlink()
-            for parent in made:
-                with suppress(OSError):
-                    parent.rmdir()
+                parent.rmdir()
 
 
 def _continued(manifest_path: Path, configuration: dict, controllers: dict, *, renewable: bool) -> tuple:

@@ -4,6 +4,7 @@ Random initial states and demand keep gradients alive (a rollout that gridlocks 
 validation on the scenario itself is kept. The same seed gives the same weights.
 """
 
+import io
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -17,8 +18,9 @@ from nmfd.controllers import guarded
 from nmfd.controllers.dpc import ACTIVATIONS, DEEPEST, WIDEST, Architecture, Policy, checkpoint
 from nmfd.errors import InputError
 from nmfd.rollout import Rollout, compiled_step
-from nmfd.runs import atomic
+from nmfd.runs import atomic, locked, sweep
 from nmfd.scenario import Scenario, as_modelled
+from nmfd.workers import RunFailed
 
 VALIDATE_EVERY = 20  # Adam steps
 MOST_STEPS = 10**7
@@ -131,45 +133,48 @@ def train(
     optimizer = torch.optim.Adam(policy.parameters(), lr=chosen.learning_rate)
     first, best, history = 0, float("inf"), []
     state_file = out.with_name(out.name + ".resume")
-    if resume:
-        first, best, history = _restore(state_file, configuration, policy, optimizer, generator)
-    for step in range(first, chosen.steps):
-        for group in optimizer.param_groups:
-            cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
-            group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
-        rollout.draw_model(chosen.batch, chosen.mfd_spread, generator)
-        x, demand = rollout.random_start(
-            chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
-        demand = rollout.perturb(
-            demand, torch.rand(chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
-        # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
-        loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        if architecture.guidance and chosen.alternating:
-            # Not by requires_grad, which would compile the step once for each decoder.
-            for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
-                weights.grad = None
-        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
-        optimizer.step()
-        last = step + 1 == chosen.steps
-        if (step + 1) % VALIDATE_EVERY == 0 or last:
-            score = validate(policy, rollout, seed, chosen)
-            history.append([step + 1, math.exp(loss.item()), score])
-            if log:
-                log(step + 1, score)
-            if score < best:
-                best = score
-                states = guarded.statistics(visited(policy, rollout, chosen, seed))
-                _write(checkpoint(
-                    policy, scenario.network, {**configuration, "validation_veh_s": best}, states), out)
-            if not last:
-                _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
-        if progress:
-            progress(step + 1, chosen.steps, f"best {best:.4g} veh s")
-    if not math.isfinite(best):
-        raise RuntimeError(f"{controller}: every validation of {chosen.steps} steps diverged; lower the learning rate")
-    state_file.unlink(missing_ok=True)
+    with locked(out.with_name(f".{out.name}.lock"), out):
+        sweep(out.parent, {out.stem, state_file.stem})
+        if resume:
+            first, best, history = _restore(state_file, configuration, policy, optimizer, generator)
+        for step in range(first, chosen.steps):
+            for group in optimizer.param_groups:
+                cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
+                group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
+            rollout.draw_model(chosen.batch, chosen.mfd_spread, generator)
+            x, demand = rollout.random_start(
+                chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
+            demand = rollout.perturb(
+                demand, torch.rand(chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
+            # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
+            loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            if architecture.guidance and chosen.alternating:
+                # Not by requires_grad, which would compile the step once for each decoder.
+                for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
+                    weights.grad = None
+            torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+            optimizer.step()
+            last = step + 1 == chosen.steps
+            if (step + 1) % VALIDATE_EVERY == 0 or last:
+                score = validate(policy, rollout, seed, chosen)
+                history.append([step + 1, math.exp(loss.item()), score])
+                if log:
+                    log(step + 1, score)
+                if score < best:
+                    best = score
+                    states = guarded.statistics(visited(policy, rollout, chosen, seed))
+                    _write(checkpoint(
+                        policy, scenario.network, {**configuration, "validation_veh_s": best}, states), out)
+                if not last:
+                    _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
+            if progress:
+                progress(step + 1, chosen.steps, f"best {best:.4g} veh s")
+        if not math.isfinite(best):
+            raise RunFailed(
+                f"{controller}: every validation of {chosen.steps} steps diverged; lower the learning rate")
+        state_file.unlink(missing_ok=True)
     return out
 
 
@@ -238,5 +243,7 @@ def _restore(state_file: Path, configuration, policy, optimizer, generator) -> t
 
 
 def _write(content: dict, path: Path) -> None:
+    buffer = io.BytesIO()  # given a path, torch would write its name into the file: never the same bytes twice
+    torch.save(content, buffer)
     with atomic(path) as temporary:
-        torch.save(content, temporary)
+        temporary.write_bytes(buffer.getvalue())

@@ -2,6 +2,7 @@
 
 import math
 import multiprocessing
+import os
 import signal
 import threading
 import time
@@ -53,7 +54,8 @@ def outcomes(
     seconds: wall time after which a task is ended; it needs `fresh`
 
     The processes are spawned, so `function` and the tasks must be picklable. A process that dies (out of memory, a
-    crash in a library) is the Failure of the task it was at. Closing the iterator ends the processes at once.
+    crash in a library) is the Failure of the task it was at. Closing the iterator ends the processes at once, and so
+    does the end of this process, however it comes.
     """
     todo, busy, deadlines = list(tasks)[::-1], {}, {}
     try:
@@ -110,6 +112,12 @@ def _spawn(function: Callable) -> tuple:
     return here, process
 
 
+def _end_with(parent) -> None:
+    """End this process when its parent has ended, which has no chance to say so when it is killed."""
+    wait([parent.sentinel])
+    os._exit(1)
+
+
 @contextmanager
 def _interrupts_ignored():
     """Processes started in here inherit it: Ctrl-C is the parent's business, and it ends its workers."""
@@ -124,6 +132,7 @@ def _interrupts_ignored():
 
 
 def _serve(function: Callable, connection) -> None:
+    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     while True:
         try:
             task = connection.recv()
