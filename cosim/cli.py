@@ -41,8 +41,8 @@ def run(
     """Run a controller in the microsimulation; print a table and write a run folder.
 
     SCENARIO is a folder with a scenario.toml on a network that SUMO can simulate. The run folder holds summary.csv,
-    sumo.csv, trajectories and records, manifest.json and pictures. The same --out goes on where it was interrupted, also
-    by kill -9: finished runs are kept, and the one that was under way starts again from its beginning.
+    sumo.csv, trajectories and records, manifest.json and pictures. The same --out goes on where it was interrupted,
+    even by kill -9: finished runs are kept, and the one that was under way starts again from its beginning.
 
     \b
     Examples:
