@@ -6,7 +6,7 @@ import click
 
 from nmfd.command_line import Commands, Interrupted
 from nmfd.errors import InputError
-from nmfd.options import COUNT, FILE, FOLDER, POSITIVE, SEED
+from nmfd.options import COUNT, FILE, FOLDER, POSITIVE, SEED, fault_option
 from nmfd.workers import RunFailed
 
 CONTROLLER_HELP = (
@@ -33,10 +33,11 @@ def main() -> None:
               help="Of the trips, the drivers and the guidance.")
 @click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
 @click.option("--policy", type=FILE, metavar="FILE", help="Policy of a DPC controller, if not SCENARIO/NAME.pt.")
+@fault_option("closed:EDGE, signal:NAME, sumo-exits")
 @click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
 def run(
     scenario: Path, controller: str, against: str | None, seed: int, steps: int | None, policy: Path | None,
-    out: Path | None,
+    faults: tuple[str, ...], out: Path | None,
 ) -> None:
     """Run a controller in the microsimulation; print a table and write a run folder.
 
@@ -49,6 +50,7 @@ def run(
       cosim run scenarios/grid7_peak --controller dpc-pcrg --against no-control
       cosim run scenarios/grid7_peak --controller pi-gating --seed 3 --out runs/gating
       cosim run scenarios/grid7_peak --controller dpc-pc+rerouting-30 --against rerouting-30
+      cosim run scenarios/grid7_peak --controller dpc-pc --fault missing:3@20-30 --fault closed:c33-c34@10-40
     """
     from cosim import strategy
 
@@ -60,7 +62,8 @@ def run(
     from cosim.simulate import Task
 
     tasks = [
-        Task(scenario=scenario, controller=name, seed=seed, policy=policy if name == controller else None, steps=steps)
+        Task(scenario=scenario, controller=name, seed=seed, policy=policy if name == controller else None, steps=steps,
+             faults=faults)
         for name in names]
     out, rows = _experiment(tasks, out)
     click.echo(experiment.table(rows))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cosim import estimates
+from cosim import estimates, incidents
 from cosim.city import ensure_built
 from cosim.plant import Settings, own_vehicles, settings
 from cosim.regions import check_adjacency, load_city
@@ -18,7 +18,7 @@ from cosim.signals import read_signals
 from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.strategy import parse
 from cosim.xml_files import read_xml
-from nmfd import runs
+from nmfd import faults, runs
 from nmfd.benchmarks import REFERENCE, draw_accumulations, interval
 from nmfd.controllers import registry
 from nmfd.errors import InputError
@@ -142,6 +142,7 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
     check_adjacency(city, scenario.network)
     read_signals(city)
     own_vehicles(scenario, chosen, city)
+    incidents.check(faults.of(scenario), city, "faults")
     for name in (*chosen.background, *chosen.additional):
         read_xml(scenario.folder / name)
     configuration = {
@@ -150,7 +151,7 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
         "demand_hash": hashlib.sha256(np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16],
         "net_file_hash": runs.file_hash(files.net_file), "regions_hash": runs.file_hash(files.regions_csv),
         "measurement_std_veh": scenario.measurement_std, "sumo": _plain(chosen, scenario.folder),
-        "libsumo": metadata.version("libsumo")}
+        "libsumo": metadata.version("libsumo"), **({"faults": list(scenario.faults)} if scenario.faults else {})}
     return configuration, controllers
 
 

@@ -15,6 +15,7 @@ from cosim.city import ensure_built
 from cosim.detectors import EVERY, Detectors, instruments, lay_out, probes, write_loops
 from cosim.flows import turning_flows
 from cosim.guidance import Guide
+from cosim.incidents import Incidents
 from cosim.max_pressure import MaxPressure
 from cosim.measure import Meter
 from cosim.originals import Originals, check_edges, read_originals, write_originals
@@ -24,7 +25,7 @@ from cosim.strategy import ACTUATED, FIXED, HOLD_BACK, MAX_PRESSURE, MODES, SIGN
 from cosim.sumo import Session
 from cosim.trip_facts import TripFacts, read_trip_facts, trip_options
 from cosim.trips import write_trips
-from nmfd import toml
+from nmfd import faults, toml
 from nmfd.errors import InputError
 from nmfd.estimation import Estimator
 from nmfd.scenario import Scenario, read_tables
@@ -243,13 +244,17 @@ class SumoPlant:
             steered_ids = {signal.id for signal in steered}
         self._signals = self._gateway_signals(without=steered_ids)
         self._original_green = self._programmed_green()
-        self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
+        self._incidents = Incidents(faults.of(scenario), self._session, self.city)
+        self._actuator = Actuator(list(self._signals.values()), self._incidents.show)
         self._k, self._rows, self._speed = 0, [], None
         return self._estimated(self._measurement()) if estimating else self._measurement()
 
     def step(self, controls: Controls) -> Measurement:
         network, session, meter = self._scenario.network, self._session, self._meter
         before = self._totals()
+        self._incidents.begin(self._k)
+        if self._detectors:
+            self._detectors.silence(self._incidents.silent_loops)
         self._actuator.command(controls.perimeter, network.u_min, network.u_max)
         self._guide.command(controls.splits, self._speed)
         begin, steps = session.time, round(self._scenario.step / session.step_length)
@@ -277,9 +282,11 @@ class SumoPlant:
             self._estimator.step(
                 controls, self._detectors.observation(after["gateway_flow"] - before["gateway_flow"]))
             measurement = self._estimated(measurement)
+        measurement = replace(measurement, problem=self._incidents.problem(estimating=self._estimator is not None))
         row = {key: after[key] - before[key] for key in after}
         with np.errstate(invalid="ignore"):
             self._speed = metres / vehicles
+        self._speed[self._incidents.closed] = 0.0  # nobody is sent through a street because it is empty
         row["production"], row["mean_accumulation"] = (
             np.bincount(self._edge_region, amount, network.regions) / len(queues) for amount in (metres, vehicles))
         row["edge_vehicles"] = (vehicles / len(queues)).astype(np.float16)  # to 0.1 % and as small as an integer
@@ -287,6 +294,9 @@ class SumoPlant:
         row["gateway_queue"], row["gateway_queue_max"] = (
             queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))
         row["gateway_original_green"] = self._original_green
+        for n, gateway in enumerate(self.city.gateways):
+            if self._incidents.refused(gateway.signal):
+                row["gateway_green"][n] = self._original_green[n]
         self._rows.append(row)
         return measurement
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from cosim.strategy import parse
+from nmfd.faults import with_faults
 from nmfd.scenario import Scenario, load_scenario
 from nmfd.types import Trajectory
 
@@ -25,7 +26,7 @@ FACTS = (
 class Task:
     """scenario: its folder; controller: a strategy (cosim.strategy); policy: of a DPC controller, instead of the
     scenario's own; steps: control intervals, all if None; demand_factor: multiplies all flows;
-    options: of the controller, instead of those of the scenario."""
+    options: of the controller, instead of those of the scenario; faults: besides those of the scenario."""
 
     scenario: Path
     controller: str
@@ -34,6 +35,7 @@ class Task:
     steps: int | None = None
     demand_factor: float = 1.0
     options: tuple[tuple[str, object], ...] = ()
+    faults: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +51,7 @@ def scenario_of(task: Task) -> Scenario:
     """The scenario with the horizon and demand of `task`. Raises InputError."""
     scenario = load_scenario(task.scenario)
     steps = scenario.steps if task.steps is None else min(task.steps, scenario.steps)
+    scenario = with_faults(scenario, task.faults)
     scenario = replace(
         scenario, steps=steps, demand=task.demand_factor * scenario.demand[:steps],
         demand_factor=task.demand_factor * scenario.demand_factor)

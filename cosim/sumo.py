@@ -9,6 +9,7 @@ import libsumo
 
 from cosim.originals import BOUND
 from nmfd.errors import InputError
+from nmfd.workers import RunFailed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +51,7 @@ class Session:
         """Raises RuntimeError if another session is open in this process, InputError if SUMO refuses to start."""
         if Session._open:
             raise RuntimeError("a SUMO session is already open in this process; close it first")
-        self.sumo_time, self.step_length = 0.0, step_length
+        self.sumo_time, self.step_length, self._exits = 0.0, step_length, False
         routes = ",".join(map(str, [route_file] if isinstance(route_file, Path) else route_file))
         self.command = [
             "sumo", "--net-file", str(net_file), "--route-files", routes, "--seed", str(seed),
@@ -70,12 +71,14 @@ class Session:
             libsumo.close()
 
     def step(self) -> None:
-        """Advance by one simulation step."""
+        """Advance by one simulation step. RunFailed, with its own words, if SUMO gives up."""
         before = time.perf_counter()
         try:
+            if self._exits:
+                raise libsumo.FatalTraCIError("ordered by the fault sumo-exits")
             libsumo.simulationStep()
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-            raise RuntimeError(f"SUMO stopped at {self.time:g} s: {_one_line(error)}") from None
+            raise RunFailed(f"SUMO stopped at {self.time:g} s: {_one_line(error)}") from None
         self.sumo_time += time.perf_counter() - before
         self.time = libsumo.simulation.getTime()
 
@@ -170,8 +173,33 @@ class Session:
     def signal_state(self, signal: str) -> str:
         return libsumo.trafficlight.getRedYellowGreenState(signal)
 
-    def set_signal_state(self, signal: str, state: str) -> None:
-        libsumo.trafficlight.setRedYellowGreenState(signal, state)
+    def set_signal_state(self, signal: str, state: str) -> bool:
+        """False where SUMO does not take it."""
+        try:
+            libsumo.trafficlight.setRedYellowGreenState(signal, state)
+        except libsumo.TraCIException:
+            return False
+        return True
+
+    # Incidents.
+
+    def restart_programme(self, signal: str) -> None:
+        """Let a signal run the programme again that it had in the beginning."""
+        own = next(logic.programID for logic in libsumo.trafficlight.getAllProgramLogics(signal)
+                   if logic.programID != "online")
+        libsumo.trafficlight.setProgram(signal, own)
+
+    def limit_speed(self, edge: str, limits: list[float]) -> list[float]:
+        """Set the speed limits [m/s] of the lanes of an edge, one for each or one for all; those before."""
+        lanes = [f"{edge}_{n}" for n in range(libsumo.edge.getLaneNumber(edge))]
+        before = [libsumo.lane.getMaxSpeed(lane) for lane in lanes]
+        for lane, limit in zip(lanes, limits * len(lanes) if len(limits) == 1 else limits, strict=True):
+            libsumo.lane.setMaxSpeed(lane, limit)
+        return before
+
+    def exit_at_next_step(self) -> None:
+        """As if SUMO gave up by itself."""
+        self._exits = True
 
 
 def _one_line(error: Exception) -> str:

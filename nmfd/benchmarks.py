@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from scipy.special import stdtrit
 
-from nmfd import closed_loop, runs
+from nmfd import closed_loop, faults, runs
 from nmfd.controllers import registry
 from nmfd.plant import AcyclicPlant, NmfdPlant
 from nmfd.scenario import Scenario
@@ -49,6 +49,7 @@ def benchmark(
     failed, which the message names. Every finished run is kept, whatever happens to the others.
     """
     policies = policies or {}
+    faults.without_city(faults.of(scenario), f"{scenario.name}: faults")
     for name in controllers:
         registry.make(name, scenario, policy=policies.get(name))
     common, settings = configuration(scenario, controllers, plant, policies)

@@ -7,7 +7,7 @@ import click
 from nmfd.command_line import Commands, Interrupted
 from nmfd.errors import InputError
 from nmfd.experiments import ablation, bound, robustness, scaling
-from nmfd.options import COUNT, FILE, FOLDER, SEED, controller_names, policy_files, quoted
+from nmfd.options import COUNT, FILE, FOLDER, SEED, controller_names, fault_option, policy_files, quoted
 
 
 @click.group(name="nmfd", cls=Commands)
@@ -35,10 +35,11 @@ def main() -> None:
               help="Runs at a time, each on one core. Timings are cleanest with 1.")
 @click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
               help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.")
+@fault_option()
 @click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
 def benchmark(
     scenario: Path, controllers: str, seeds: int, plant: str, workers: int, policies: tuple[str, ...],
-    out: Path | None,
+    faults: tuple[str, ...], out: Path | None,
 ) -> None:
     """Run controllers on a regional model; print a table and write a run folder.
 
@@ -56,10 +57,11 @@ def benchmark(
     files = policy_files(policies, names)
 
     from nmfd import benchmarks, runs
+    from nmfd.faults import with_faults
     from nmfd.progress import progress_line
     from nmfd.scenario import load_scenario
 
-    loaded = load_scenario(scenario)
+    loaded = with_faults(load_scenario(scenario), faults)
     out = runs.default_folder(loaded) if out is None else out
     try:
         with progress_line("benchmark") as progress:

@@ -30,6 +30,16 @@ class Positive(click.FloatRange):
 POSITIVE = Positive()
 
 
+def fault_option(more: str = ""):
+    """--fault, which may be repeated. more: kinds besides those of every plant"""
+    kinds = ("frozen, delayed:N, missing:REGION, detectors:SHARE, off:FACTOR, solver-fails, solver-diverges, "
+             "solver-late, ")
+    return click.option(
+        "--fault", "faults", multiple=True, metavar="KIND[:VALUE][@FROM-TO]",
+        help=f"Inject a fault, in the control intervals FROM to TO - 1: {kinds}policy-nan{', ' if more else ''}{more}. "
+             "May be repeated; what is done instead is in the status of every decision.")
+
+
 def controller_names(controllers: str) -> list[str]:
     """The controllers in a list separated by commas. InputError for an unknown, repeated or empty name."""
     from nmfd.controllers import registry

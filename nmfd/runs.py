@@ -56,8 +56,11 @@ def atomic(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+    except BaseException as error:
+        if isinstance(error, OSError) and error.filename is None:  # a full disk is met without a name
+            error.filename = str(path)
+        with suppress(OSError):
+            temporary.unlink()
         raise
 
 
@@ -190,6 +193,8 @@ def scenario_hash(scenario: Scenario) -> str:
         scenario.substeps, scenario.protected, scenario.controller_options]
     if scenario.forecast_error:
         settings.append([scenario.forecast_error, scenario.forecast_seed])
+    if scenario.faults:
+        settings.append(scenario.faults)
     text = json.dumps(settings, sort_keys=True, default=str)
     return hashlib.sha256(text.encode() + np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16]
 

@@ -34,6 +34,7 @@ class Scenario:
     forecast_error: standard deviation of the logarithm of what a controller is told of the demand, over the truth [-]
     forecast_seed: of that error
     controller_options: controller name -> its table in [controllers], checked by that controller
+    faults: injected into every run (nmfd.faults)
     folder: where scenario.toml was, or None
     """
 
@@ -50,6 +51,7 @@ class Scenario:
     demand_factor: float = 1.0
     forecast_error: float = 0.0
     forecast_seed: int = 0
+    faults: tuple[str, ...] = ()
     folder: Path | None = None
 
     @cached_property
@@ -150,16 +152,23 @@ def load_scenario(folder: Path | str) -> Scenario:
     forecast = root.table("forecast", None)
     forecast_error, forecast_seed = forecast.number("error", 0.0, low=0.0, high=2.0), forecast.integer("seed", 0)
     forecast.close()
-    controller_options = root.raw_table("controllers")
+    controller_options, ordered = root.raw_table("controllers"), root.texts("faults", ())
     root.raw_table("sumo")
     root.close()
     check_step(network, step / substeps, str(folder / "scenario.toml"))
     scenario = Scenario(
         name=name, network=network, step=step, steps=steps, demand=factor * demand, measurement_std=measurement_std,
         integrator=integrator, substeps=substeps, protected=protected, controller_options=controller_options,
-        demand_factor=factor, forecast_error=forecast_error, forecast_seed=forecast_seed, folder=folder)
+        demand_factor=factor, forecast_error=forecast_error, forecast_seed=forecast_seed, faults=ordered, folder=folder)
     registry.check_options(scenario)
+    _check_faults(scenario)
     return scenario
+
+
+def _check_faults(scenario: Scenario) -> None:
+    from nmfd import faults
+
+    faults.of(scenario)
 
 
 def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:

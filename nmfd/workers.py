@@ -40,6 +40,8 @@ def attempt(function: Callable, task):
         return function(task)
     except InputError as error:
         return Failure(str(error), mistake=True)
+    except RunFailed as error:
+        return Failure(str(error))
     except Exception as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
         return Failure(f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})")

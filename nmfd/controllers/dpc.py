@@ -133,6 +133,7 @@ class DpcController:
     def __init__(self, policy: Policy):
         self._policy = policy.eval()
         self.name = "dpc-pcrg" if policy.architecture.guidance else "dpc-pc"
+        self.fault: str | None = None  # injected (nmfd.faults)
         self._onward = policy.onward.numpy() if policy.architecture.sparse else None
         self._u_max = self._full(policy.u_max * policy.adjacency.numpy())
 
@@ -144,6 +145,8 @@ class DpcController:
             x = torch.from_numpy(measurement.accumulation.astype(np.float32))
             perimeter, splits = self._policy.listed(x)
         perimeter = perimeter.numpy()
+        if self.fault == "policy-nan":
+            perimeter = np.full_like(perimeter, np.nan)
         if splits is not None:
             splits = splits.numpy().astype(float)
             sums = splits.sum(axis=1, keepdims=True)
