@@ -395,7 +395,7 @@ class SumoPlant:
 
     def _measurement(self) -> Measurement:
         return Measurement(
-            step=self._k, time=self._k * self._scenario.step, accumulation=self._meter.accumulation(),
+            step=self._k, time=self._k * self._scenario.step, accumulation=self._meter.accumulation(self._k),
             backlog=self._meter.backlog())
 
     def _estimated(self, measurement: Measurement) -> Measurement:

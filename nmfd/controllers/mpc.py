@@ -171,8 +171,9 @@ class EconomicMpc:
             found = self._solve(start, demand, last)
         except (ArithmeticError, ValueError, RuntimeError) as error:  # of NumPy and SciPy, LinAlgError too
             return self._without(measurement, last, f"solver failed ({type(error).__name__})")
-        solved = found.reason is None or found.gap <= ACCEPTABLE * found.value
-        if not solved and (found.point is last or not np.isfinite(found.gap)) and found.reason != AT_REST:
+        known = np.isfinite(found.gap)
+        solved = found.reason is None or (known and found.gap <= ACCEPTABLE * found.value)
+        if not solved and (found.point is last or not known) and found.reason != AT_REST:
             return self._without(measurement, last, found.reason)
         self._plan, self._left, self._gates = found.point, self._moves - 1, False
         return self._first(status="ok" if solved else f"{found.reason}: best plan so far used")
