@@ -6,10 +6,9 @@ import click
 
 from nmfd.command_line import Commands, Interrupted
 from nmfd.errors import InputError
+from nmfd.options import COUNT, FILE, FOLDER, POSITIVE, SEED, fault_option
 from nmfd.workers import RunFailed
 
-FOLDER = click.Path(path_type=Path, file_okay=False)
-FILE = click.Path(path_type=Path, dir_okay=False)
 CONTROLLER_HELP = (
     "no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc or dpc-pcrg; what else the city does is joined by +: webster, "
     "actuated or max-pressure signals, rerouting-N (percent of the drivers), hold-back or redistribute, compliance-N. "
@@ -31,23 +30,25 @@ def main() -> None:
 @click.argument("scenario", type=FOLDER)
 @click.option("--controller", required=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
 @click.option("--against", metavar="NAME", help="Run this controller too, on the same trips, in a second process.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True,
+@click.option("--seed", type=SEED, default=0, show_default=True,
               help="Of the trips, the drivers and the guidance.")
-@click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
+@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
 @click.option("--policy", type=FILE, metavar="FILE", help="Policy of a DPC controller, if not SCENARIO/NAME.pt.")
 @click.option("--sumo-output", metavar="A,B,...",
               help="SUMO's own outputs in the run folder too: tripinfo, summary, edgedata (per control interval), "
                    "emission (of every vehicle in every step, large).")
 @click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.frames).")
+@fault_option("closed:EDGE, signal:NAME, sumo-exits")
 @click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
 def run(
     scenario: Path, controller: str, against: str | None, seed: int, steps: int | None, policy: Path | None,
-    sumo_output: str | None, parquet: bool, out: Path | None,
+    sumo_output: str | None, parquet: bool, faults: tuple[str, ...], out: Path | None,
 ) -> None:
     """Run a controller in the microsimulation; print a table and write a run folder.
 
     SCENARIO is a folder with a scenario.toml on a network that SUMO can simulate. The run folder holds summary.csv,
-    sumo.csv, trajectories and records, manifest.json and pictures. The same --out goes on where it was interrupted.
+    sumo.csv, trajectories and records, manifest.json and pictures. The same --out goes on where it was interrupted,
+    even by kill -9: finished runs are kept, and the one that was under way starts again from its beginning.
 
     \b
     Examples:
@@ -55,6 +56,7 @@ def run(
       cosim run scenarios/grid7_peak --controller pi-gating --seed 3 --out runs/gating
       cosim run scenarios/grid7_peak --controller dpc-pc+rerouting-30 --against rerouting-30
       cosim run scenarios/grid7_peak --controller pi-gating --sumo-output tripinfo,edgedata --parquet
+      cosim run scenarios/grid7_peak --controller dpc-pc --fault missing:3@20-30 --fault closed:c33-c34@10-40
     """
     from cosim import strategy
     from cosim import sumo_output as outputs
@@ -68,7 +70,8 @@ def run(
     from cosim.simulate import Task
 
     tasks = [
-        Task(scenario=scenario, controller=name, seed=seed, policy=policy if name == controller else None, steps=steps)
+        Task(scenario=scenario, controller=name, seed=seed, policy=policy if name == controller else None, steps=steps,
+             faults=faults)
         for name in names]
     out, rows = _experiment(tasks, out, kinds)
     click.echo(experiment.table(rows))
@@ -86,18 +89,18 @@ def run(
 @main.command()
 @click.argument("scenario", type=FOLDER)
 @click.option("--controllers", required=True, metavar="A,B,...", help="Separated by commas. " + CONTROLLER_HELP)
-@click.option("--seeds", type=click.IntRange(min=1), default=10, show_default=True, metavar="N",
+@click.option("--seeds", type=COUNT, default=10, show_default=True, metavar="N",
               help="Runs per controller and demand level, on the same trips for all controllers.")
-@click.option("--first-seed", type=click.IntRange(min=0), default=2000, show_default=True, metavar="S",
+@click.option("--first-seed", type=SEED, default=2000, show_default=True, metavar="S",
               help="The seeds are S to S + N - 1. From 2000 on they were never used in development.")
 @click.option("--demand", default="1.0", show_default=True, metavar="A,B,...",
               help="Demand levels: multiples of the scenario's demand.")
 @click.option("--reference", metavar="NAME", help="Pair all controllers with this one too, besides no-control.")
 @click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
               help="Policy of a DPC controller, if not SCENARIO/NAME.pt. May be repeated.")
-@click.option("--workers", type=click.IntRange(min=1), metavar="N",
+@click.option("--workers", type=COUNT, metavar="N",
               help="Runs at a time, each in a process of its own. [default: one per core]")
-@click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
+@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
 @click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-evaluate]")
 def evaluate(
     scenario: Path, controllers: str, seeds: int, first_seed: int, demand: str, reference: str | None,
@@ -225,8 +228,8 @@ def sweep(
 @main.command()
 @click.argument("target", type=FOLDER, metavar="SCENARIO|RUN")
 @click.option("--controller", default="no-control", show_default=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-@click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
+@click.option("--seed", type=SEED, default=0, show_default=True)
+@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
 @click.option("--out", type=FOLDER, metavar="DIR", help="Run folder of a SCENARIO. [default: runs/<scenario>-<time>]")
 def compare(target: Path, controller: str, seed: int, steps: int | None, out: Path | None) -> None:
     """Compare microsimulated accumulations with what the regional model predicts.
@@ -239,8 +242,6 @@ def compare(target: Path, controller: str, seed: int, steps: int | None, out: Pa
       cosim compare scenarios/grid7_peak --controller no-control
       cosim compare runs/gating --controller pi-gating --seed 3
     """
-    import json
-
     from cosim import compare, experiment
     from cosim.simulate import Task, scenario_of
     from nmfd import runs
@@ -248,10 +249,14 @@ def compare(target: Path, controller: str, seed: int, steps: int | None, out: Pa
     if (target / "manifest.json").is_file():
         if out is not None:
             raise InputError(f"--out: {out}: a comparison is written into its run folder {target}; leave --out away")
-        manifest = json.loads((target / "manifest.json").read_text())
-        task = Task(
-            scenario=Path(manifest["sessions"][-1]["scenario_folder"]), controller=controller, seed=seed,
-            steps=manifest["configuration"]["steps"], demand_factor=manifest["configuration"]["demand_factor"])
+        manifest = runs.read_manifest(target / "manifest.json")
+        try:
+            task = Task(
+                scenario=Path(manifest["sessions"][-1]["scenario_folder"]), controller=controller, seed=seed,
+                steps=manifest["configuration"]["steps"], demand_factor=manifest["configuration"]["demand_factor"])
+        except (LookupError, TypeError):
+            raise InputError(
+                f"{target / 'manifest.json'}: is not that of a run in SUMO; choose another folder") from None
         out = target
     else:
         task = Task(scenario=target, controller=controller, seed=seed, steps=steps)
@@ -370,15 +375,15 @@ def watch(
 @click.argument("scenario", type=FOLDER)
 @click.option("--levels", default="0.6,0.8,1.0", show_default=True, metavar="A,B,...",
               help="The loading runs: multiples of the scenario's demand.")
-@click.option("--seeds", type=click.IntRange(min=1), default=2, show_default=True, metavar="N",
+@click.option("--seeds", type=COUNT, default=2, show_default=True, metavar="N",
               help="Loading runs per level, with seeds 1000 to 1000 + N - 1.")
-@click.option("--workers", type=click.IntRange(min=1), default=2, show_default=True, metavar="N")
+@click.option("--workers", type=COUNT, default=2, show_default=True, metavar="N")
 @click.option("--guided", is_flag=True, help="With route guidance: the model of a city whose drivers are guided.")
 @click.option("--with", "options", metavar="OPTION[+...]",
               help="Of a city with such signals or drivers: max-pressure, rerouting-30, ... as in a strategy's name.")
 @click.option("--network", "target", type=FOLDER, metavar="DIR",
               help="The folder whose network.toml is written. [default: the scenario's network]")
-@click.option("--iterations", type=click.IntRange(min=1), default=600, show_default=True, metavar="N",
+@click.option("--iterations", type=COUNT, default=600, show_default=True, metavar="N",
               help="Of the fit.")
 @click.option("--out", type=FOLDER, metavar="DIR", help="Samples and pictures. [default: runs/<scenario>-identify]")
 def identify(
@@ -437,11 +442,11 @@ def identify(
 @click.option("--taz", type=FILE, metavar="FILE", help="or a SUMO file with a TAZ per region,")
 @click.option("--polygons", type=FILE, metavar="FILE", help="or one with a polygon or more (id, id.1, ...) per region.")
 @click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak, for a city without demand.")
-@click.option("--level", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True,
+@click.option("--level", type=POSITIVE, default=1.0, show_default=True,
               help="Of --demand peak: times its usual number of trips.")
 @click.option("--begin", metavar="TIME", help="Instead of the sumocfg's, in seconds or as hours:minutes:seconds.")
 @click.option("--end", metavar="TIME", help="Later departures are left out.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--seed", type=SEED, default=0, show_default=True)
 @click.option("--no-run", is_flag=True, help="Do not simulate the city first: no densities and no flows.")
 @click.option("--force", is_flag=True, help="Replace a network and scenario that are there.")
 def import_(

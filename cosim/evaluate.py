@@ -16,6 +16,7 @@ from cosim import experiment, report, tables
 from cosim.simulate import Task
 from nmfd.errors import InputError
 from nmfd.scenario import load_scenario
+from nmfd.workers import ended
 
 FIRST_SEED = 2000  # these seeds are kept for evaluations: nothing was chosen, trained or identified on them
 
@@ -66,7 +67,9 @@ def evaluate(
     if len(rows):
         table = tables.write(out, rows, evaluation.reference)
         report.draw_all(out, level_folders(out), load_scenario(evaluation.scenario), rows)
-    return table, [f"{experiment.label(task)}: {reason}" for task, reason in failures]
+    if failures and table.empty and all(failure.mistake for _, failure in failures):
+        raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])
+    return table, [f"{experiment.label(task)}: {failure.reason}" for task, failure in failures]
 
 
 def level_folders(out: Path) -> dict[float, Path]:

@@ -22,7 +22,7 @@ from nmfd.errors import InputError
 from nmfd.identification import Observed
 from nmfd.network import Network
 from nmfd.scenario import Scenario, load_scenario
-from nmfd.workers import RunFailed
+from nmfd.workers import ended
 
 FEWEST = 30.0   # vehicles that must have crossed before their split ratios count
 AHEAD = 900.0   # s, of the longer prediction that is judged
@@ -115,7 +115,7 @@ def _load(
         for level in loading.levels for seed in loading.seeds]
     failures = experiment.perform(plan, workers=workers, progress=progress, tell=lambda line: None)
     if failures:
-        raise RunFailed("; ".join(f"{experiment.label(task)}: {reason}" for task, reason in failures))
+        raise ended([(experiment.label(task), failure) for task, failure in failures])
     return [experiment.read_run(folder, controller, task.seed) for folder, task in plan]
 
 

@@ -15,16 +15,17 @@ from cosim.city import ensure_built
 from cosim.detectors import EVERY, Detectors, instruments, lay_out, probes, write_loops
 from cosim.flows import turning_flows
 from cosim.guidance import Guide
+from cosim.incidents import Incidents
 from cosim.max_pressure import MaxPressure
 from cosim.measure import Meter
-from cosim.originals import Originals, read_originals, write_originals
+from cosim.originals import Originals, check_edges, read_originals, write_originals
 from cosim.regions import City, Gateway, check_adjacency, gateway_room_taken, load_city
 from cosim.signals import Signal, read_signals, write_programmes
 from cosim.strategy import ACTUATED, FIXED, HOLD_BACK, MAX_PRESSURE, MODES, SIGNALS, WEBSTER
 from cosim.sumo import Session, Window
 from cosim.trip_facts import TripFacts, read_trip_facts, trip_options
 from cosim.trips import write_trips
-from nmfd import toml
+from nmfd import faults, toml
 from nmfd.errors import InputError
 from nmfd.estimation import Estimator
 from nmfd.scenario import Scenario, read_tables
@@ -129,6 +130,13 @@ def settings(scenario: Scenario) -> Settings:
             f"{path}: sumo.step_length: expected a divisor of the control interval {scenario.step:g} s, got "
             f"{chosen.step_length:g} instead")
     return chosen
+
+
+def own_vehicles(scenario: Scenario, chosen: Settings, city: City) -> Originals:
+    """The vehicles of the route files that [sumo] names. Raises InputError."""
+    originals = read_originals([scenario.folder / name for name in chosen.routes])
+    check_edges(originals, city, f"{scenario.folder / 'scenario.toml'}: sumo.routes")
+    return originals
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,13 +260,17 @@ class SumoPlant:
             self._rationed = {signal.id: signal for signal in steered if signal.id in self._gateway_ids}
         self._signals = self._gateway_signals()
         self._original_green = self._programmed_green()
-        self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
+        self._incidents = Incidents(faults.of(scenario), self._session, self.city)
+        self._actuator = Actuator(list(self._signals.values()), self._incidents.show)
         self._k, self._rows, self._speed, self._opened = 0, [], None, {}
         return self._estimated(self._measurement()) if estimating else self._measurement()
 
     def step(self, controls: Controls) -> Measurement:
         network, session, meter = self._scenario.network, self._session, self._meter
         before = self._totals()
+        self._incidents.begin(self._k)
+        if self._detectors:
+            self._detectors.silence(self._incidents.silent_loops)
         share = np.clip((controls.perimeter - network.u_min) / (network.u_max - network.u_min), 0.0, 1.0)
         self._actuator.command(share, self._opened)
         if self._max_pressure is not None:
@@ -289,9 +301,11 @@ class SumoPlant:
             self._estimator.step(
                 controls, self._detectors.observation(after["gateway_flow"] - before["gateway_flow"]))
             measurement = self._estimated(measurement)
+        measurement = replace(measurement, problem=self._incidents.problem(estimating=self._estimator is not None))
         row = {key: after[key] - before[key] for key in after}
         with np.errstate(invalid="ignore"):
             self._speed = metres / vehicles
+        self._speed[self._incidents.closed] = 0.0  # nobody is sent through a street because it is empty
         row["production"], row["mean_accumulation"] = (
             np.bincount(self._edge_region, amount, network.regions) / len(queues) for amount in (metres, vehicles))
         self._opened = self._overridden(vehicles / len(queues))
@@ -300,6 +314,9 @@ class SumoPlant:
         row["gateway_queue"], row["gateway_queue_max"] = (
             queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))
         row["gateway_original_green"] = self._original_green
+        for n, gateway in enumerate(self.city.gateways):
+            if self._incidents.refused(gateway.signal):
+                row["gateway_green"][n] = self._original_green[n]
         self._rows.append(row)
         return measurement
 
@@ -345,7 +362,7 @@ class SumoPlant:
         if not chosen.routes:
             return [f"v{n}" for n in range(write_trips(self.city, scenario.demand, scenario.step, seed, path))]
         if self._originals is None:
-            self._originals: Originals | None = read_originals([scenario.folder / name for name in chosen.routes])
+            self._originals: Originals | None = own_vehicles(scenario, chosen, self.city)
         return write_originals(
             self._originals, path, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
             begin=chosen.begin)
@@ -407,7 +424,7 @@ class SumoPlant:
 
     def _measurement(self) -> Measurement:
         return Measurement(
-            step=self._k, time=self._k * self._scenario.step, accumulation=self._meter.accumulation(),
+            step=self._k, time=self._k * self._scenario.step, accumulation=self._meter.accumulation(self._k),
             backlog=self._meter.backlog())
 
     def _estimated(self, measurement: Measurement) -> Measurement:

@@ -1,7 +1,5 @@
 """Signals as the network file describes them, and other programmes for them as an additional file of SUMO."""
 
-import gzip
-import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -10,7 +8,9 @@ from xml.sax.saxutils import quoteattr
 
 from cosim.regions import City
 from cosim.sumo import Phase
+from cosim.xml_files import BROKEN, read_xml
 from nmfd import runs
+from nmfd.errors import InputError
 
 GREEN = frozenset("Gg")
 
@@ -51,9 +51,14 @@ def is_stage(state: str) -> bool:
 def read_signals(city: City) -> tuple[list[Signal], list[str]]:
     """The simple signals of the city, and the names of all others, which no signal plan here touches: already actuated,
     several programmes, fewer than two stages, or lights other than red, yellow and green."""
-    path = city.net_file
-    with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as stream:
-        root = ElementTree.parse(stream).getroot()
+    try:
+        return _signals(city)
+    except BROKEN as error:
+        raise InputError(f"{city.net_file}: its signals cannot be read ({error}); build it with netconvert") from None
+
+
+def _signals(city: City) -> tuple[list[Signal], list[str]]:
+    root = read_xml(city.net_file)
     programmes = Counter(logic.get("id") for logic in root.iter("tlLogic"))
     links: dict[str, list[Link]] = {}
     for connection in root.iter("connection"):

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cosim.strategy import Strategy, configured, parse
+from nmfd.faults import with_faults
 from nmfd.scenario import Scenario, load_scenario
 from nmfd.types import Controller, Trajectory
 
@@ -27,7 +28,7 @@ class Task:
     """scenario: its folder; controller: a strategy (cosim.strategy); policy: of a DPC controller, instead of the
     scenario's own; steps: control intervals, all if None; demand_factor: multiplies all flows;
     options: of the controller, instead of those of the scenario; sumo_output: kind (cosim.sumo_output) and file of
-    SUMO's own outputs."""
+    SUMO's own outputs; faults: besides those of the scenario."""
 
     scenario: Path
     controller: str
@@ -37,6 +38,7 @@ class Task:
     demand_factor: float = 1.0
     options: tuple[tuple[str, object], ...] = ()
     sumo_output: tuple[tuple[str, Path], ...] = ()
+    faults: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +54,7 @@ def scenario_of(task: Task) -> Scenario:
     """The scenario with the horizon and demand of `task`. Raises InputError."""
     scenario = load_scenario(task.scenario)
     steps = scenario.steps if task.steps is None else min(task.steps, scenario.steps)
+    scenario = with_faults(scenario, task.faults)
     scenario = replace(
         scenario, steps=steps, demand=task.demand_factor * scenario.demand[:steps],
         demand_factor=task.demand_factor * scenario.demand_factor)

@@ -18,7 +18,7 @@ from nmfd.controllers import registry
 from nmfd.demand_noise import perturbed
 from nmfd.metrics import summary
 from nmfd.scenario import Scenario
-from nmfd.workers import Failure, RunFailed
+from nmfd.workers import Failure, ended
 
 COLUMNS = {
     "sigma_veh_per_s": float, "scenario": int, "controller": str, "trips_veh": float,
@@ -77,14 +77,14 @@ def robustness(
         work = partial(run_one, scenario=scenario, plant=plant, where=where, policies=policies)
         for run, outcome in results(work, todo, workers, scenario.steps, progress, label=_label):
             if isinstance(outcome, Failure):
-                failures.append(f"{_label(run)}: {outcome.reason}")
+                failures.append((_label(run), outcome))
             else:
                 rows[run] = outcome
                 runs.write_rows(file, COLUMNS, [rows[run] for run in sorted(rows)])
         if rows:
             draw(out, [rows[run] for run in sorted(rows)])
     if failures:
-        raise RunFailed("; ".join(failures))
+        raise ended(failures)
     return [rows[run] for run in sorted(rows)]
 
 

@@ -18,6 +18,7 @@ class Measurement:
     accumulation: (R, R) [veh], [i, j] = in region i bound for j
     backlog: (R, R) [veh], [i, j] = waiting outside the network to enter region i, bound for j; zero in the NMFD
     estimate, estimated_backlog: (R, R) [veh], what a controller sees instead where the plant only estimates them
+    problem: what the plant could not do in the interval that has just ended, "" if nothing
     """
 
     step: int
@@ -26,6 +27,7 @@ class Measurement:
     backlog: np.ndarray
     estimate: np.ndarray | None = None
     estimated_backlog: np.ndarray | None = None
+    problem: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

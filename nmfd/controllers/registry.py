@@ -204,3 +204,36 @@ def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Contro
     from nmfd.controllers import dpc
 
     return dpc.load(path, scenario, guidance=_WITH_POLICY[name])
+
+
+def check_options(scenario: Scenario) -> None:
+    """InputError for a wrong option of any controller in the scenario's [controllers], whether it is run or not.
+
+    An option of a controller that nobody runs today would else be found wrong in the middle of tomorrow's work. The
+    networks of other models are read only where they are used.
+    """
+    from dataclasses import replace
+
+    from nmfd import toml
+
+    where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
+    tables = toml.Table(scenario.controller_options, where, "controllers.")
+    for name in scenario.controller_options:
+        table = tables.table(name)
+        if name not in names():
+            raise tables.error(name, f"unknown controller; choose from {', '.join(names())}")
+        table.text("model", None)
+        own = replace(scenario, controller_options={name: table.raw()})
+        if name.startswith("mpc-"):
+            from nmfd.controllers import mpc
+
+            mpc.options(own, name)
+        elif name in _WITH_POLICY:
+            from nmfd import training
+
+            training.settings(own, name)
+        elif name in ("pi-gating", "probing-pc", "probing-pcrg"):
+            if scenario.protected:  # without a protected region gating cannot be made, and is not made
+                _WITHOUT_POLICY[name](own)
+        else:
+            table.close()
