@@ -182,9 +182,8 @@ class Actuator:
         """show(signal, state) puts a state on a signal."""
         self._signals, self._show = signals, show
 
-    def command(self, perimeter: np.ndarray, u_min: float, u_max: float) -> None:
-        """perimeter: (R, R) [-], [i, h] = u_ih."""
-        share = np.clip((perimeter - u_min) / (u_max - u_min), 0.0, 1.0)
+    def command(self, share: np.ndarray) -> None:
+        """share: (R, R) [-], [i, h] = (u_ih - u_min) / (u_max - u_min)."""
         for signal in self._signals:
             signal.command(share)
 

@@ -2,7 +2,6 @@
 
 import tempfile
 from collections import Counter
-from collections.abc import Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -51,7 +50,7 @@ class Settings:
     measurement: "exact", or "estimate": controllers see what detectors and probes tell (cosim/detectors.py)
     detector_share: of the links, with loop detectors [-]; probe_share: of the vehicles [-]
     signals: one of cosim.strategy.SIGNALS; gateways_fixed (of the strategy, no key of the table): whether signals with
-        a gateway movement stay fixed-time, for perimeter control, where the others are actuated or max-pressure
+        a gateway movement stay fixed-time, for perimeter control, where the others are actuated
 
     Of a city with vehicles of its own (cosim import), files relative to the scenario's folder:
     routes: their route files; without any, trips are drawn from the scenario's demand
@@ -196,7 +195,7 @@ class SumoPlant:
         self._vehicles, files = self._write_vehicles(routes, seed), [routes]
         self._trip_file = routes.with_name("tripinfo.xml")
         steered = [s for s in self.simple_signals if s.id not in chosen.leave_signals and not (
-            chosen.gateways_fixed and s.id in self._gateway_ids)]
+            chosen.gateways_fixed and chosen.signals == ACTUATED and s.id in self._gateway_ids)]
         options = [
             *trip_options(self._trip_file), "--begin", str(chosen.begin), "--ignore-route-errors",
             str(bool(chosen.routes)).lower()]
@@ -228,13 +227,13 @@ class SumoPlant:
         self._guide = Guide(
             self._session, self.city, scenario.network.nominal_splits, compliance=chosen.compliance,
             most_detour=chosen.most_detour, random=np.random.default_rng([seed, 0x67756964]))
-        self._max_pressure, steered_ids = None, set()
+        self._max_pressure, self._rationed = None, {}
         if chosen.signals == MAX_PRESSURE:
             flows = turning_flows(self.city, scenario.demand, scenario.step)
             others = [signal for signal in self.simple_signals if signal not in steered]
             self._max_pressure = MaxPressure(self._session, self.city, steered, flows, others=others)
-            steered_ids = {signal.id for signal in steered}
-        self._signals = self._gateway_signals(without=steered_ids)
+            self._rationed = {signal.id: signal for signal in steered if signal.id in self._gateway_ids}
+        self._signals = self._gateway_signals()
         self._original_green = self._programmed_green()
         self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
         self._k, self._rows, self._speed = 0, [], None
@@ -243,7 +242,10 @@ class SumoPlant:
     def step(self, controls: Controls) -> Measurement:
         network, session, meter = self._scenario.network, self._session, self._meter
         before = self._totals()
-        self._actuator.command(controls.perimeter, network.u_min, network.u_max)
+        share = np.clip((controls.perimeter - network.u_min) / (network.u_max - network.u_min), 0.0, 1.0)
+        self._actuator.command(share)
+        if self._max_pressure is not None:
+            self._max_pressure.command(share)
         self._guide.command(controls.splits, self._speed)
         begin, steps = session.time, round(self._scenario.step / session.step_length)
         every, often = (
@@ -310,7 +312,7 @@ class SumoPlant:
 
     def leaks(self) -> list[Gateway]:
         """Gateways that no fixed-time signal controls: perimeter control does not reach them."""
-        return [g for g in self.city.gateways if g.signal not in self._signals]
+        return [g for g in self.city.gateways if g.signal not in self._signals and g.signal not in self._rationed]
 
     @property
     def trips(self) -> int:
@@ -348,10 +350,10 @@ class SumoPlant:
             return []
         return [path]
 
-    def _gateway_signals(self, *, without: Set[str]) -> dict[str, GatewaySignal]:
+    def _gateway_signals(self) -> dict[str, GatewaySignal]:
         movements: dict[str, dict[int, tuple[int, int]]] = {}
         for gateway in self.city.gateways:
-            if gateway.signal is not None and gateway.signal not in without:
+            if gateway.signal is not None and gateway.signal not in self._rationed:
                 for link in gateway.links:
                     movements.setdefault(gateway.signal, {})[link] = (gateway.source, gateway.target)
         signals = {}
@@ -369,11 +371,12 @@ class SumoPlant:
         """(G,) [s] per control interval, as Record.gateway_original_green."""
         green = np.full(len(self.city.gateways), np.nan)
         for n, gateway in enumerate(self.city.gateways):
-            if gateway.signal in self._signals:
-                programme = self._session.programme(gateway.signal)
+            if gateway.signal in self._signals or gateway.signal in self._rationed:
+                plan = self._rationed.get(gateway.signal) or self._session.programme(gateway.signal)
                 lasting = [phase.duration * (phase.state[link] in GREEN)
-                           for phase in programme.phases for link in gateway.links]
-                green[n] = sum(lasting) / len(gateway.links) * self._scenario.step / programme.cycle
+                           for phase in plan.phases for link in gateway.links]
+                cycle = sum(phase.duration for phase in plan.phases)
+                green[n] = sum(lasting) / len(gateway.links) * self._scenario.step / cycle
         return green
 
     def _measurement(self) -> Measurement:
@@ -398,6 +401,7 @@ class SumoPlant:
         # Several movements may lead from one region to one edge: they share its flow.
         alike = Counter((g.source, g.to_edge) for g in self.city.gateways)
         green = {signal: filtered.green_time() for signal, filtered in self._signals.items()}
+        green |= self._max_pressure.green_time() if self._max_pressure is not None else {}
         return {
             "departures": self._meter.departures.copy(), "arrivals": self._meter.arrivals.copy(),
             "crossings": self._meter.crossings.copy(), "teleports": np.array(self._meter.teleports),

@@ -1,6 +1,6 @@
 """Strategies by name: CONTROLLER[+OPTION...], a regional controller and what else the city does.
 
-    dpc-pc+max-pressure      DPC at the gateways, max-pressure at the other signals
+    dpc-pc+max-pressure      max-pressure at all signals, DPC limits the green of the gateways
     no-control+rerouting-30  nobody controls, 30 % of the drivers reroute; `rerouting-30` for short
 """
 
