@@ -56,6 +56,23 @@ def read_originals(paths: Sequence[Path]) -> Originals:
     return Originals(depart=departs[order], elements=tuple(elements[n][1] for n in order))
 
 
+def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
+    """Name -> edges of the routes that additional files define for vehicles to share; of a distribution, its first."""
+    found: dict[str, tuple[str, ...]] = {}
+    for path in paths:
+        with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as stream:
+            root = ElementTree.parse(stream).getroot()
+        for route in root.iter("route"):
+            if route.get("id") and route.get("edges"):
+                found[route.get("id")] = tuple(route.get("edges").split())
+        for distribution in root.iter("routeDistribution"):
+            routes = [tuple(r.get("edges").split()) for r in distribution.iter("route") if r.get("edges")]
+            routes += [found[name] for name in distribution.get("routes", "").split() if name in found]
+            if routes:
+                found[distribution.get("id")] = routes[0]
+    return found
+
+
 def draw(
     originals: Originals, *, seed: int, factor: float, jitter: float, begin: float,
 ) -> list[tuple[float, int, str]]:

@@ -1,7 +1,7 @@
 """Why a controller gained something against no control, or nothing: what the runs of an evaluation say about it.
 
 Perimeter control can only gain where it controls the boundaries, where a region would go beyond its critical
-accumulation without it, and if it holds vehicles back at all; where all three hold, it may still cost more than it wins.
+accumulation without it, and if it holds vehicles back at all; where all three hold it may still cost more than it saves.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -100,8 +100,8 @@ def verdict(
         return f"{size}; no regional controller"
     reasons = []
     if leaking > NO_AUTHORITY:
-        reasons.append(f"no authority at the boundaries: {_share(leaking)} of the flow over them passes no signal under "
-                       "control")
+        reasons.append(
+            f"no authority at the boundaries: {_share(leaking)} of the flow over them passes no signal under control")
     if not len(found.critical):
         reasons.append("no region is ever critical, so that there is nothing to protect")
     if held < HARDLY:
