@@ -12,6 +12,7 @@ from nmfd import runs
 from nmfd.errors import InputError
 
 STREAM = 7102  # keeps these random numbers apart from others of the same seed
+MESOSCOPIC = ("--mesosim", "true", "--meso-junction-control", "true")  # options of SUMO
 # Vehicle classes that keep to their lines, or do not use the road as cars do.
 BOUND = frozenset({
     "bus", "coach", "tram", "rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car", "ship",

@@ -16,7 +16,7 @@ from cosim.flows import own_flows, turning_flows
 from cosim.guidance import Guide
 from cosim.max_pressure import MaxPressure
 from cosim.measure import Meter
-from cosim.originals import Originals, read_originals, read_routes, write_originals
+from cosim.originals import MESOSCOPIC, Originals, read_originals, read_routes, write_originals
 from cosim.regions import City, Gateway, check_adjacency, load_city
 from cosim.signals import Signal, read_signals, write_programmes
 from cosim.strategy import ACTUATED, FIXED, HOLD_BACK, MAX_PRESSURE, MODES, SIGNALS, WEBSTER
@@ -205,7 +205,7 @@ class SumoPlant:
         if chosen.rerouting > 0:
             options += [*REROUTING, "--device.rerouting.probability", str(chosen.rerouting)]
         if chosen.mesoscopic:
-            options += ["--mesosim", "true", "--meso-junction-control", "true"]
+            options += MESOSCOPIC
         additional = self._signal_plan(steered)
         if scenario.folder is not None:
             files += [scenario.folder / name for name in chosen.background]

@@ -1,7 +1,7 @@
 """Why a controller gained something against no control, or nothing: what the runs of an evaluation say about it.
 
 Perimeter control can only gain where it controls the boundaries, where a region would go beyond its critical
-accumulation without it, and if it holds vehicles back at all; where all three hold it may still cost more than it saves.
+accumulation without it, and if it holds vehicles back at all; even then it may cost more than it saves.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

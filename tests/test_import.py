@@ -12,9 +12,11 @@ import tiny_city
 from click.testing import CliRunner
 
 from cosim.cli import main
+from cosim.importing import level
 from cosim.importing.case import read_case
 from cosim.importing.demand import read_traffic
 from cosim.importing.streets import graph, read_streets
+from cosim.originals import read_originals
 from cosim.plant import SumoPlant, settings
 from cosim.regions import load_city
 from nmfd.scenario import load_scenario
@@ -215,7 +217,7 @@ def test_mesoscopic_keeps_the_ledger(imported):
     (lambda folder: (folder / "city.net.xml").write_text("<net></net>"), "has no edge that cars may use"),
     (lambda folder: (folder / "city.sumocfg").write_text("<routes/>"), "expected a sumocfg or a net.xml"),
     (lambda folder: (folder / "city.sumocfg").write_text(
-        '<configuration><net-file value="city.net.xml"/></configuration>'), "add --demand peak"),
+        '<configuration><net-file value="city.net.xml"/></configuration>'), "or add --od FILE or --demand peak"),
 ])
 def test_one_clear_line(config, tmp_path, change, expected):
     for file in config.parent.iterdir():
@@ -224,3 +226,31 @@ def test_one_clear_line(config, tmp_path, change, expected):
     line = error_line(cosim("import", tmp_path / "city.sumocfg", "--regions", 3, "--out", tmp_path / "networks" / "x"))
     assert expected in line
     assert not (tmp_path / "networks").exists() or not list((tmp_path / "networks").iterdir())
+
+
+def test_level_auto_finds_where_it_congests():
+    """Made-up paces: the search ends at the lowest level beyond the limit in the scenario's own model."""
+    asked = []
+
+    def pace(times, mesoscopic):
+        asked.append((times, mesoscopic))
+        return 2.0 + (3.0 if mesoscopic else 2.0) * max(times - 1.0, 0.0)  # 3 from 1.33 on, and from 1.5 on
+
+    assert level.congesting(pace, mesoscopic=True, tell=lambda line: None) == (1.44, True)
+    assert level.congesting(pace, mesoscopic=False, tell=lambda line: None) == (1.73, True)
+    assert asked[-1] == (1.73, False) and (1.44, False) in asked and (1.2, False) not in asked
+    assert level.congesting(lambda *_: 2.0, mesoscopic=True, tell=lambda line: None) == (2.99, False)
+
+
+def test_import_at_a_congested_level(config, tmp_path):
+    """The factor reaches the scenario: vehicles, demand and all; mesoscopic too."""
+    text = good(cosim("import", config, "--regions", 2, "--method", "geometric", "--mesoscopic", "--level", "auto",
+                      "--out", tmp_path / "networks" / "busy"))
+    scenario = load_scenario(tmp_path / "scenarios" / "busy")
+    assert "level: " in text and settings(scenario).mesoscopic
+    assert f"demand times {scenario.demand_factor:g}" in text
+    vehicles = read_originals([scenario.folder / "vehicles.rou.xml.gz"])
+    total = scenario.demand.sum() * scenario.step
+    assert total == pytest.approx(scenario.demand_factor * len(vehicles.depart), rel=1e-4)
+    line = error_line(cosim("import", config, "--regions", 2, "--level", "twice", "--out", tmp_path / "networks" / "x"))
+    assert "--level: expected numbers above 0" in line
