@@ -254,3 +254,33 @@ def test_import_at_a_congested_level(config, tmp_path):
     assert total == pytest.approx(scenario.demand_factor * len(vehicles.depart), rel=1e-4)
     line = error_line(cosim("import", config, "--regions", 2, "--level", "twice", "--out", tmp_path / "networks" / "x"))
     assert "--level: expected numbers above 0" in line
+
+
+def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
+    """Taxis over and to a bus road keep their way; cars in the same city are guided."""
+    net = tmp_path / "city.net.xml"
+    root = ElementTree.parse(config.parent / "city.net.xml")
+    for lane in root.iter("lane"):
+        if lane.get("id").startswith("C1D1_"):
+            lane.set("allow", "bus taxi")
+    root.write(net)
+    (tmp_path / "cars.rou.xml").write_text(
+        '<routes><vType id="taxi" vClass="taxi"/><route id="over" edges="A1B1 B1C1 C1D1 D1D2"/>'
+        '<flow id="over" type="taxi" begin="0" end="600" period="20" route="over"/>'
+        '<flow id="to" type="taxi" begin="0" end="600" period="20" from="A0A1" to="C1D1"/>'
+        '<flow id="car" begin="0" end="600" period="10" from="A0A1" to="D2D3"/></routes>')
+    (tmp_path / "city.sumocfg").write_text(
+        '<configuration><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></configuration>')
+    good(cosim("import", tmp_path / "city.sumocfg", "--regions", 2, "--method", "geometric", "--no-run", "--out",
+               tmp_path / "networks" / "taxis"))
+    scenario = replace(load_scenario(tmp_path / "scenarios" / "taxis"), steps=6)
+    network = scenario.network
+    plant = SumoPlant(scenario)
+    try:
+        plant.reset(0)
+        for _ in range(scenario.steps):
+            plant.step(Controls(
+                perimeter=np.where(network.adjacency, 0.9, 0.0), splits=network.nominal_splits))
+        assert plant.record().guided.sum() > 10
+    finally:
+        plant.close()
