@@ -55,11 +55,30 @@ def load(network: Network, trajectories: Sequence[Trajectory], records: Iterable
         beyond=np.mean([(state > 1.0).mean(axis=0) for state in states], axis=0), inside=inside)
 
 
-def held_back(network: Network, trajectories: Sequence[Trajectory]) -> float:
-    """Share of the commands, one per boundary, direction and interval, that were below the upper bound by more than
-    HARDLY of the range; NaN where there is no boundary."""
+@dataclass(frozen=True, kw_only=True)
+class Deeds:
+    """What a controller did. held: share of its perimeter commands, one per boundary, direction and interval, that were
+    below the upper bound by more than HARDLY of the range; guided: vehicles per trip that it gave a next region."""
+
+    held: float
+    guided: float
+
+    def __str__(self) -> str:
+        parts = [f"it held back in {_share(self.held)} of its commands"] if self.held >= HARDLY else []
+        if self.guided > 0:
+            parts.append(f"it guided {self.guided:.1f} times per trip")
+        return " and ".join(parts) or "it never held back and never guided"
+
+
+def deeds(network: Network, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> Deeds:
+    """What a controller did in some runs."""
     limit = network.u_max - HARDLY * (network.u_max - network.u_min)
-    return float(np.mean([(t.perimeter[:, network.adjacency] < limit).mean() for t in trajectories]))
+    held = [(t.perimeter[:, network.adjacency] < limit).mean() for t in trajectories]
+    guided, trips = 0.0, 0.0
+    for record in records:
+        if {"guided", "departures"} <= record.keys():
+            guided, trips = guided + record["guided"].sum(), trips + record["departures"].sum()
+    return Deeds(held=float(np.mean(held)), guided=float(guided / max(trips, 1.0)))
 
 
 def text(folders: Mapping[float, Path], network: Network, rows: pd.DataFrame) -> str:
@@ -72,59 +91,59 @@ def text(folders: Mapping[float, Path], network: Network, rows: pd.DataFrame) ->
         part = rows[rows["demand"] == level]
         kept = {name: [int(seed) for seed in group["seed"]] for name, group in part.groupby("controller", sort=False)}
         shown = REFERENCE if REFERENCE in kept else next(iter(kept))
-        found = load(network, _trajectories(folder, shown, kept[shown]),
-                     (experiment.read_run(folder, shown, seed).record for seed in kept[shown]))
+        found = load(network, *_runs(folder, shown, kept[shown]))
         leaking = float(part.loc[part["controller"] == shown, "leaking_share"].mean())
-        lines = [f"## Why, at demand times {level:g}", _city(network, found, leaking, shown)]
+        lines = [f"## Why, at demand times {level:g}", "", _city(network, found, leaking, shown), ""]
         for name, seeds in kept.items():
             if name != REFERENCE:
-                held = held_back(network, _trajectories(folder, name, seeds))
-                lines.append(f"- {name}: {verdict(part, level, name, found, leaking, held, network)}")
-        parts.append("\n".join([lines[0], "", lines[1], "", *lines[2:]]))
+                done = deeds(network, *_runs(folder, name, seeds))
+                lines.append(f"- {name} {verdict(part, level, name, found, leaking, done, network)}")
+        parts.append("\n".join(lines))
     return "\n\n".join(parts) + "\n"
 
 
+def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Trajectory], Iterable[Mapping]]:
+    """Trajectories and records of one controller."""
+    return ([runs.read_trajectory(folder / f"{name}-{seed}.npz") for seed in seeds],
+            (experiment.read_run(folder, name, seed).record for seed in seeds))
+
+
 def verdict(
-    rows: pd.DataFrame, level: float, name: str, found: Load, leaking: float, held: float, network: Network,
+    rows: pd.DataFrame, level: float, name: str, found: Load, leaking: float, done: Deeds, network: Network,
 ) -> str:
-    """One line: gained or not, and why. rows: of this demand level; held: `held_back` of this controller."""
+    """What a controller came to against no control, and why, in one line that begins behind its name. rows: of this
+    demand level; leaking: share of the flow over the boundaries that passes no signal under control."""
     pair = tables.paired(tables.by_seed(rows, level, name), tables.by_seed(rows, level, REFERENCE))
     if not pair.seeds:
-        return f"no common seed with {REFERENCE}, so that nothing can be said; add it to --controllers"
-    size = f"{pair.percent:+.1f} % in total time spent"
-    if pair.seeds > 1:
-        size += f" ± {pair.percent_half:.1f}"
-    if pair.excludes_zero and pair.percent < 0:
-        return f"gains ({size}); it held back in {_share(held)} of its commands"
-    if parse(name).model_free:
-        return f"{size}; no regional controller"
+        return f"has no common seed with {REFERENCE}, so that nothing can be said: add it to --controllers"
+    spread = f"± {pair.percent_half:.1f} over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed, no proof"
+    size = f"{pair.percent:+.1f} % in total time spent {spread}"
+    model_free = parse(name).model_free
+    if pair.percent < 0 and (pair.excludes_zero or pair.seeds == 1):
+        return f"gains ({size})" + ("" if model_free else f"; {done}")
+    kind = "loses" if pair.excludes_zero or pair.seeds == 1 else "gains nothing that stands out from the seeds"
+    reasons = [] if model_free else _reasons(rows, name, found, leaking, done, network)
+    return f"{kind} ({size})" + (f": {'; '.join(reasons)}" if reasons else "")
+
+
+def _reasons(
+    rows: pd.DataFrame, name: str, found: Load, leaking: float, done: Deeds, network: Network,
+) -> list[str]:
+    """Why perimeter control, or guidance, gains nothing."""
     reasons = []
     if leaking > NO_AUTHORITY:
-        reasons.append(
-            f"no authority at the boundaries: {_share(leaking)} of the flow over them passes no signal under control")
+        reasons.append(f"no control authority at the boundaries, {_share(leaking)} of the flow over them passes no "
+                       "signal under control")
     if not len(found.critical):
         reasons.append("no region is ever critical, so that there is nothing to protect")
-    if held < HARDLY:
-        reasons.append(f"it held back in {_share(held)} of its commands, so that the signals did what they do anyway")
-    elif len(found.critical):
-        inside = [r for r in found.critical if found.inside[r] > MOSTLY_INSIDE]
-        if len(inside) == len(found.critical):
-            reasons.append(f"most of what fills {_list(network, inside)} starts there, where no gateway holds it back")
-        full = rows.groupby("controller")["gateway_full_share"].mean()
-        if full.get(name, 0.0) - full.get(REFERENCE, 0.0) > MORE_FULL:
-            reasons.append(
-                f"its queues fill the streets before the gateways ({_share(full[name])} of the time, "
-                f"{_share(full[REFERENCE])} without control) and block others")
-        if not reasons:
-            reasons.append(f"holding back in {_share(held)} of its commands delayed as much as it saved")
-    elif held >= HARDLY:
-        reasons.append(f"it held vehicles back all the same, in {_share(held)} of its commands")
-    if pair.seeds == 1:
-        reasons.append("one seed proves nothing: give more")
-    elif not pair.excludes_zero:
-        reasons.append("the difference is within the spread of the seeds")
-    kind = "loses" if pair.excludes_zero else "no gain to be seen"
-    return f"{kind} ({size}): {'; '.join(reasons)}"
+    elif done.held >= HARDLY and all(found.inside[r] > MOSTLY_INSIDE for r in found.critical):
+        reasons.append(f"most of what fills {_list(network, found.critical)} starts there, where no gateway holds it "
+                       "back")
+    full = rows.groupby("controller")["gateway_full_share"].mean()
+    if done.held >= HARDLY and full.get(name, 0.0) - full.get(REFERENCE, 0.0) > MORE_FULL:
+        reasons.append(f"its queues fill the streets before the gateways ({_share(full[name])} of the time, "
+                       f"{_share(full[REFERENCE])} without control) and block others")
+    return [*reasons, str(done)]
 
 
 def _city(network: Network, found: Load, leaking: float, shown: str) -> str:
@@ -137,10 +156,6 @@ def _city(network: Network, found: Load, leaking: float, shown: str) -> str:
         f"no region went beyond its critical accumulation; {_list(network, [highest])} came nearest, with "
         f"{found.most[highest]:.1f} times it")
     return f"Signals under control see {_share(1.0 - leaking)} of the flow over the boundaries. {when} {state}."
-
-
-def _trajectories(folder: Path, name: str, seeds: Sequence[int]) -> list[Trajectory]:
-    return [runs.read_trajectory(folder / f"{name}-{seed}.npz") for seed in seeds]
 
 
 def _list(network: Network, regions: Sequence[int]) -> str:
