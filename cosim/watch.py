@@ -145,10 +145,10 @@ def view_xml(city: City, delay: float) -> str:
 def layers_xml(city: City) -> str:
     """An additional file: a band under every edge in the colour of its region, and a grey mark where an edge ends at a
     boundary."""
-    shapes = dict(zip(city.edges, edge_shapes(city), strict=True))
+    shapes, width = dict(zip(city.edges, edge_shapes(city), strict=True)), BAND * extent(city)
     lines = [
         f'  <poly id={quoteattr("region-" + edge)} color="{_rgb(city.region_of[edge])}" fill="0" layer="-1" '
-        f'lineWidth="{BAND * extent(city):.1f}" shape="{" ".join(f"{x:.1f},{y:.1f}" for x, y in shape)}"/>\n'
+        f'lineWidth="{width:.1f}" shape="{" ".join(f"{x:.1f},{y:.1f}" for x, y in shape)}"/>\n'
         for edge, shape in shapes.items()]
     grey = ",".join(map(str, LEFT_ALONE))
     for mark, gateway in marked(city).items():

@@ -6,7 +6,6 @@ Without a screen SUMO's program without a window stands in for sumo-gui; it is d
 import re
 import shutil
 import subprocess
-import time
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -108,11 +107,10 @@ def test_in_a_window(task, monkeypatch):
                               stderr=subprocess.DEVNULL, text=True)
     try:
         monkeypatch.setenv("DISPLAY", f":{server.stdout.readline().strip()}")
-        begin = time.monotonic()
         result = cosim(
             "watch", task.scenario, "--controller", "pi-gating", "--seed", "3", "--steps", "1", "--delay", "1")
         assert result.exit_code == 0, result.output + str(result.exception)
-        assert "pi-gating, seed 3: total time spent" in result.stdout and time.monotonic() - begin < 100
+        assert "pi-gating, seed 3: total time spent" in result.stdout
     finally:
         server.terminate()
         server.wait()
