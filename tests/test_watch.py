@@ -16,7 +16,7 @@ from test_page import cosim, error_line
 from cosim import sumo, watch
 from cosim.city import ensure_built
 from cosim.plant import SumoPlant
-from cosim.regions import load_city
+from cosim.regions import edge_shapes, load_city
 from cosim.simulate import Task, simulate
 from nmfd.scenario import load_scenario
 
@@ -59,7 +59,7 @@ def test_marks_are_there_to_be_painted_and_every_street_lies_on_its_region(task)
     network = load_scenario(task.scenario).network
     files = ensure_built(network)
     city = load_city(files.net_file, files.regions_csv, network.regions)
-    root = ElementTree.fromstring(watch.layers_xml(city))
+    root = ElementTree.fromstring(watch.layers_xml(city, edge_shapes(city)))
     bands = {element.get("id"): element.get("color") for element in root.iter("poly")}
     assert set(bands) == {f"region-{edge}" for edge in city.edges}
     for region in range(city.regions):
@@ -67,7 +67,7 @@ def test_marks_are_there_to_be_painted_and_every_street_lies_on_its_region(task)
     assert len(set(bands.values())) == city.regions
     marks = {element.get("id"): element for element in root.iter("poi")}
     assert set(marks) == set(watch.marked(city)) and len(marks) > 20
-    ElementTree.fromstring(watch.view_xml(city, 20.0))
+    ElementTree.fromstring(watch.view_xml(edge_shapes(city), 20.0))
 
 
 def test_red_is_closed_and_green_is_open():
