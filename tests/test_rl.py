@@ -85,6 +85,16 @@ def test_every_action_is_admissible_and_reaches_the_bounds(hexagon, guidance):
     assert guidance or splits is None
 
 
+def test_metering_closes_all_entries_of_a_region_alike(hexagon):
+    interface, network = rl.Interface(hexagon.network, metering=True), hexagon.network
+    assert interface.action_size == network.regions
+    action = np.ones(7)
+    action[3] = -1.0
+    perimeter = interface.perimeter(action)
+    assert (perimeter[network.adjacency[:, 3], 3] == network.u_min).all()
+    assert (perimeter[network.adjacency & (np.arange(7) != 3)] == network.u_max).all()
+
+
 class Constant:
     """Plays one action."""
 

@@ -72,6 +72,8 @@ _WITHOUT_POLICY: dict[str, Callable[[Scenario], Controller]] = {
 _WITH_POLICY = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
 # The policy that is watched.
 _GUARDED = {"dpc-pc-guarded": "dpc-pc", "dpc-pcrg-guarded": "dpc-pcrg"}
+# The policy that goes on learning.
+_ONLINE = {"dpc-pc-online": "dpc-pc", "dpc-pcrg-online": "dpc-pcrg"}
 # Whether the plan guides routes too. The same as bound.NAMES.
 _WITH_PLAN = {"bound-pc": False, "bound-pcrg": True}
 _OWN = re.compile(r".+\.py:\w+(?=\+|$)")
@@ -79,12 +81,12 @@ _OWN = re.compile(r".+\.py:\w+(?=\+|$)")
 
 def names() -> tuple[str, ...]:
     """Every controller that is built in."""
-    return (*_WITHOUT_POLICY, *_WITH_POLICY, *_GUARDED, *_WITH_PLAN)
+    return (*_WITHOUT_POLICY, *_WITH_POLICY, *_GUARDED, *_ONLINE, *_WITH_PLAN)
 
 
 def policy_names() -> tuple[str, ...]:
     """The controllers that need a trained policy."""
-    return (*_WITH_POLICY, *_GUARDED)
+    return (*_WITH_POLICY, *_GUARDED, *_ONLINE)
 
 
 def check(name: str) -> None:
@@ -173,7 +175,7 @@ def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Pa
 def _owner(name: str) -> str:
     """Whose policy and options `name` uses."""
     name, rest = split(name)
-    return "+".join([_GUARDED.get(name, name), *rest])
+    return "+".join([{**_GUARDED, **_ONLINE}.get(name, name), *rest])
 
 
 def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Controller:
@@ -201,6 +203,10 @@ def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Contro
         from nmfd.controllers import guarded
 
         return guarded.load(path, scenario, guidance=_WITH_POLICY[_GUARDED[name]])
+    if name in _ONLINE:
+        from nmfd.controllers import online
+
+        return online.load(path, scenario, guidance=_WITH_POLICY[_ONLINE[name]])
     from nmfd.controllers import dpc
 
     return dpc.load(path, scenario, guidance=_WITH_POLICY[name])
