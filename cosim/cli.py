@@ -6,7 +6,7 @@ import click
 
 from nmfd.command_line import Commands, Interrupted
 from nmfd.errors import InputError
-from nmfd.options import COUNT, FILE, FOLDER, POSITIVE, SEED, fault_option
+from nmfd.options import COUNT, FILE, FOLDER, SEED, fault_option
 from nmfd.workers import RunFailed
 
 CONTROLLER_HELP = (
@@ -438,9 +438,14 @@ def identify(
 @click.option("--edges", type=FILE, metavar="CSV", help="Or your own regions: a table with the columns edge,region,")
 @click.option("--taz", type=FILE, metavar="FILE", help="or a SUMO file with a TAZ per region,")
 @click.option("--polygons", type=FILE, metavar="FILE", help="or one with a polygon or more (id, id.1, ...) per region.")
+@click.option("--od", type=FILE, multiple=True, metavar="FILE",
+              help="OD matrix between TAZ: tazRelation XML, or VISUM's O- or V-format. May be repeated.")
+@click.option("--zones", type=FILE, multiple=True, metavar="FILE", help="The TAZ of --od, if not in the sumocfg.")
 @click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak, for a city without demand.")
-@click.option("--level", type=POSITIVE, default=1.0, show_default=True,
-              help="Of --demand peak: times its usual number of trips.")
+@click.option("--level", default="1", show_default=True, metavar="X|auto",
+              help="Times the city's vehicles, or the usual peak; auto: the lowest that congests without control.")
+@click.option("--mesoscopic", is_flag=True,
+              help="With SUMO's queue model, now and later: ten times as fast, no lanes; for quick studies.")
 @click.option("--begin", metavar="TIME", help="Instead of the sumocfg's, in seconds or as hours:minutes:seconds.")
 @click.option("--end", metavar="TIME", help="Later departures are left out.")
 @click.option("--seed", type=SEED, default=0, show_default=True)
@@ -448,8 +453,8 @@ def identify(
 @click.option("--force", is_flag=True, help="Replace a network and scenario that are there.")
 def import_(
     source: Path, regions: int | None, out: Path, scenario: Path | None, method: str, edges: Path | None,
-    taz: Path | None, polygons: Path | None, demand: str | None, level: float, begin: str | None, end: str | None,
-    seed: int, no_run: bool, force: bool,
+    taz: Path | None, polygons: Path | None, od: tuple[Path, ...], zones: tuple[Path, ...], demand: str | None,
+    level: str, mesoscopic: bool, begin: str | None, end: str | None, seed: int, no_run: bool, force: bool,
 ) -> None:
     """Turn any SUMO city into a network and a scenario: regions, gateways, demand by pair of regions, map.
 
@@ -472,12 +477,22 @@ def import_(
     method, given = next(iter(own.items()), (method, None))
     order = Order(
         source=source, regions=regions, out=out, method=method, given=given, seed=seed, run=not no_run, force=force,
-        level=level if demand else None, scenario=scenario or out.parent.parent / "scenarios" / out.name,
-        begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"))
+        peak=demand is not None, level=_level(level, no_run), mesoscopic=mesoscopic,
+        scenario=scenario or out.parent.parent / "scenarios" / out.name,
+        begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"), od=od, zones=zones)
     with progress_line("import") as progress:
         report = import_city(order, (lambda stage: progress(0, 1, stage)) if progress else lambda stage: None)
     click.echo(report)
     click.echo(f"Written to {order.out} (see map.png, quality.csv, gateways.csv) and {order.scenario}")
+
+
+def _level(text: str, no_run: bool) -> float | None:
+    """--level; None for auto. InputError for anything else."""
+    if text == "auto":
+        if no_run:
+            raise InputError("--level: auto simulates the city, which --no-run forbids; leave one of them away")
+        return None
+    return _levels("--level", text)[0] if "," not in text else _levels("--level", "")[0]
 
 
 def _levels(option: str, text: str) -> list[float]:

@@ -105,8 +105,10 @@ class Guide:
             return
         for event in events:
             if event.free and self._random.random() < self._compliance:
-                taste, target = int(self._random.integers(TASTES)), self._index[event.edge]
+                taste, target = int(self._random.integers(TASTES)), self._index.get(event.edge)
                 here = self._index.get(self._session.road(event.vehicle))
+                if target is None:  # it may use roads that are closed to cars, a taxi on its way to a bus road
+                    continue
                 if here is None or self._region[here] != event.region:  # on a junction already: too late to turn
                     continue
                 if event.region == event.destination:
@@ -157,8 +159,10 @@ class Guide:
 
     def _keeps(self, vehicle: str, here: int, time: np.ndarray, cost: float, following: int | None = None) -> bool:
         """Whether the driver's present way, at `time` (E,) [s], is about as good as one of `cost` [s], and leads into
-        the region `following` next, if that is given."""
+        the region `following` next, if that is given; so it is where the way uses roads that are closed to cars."""
         route = self._session.route(vehicle)[self._session.route_index(vehicle):]
+        if any(edge not in self._index for edge in route):
+            return True
         way = [self._index[edge] for edge in route]
         if way[0] != here:
             return False

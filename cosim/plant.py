@@ -13,12 +13,12 @@ from cosim.actuate import GREEN, Actuator, GatewaySignal
 from cosim.actuated import actuated_row
 from cosim.city import ensure_built
 from cosim.detectors import EVERY, Detectors, instruments, lay_out, probes, write_loops
-from cosim.flows import turning_flows
+from cosim.flows import own_flows, turning_flows
 from cosim.guidance import Guide
 from cosim.incidents import Incidents
 from cosim.max_pressure import MaxPressure
 from cosim.measure import Meter
-from cosim.originals import Originals, check_edges, read_originals, write_originals
+from cosim.originals import MESOSCOPIC, Originals, check_edges, read_originals, read_routes, write_originals
 from cosim.regions import City, Gateway, check_adjacency, gateway_room_taken, load_city
 from cosim.signals import Signal, read_signals, write_programmes
 from cosim.strategy import ACTUATED, FIXED, HOLD_BACK, MAX_PRESSURE, MODES, SIGNALS, WEBSTER
@@ -199,7 +199,10 @@ class SumoPlant:
         self._net_file = files.net_file
         self._layout = lay_out(self.city, self._settings.detector_share)
         self._instruments = instruments(self.city, self._layout, self._settings.probe_share)
-        self.simple_signals, self.other_signals = read_signals(self.city)
+        simple, others = read_signals(self.city, self._additional())
+        left = set(self._settings.leave_signals)
+        self.simple_signals = [signal for signal in simple if signal.id not in left]
+        self.other_signals = sorted({*others, *(signal.id for signal in simple if signal.id in left)})
         if self._settings.signals != FIXED and not self.simple_signals:
             raise InputError(
                 f"{files.net_file}: sumo.signals: {self._settings.signals} needs fixed-time signals with several green "
@@ -215,7 +218,7 @@ class SumoPlant:
         routes = Path(self._folder.name) / "trips.rou.xml"
         self._vehicles, files = self._write_vehicles(routes, seed), [routes]
         self._trip_file = self._outputs.get("tripinfo", routes.with_name("tripinfo.xml"))
-        steered = [s for s in self.simple_signals if s.id not in chosen.leave_signals and not (
+        steered = [s for s in self.simple_signals if not (
             chosen.gateways_fixed and chosen.signals == ACTUATED and s.id in self._gateway_ids)]
         options = [
             *trip_options(self._trip_file), *sumo_output.options(self._outputs), "--begin", str(chosen.begin),
@@ -223,11 +226,11 @@ class SumoPlant:
         if chosen.rerouting > 0:
             options += [*REROUTING, "--device.rerouting.probability", str(chosen.rerouting)]
         if chosen.mesoscopic:
-            options += ["--mesosim", "true", "--meso-junction-control", "true"]
+            options += MESOSCOPIC
         additional = self._signal_plan(steered)
         if scenario.folder is not None:
             files += [scenario.folder / name for name in chosen.background]
-            additional = [scenario.folder / name for name in chosen.additional] + additional
+            additional = self._additional() + additional
         estimating = chosen.measurement == ESTIMATE
         if estimating:
             loops = Path(self._folder.name) / "loops.add.xml"
@@ -254,7 +257,9 @@ class SumoPlant:
             most_detour=chosen.most_detour, random=np.random.default_rng([seed, 0x67756964]))
         self._max_pressure, self._rationed = None, {}
         if chosen.signals == MAX_PRESSURE:
-            flows = turning_flows(self.city, scenario.demand, scenario.step)
+            flows = self._own_flows()
+            if flows is None:
+                flows = turning_flows(self.city, scenario.demand, scenario.step)
             others = [signal for signal in self.simple_signals if signal not in steered]
             self._max_pressure = MaxPressure(self._session, self.city, steered, flows, others=others)
             self._rationed = {signal.id: signal for signal in steered if signal.id in self._gateway_ids}
@@ -367,6 +372,16 @@ class SumoPlant:
             self._originals, path, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
             begin=chosen.begin)
 
+    def _additional(self) -> list[Path]:
+        """The city's own additional files."""
+        return [self._scenario.folder / name for name in self._settings.additional] if self._scenario.folder else []
+
+    def _own_flows(self) -> dict[tuple[str, str], float] | None:
+        """Turning flows of the city's own vehicles; None where trips are drawn from the scenario's demand."""
+        if self._originals is None:
+            return None
+        return own_flows(self.city, self._originals, read_routes(self._additional()), self._scenario.demand_factor)
+
     def _end_session(self) -> None:
         if self._session is not None:
             self._session.close()
@@ -377,7 +392,7 @@ class SumoPlant:
         if self._settings.signals == WEBSTER:
             path = webster.plan(
                 self.city, self.simple_signals, self._scenario.demand, self._scenario.step,
-                folder=self._scenario.network.folder / "build")
+                folder=self._scenario.network.folder / "build", flows=self._own_flows())
         elif self._settings.signals == ACTUATED:
             path = Path(self._folder.name) / "actuated.add.xml"
             write_programmes(path, [actuated_row(signal) for signal in signals])

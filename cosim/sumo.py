@@ -148,6 +148,14 @@ class Session:
         """On the road; teleporting ones are not."""
         return self._sumo.vehicle.getIDList()
 
+    def teleports(self) -> int:
+        """How many there were so far, by SUMO's own count: the mesoscopic model has no events for them."""
+        return int(libsumo.simulation.getParameter("", "stats.teleports.total"))
+
+    def known(self) -> tuple[str, ...]:
+        """All that were loaded and have not arrived, wherever they are."""
+        return libsumo.vehicle.getLoadedIDList()
+
     def pending(self) -> tuple[str, ...]:
         """Due to depart, but not yet inserted: the backlog."""
         return self._sumo.simulation.getPendingVehicles()

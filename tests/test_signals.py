@@ -96,14 +96,21 @@ def test_signals_of_the_city(city):
 
 
 def test_signals_that_are_not_simple_are_left_alone(city, tmp_path):
+    """Of several programmes the last counts, in additional files too."""
     text = city.net_file.read_text()
     text = text.replace('<tlLogic id="c11" type="static"', '<tlLogic id="c11" type="actuated"')
     begin = text.index('<tlLogic id="c12"')
     end = text.index("</tlLogic>", begin) + len("</tlLogic>")
-    text = text[:end] + text[begin:end].replace('programID="0"', 'programID="night"') + text[end:]
+    night = text[begin:end].replace('programID="0"', 'programID="night"')
+    text = text[:end] + night.replace('type="static"', 'type="delay_based"') + text[end:]
     (tmp_path / "net.xml").write_text(text)
-    simple, others = read_signals(replace(city, net_file=tmp_path / "net.xml"))
+    changed = replace(city, net_file=tmp_path / "net.xml")
+    simple, others = read_signals(changed)
     assert others == ["c11", "c12"] and not {"c11", "c12"} & {s.id for s in simple}
+    last = night.replace("night", "last").replace('offset="0"', 'offset="7"')
+    (tmp_path / "more.add.xml").write_text(f"<additional>{last}</additional>")
+    simple, others = read_signals(changed, [tmp_path / "more.add.xml"])
+    assert others == ["c11"] and [s.offset for s in simple if s.id == "c12"] == [7.0]
 
 
 @pytest.mark.parametrize("phases", [PHASES, SINGLE, CROSS])
@@ -333,6 +340,6 @@ def test_the_same_drivers_reroute(scenario, plant_of):
 
 
 def test_a_city_without_fixed_signals(scenario, monkeypatch):
-    monkeypatch.setattr("cosim.plant.read_signals", lambda city: ([], ["c11"]))
+    monkeypatch.setattr("cosim.plant.read_signals", lambda *_: ([], ["c11"]))
     with pytest.raises(InputError, match="sumo.signals: webster needs fixed-time signals"):
         SumoPlant(scenario, overrides=Settings(signals="webster"))
