@@ -72,6 +72,17 @@ class ModelEstimate:
         return parts
 
 
+def options(scenario: Scenario, name: str) -> tuple[int, int, float, int]:
+    """look_ahead, iterations, learning_rate and rollouts (OnlineDpc) in the table of `name`. Raises InputError."""
+    where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
+    table = toml.Table(scenario.controller_options.get(name, {}), where, f"controllers.{name}.")
+    found = (
+        table.integer("look_ahead", 80, low=1), table.integer("iterations", 2, low=0),
+        table.number("learning_rate", 3e-4, above=0.0), table.integer("rollouts", 4, low=1))
+    table.close()
+    return found
+
+
 class OnlineDpc:
     """A policy that is fine-tuned between control steps (nmfd.types.Controller).
 
@@ -87,13 +98,7 @@ class OnlineDpc:
 
     def __init__(self, policy: Policy, scenario: Scenario):
         self.name = f"dpc-{'pcrg' if policy.architecture.guidance else 'pc'}-online"
-        where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-        options = toml.Table(scenario.controller_options.get(self.name, {}), where, f"controllers.{self.name}.")
-        self._look_ahead = options.integer("look_ahead", 80, low=1)
-        self._iterations = options.integer("iterations", 2, low=0)
-        self._learning_rate = options.number("learning_rate", 3e-4, above=0.0)
-        self._count = options.integer("rollouts", 4, low=1)
-        options.close()
+        self._look_ahead, self._iterations, self._learning_rate, self._count = options(scenario, self.name)
         self._scenario, self._frozen = scenario, policy.eval()
         self._rollout = Rollout(scenario)
         self._nominal = self._rollout.parameters

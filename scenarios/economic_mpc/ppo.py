@@ -1,6 +1,6 @@
 """PPO (Stable-Baselines3) on the benchmark, as a rival for DPC, MPC and gating. Needs the extra `rl`.
 
-Train it, about 8 minutes on one core (writes ppo.pt beside this file), and put it into the benchmark's table:
+Train it, a few minutes on one core (writes ppo.pt beside this file), and put it into the benchmark's table:
 
     python scenarios/economic_mpc/ppo.py
     nmfd benchmark scenarios/economic_mpc \
@@ -27,7 +27,7 @@ HERE = Path(__file__).parent
 WEIGHTS = HERE / "ppo.pt"
 NETWORK = {"net_arch": [128, 128], "log_std_init": -1.0}
 ENVS = 64
-ROUNDS = 150  # of ENVS episodes each
+ROUNDS = 50  # of ENVS episodes each
 
 
 class Ppo:
