@@ -33,7 +33,8 @@ COLUMNS = {
     "control_step_ms_median": float, "control_step_ms_max": float, "fallbacks": int}
 CAPTION = (
     "TTS: total time spent, mean over seeds; change: against the first controller but no-control; decision: median /\n"
-    "longest. Cases: " + "; ".join(f"{name}, {what}" for name, what in CASES.items()))
+    "longest; nothing of a case is told to a controller:\n" + "\n".join(
+        f"  {name}: {what}" for name, what in CASES.items()))
 
 
 class Run(NamedTuple):

@@ -56,8 +56,9 @@ class Ppo:
 class Best(BaseCallback):
     """Keeps the agent that does best, without exploring, on the scenario itself: as the training of DPC does."""
 
-    def __init__(self, scenario: nmfd.Scenario, every: int):
+    def __init__(self, scenario: nmfd.Scenario, every: int, out: Path):
         super().__init__()
+        self._out = out
         self._env, self._every, self._round = NmfdVectorEnv(scenario, 2, metering=True), every, 0
         self._best, self._exploring = float("inf"), float("nan")
 
@@ -78,12 +79,13 @@ class Best(BaseCallback):
         spent = float(info["final_info"]["total_time_spent_veh_s"].mean())
         if spent < self._best:
             self._best = spent
-            torch.save(self.model.policy.state_dict(), WEIGHTS)
+            torch.save(self.model.policy.state_dict(), self._out)
         print(f"round {self._round}: {spent:.4g} veh s, best {self._best:.4g}, exploring {self._exploring:.4g}",
               flush=True)
 
 
-def train(rounds: int, seed: int) -> None:
+def train(rounds: int, seed: int, out: Path = WEIGHTS) -> None:
+    """`rounds` of ENVS episodes each; the best agent so far is in `out`."""
     torch.set_num_threads(1)
     scenario = nmfd.load_scenario(HERE)
     env = Sb3VecEnv(NmfdVectorEnv(scenario, ENVS, metering=True, demand_spread=0.2, initial_share=0.5))
@@ -95,7 +97,7 @@ def train(rounds: int, seed: int) -> None:
         # Exploration that keeps its direction for half an hour: noise that is new every interval averages out.
         use_sde=True, sde_sample_freq=60, policy_kwargs=NETWORK,
         seed=seed, device="cpu")
-    best = Best(scenario, every=5)
+    best = Best(scenario, every=5, out=out)
     model.learn(rounds * ENVS * scenario.steps, callback=best)
     best.validate()
 
@@ -104,5 +106,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="of 64 episodes each (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=WEIGHTS, help="the weights (default: %(default)s)")
     arguments = parser.parse_args()
-    train(arguments.rounds, arguments.seed)
+    train(arguments.rounds, arguments.seed, arguments.out)
