@@ -16,7 +16,7 @@ from cosim.plant import Settings, own_vehicles, settings
 from cosim.regions import check_adjacency, load_city
 from cosim.signals import read_signals
 from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
-from cosim.strategy import parse
+from cosim.strategy import configured, parse
 from cosim.xml_files import read_xml
 from nmfd import faults, runs
 from nmfd.benchmarks import REFERENCE, draw_accumulations, interval
@@ -54,7 +54,8 @@ def experiment(
 def perform(
     plan: Sequence[tuple[Path, Task]], *, workers: int = 1, fresh: bool = False,
     progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
-    kept: Callable[[], None] | None = None,
+    kept: Callable[[], object] | None = None, failed: Callable[[Task, str], None] | None = None,
+    source: Callable[[Sequence[Task]], Iterator[tuple[Task, Result | Failure]]] | None = None,
 ) -> list[tuple[Task, Failure]]:
     """Run every task, in this order, that is not yet in its run folder; returns those that failed, and why.
 
@@ -70,7 +71,8 @@ def perform(
     fresh: every run in a process of its own
     progress: called with what is done and to do, and what is running
     tell: takes one line where the runs of a controller do not count any more because it changed; None: an InputError
-    kept: called after every run that was kept
+    kept: called after every run that was kept; failed: with every one that failed, and why
+    source: runs the tasks elsewhere and gives their outcomes as they finish, instead of `workers` processes here
 
     Raises InputError, before anything is written, for a city or controller that cannot be made, and for a folder that
     holds runs of another city or demand.
@@ -87,10 +89,14 @@ def perform(
                 order=[(task.controller, task.seed) for task in tasks], renew=tell,
                 session={"scenario_folder": str(tasks[0].scenario), "workers": workers}))
         there = {path: _finished(folder) for path, folder in folders.items()}
-        todo = [task for task in where if (task.controller, task.seed) not in there[where[task]]]
-        for task, outcome in _outcomes(todo, workers, fresh, progress):
+        todo = [task for task in where if (task.controller, task.seed) not in there[where[task]] or not all(
+            file.is_file() for _, file in task.sumo_output)]
+        found = _outcomes(todo, workers, fresh, progress) if source is None else _reported(source, todo, progress)
+        for task, outcome in found:
             if isinstance(outcome, Failure):
                 failures.append((task, outcome))
+                if failed:
+                    failed(task, outcome.reason)
                 continue
             folder = folders[where[task]]
             write_record(record_path(folder.path, task.controller, task.seed), outcome)
@@ -113,20 +119,24 @@ def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> d
     on none of these, and loading runs only on their options and the split ratios that they start from. Raises
     InputError for a controller that cannot be made.
     """
-    controller = parse(name).controller
-    registry.make(controller, scenario, policy=policy)
+    controller, variant = parse(name).controller, configured(name, scenario.controller_options)
+    registry.make(variant, scenario, policy=policy)
     if controller == REFERENCE:
         return {}
-    options = scenario.controller_options.get(controller, {})
+    tables = scenario.controller_options
+    options = {**tables.get(controller, {}), **tables.get(variant, {})}
     if controller in LOADING:
         splits = scenario.network.nominal_splits if LOADING[controller] else np.empty(0)
         return {"options": options, "splits_hash": hashlib.sha256(splits.round(9).tobytes()).hexdigest()[:16]}
-    path = registry.policy_path(controller, scenario, policy)
-    network = as_modelled(scenario, controller).network
+    path = registry.policy_path(variant, scenario, policy)
+    if registry.is_own(controller):
+        variant = registry.table_name(controller)
+        options = tables.get(variant, {})
+    network = as_modelled(scenario, variant).network
     model = json.dumps([network.hash, scenario.integrator, scenario.substeps, scenario.protected])
     return {
         "options": options,
-        "policy_hash": None if path is None else runs.file_hash(path),
+        "policy_hash": None, **registry.fingerprint(controller, path),
         "model_hash": hashlib.sha256(model.encode()).hexdigest()[:16], "torch": metadata.version("torch")}
 
 
@@ -188,8 +198,17 @@ def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress) -> Iter
         yield task, outcome
 
 
+def _reported(source, todo: Sequence[Task], progress) -> Iterator[tuple]:
+    """What comes from `source`, with a word to `progress` of each."""
+    report = progress or (lambda done, total, note: None)
+    report(0, len(todo), "")
+    for done, (task, outcome) in enumerate(source(todo) if todo else (), start=1):
+        report(done, len(todo), f"{'failed' if isinstance(outcome, Failure) else 'last'} {label(task)}")
+        yield task, outcome
+
+
 def record_path(folder: Path, controller: str, seed: int) -> Path:
-    return folder / f"{controller}-{seed}.record.npz"
+    return folder / f"{runs.run_name(controller, seed)}.record.npz"
 
 
 def write_record(path: Path, result: Result) -> None:
@@ -208,14 +227,14 @@ def read_run(folder: Path, controller: str, seed: int) -> Result:
         raise InputError(f"{path}: no such run; choose a controller and seed of {folder / 'sumo.csv'}") from None
     except runs.DAMAGED as error:
         raise InputError(f"{path}: is no record of a run ({error}); delete it and run again") from None
-    trajectory = runs.read_trajectory(folder / f"{controller}-{seed}.npz")
+    trajectory = runs.read_trajectory(folder / f"{runs.run_name(controller, seed)}.npz")
     return Result(trajectory=trajectory, record=record, facts={})
 
 
 def trajectories(folder: Path) -> list[Trajectory]:
     """The finished runs of the run folder. Raises InputError."""
     return [
-        runs.read_trajectory(folder / f"{row['controller']}-{row['seed']}.npz")
+        runs.read_trajectory(folder / f"{runs.run_name(row['controller'], row['seed'])}.npz")
         for row in runs.read_summary(folder / "summary.csv")]
 
 

@@ -14,6 +14,7 @@ from nmfd import runs
 from nmfd.errors import InputError
 
 STREAM = 7102  # keeps these random numbers apart from others of the same seed
+MESOSCOPIC = ("--mesosim", "true", "--meso-junction-control", "true")  # options of SUMO
 # Vehicle classes that keep to their lines, or do not use the road as cars do.
 BOUND = frozenset({
     "bus", "coach", "tram", "rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car", "ship",
@@ -72,6 +73,20 @@ def check_edges(originals: Originals, city: City, where: str) -> None:
                 raise InputError(
                     f"{where}: {element.tag} {element.get('id')}: edge {edge} is not in {city.net_file}; remove the "
                     "vehicle, or give the routes of this network")
+def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
+    """Name -> edges of the routes that additional files define for vehicles to share; of a distribution, its first."""
+    found: dict[str, tuple[str, ...]] = {}
+    for path in paths:
+        root = read_xml(path)
+        for route in root.iter("route"):
+            if route.get("id") and route.get("edges"):
+                found[route.get("id")] = tuple(route.get("edges").split())
+        for distribution in root.iter("routeDistribution"):
+            routes = [tuple(r.get("edges").split()) for r in distribution.iter("route") if r.get("edges")]
+            routes += [found[name] for name in distribution.get("routes", "").split() if name in found]
+            if routes:
+                found[distribution.get("id")] = routes[0]
+    return found
 
 
 def draw(

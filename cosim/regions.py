@@ -13,6 +13,8 @@ from cosim.xml_files import BROKEN, opened
 from nmfd.errors import InputError
 from nmfd.network import Network
 
+JAM_SPACING = 7.5  # m of lane per standing vehicle
+
 
 @dataclass(frozen=True, kw_only=True)
 class Gateway:
@@ -260,3 +262,15 @@ def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gate
                 lanes=tuple(sorted({link.lane for link in members})),
                 shared=tuple(sorted({link.lane for link in members if len(onward[key[2], link.lane]) > 1})))
         for key, members in sorted(movements.items()))
+
+
+def edge_room(city: City) -> np.ndarray:
+    """(E,) [veh]: how many stand on each edge at JAM_SPACING."""
+    return np.array([max(city.lanes[edge] * city.length[edge] / JAM_SPACING, 1.0) for edge in city.edges])
+
+
+def gateway_room_taken(edge_vehicles: np.ndarray, city: City) -> np.ndarray:
+    """(..., G) [-]: the share of the room on the edge before each gateway that edge_vehicles (..., E) [veh] take."""
+    index = {edge: n for n, edge in enumerate(city.edges)}
+    before = [index[gateway.from_edge] for gateway in city.gateways]
+    return edge_vehicles[..., before] / edge_room(city)[before]

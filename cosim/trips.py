@@ -73,7 +73,7 @@ def make_trips(city: City, demand: np.ndarray, step: float, seed: int) -> Trips:
     draws = rng.random((len(depart), 2))
     tastes = rng.integers(TASTES, size=len(depart))
     positions = rng.random(len(depart))
-    trees = _Trees(city, rng)
+    trees = Ways(city, rng)
     number = {edge: n for n, edge in enumerate(city.edges)}
     first, last = np.empty(len(depart), dtype=int), np.empty(len(depart), dtype=int)
     for n, (i, j) in enumerate(zip(origin, destination, strict=True)):
@@ -161,7 +161,7 @@ def _draw(edges: list[str], weights: np.ndarray, uniform: float) -> str:
     return edges[min(int(np.searchsorted(weights, uniform, side="right")), len(edges) - 1)]
 
 
-class _Trees:
+class Ways:
     """Shortest paths over the edges as nodes: an arc costs the junction and the edge after it."""
 
     def __init__(self, city: City, rng):

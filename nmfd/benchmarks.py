@@ -77,7 +77,7 @@ def configuration(scenario: Scenario, controllers, plant: str, policies) -> tupl
     settings = {}
     for name in controllers:
         policy = registry.policy_path(name, scenario, policies.get(name))
-        settings[name] = {} if policy is None else {"policy_hash": runs.file_hash(policy)}
+        settings[name] = registry.fingerprint(name, policy)
     common = {
         "scenario": scenario.name, "scenario_hash": runs.scenario_hash(scenario), "network": scenario.network.name,
         "network_hash": scenario.network.hash, "plant": plant, "step_s": scenario.step, "steps": scenario.steps,

@@ -6,6 +6,7 @@ import click
 
 from nmfd.command_line import Commands, Interrupted
 from nmfd.errors import InputError
+from nmfd.exchange import export, new_controller
 from nmfd.experiments import ablation, bound, robustness, scaling
 from nmfd.options import COUNT, FILE, FOLDER, SEED, controller_names, fault_option, policy_files, quoted
 
@@ -26,7 +27,7 @@ def main() -> None:
 @click.option("--controllers", required=True, metavar="A,B,...",
               help="Which to run: no-control, route-guidance, pi-gating, mpc-pc, mpc-pcrg, probing-pc, "
                    "probing-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, dpc-pcrg-robust, dpc-pc-guarded, "
-                   "dpc-pcrg-guarded, bound-pc, bound-pcrg.")
+                   "dpc-pcrg-guarded, bound-pc, bound-pcrg, or file.py:Class (see nmfd new-controller).")
 @click.option("--seeds", type=COUNT, default=1, show_default=True, metavar="N",
               help="Run seeds 0 to N-1 of the measurement noise.")
 @click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", show_default=True,
@@ -35,11 +36,12 @@ def main() -> None:
               help="Runs at a time, each on one core. Timings are cleanest with 1.")
 @click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
               help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.")
+@click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.frames).")
 @fault_option()
 @click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
 def benchmark(
     scenario: Path, controllers: str, seeds: int, plant: str, workers: int, policies: tuple[str, ...],
-    faults: tuple[str, ...], out: Path | None,
+    parquet: bool, faults: tuple[str, ...], out: Path | None,
 ) -> None:
     """Run controllers on a regional model; print a table and write a run folder.
 
@@ -72,6 +74,14 @@ def benchmark(
             raise Interrupted("interrupted before a run was finished; nothing is kept") from None
         raise Interrupted(
             f"interrupted; finished runs are in {out}: the same command with --out {quoted(out)} goes on") from None
+    if parquet:
+        import pandas as pd
+
+        from nmfd import frames
+
+        frames.write(out, [
+            runs.read_trajectory(out / f"{runs.run_name(row['controller'], row['seed'])}.npz") for row in rows],
+            {"summary": pd.DataFrame(rows)})
     click.echo(f"{loaded.name}, {plant} plant, {loaded.steps} control intervals of {loaded.step:g} s")
     click.echo(benchmarks.table(rows))
     click.echo(f"Written to {out}")
@@ -183,7 +193,7 @@ def _stamp(path: Path) -> int | None:
     return path.stat().st_mtime_ns if path.exists() else None
 
 
-for command in (bound, robustness, ablation, scaling):
+for command in (bound, robustness, ablation, scaling, new_controller, export):
     main.add_command(command)
 
 

@@ -113,9 +113,10 @@ def improvements(rows: Sequence[Mapping], controller: str) -> dict[float, tuple[
 
 
 def compared(rows: Sequence[Mapping]) -> list[str]:
-    """The controllers in `rows` but no control, in the order of the registry."""
-    there = {row["controller"] for row in rows}
-    return [name for name in registry.names() if name in there and name != REFERENCE]
+    """The controllers in `rows` but no control, in the order of the registry, others behind."""
+    there = dict.fromkeys(row["controller"] for row in rows)
+    order = dict.fromkeys([*(name for name in registry.names() if name in there), *there])
+    return [name for name in order if name != REFERENCE]
 
 
 def trips(rows: Sequence[Mapping]) -> dict[float, float]:

@@ -23,6 +23,7 @@ from dataclasses import replace
 from datetime import datetime
 from importlib import metadata
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 
@@ -233,6 +234,11 @@ def file_name(name: str) -> str:
     return re.sub(r"[^\w.-]+", "-", name)
 
 
+def run_name(controller: str, seed: int) -> str:
+    """What the files of a run are called; of a controller in a file, path/to/file.py:Class, without the / and :."""
+    return f"{quote(controller, safe='+,-._ ')}-{seed}"
+
+
 def default_folder(scenario: Scenario) -> Path:
     """runs/<scenario>-<timestamp> in the current folder, a name not taken yet."""
     stem = f"{file_name(scenario.name)}-{datetime.now():%Y%m%d-%H%M%S}"
@@ -254,7 +260,7 @@ class RunFolder:
         return [run for run in self._order if run in self._rows and self.trajectory_path(*run).is_file()]
 
     def trajectory_path(self, controller: str, seed: int) -> Path:
-        return self.path / f"{controller}-{seed}.npz"
+        return self.path / f"{run_name(controller, seed)}.npz"
 
     def add(self, trajectory: Trajectory) -> None:
         """Write a finished run at once: its trajectory, then summary.csv, which is what makes it count."""

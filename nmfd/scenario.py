@@ -205,11 +205,14 @@ def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
 def as_modelled(scenario: Scenario, controller: str) -> Scenario:
     """`scenario` with the regional model that `controller` plans with: the network that its option `model` names.
 
-    Drivers who are guided, or who reroute by themselves, make another model of the same city. Raises InputError.
+    Drivers who are guided, or who reroute by themselves, make another model of the same city. A controller "NAME+..."
+    is NAME with the options of [controllers."NAME+..."] over those of [controllers.NAME]. Raises InputError.
     """
-    options = dict(scenario.controller_options.get(controller, {}))
+    name, tables = controller.partition("+")[0], scenario.controller_options
+    options = {**tables.get(name, {}), **tables.get(controller, {})}
+    configured = replace(scenario, controller_options={**tables, name: options})
     if "model" not in options or scenario.folder is None:
-        return scenario
+        return configured
     table = toml.Table(options, scenario.folder / "scenario.toml", f"controllers.{controller}.")
     model = load_network(scenario.folder / table.text("model"))
     if not np.array_equal(model.adjacency, scenario.network.adjacency):
@@ -217,8 +220,7 @@ def as_modelled(scenario: Scenario, controller: str) -> Scenario:
                           "; identify one for the same city with 'cosim identify'")
     del options["model"]
     check_step(model, scenario.step / scenario.substeps, f"{model.folder}")
-    return replace(
-        scenario, network=model, controller_options={**scenario.controller_options, controller: options})
+    return replace(configured, network=model)
 
 
 def _region(row: toml.Table, key: str, network: Network) -> int:

@@ -17,6 +17,7 @@ from nmfd import toml
 from nmfd.controllers import guarded
 from nmfd.controllers.dpc import ACTIVATIONS, DEEPEST, WIDEST, Architecture, Policy, checkpoint
 from nmfd.errors import InputError
+from nmfd.network import Network
 from nmfd.rollout import Rollout, compiled_step
 from nmfd.runs import atomic, locked, sweep
 from nmfd.scenario import Scenario, as_modelled
@@ -26,6 +27,7 @@ VALIDATE_EVERY = 20  # Adam steps
 MOST_STEPS = 10**7
 ROBUST_NOISE = 3.0     # veh/s, of the policies whose name ends in -robust
 WORTH_COMPILING = 200  # Adam steps
+WEAK, OPEN, RARE = 0.1, 3.0, 1e-3  # of the first policy from no control: factor of weights, logit of u, least theta
 VALIDATIONS = 16       # perturbed scenarios in a validation, if training perturbs the demand
 NAMES = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
 
@@ -46,6 +48,7 @@ class Training:
         rollout has its own sigma, evenly between 0 and `noise` (demand_noise.WHERE, "pairs")
     detour_cost: what a vehicle loses that is guided off the drivers' own split ratios, in the objective [s]
     mfd_spread: of the regional model that every rollout has for itself (Rollout.draw_model) [-]
+    from_no_control: the first policy is nearly no control, so that what training finds no reason to change stays open
     noise_all: the same of the noise on every pair of regions ("all"), in every other rollout, instead of `noise`
     """
 
@@ -64,6 +67,7 @@ class Training:
     noise_all: float = 0.0
     mfd_spread: float = 0.0
     detour_cost: float = 0.0
+    from_no_control: bool = False
 
     @property
     def levels(self) -> tuple[float, float]:
@@ -71,13 +75,21 @@ class Training:
 
 
 def settings(scenario: Scenario, controller: str, steps: int | None = None) -> Training:
-    """The training settings of `controller` in `scenario`, checked; `steps` overrides."""
-    if controller not in NAMES:
+    """The training settings of `controller` in `scenario`, checked; `steps` overrides.
+
+    controller: one of NAMES, or "NAME+..." if the scenario has a table of that name (nmfd.scenario.as_modelled)
+    """
+    name, variant, _ = controller.partition("+")
+    if name not in NAMES:
         raise InputError(f"--controller: {controller!r} cannot be trained; choose one of {', '.join(NAMES)}")
+    if variant and controller not in scenario.controller_options:
+        raise InputError(
+            f"--controller: {controller!r} needs a table [controllers.\"{controller}\"] in {scenario.folder}/"
+            f"scenario.toml that says what is different from {name}; add one, or train {name}")
     scenario = as_modelled(scenario, controller)
-    default = Training(noise=ROBUST_NOISE if controller.endswith("-robust") else 0.0)
+    default = Training(noise=ROBUST_NOISE if name.endswith("-robust") else 0.0)
     table = toml.Table(
-        scenario.controller_options.get(controller, {}), scenario.folder / "scenario.toml" if scenario.folder else
+        scenario.controller_options.get(name, {}), scenario.folder / "scenario.toml" if scenario.folder else
         Path("scenario"), f"controllers.{controller}.")
     chosen = Training(
         width=table.integer("width", default.width, low=1, high=WIDEST),
@@ -94,7 +106,8 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         noise=table.number("noise", default.noise, low=0.0, high=1e6),
         noise_all=table.number("noise_all", default.noise_all, low=0.0, high=1e6),
         mfd_spread=table.number("mfd_spread", default.mfd_spread, low=0.0, high=1.0),
-        detour_cost=table.number("detour_cost", default.detour_cost, low=0.0, high=1e6))
+        detour_cost=table.number("detour_cost", default.detour_cost, low=0.0, high=1e6),
+        from_no_control=table.flag("from_no_control", default.from_no_control))
     table.close()
     return chosen if steps is None else Training(**{**asdict(chosen), "steps": steps})
 
@@ -111,23 +124,27 @@ def train(
     device: str = "cpu", compiled: bool = False, progress: Callable[[int, int, str], None] | None = None,
     log: Callable[[int, float], None] | None = None,
 ) -> Path:
-    """Train `controller`, one of NAMES, on the regional model and write the policy to `out`.
+    """Train `controller`, one that `settings` knows, on the regional model and write the policy to `out`.
 
     `out` holds the best policy so far after every validation; `out`.resume beside it holds what `resume` needs and
     goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done, TTS)` after
     every validation. `compiled` makes a step about twice as fast, after up to a minute or two of compilation; the
     weights differ by rounding.
     """
-    scenario = as_modelled(scenario, controller)
     chosen = settings(scenario, controller, steps)
+    scenario = as_modelled(scenario, controller)
     configuration = {
         "controller": controller, "scenario": scenario.name, "seed": seed, "compiled": compiled, **asdict(chosen)}
     torch.set_num_threads(1)  # the matrices are small: more threads only wait for one another
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
+    guidance = NAMES[controller.partition("+")[0]]
     architecture = Architecture(
-        width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=NAMES[controller])
-    policy = Policy(scenario.network, architecture).to(device)
+        width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=guidance)
+    policy = Policy(scenario.network, architecture)
+    if chosen.from_no_control:
+        begin_as_no_control(policy, scenario.network)
+    policy = policy.to(device)
     rollout = Rollout(scenario, device=device, detour_cost=chosen.detour_cost)
     advance = compiled_step(rollout.step) if compiled else rollout.step
     optimizer = torch.optim.Adam(policy.parameters(), lr=chosen.learning_rate)
@@ -176,6 +193,17 @@ def train(
                 f"{controller}: every validation of {chosen.steps} steps diverged; lower the learning rate")
         state_file.unlink(missing_ok=True)
     return out
+
+
+def begin_as_no_control(policy: Policy, network: Network) -> None:
+    """Let `policy` hardly depend on the state, with nearly open gateways and nearly the drivers' own split ratios."""
+    with torch.no_grad():
+        policy.perimeter_decoder.weight.mul_(WEAK)
+        policy.perimeter_decoder.bias.fill_(OPEN)
+        if policy.architecture.guidance:
+            own = torch.tensor(network.nominal_splits[np.arange(network.regions)[:, None], policy.onward.numpy()])
+            policy.splits_decoder.weight.mul_(WEAK)
+            policy.splits_decoder.bias.copy_(own.clamp(min=RARE).log().flatten())
 
 
 def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> float:

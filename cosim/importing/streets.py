@@ -79,6 +79,22 @@ class Streets:
         """(E,) bool: the largest set of edges of which each can be reached from each."""
         return self._largest("strong")
 
+    @cached_property
+    def onward(self) -> np.ndarray:
+        """(E,) bool: the edges from which the core can be reached."""
+        return self._reached(self.links[:, ::-1])
+
+    @cached_property
+    def reached(self) -> np.ndarray:
+        """(E,) bool: the edges that can be reached from the core."""
+        return self._reached(self.links)
+
+    def _reached(self, links: np.ndarray) -> np.ndarray:
+        found = np.zeros(len(self.edges), dtype=bool)
+        found[breadth_first_order(graph(links, len(self.edges)), int(np.argmax(self.core)),
+                                  return_predecessors=False)] = True
+        return found
+
     def connected(self, pairs: Iterable[tuple[int, int]]) -> dict[tuple[int, int], bool]:
         """Whether a way leads from the first edge of each pair to its second, for a vehicle that may use every lane."""
         onward = graph(self.all_links, len(self.edges))
