@@ -31,6 +31,7 @@ class Streets:
 
     def __init__(self):
         self.time, self.places, self.routes, self.waiting, self.bound = 0.0, {}, {}, [], set()
+        self.held, self.jumped = set(), 0
         self.clear()
 
     def clear(self):
@@ -51,6 +52,12 @@ class Streets:
 
     def ended_teleport(self):
         return tuple(self.lands)
+
+    def teleports(self):
+        return self.jumped
+
+    def known(self):
+        return (*self.places, *self.held)
 
     def running(self):
         return tuple(self.places)
@@ -158,6 +165,29 @@ def test_teleporting_vehicles_stay_where_they_were(play):
     play.step(gone=["v"])
     assert (play.meter.accumulation() == x((0, 1))).all() and play.meter.teleports == 2
     assert play.meter._teleporting == set()
+
+
+def test_vehicles_that_the_mesoscopic_model_holds_stay_where_they_were(play):
+    """Taken off the road without a word, but not forgotten; one that SUMO does not know any more is lost."""
+    play.session.routes = {"v": ("a0", "b0", "b1", "c0"), "w": ("a0", "b0"), "u": ("a0", "b0")}
+    play.step(new=["v", "w"], loads=["u"], waiting=["u"])
+    play.session.places.pop("v")
+    play.session.held = {"v", "u"}
+    assert (play.meter.accumulation() == x((0, 2), (0, 1))).all()
+    play.session.held = set()
+    with pytest.raises(LedgerError, match="1 vehicles are in the city, but 2 departures"):
+        play.meter.accumulation()
+
+
+def test_teleports_that_nobody_reported_count(play):
+    play.session.routes = {"v": ("a0", "b0")}
+    play.step(new=["v"])
+    play.session.jumped = 3
+    play.meter.accumulation()
+    assert play.meter.teleports == 3
+    play.session.jumped = 1
+    play.meter.accumulation()
+    assert play.meter.teleports == 3
 
 
 def test_a_teleporting_vehicle_enters_nothing(play):
