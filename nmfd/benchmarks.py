@@ -13,10 +13,10 @@ from nmfd import closed_loop, faults, runs
 from nmfd.controllers import registry
 from nmfd.plant import AcyclicPlant, NmfdPlant
 from nmfd.scenario import Scenario
-from nmfd.types import Trajectory
+from nmfd.types import Plant, Trajectory
 from nmfd.workers import Failure, attempt, ended, outcomes
 
-PLANTS = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
+PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
 CAPTION = (
     "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against no-control; control: time of all\n"
@@ -90,7 +90,7 @@ def _label(run: tuple[str, int]) -> str:
 
 
 def results(
-    work: Callable, todo: Sequence[tuple], workers: int, steps: int, progress, *, label: Callable[[tuple], str],
+    work: Callable, todo: Sequence[tuple], workers: int, steps: int, progress, *, label: Callable[..., str],
 ) -> Iterator[tuple]:
     """(run, result or Failure) of every run, in this process if there is one worker.
 

@@ -161,6 +161,7 @@ def test_teleporting_vehicles_stay_where_they_were(play):
     assert (play.meter.accumulation() == x((0, 2), (0, 1))).all() and play.meter.teleports == 1
     play.step(move={"v": "b1"}, lands=["v"])
     assert (play.meter.accumulation() == x((1, 2), (0, 1))).all() and play.meter.teleports == 1
+    assert play.meter._teleporting == set()
     play.step(jumps=["v"])
     play.step(gone=["v"])
     assert (play.meter.accumulation() == x((0, 1))).all() and play.meter.teleports == 2
@@ -220,6 +221,9 @@ def test_probes_are_counted_apart(play):
     assert (play.meter.probes() == 0).all() and (play.meter.probe_backlog() == x((0, 1))).all()
     play.step(new=["p", "v"], waiting=[])
     assert (play.meter.probes() == x((0, 1))).all() and (play.meter.probe_departures == x((0, 1))).all()
+    play.session.routes["w"] = ("b0", "b1")
+    play.step(new=["w"])
+    assert (play.meter.probe_departures == x((0, 1))).all()
     assert (play.meter.departures == 2 * x((0, 1))).all() and (play.meter.probe_backlog() == 0).all()
     play.step(gone=["p", "v"])
     assert (play.meter.probes() == 0).all()
