@@ -218,12 +218,15 @@ def check_options(scenario: Scenario) -> None:
 
     where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
     tables = toml.Table(scenario.controller_options, where, "controllers.")
-    for name in scenario.controller_options:
-        table = tables.table(name)
+    for variant in scenario.controller_options:
+        table, name = tables.table(variant), split(variant)[0]
         if name not in names():
-            raise tables.error(name, f"unknown controller; choose from {', '.join(names())}")
+            raise tables.error(variant, f"unknown controller; choose from {', '.join(names())}, or one of them with + "
+                               "and the options of a strategy")
         table.text("model", None)
-        own = replace(scenario, controller_options={name: table.raw()})
+        options = {**scenario.controller_options.get(name, {}), **table.raw()}
+        options.pop("model", None)
+        own = replace(scenario, controller_options=dict.fromkeys((name, variant), options))
         if name.startswith("mpc-"):
             from nmfd.controllers import mpc
 
@@ -231,7 +234,7 @@ def check_options(scenario: Scenario) -> None:
         elif name in _WITH_POLICY:
             from nmfd import training
 
-            training.settings(own, name)
+            training.settings(own, variant)
         elif name in ("pi-gating", "probing-pc", "probing-pcrg"):
             if scenario.protected:  # without a protected region gating cannot be made, and is not made
                 _WITHOUT_POLICY[name](own)
