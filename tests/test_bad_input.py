@@ -25,6 +25,7 @@ import nmfd.cli
 from nmfd import benchmarks, closed_loop, training
 from nmfd.controllers.dpc import Architecture, Policy, checkpoint
 from nmfd.network import load_network
+from nmfd.scenario import load_scenario
 
 ROOT = Path(__file__).parents[1]
 MAINS = {"nmfd": nmfd.cli.main, "cosim": cosim.cli.main}
@@ -144,6 +145,18 @@ def test_every_key_of_a_recipe(tmp_path):
                ("0 0 0", "0 . 0"))
     pictures = [(f"regions {old!r} -> {new!r}", text.replace(old, new, 1).encode()) for old, new in changes]
     assert every([*toml_cases(text, 4, [("centre", "x"), ("signals", "cycle")]), *pictures], test) > 80
+
+
+@pytest.mark.parametrize("name", ["pi_gating", "pi-gatin", "dcp-pc", "dpc-pc-robst", "pi-gatng+max-pressure"])
+def test_a_table_of_a_controller_that_is_misspelt(tmp_path, name):
+    text, out = f'{tiny.SCENARIO}\n[controllers."{name}"]\nx = 1\n', tmp_path / "out"
+    scenario = tiny.write(tmp_path, scenario=text)
+    line = check("nmfd", "benchmark", scenario, "--controllers", "no-control", "--out", out, out=out)
+    assert f"controllers.{name}: unknown controller, very like " in line
+
+
+def test_a_table_of_a_controller_of_the_users_own_is_his_business(tmp_path):
+    load_scenario(tiny.write(tmp_path, scenario=tiny.SCENARIO + "\n[controllers.my-controller]\ngain = 'x'\n"))
 
 
 def npz(**arrays) -> bytes:

@@ -5,6 +5,7 @@ Besides those here there are controllers of the user's own (nmfd.controllers.own
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -221,8 +222,11 @@ def check_options(scenario: Scenario) -> None:
     for variant in scenario.controller_options:
         table, name = tables.table(variant), split(variant)[0]
         if name not in names():
-            raise tables.error(variant, f"unknown controller; choose from {', '.join(names())}, or one of them with + "
-                               "and the options of a strategy")
+            if near := difflib.get_close_matches(name, names(), n=1, cutoff=0.82):
+                raise tables.error(
+                    variant, f"unknown controller, very like {near[0]}; choose from {', '.join(names())}, or one of them "
+                    "with + and the options of a strategy")
+            continue  # of a controller of the user's own, who reads it
         table.text("model", None)
         options = {**scenario.controller_options.get(name, {}), **table.raw()}
         options.pop("model", None)
