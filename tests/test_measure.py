@@ -221,10 +221,10 @@ def test_probes_are_counted_apart(play):
     assert (play.meter.probes() == 0).all() and (play.meter.probe_backlog() == x((0, 1))).all()
     play.step(new=["p", "v"], waiting=[])
     assert (play.meter.probes() == x((0, 1))).all() and (play.meter.probe_departures == x((0, 1))).all()
+    assert (play.meter.departures == 2 * x((0, 1))).all() and (play.meter.probe_backlog() == 0).all()
     play.session.routes["w"] = ("b0", "b1")
     play.step(new=["w"])
     assert (play.meter.probe_departures == x((0, 1))).all()
-    assert (play.meter.departures == 2 * x((0, 1))).all() and (play.meter.probe_backlog() == 0).all()
     play.step(gone=["p", "v"])
     assert (play.meter.probes() == 0).all()
 
@@ -268,9 +268,9 @@ def test_public_transport_is_not_free(play):
 
 
 def test_routes_from_streets_without_a_region_count_as_region_0(play):
-    play.session.routes = {"v": ("somewhere", "b0")}
-    play.step(new=["v"])
-    assert (play.meter.accumulation() == x((0, 1))).all()
+    play.session.routes = {"v": ("somewhere", "b0"), "w": ("b0", "somewhere")}
+    play.step(new=["v", "w"])
+    assert (play.meter.departures == x((0, 1), (1, 0))).all()
 
 
 @pytest.mark.parametrize("length, speed, every", [(100.0, 10.0, 3), (20.0, 10.0, 1), (40.0, 10.0, 2), (10.0, 50.0, 1)])
@@ -283,7 +283,13 @@ def test_short_entries_are_polled_more_often(length, speed, every):
     session.clear()
     session.places["v"] = "b0"
     steps = next(n for n in range(2, 9) if meter.observe())
-    assert steps == max(every, 2 if every < 3 else every)
+    assert meter._poll_every == every and steps == max(every, 2)
+
+
+def test_the_shortest_entry_decides():
+    streets = city()
+    streets = City(**{**vars(streets), "length": {**streets.length, "b0": 20.0, "a0": 900.0}})
+    assert Meter(Streets(), streets)._poll_every == 1
 
 
 def test_finer_steps_are_polled_as_often_in_time():

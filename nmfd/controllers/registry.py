@@ -224,8 +224,8 @@ def check_options(scenario: Scenario) -> None:
         if name not in names():
             if near := difflib.get_close_matches(name, names(), n=1, cutoff=0.82):
                 raise tables.error(
-                    variant, f"unknown controller, very like {near[0]}; choose from {', '.join(names())}, or one of them "
-                    "with + and the options of a strategy")
+                    variant, f"unknown controller, very like {near[0]}; choose from {', '.join(names())}, or one of "
+                    "them with + and the options of a strategy")
             continue  # of a controller of the user's own, who reads it
         table.text("model", None)
         options = {**scenario.controller_options.get(name, {}), **table.raw()}
