@@ -481,6 +481,13 @@ LINES = {
         scaling --family square --out {none}
         scaling --memory 0|nan|-1|x --out {none}
         scaling --time-limit 0|nan|x --out {none}
+        export {none} --out {out}
+        export {s}/scenario.toml --out {out}
+        export {s}/scenario.toml
+        new-controller {s}/scenario.toml|{none}/x.py|/dev/null/x.py
+        new-controller
+        benchmark {s} --controllers {none}.py:Mine|{s}/scenario.toml:Mine|mine.py
+        benchmark {s} --controllers no-control --fault x|frozen:1|closed:a
         nonsense
         --nonsense
     """,
@@ -509,6 +516,28 @@ LINES = {
         compare {g} --controller x
         compare {g} --seed -1
         compare
+        report {none}|{g}
+        report
+        report {none} --reference x
+        sweep {g} --controllers x|no-control,no-control|,
+        sweep {g} --controllers no-control --seeds 0|x|99999999999
+        sweep {g} --controllers no-control --first-seed -1|9999999999
+        sweep {g} --controllers no-control --demand 0|nan|x|1,1
+        sweep {g} --controllers no-control --compliance -1|101|nan|x|1,1
+        sweep {g} --controllers dpc-pc --policy x|dpc-pc={none}
+        sweep {g} --controllers no-control --scheduler nowhere
+        sweep {none} --controllers no-control
+        video {none}|{g}
+        video {g} --rate 0|x
+        video {g} --demand nan|0|11
+        watch {none} --controller no-control
+        watch {g} --controller x
+        watch {g} --controller no-control --delay nan|-1|x
+        watch {g} --controller no-control --demand nan|0|11
+        watch {g} --controller no-control --seed -1
+        watch {g} --controller no-control --steps 0
+        run {g} --controller no-control --fault x|closed:nowhere|signal:nobody|missing:7
+        run {g} --controller {none}.py:Mine
         identify {none}
         identify {g} --levels 0|x|nan|1,1
         identify {g} --seeds 0|x
