@@ -6,7 +6,7 @@ import click
 
 from nmfd.command_line import Commands, Interrupted
 from nmfd.errors import InputError
-from nmfd.options import COUNT, FILE, FOLDER, LEVEL, POSITIVE, SEED, Positive, fault_option
+from nmfd.options import COUNT, FILE, FOLDER, LEVEL, SEED, Positive, fault_option
 from nmfd.workers import RunFailed
 
 CONTROLLER_HELP = (

@@ -49,7 +49,6 @@ def benchmark(
     failed, which the message names. Every finished run is kept, whatever happens to the others.
     """
     policies = policies or {}
-    faults.without_city(faults.of(scenario), f"{scenario.name}: faults")
     for name in controllers:
         registry.make(name, scenario, policy=policies.get(name))
     common, settings = configuration(scenario, controllers, plant, policies)
@@ -73,7 +72,9 @@ def benchmark(
 
 
 def configuration(scenario: Scenario, controllers, plant: str, policies) -> tuple[dict, dict]:
-    """What all runs have in common, and what each controller depends on besides."""
+    """What all runs have in common, and what each controller depends on besides. InputError for a fault that the
+    regional model cannot have."""
+    faults.without_city(faults.of(scenario), f"{scenario.name}: faults")
     settings = {}
     for name in controllers:
         policy = registry.policy_path(name, scenario, policies.get(name))
