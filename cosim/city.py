@@ -235,8 +235,11 @@ def _plain_xml(recipe: Recipe) -> tuple[str, str, str, dict[str, int]]:
             target = first[b, turns[turn]]
             for lane, into in zip(lanes_of_turn, _into(turn, len(lanes_of_turn), lanes[target]), strict=True):
                 connection_rows += [_link(source, target, lane, number) for number in into]
-    parts = (("nodes", node_rows), ("edges", edge_rows), ("connections", connection_rows))
-    return *(f"<{tag}>\n{''.join(rows)}</{tag}>\n" for tag, rows in parts), region_of
+    return _file("nodes", node_rows), _file("edges", edge_rows), _file("connections", connection_rows), region_of
+
+
+def _file(tag: str, rows: list[str]) -> str:
+    return f"<{tag}>\n{''.join(rows)}</{tag}>\n"
 
 
 def _leads_in(recipe: Recipe, a: str, b: str) -> bool:

@@ -6,7 +6,7 @@ import click
 
 from nmfd.command_line import Commands, Interrupted
 from nmfd.errors import InputError
-from nmfd.options import COUNT, FILE, FOLDER, SEED, fault_option
+from nmfd.options import COUNT, FILE, FOLDER, LEVEL, SEED, Positive, fault_option
 from nmfd.workers import RunFailed
 
 CONTROLLER_HELP = (
@@ -296,7 +296,7 @@ def report(folders: tuple[Path, ...], out: Path | None, reference: str | None, s
 @click.argument("folder", type=FOLDER, metavar="RUN")
 @click.option("--controller", metavar="NAME", help="Whose run. [default: the best one]")
 @click.option("--against", metavar="NAME", help="A second run, shown beside it.")
-@click.option("--seed", type=click.IntRange(min=0), help="[default: the first one there]")
+@click.option("--seed", type=SEED, help="[default: the first one there]")
 @click.option("--demand", type=float, metavar="X", help="Level of an evaluation. [default: the one nearest to 1]")
 @click.option("--rate", type=click.IntRange(1, 60), default=8, show_default=True, metavar="N",
               help="Control intervals per second of the film.")
@@ -331,12 +331,12 @@ def video(
 @main.command()
 @click.argument("scenario", type=FOLDER)
 @click.option("--controller", required=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-@click.option("--steps", type=click.IntRange(min=1), metavar="N", help="Control intervals. [default: the scenario's]")
-@click.option("--demand", type=click.FloatRange(0.0, 10.0, min_open=True), default=1.0, show_default=True, metavar="X",
+@click.option("--seed", type=SEED, default=0, show_default=True)
+@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
+@click.option("--demand", type=LEVEL, default=1.0, show_default=True, metavar="X",
               help="Multiple of the scenario's demand.")
 @click.option("--policy", type=FILE, metavar="FILE", help="Policy of a DPC controller, if not SCENARIO/NAME.pt.")
-@click.option("--delay", type=click.FloatRange(min=0.0), default=20.0, show_default=True, metavar="MS",
+@click.option("--delay", type=Positive(1e6, zero=True), default=20.0, show_default=True, metavar="MS",
               help="Wall time per simulated second at least; the window has a slider for it, too.")
 def watch(
     scenario: Path, controller: str, seed: int, steps: int | None, demand: float, policy: Path | None, delay: float,

@@ -47,7 +47,7 @@ def predict(scenario: Scenario, result: Result) -> Trajectory:
     """
     same = replace(
         scenario, steps=len(result.trajectory.perimeter), demand=result.record["departures"] / scenario.step,
-        measurement_std=0.0)
+        measurement_std=0.0, faults=())
     trajectory = closed_loop.run(NmfdPlant(same), Replay(result.trajectory), same, seed=result.trajectory.seed)
     return replace(trajectory, plant="nmfd")
 

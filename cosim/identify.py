@@ -8,7 +8,7 @@ runs by prediction error (nmfd.identification).
 import csv
 import io
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -75,7 +75,7 @@ def identify(
     set_point = tuple(network.mfds[region].critical for region in loaded.protected)
     found += _load(scenario, loading, second, {"set_point": set_point}, out, workers, progress)
     held_out = [result for result in found if len(loading.seeds) > 1 and result.trajectory.seed == loading.seeds[-1]]
-    scheme = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
+    scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
     def fitted(results: Sequence[Result], what: str) -> Network:
         def tell(done, total, note):
@@ -225,7 +225,7 @@ def _sumo_table(folder: Path, target: Path) -> dict[str, str]:
         for key, value in table.items()}
 
 
-def network_toml(network: Network, sumo: dict[str, str], comment: str) -> str:
+def network_toml(network: Network, sumo: Mapping[str, str], comment: str) -> str:
     """network.toml of `network` with this table [sumo]."""
     out = io.StringIO()
     out.write(f"# {comment}\nname = \"{network.name}\"\n\n")

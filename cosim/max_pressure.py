@@ -194,8 +194,8 @@ class Roads:
         for edge, target in self.movements:
             row = self._queue(edge, target)
             end = self._chain(target)[-1]
-            for after, share in self._shares(end, self._targets(end)).items():
-                for lane, part in self._queue(end, after).items():
+            for onward, share in self._shares(end, self._targets(end)).items():
+                for lane, part in self._queue(end, onward).items():
                     row[lane] = row.get(lane, 0.0) - share * part
             rows.append(row)
         self.weights = _sparse(rows, len(self.lanes))

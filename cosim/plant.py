@@ -187,7 +187,8 @@ class SumoPlant:
         outputs: kind (cosim.sumo_output) -> file, of SUMO's own outputs; complete after `trip_facts` or `close`
         window: to watch; the simulation is the same, only slower
         """
-        self._scenario, self._originals, self._window = scenario, None, window
+        self._scenario, self._window = scenario, window
+        self._originals: Originals | None = None
         self._outputs = dict(outputs or {})
         self._settings = overrides or settings(scenario)
         files = ensure_built(scenario.network)
@@ -267,7 +268,8 @@ class SumoPlant:
         self._original_green = self._programmed_green()
         self._incidents = Incidents(faults.of(scenario), self._session, self.city)
         self._actuator = Actuator(list(self._signals.values()), self._incidents.show)
-        self._k, self._rows, self._speed, self._opened = 0, [], None, {}
+        self._speed: np.ndarray | None = None
+        self._k, self._rows, self._opened = 0, [], {}
         return self._estimated(self._measurement()) if estimating else self._measurement()
 
     def step(self, controls: Controls) -> Measurement:
@@ -309,8 +311,9 @@ class SumoPlant:
         measurement = replace(measurement, problem=self._incidents.problem(estimating=self._estimator is not None))
         row = {key: after[key] - before[key] for key in after}
         with np.errstate(invalid="ignore"):
-            self._speed = metres / vehicles
-        self._speed[self._incidents.closed] = 0.0  # nobody is sent through a street because it is empty
+            speed = metres / vehicles
+        speed[self._incidents.closed] = 0.0  # nobody is sent through a street because it is empty
+        self._speed = speed
         row["production"], row["mean_accumulation"] = (
             np.bincount(self._edge_region, amount, network.regions) / len(queues) for amount in (metres, vehicles))
         self._opened = self._overridden(vehicles / len(queues))
@@ -367,7 +370,7 @@ class SumoPlant:
         if not chosen.routes:
             return [f"v{n}" for n in range(write_trips(self.city, scenario.demand, scenario.step, seed, path))]
         if self._originals is None:
-            self._originals: Originals | None = own_vehicles(scenario, chosen, self.city)
+            self._originals = own_vehicles(scenario, chosen, self.city)
         return write_originals(
             self._originals, path, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
             begin=chosen.begin)
@@ -376,7 +379,7 @@ class SumoPlant:
         """The city's own additional files."""
         return [self._scenario.folder / name for name in self._settings.additional] if self._scenario.folder else []
 
-    def _own_flows(self) -> dict[tuple[str, str], float] | None:
+    def _own_flows(self) -> Mapping[tuple[str, str], float] | None:
         """Turning flows of the city's own vehicles; None where trips are drawn from the scenario's demand."""
         if self._originals is None:
             return None

@@ -7,6 +7,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 from nmfd.controllers import registry
 from nmfd.errors import InputError
@@ -34,7 +35,7 @@ class Strategy:
 
     name: str
     controller: str
-    overrides: dict[str, object] = field(default_factory=dict)
+    overrides: dict[str, Any] = field(default_factory=dict)
 
     @property
     def model_free(self) -> bool:
@@ -50,7 +51,7 @@ def parse(name: str) -> Strategy:
         controller, words = ALONE, [first, *words]
     elif not registry.known(first):
         raise _unknown(name, first, controllers=True)
-    overrides: dict[str, object] = {"gateways_fixed": controller != ALONE}
+    overrides: dict[str, Any] = {"gateways_fixed": controller != ALONE}
     chosen: dict[str, str] = {}
     for word in words:
         option = _option(word)

@@ -159,8 +159,8 @@ def _delay(signal: Signal, durations: list[float], lanes: list[_Lane], opposing,
                 if light == "G":
                     headway += share / rate
                 elif light == "g":
-                    against = opposing.get((n, lane.edge), (SATURATION, SATURATION))
-                    headway += share / min(_permitted(*against, durations[n], cycle), rate)
+                    flow, fullest = opposing.get((n, lane.edge), (SATURATION, SATURATION))
+                    headway += share / min(_permitted(flow, fullest, durations[n], cycle), rate)
                 else:
                     headway = math.inf
             if headway < math.inf:

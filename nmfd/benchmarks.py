@@ -13,10 +13,10 @@ from nmfd import closed_loop, faults, runs
 from nmfd.controllers import registry
 from nmfd.plant import AcyclicPlant, NmfdPlant
 from nmfd.scenario import Scenario
-from nmfd.types import Trajectory
+from nmfd.types import Plant, Trajectory
 from nmfd.workers import Failure, attempt, ended, outcomes
 
-PLANTS = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
+PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
 CAPTION = (
     "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against no-control; control: time of all\n"
@@ -49,7 +49,6 @@ def benchmark(
     failed, which the message names. Every finished run is kept, whatever happens to the others.
     """
     policies = policies or {}
-    faults.without_city(faults.of(scenario), f"{scenario.name}: faults")
     for name in controllers:
         registry.make(name, scenario, policy=policies.get(name))
     common, settings = configuration(scenario, controllers, plant, policies)
@@ -73,7 +72,9 @@ def benchmark(
 
 
 def configuration(scenario: Scenario, controllers, plant: str, policies) -> tuple[dict, dict]:
-    """What all runs have in common, and what each controller depends on besides."""
+    """What all runs have in common, and what each controller depends on besides. InputError for a fault that the
+    regional model cannot have."""
+    faults.without_city(faults.of(scenario), f"{scenario.name}: faults")
     settings = {}
     for name in controllers:
         policy = registry.policy_path(name, scenario, policies.get(name))
@@ -90,7 +91,7 @@ def _label(run: tuple[str, int]) -> str:
 
 
 def results(
-    work: Callable, todo: Sequence[tuple], workers: int, steps: int, progress, *, label: Callable[[tuple], str],
+    work: Callable, todo: Sequence[tuple], workers: int, steps: int, progress, *, label: Callable[..., str],
 ) -> Iterator[tuple]:
     """(run, result or Failure) of every run, in this process if there is one worker.
 

@@ -181,7 +181,7 @@ def _shares(row: toml.Table, neighbours: tuple[int, ...]) -> dict[int, float]:
 
 def _boundary(row: toml.Table, regions: int, adjacent: tuple[int, ...]) -> dict:
     """The options of one region: exit_rates (R,), capacity (one per region it leads to), storage; None if absent."""
-    found = {
+    found: dict = {
         "exit_rates": row.numbers("exit_rates", length=regions) if row.has("exit_rates") else None,
         "capacity": row.numbers("capacity", length=len(adjacent)) if row.has("capacity") else None,
         "storage": row.number("storage", above=0.0, high=MOST) if row.has("storage") else None}

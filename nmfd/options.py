@@ -15,10 +15,10 @@ COUNT = click.IntRange(1, 10**6)
 
 
 class Positive(click.FloatRange):
-    """Above 0 and up to a million; not NaN, which click lets pass."""
+    """Above 0, or from it, and up to `most`; not NaN, which click lets pass."""
 
-    def __init__(self):
-        super().__init__(0.0, 1e6, min_open=True)
+    def __init__(self, most: float, *, zero: bool = False):
+        super().__init__(0.0, most, min_open=not zero)
 
     def convert(self, value, param, ctx):
         number = super().convert(value, param, ctx)
@@ -27,7 +27,8 @@ class Positive(click.FloatRange):
         return number
 
 
-POSITIVE = Positive()
+POSITIVE = Positive(1e6)
+LEVEL = Positive(10.0)  # of demand
 
 
 def fault_option(more: str = ""):

@@ -367,7 +367,7 @@ def manifest(
                 parent.rmdir()
 
 
-def _continued(manifest_path: Path, configuration: dict, controllers: dict, *, renewable: bool) -> tuple:
+def _continued(manifest_path: Path, configuration: Mapping, controllers: Mapping, *, renewable: bool) -> tuple:
     """The sessions so far, the controllers there and in `controllers`, and those that changed -> what of them.
 
     InputError where the configurations, or without `renewable` the controllers, do not agree.

@@ -2,6 +2,7 @@
 
 import math
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 
 from nmfd.errors import InputError
@@ -42,7 +43,7 @@ def shown(value) -> str:
 class Table:
     """One TOML table. Every key is taken once; `close` complains of the keys that nobody took."""
 
-    def __init__(self, values: dict, path: Path, prefix: str = ""):
+    def __init__(self, values: Mapping, path: Path | str, prefix: str = ""):
         self._values, self._path, self._prefix = dict(values), path, prefix
         self._known: list[str] = []
         self._taken: dict = {}

@@ -25,6 +25,7 @@ import nmfd.cli
 from nmfd import benchmarks, closed_loop, training
 from nmfd.controllers.dpc import Architecture, Policy, checkpoint
 from nmfd.network import load_network
+from nmfd.scenario import load_scenario
 
 ROOT = Path(__file__).parents[1]
 MAINS = {"nmfd": nmfd.cli.main, "cosim": cosim.cli.main}
@@ -144,6 +145,18 @@ def test_every_key_of_a_recipe(tmp_path):
                ("0 0 0", "0 . 0"))
     pictures = [(f"regions {old!r} -> {new!r}", text.replace(old, new, 1).encode()) for old, new in changes]
     assert every([*toml_cases(text, 4, [("centre", "x"), ("signals", "cycle")]), *pictures], test) > 80
+
+
+@pytest.mark.parametrize("name", ["pi_gating", "pi-gatin", "dcp-pc", "dpc-pc-robst", "pi-gatng+max-pressure"])
+def test_a_table_of_a_controller_that_is_misspelt(tmp_path, name):
+    text, out = f'{tiny.SCENARIO}\n[controllers."{name}"]\nx = 1\n', tmp_path / "out"
+    scenario = tiny.write(tmp_path, scenario=text)
+    line = check("nmfd", "benchmark", scenario, "--controllers", "no-control", "--out", out, out=out)
+    assert f"controllers.{name}: unknown controller; choose from " in line
+
+
+def test_a_table_of_a_controller_of_the_users_own_is_his_business(tmp_path):
+    load_scenario(tiny.write(tmp_path, scenario=tiny.SCENARIO + "\n[controllers.own.my-controller]\ngain = 'x'\n"))
 
 
 def npz(**arrays) -> bytes:
@@ -468,6 +481,13 @@ LINES = {
         scaling --family square --out {none}
         scaling --memory 0|nan|-1|x --out {none}
         scaling --time-limit 0|nan|x --out {none}
+        export {none} --out {out}
+        export {s}/scenario.toml --out {out}
+        export {s}/scenario.toml
+        new-controller {s}/scenario.toml|{none}/x.py|/dev/null/x.py
+        new-controller
+        benchmark {s} --controllers {none}.py:Mine|{s}/scenario.toml:Mine|mine.py
+        benchmark {s} --controllers no-control --fault x|frozen:1|closed:a
         nonsense
         --nonsense
     """,
@@ -496,6 +516,28 @@ LINES = {
         compare {g} --controller x
         compare {g} --seed -1
         compare
+        report {none}|{g}
+        report
+        report {none} --reference x
+        sweep {g} --controllers x|no-control,no-control|,
+        sweep {g} --controllers no-control --seeds 0|x|99999999999
+        sweep {g} --controllers no-control --first-seed -1|9999999999
+        sweep {g} --controllers no-control --demand 0|nan|x|1,1
+        sweep {g} --controllers no-control --compliance -1|101|nan|x|1,1
+        sweep {g} --controllers dpc-pc --policy x|dpc-pc={none}
+        sweep {g} --controllers no-control --scheduler nowhere
+        sweep {none} --controllers no-control
+        video {none}|{g}
+        video {g} --rate 0|x
+        video {g} --demand nan|0|11
+        watch {none} --controller no-control
+        watch {g} --controller x
+        watch {g} --controller no-control --delay nan|-1|x
+        watch {g} --controller no-control --demand nan|0|11
+        watch {g} --controller no-control --seed -1
+        watch {g} --controller no-control --steps 0
+        run {g} --controller no-control --fault x|closed:nowhere|signal:nobody|missing:7
+        run {g} --controller {none}.py:Mine
         identify {none}
         identify {g} --levels 0|x|nan|1,1
         identify {g} --seeds 0|x

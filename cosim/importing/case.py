@@ -87,8 +87,8 @@ def root_of(path: Path) -> ElementTree.Element:
     """The root element of an XML file, with its attributes only. Raises InputError."""
     try:
         with opened(path) as stream:
-            for _, element in ElementTree.iterparse(stream, events=("start",)):
-                return element
+            _, element = next(iter(ElementTree.iterparse(stream, events=("start",))))
+            return element
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; give the path of an existing one") from None
     except BROKEN as error:

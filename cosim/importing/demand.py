@@ -126,9 +126,9 @@ class _Reader:
             if element.tag == "routeDistribution":
                 self._routes[element.get("id")] = self._likeliest(element)
         for zone in element.iter("taz"):
-            members = [(edge, 1.0) for edge in zone.get("edges", "").split()]
+            inside = [(edge, 1.0) for edge in zone.get("edges", "").split()]
             self._zones[zone.get("id")] = {
-                key: members + [(e.get("id"), float(e.get("weight", 1.0))) for e in zone.iter(tag)]
+                key: inside + [(e.get("id"), float(e.get("weight", 1.0))) for e in zone.iter(tag)]
                 for key, tag in (("from", "tazSource"), ("to", "tazSink"))}
 
     def _likeliest(self, distribution: Element) -> list[str]:

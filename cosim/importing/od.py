@@ -83,7 +83,7 @@ def _read_lines(path: Path) -> list[Cell]:
     if len(times) != 2:
         raise InputError(f"{path}: expected from-time and to-time, such as 7.00 8.00, got {' '.join(times)!r} instead")
     factor = _number(_next(rows, path, "factor"), f"{path}: factor")
-    shared = {"begin": _hours(times[0], path), "end": _hours(times[1], path), "type": kind, "where": str(path)}
+    shared: dict = {"begin": _hours(times[0], path), "end": _hours(times[1], path), "type": kind, "where": str(path)}
     found = []
     if head[0] == "O":
         for row in rows:

@@ -77,7 +77,7 @@ class Guarded:
         self._policy.reset(seed)
         self._left = 0          # intervals that PI gating keeps the control for
         self._error = 0.0       # squared, of the predictions so far
-        self._predicted = None  # accumulations (R,) at the end of this interval
+        self._predicted: np.ndarray | None = None  # accumulations (R,) at the end of this interval
 
     def distance(self, accumulation: np.ndarray) -> float:
         """Mahalanobis distance of accumulation (R, R) [veh] from the training states, as a share of its limit."""

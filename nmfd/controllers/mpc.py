@@ -7,6 +7,7 @@ simplex and acts linearly on the model, so that nearly all of them end at a boun
 gradients, while an interior-point method factorises the whole horizon some twenty times.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -148,10 +149,10 @@ class EconomicMpc:
         self._moves = horizon - 1 if blind else horizon
         self._model = build(network, self._used, guidance=guidance)
         rounded = replace(self._model, rounding=ROUNDING * min(mfd.jam for mfd in network.mfds))
-        scheme = {"step": scenario.step, "substeps": scenario.substeps, "integrator": scenario.integrator}
-        self._exact = partial(vehicle_steps, self._model, **scheme)
-        self._rounded = partial(vehicle_steps, rounded, gradient=True, **scheme)
-        self._at_stake = partial(vehicles_at_stake, self._model, **scheme)
+        scheme: dict = {"step": scenario.step, "substeps": scenario.substeps, "integrator": scenario.integrator}
+        self._exact: Callable = partial(vehicle_steps, self._model, **scheme)
+        self._rounded: Callable = partial(vehicle_steps, rounded, gradient=True, **scheme)
+        self._at_stake: Callable = partial(vehicles_at_stake, self._model, **scheme)
         self.admissible = Admissible(network, self._model, guidance=guidance)
         self._open = self.admissible.open(self._moves)
         self._gating = PiGating(scenario) if scenario.protected else None

@@ -10,7 +10,8 @@ class Sb3VecEnv(VecEnv):
     """`PPO("MlpPolicy", Sb3VecEnv(NmfdVectorEnv(scenario, 64)))`; episodes end by time limit and begin anew at once."""
 
     def __init__(self, env: NmfdVectorEnv):
-        self.env, self.render_mode, self._seed = env, None, None
+        self.env, self.render_mode = env, None
+        self._seed: int | None = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> np.ndarray:
