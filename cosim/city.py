@@ -105,6 +105,7 @@ def _built(recipe_file: Path, network: Network) -> SumoFiles:
             files.regions_csv.is_file()):
         return files
     folder.mkdir(exist_ok=True)
+    stamp_file.unlink(missing_ok=True)  # nothing here counts until it is written again
     net, regions = build(recipe, str(recipe_file))
     # the stamp comes last: whoever sees it finds the files that belong to it
     for file, content in ((files.net_file, net), (files.regions_csv, regions), (stamp_file, stamp.encode())):
@@ -128,7 +129,7 @@ def read_recipe(path: Path, regions: int) -> Recipe:
     region = centre.integer("region", high=regions - 1)
     centre_x, centre_y = _lines(centre, "x"), _lines(centre, "y")
     outer_x, outer_y = _lines(outer, "x"), _lines(outer, "y")
-    picture = [line.split() for line in outer.text("regions").strip().splitlines()][::-1]
+    picture = [line.split() for line in outer.lines("regions")][::-1]
     if [len(row) for row in picture] != [len(outer_x)] * len(outer_y):
         raise outer.error("regions", f"expected {len(outer_y)} rows of {len(outer_x)} regions or dots; correct it")
     nodes = {}

@@ -18,6 +18,7 @@ from cosim.simulate import Task
 from nmfd import runs
 from nmfd.errors import InputError
 from nmfd.scenario import load_scenario
+from nmfd.workers import ended
 
 FIRST_SEED = 2000  # these seeds are kept for evaluations: nothing was chosen, trained or identified on them
 
@@ -71,7 +72,9 @@ def evaluate(
         why = reasons.text(level_folders(out), scenario.network, rows)
         runs.write_text(out / "evaluate.md", tables.markdown(table, evaluation.reference) + "\n" + why)
         report.draw_all(out, level_folders(out), scenario, rows)
-    return table, [f"{experiment.label(task)}: {reason}" for task, reason in failures]
+    if failures and table.empty and all(failure.mistake for _, failure in failures):
+        raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])
+    return table, [f"{experiment.label(task)}: {failure.reason}" for task, failure in failures]
 
 
 def level_folders(out: Path) -> dict[float, Path]:

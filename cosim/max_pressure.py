@@ -10,7 +10,7 @@ x counts vehicles per lane, as loops and cameras see them; on lanes that several
 turn lanes, they are shared out by r, from the demand's static routes.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -48,10 +48,10 @@ class MaxPressure:
         for junction in self._junctions:
             session.set_signal_state(junction.signal, junction.state)
 
-    def command(self, share: np.ndarray) -> None:
-        """(R, R) [-]: (u - u_min) / (u_max - u_min)."""
+    def command(self, share: np.ndarray, opened: Mapping[str, Collection[int]]) -> None:
+        """share: (R, R) [-], (u - u_min) / (u_max - u_min); opened: signal -> gateway links without a ration."""
         for junction in self._junctions:
-            junction.command(share)
+            junction.command(share, opened.get(junction.signal, ()))
 
     def green_time(self) -> dict[str, dict[int, float]]:
         """Signal -> gateway link -> seconds of green shown so far."""
@@ -106,9 +106,9 @@ class Junction:
     def rationed(self) -> bool:
         return bool(self._rations)
 
-    def command(self, share: np.ndarray) -> None:
-        for ration in self._rations.values():
-            ration.command(float(share[ration.pair]))
+    def command(self, share: np.ndarray, opened: Collection[int] = ()) -> None:
+        for link, ration in self._rations.items():
+            ration.command(1.0 if link in opened else float(share[ration.pair]))
 
     def exhausted(self) -> set[tuple[str, str]]:
         """(edge, next edge) of the gateway movements that get no more green for now."""

@@ -2,28 +2,30 @@
 
 import tempfile
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from cosim import webster
+from cosim import sumo_output, webster
 from cosim.actuate import GREEN, Actuator, GatewaySignal
 from cosim.actuated import actuated_row
 from cosim.city import ensure_built
 from cosim.detectors import EVERY, Detectors, instruments, lay_out, probes, write_loops
 from cosim.flows import own_flows, turning_flows
 from cosim.guidance import Guide
+from cosim.incidents import Incidents
 from cosim.max_pressure import MaxPressure
 from cosim.measure import Meter
-from cosim.originals import MESOSCOPIC, Originals, read_originals, read_routes, write_originals
-from cosim.regions import City, Gateway, check_adjacency, load_city
+from cosim.originals import MESOSCOPIC, Originals, check_edges, read_originals, read_routes, write_originals
+from cosim.regions import City, Gateway, check_adjacency, gateway_room_taken, load_city
 from cosim.signals import Signal, read_signals, write_programmes
 from cosim.strategy import ACTUATED, FIXED, HOLD_BACK, MAX_PRESSURE, MODES, SIGNALS, WEBSTER
-from cosim.sumo import Session
+from cosim.sumo import Session, Window
 from cosim.trip_facts import TripFacts, read_trip_facts, trip_options
 from cosim.trips import write_trips
-from nmfd import toml
+from nmfd import faults, toml
 from nmfd.errors import InputError
 from nmfd.estimation import Estimator
 from nmfd.scenario import Scenario, read_tables
@@ -44,6 +46,8 @@ class Settings:
 
     step_length: of SUMO [s]; time_to_teleport: [s], -1 for never; collision_action: SUMO's
     actuation: "hold-back" or "redistribute"; min_green: of a gateway movement [s]
+    queue_override: a gateway whose edge held this share of its room in the last control interval is left open, 0 for
+        never [-]
     compliance: share of the decisions in which a driver follows the route guidance [-]
     most_detour: a driver does not follow route guidance into a next region that costs him more than this [s]
     rerouting: share of the drivers with SUMO's own rerouting device [-]
@@ -69,6 +73,7 @@ class Settings:
     collision_action: str = "warn"
     actuation: str = HOLD_BACK
     min_green: float = 5.0
+    queue_override: float = 0.0
     compliance: float = 1.0
     most_detour: float = 60.0
     rerouting: float = 0.0
@@ -99,6 +104,7 @@ def settings(scenario: Scenario) -> Settings:
             "collision_action", default.collision_action, ("none", "warn", "teleport", "remove")),
         actuation=table.text("actuation", default.actuation, MODES),
         min_green=table.number("min_green", default.min_green, low=1.0),
+        queue_override=table.number("queue_override", default.queue_override, low=0.0, high=1.0),
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
         most_detour=table.number("most_detour", default.most_detour, low=0.0),
         rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0),
@@ -124,6 +130,13 @@ def settings(scenario: Scenario) -> Settings:
             f"{path}: sumo.step_length: expected a divisor of the control interval {scenario.step:g} s, got "
             f"{chosen.step_length:g} instead")
     return chosen
+
+
+def own_vehicles(scenario: Scenario, chosen: Settings, city: City) -> Originals:
+    """The vehicles of the route files that [sumo] names. Raises InputError."""
+    originals = read_originals([scenario.folder / name for name in chosen.routes])
+    check_edges(originals, city, f"{scenario.folder / 'scenario.toml'}: sumo.routes")
+    return originals
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,9 +178,17 @@ class SumoPlant:
     since the reset.
     """
 
-    def __init__(self, scenario: Scenario, *, overrides: Settings | None = None):
-        """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network."""
-        self._scenario, self._originals = scenario, None
+    def __init__(
+        self, scenario: Scenario, *, overrides: Settings | None = None, outputs: Mapping[str, Path] | None = None,
+        window: Window | None = None,
+    ):
+        """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network.
+
+        outputs: kind (cosim.sumo_output) -> file, of SUMO's own outputs; complete after `trip_facts` or `close`
+        window: to watch; the simulation is the same, only slower
+        """
+        self._scenario, self._originals, self._window = scenario, None, window
+        self._outputs = dict(outputs or {})
         self._settings = overrides or settings(scenario)
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
@@ -196,12 +217,12 @@ class SumoPlant:
         scenario, chosen = self._scenario, self._settings
         routes = Path(self._folder.name) / "trips.rou.xml"
         self._vehicles, files = self._write_vehicles(routes, seed), [routes]
-        self._trip_file = routes.with_name("tripinfo.xml")
+        self._trip_file = self._outputs.get("tripinfo", routes.with_name("tripinfo.xml"))
         steered = [s for s in self.simple_signals if not (
             chosen.gateways_fixed and chosen.signals == ACTUATED and s.id in self._gateway_ids)]
         options = [
-            *trip_options(self._trip_file), "--begin", str(chosen.begin), "--ignore-route-errors",
-            str(bool(chosen.routes)).lower()]
+            *trip_options(self._trip_file), *sumo_output.options(self._outputs), "--begin", str(chosen.begin),
+            "--ignore-route-errors", str(bool(chosen.routes)).lower()]
         if chosen.rerouting > 0:
             options += [*REROUTING, "--device.rerouting.probability", str(chosen.rerouting)]
         if chosen.mesoscopic:
@@ -215,12 +236,16 @@ class SumoPlant:
             loops = Path(self._folder.name) / "loops.add.xml"
             write_loops(self.city, self._layout, scenario.step, loops)
             additional.append(loops)
+        additional += self._window.additional if self._window else ()
+        if "edgedata" in self._outputs:
+            additional.append(sumo_output.write_edge_data(
+                routes.with_name("edgedata.add.xml"), self._outputs["edgedata"], scenario.step))
         if additional:
             options += ["--additional-files", ",".join(map(str, additional))]
         self._session = Session(
             self._net_file, files, seed=seed, step_length=chosen.step_length,
             time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action,
-            options=tuple(options))
+            options=tuple(options), window=self._window)
         self._meter = Meter(
             self._session, self.city, probes(self._vehicles, chosen.probe_share, seed) if estimating else frozenset())
         self._detectors, self._estimator = None, None
@@ -240,17 +265,21 @@ class SumoPlant:
             self._rationed = {signal.id: signal for signal in steered if signal.id in self._gateway_ids}
         self._signals = self._gateway_signals()
         self._original_green = self._programmed_green()
-        self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
-        self._k, self._rows, self._speed = 0, [], None
+        self._incidents = Incidents(faults.of(scenario), self._session, self.city)
+        self._actuator = Actuator(list(self._signals.values()), self._incidents.show)
+        self._k, self._rows, self._speed, self._opened = 0, [], None, {}
         return self._estimated(self._measurement()) if estimating else self._measurement()
 
     def step(self, controls: Controls) -> Measurement:
         network, session, meter = self._scenario.network, self._session, self._meter
         before = self._totals()
+        self._incidents.begin(self._k)
+        if self._detectors:
+            self._detectors.silence(self._incidents.silent_loops)
         share = np.clip((controls.perimeter - network.u_min) / (network.u_max - network.u_min), 0.0, 1.0)
-        self._actuator.command(share)
+        self._actuator.command(share, self._opened)
         if self._max_pressure is not None:
-            self._max_pressure.command(share)
+            self._max_pressure.command(share, self._opened)
         self._guide.command(controls.splits, self._speed)
         begin, steps = session.time, round(self._scenario.step / session.step_length)
         every, often = (
@@ -277,16 +306,22 @@ class SumoPlant:
             self._estimator.step(
                 controls, self._detectors.observation(after["gateway_flow"] - before["gateway_flow"]))
             measurement = self._estimated(measurement)
+        measurement = replace(measurement, problem=self._incidents.problem(estimating=self._estimator is not None))
         row = {key: after[key] - before[key] for key in after}
         with np.errstate(invalid="ignore"):
             self._speed = metres / vehicles
+        self._speed[self._incidents.closed] = 0.0  # nobody is sent through a street because it is empty
         row["production"], row["mean_accumulation"] = (
             np.bincount(self._edge_region, amount, network.regions) / len(queues) for amount in (metres, vehicles))
+        self._opened = self._overridden(vehicles / len(queues))
         row["edge_vehicles"] = (vehicles / len(queues)).astype(np.float16)  # to 0.1 % and as small as an integer
         queues = np.array(queues).reshape(len(queues), len(self._upstream))
         row["gateway_queue"], row["gateway_queue_max"] = (
             queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))
         row["gateway_original_green"] = self._original_green
+        for n, gateway in enumerate(self.city.gateways):
+            if self._incidents.refused(gateway.signal):
+                row["gateway_green"][n] = self._original_green[n]
         self._rows.append(row)
         return measurement
 
@@ -332,7 +367,7 @@ class SumoPlant:
         if not chosen.routes:
             return [f"v{n}" for n in range(write_trips(self.city, scenario.demand, scenario.step, seed, path))]
         if self._originals is None:
-            self._originals: Originals | None = read_originals([scenario.folder / name for name in chosen.routes])
+            self._originals: Originals | None = own_vehicles(scenario, chosen, self.city)
         return write_originals(
             self._originals, path, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
             begin=chosen.begin)
@@ -382,6 +417,14 @@ class SumoPlant:
                     mode=self._settings.actuation, start=self._session.time)
         return signals
 
+    def _overridden(self, edge_vehicles: np.ndarray) -> dict[str, set[int]]:
+        """Signal -> links of the gateways that stay open because of their queue. edge_vehicles: (E,) [veh], mean."""
+        limit, links = self._settings.queue_override, {}
+        for n in np.flatnonzero(gateway_room_taken(edge_vehicles, self.city) >= limit) if limit else ():
+            gateway = self.city.gateways[n]
+            links.setdefault(gateway.signal, set()).update(gateway.links)
+        return links
+
     def _programmed_green(self) -> np.ndarray:
         """(G,) [s] per control interval, as Record.gateway_original_green."""
         green = np.full(len(self.city.gateways), np.nan)
@@ -396,7 +439,7 @@ class SumoPlant:
 
     def _measurement(self) -> Measurement:
         return Measurement(
-            step=self._k, time=self._k * self._scenario.step, accumulation=self._meter.accumulation(),
+            step=self._k, time=self._k * self._scenario.step, accumulation=self._meter.accumulation(self._k),
             backlog=self._meter.backlog())
 
     def _estimated(self, measurement: Measurement) -> Measurement:

@@ -6,8 +6,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cosim import experiment, facts, figures, tables
+from cosim import compare, experiment, facts, figures, tables
 from cosim.city import ensure_built
+from cosim.importing import atlas
+from cosim.importing.quality import Tables
+from cosim.importing.streets import read_streets
+from cosim.plant import settings
 from cosim.regions import City, edge_shapes, load_city
 from cosim.simulate import Result
 from nmfd import plots
@@ -18,28 +22,43 @@ from nmfd.scenario import Scenario
 MAPS = 4       # times of the maps
 PANELS = 11    # boundaries, or pairs of region and destination, that are shown one by one
 WINDOW = 3     # control intervals over which realised shares are taken
+DRAWN = (      # what pictures of streets and gateways need of a record
+    "edge_vehicles", "gateway_queue", "gateway_flow", "gateway_green", "gateway_original_green", "crossings", "guided")
 
 
-def draw(folder: Path, scenario: Scenario, city: City, rows: pd.DataFrame) -> None:
-    """All pictures of one demand level into its run folder; `rows` as in cosim.tables, of this level."""
+def draw(
+    folder: Path, scenario: Scenario, city: City | None, rows: pd.DataFrame, out: Path | None = None,
+) -> None:
+    """All pictures of one demand level into `out`, or into its run folder; `rows` as in cosim.tables, of this level.
+
+    Those of streets and gateways need the `city`, and records that hold DRAWN.
+    """
+    out = folder if out is None else out
     names = ranked(rows)
     seed = shown_seed(rows)
     order = list(dict.fromkeys(rows["controller"]))
     runs = sorted(experiment.trajectories(folder), key=lambda t: (order.index(t.controller), t.seed))
     note = teleports(rows)
-    draw_accumulations(folder, scenario, runs, seed=seed, title=f"seed {seed}, shaded: all seeds; {note}")
-    results = {name: experiment.read_run(folder, name, seed) for name in names if seed in set(
-        rows.loc[rows["controller"] == name, "seed"])}
+    draw_accumulations(out, scenario, runs, seed=seed, title=f"seed {seed}, shaded: all seeds; {note}")
+    results = {} if city is None else {
+        name: result for name, result in recorded(folder, rows, seed).items() if set(DRAWN) <= set(result.record)}
     best = next((name for name in names if name != REFERENCE and name in results), None)
     pair = {name: results[name] for name in (REFERENCE, best) if name in results}
-    link_maps(folder / "link_densities.png", city, pair, f"seed {seed}; {note}")
-    gateway_queues(folder / "gateway_queues.png", city, pair, f"seed {seed}; {note}")
+    if pair:
+        link_maps(out / "link_densities.png", city, pair, f"seed {seed}; {note}")
+        gateway_queues(out / "gateway_queues.png", city, pair, f"seed {seed}; {note}")
     gating = next((name for name in names if name in results and acts(results[name], scenario.network)), None)
     if gating:
-        perimeter(folder / "perimeter.png", city, scenario.network, results[gating], note)
+        perimeter(out / "perimeter.png", city, scenario.network, results[gating], note)
     guiding = next((name for name in names if name in results and results[name].record["guided"].sum() > 0), None)
     if guiding:
-        splits(folder / "splits.png", scenario.network, results[guiding], note)
+        splits(out / "splits.png", scenario.network, results[guiding], note)
+
+
+def recorded(folder: Path, rows: pd.DataFrame, seed: int) -> dict[str, Result]:
+    """The runs of this seed, the best controller first."""
+    there = set(rows.loc[rows["seed"] == seed, "controller"])
+    return {name: experiment.read_run(folder, name, seed) for name in ranked(rows) if name in there}
 
 
 def acts(result: Result, network: Network) -> bool:
@@ -207,3 +226,45 @@ def draw_all(out: Path, folders: Mapping[float, Path], scenario: Scenario, rows:
         draw(folder, scenario, city, rows[rows["demand"] == level])
     if len(folders) > 1:
         demand_levels(out / "demand.png", rows)
+
+
+def draw_more(out: Path, scenario: Scenario, folder: Path, rows: pd.DataFrame) -> None:
+    """Beside `draw`, for a page, of one demand level: MFDs and decision times; arguments as there."""
+    results = recorded(folder, rows, shown_seed(rows))
+    best = next((name for name in results if name != REFERENCE), None)
+    outflows(out / "mfd.png", scenario.network, {
+        name: results[name] for name in (REFERENCE, best) if name in results})
+    decision_times(out / "decision_times.png", rows, scenario.step)
+
+
+def region_map(path: Path, scenario: Scenario, city: City) -> None:
+    """The regions and gateways of the city."""
+    streets = read_streets(city.net_file)
+    regions = np.array([city.region_of.get(edge, -1) for edge in streets.edges])
+    places = np.stack([streets.centre[streets.drivable & (regions == r)].mean(axis=0) for r in range(city.regions)])
+    left_alone = settings(scenario).leave_signals
+    gateways = [{
+        "from_edge": g.from_edge, "control": "controlled" if g.signal is not None and g.signal not in left_alone and
+        streets.logics[g.signal][-1].kind == "static" else "left alone"} for g in city.gateways]
+    atlas.draw_map(path, streets, regions, scenario.network.region_names, places,
+                   Tables(quality=(), gateways=gateways), None)
+
+
+def outflows(path: Path, network: Network, results: dict[str, Result]) -> None:
+    """The MFD of every region: of the regional model as a curve, in these runs as dots."""
+    samples = []
+    for region in range(network.regions):
+        clouds = {name: compare.outflow_samples(
+            [result.trajectory], [result.record], network.u_max, region, network.adjacency)
+            for name, result in results.items()}
+        samples.append({name: np.concatenate(list(parts.values())) for name, parts in clouds.items()})
+    compare.draw_mfds(path, network, samples)
+
+
+def decision_times(path: Path, rows: pd.DataFrame, step: float) -> None:
+    """Wall time per decision of every controller, all seeds."""
+    groups = rows.groupby("controller", sort=False)
+    median, longest = groups["control_step_ms_median"].median(), groups["control_step_ms_max"].max()
+    drawing = plots.figure(8.0, 1.4 + 0.32 * len(median))
+    figures.decision_times(drawing.subplots(), median.to_dict(), longest.to_dict(), step)
+    plots.save(drawing, path)

@@ -1,6 +1,5 @@
 """Signals as the network file describes them, and other programmes for them as an additional file of SUMO."""
 
-import gzip
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -9,7 +8,9 @@ from xml.sax.saxutils import quoteattr
 
 from cosim.regions import City
 from cosim.sumo import Phase
+from cosim.xml_files import BROKEN, read_xml
 from nmfd import runs
+from nmfd.errors import InputError
 
 GREEN = frozenset("Gg")
 
@@ -54,7 +55,14 @@ def read_signals(city: City, additional: Iterable[Path] = ()) -> tuple[list[Sign
     Of several programmes the one that is read last counts, as in SUMO: those of the network file come first, then those
     of the `additional` files.
     """
-    root = _parsed(city.net_file)
+    try:
+        return _signals(city, additional)
+    except BROKEN as error:
+        raise InputError(f"{city.net_file}: its signals cannot be read ({error}); build it with netconvert") from None
+
+
+def _signals(city: City, additional: Iterable[Path]) -> tuple[list[Signal], list[str]]:
+    root = read_xml(city.net_file)
     links: dict[str, list[Link]] = {}
     for connection in root.iter("connection"):
         ends = connection.get("from"), connection.get("to")
@@ -62,7 +70,7 @@ def read_signals(city: City, additional: Iterable[Path] = ()) -> tuple[list[Sign
             links.setdefault(connection.get("tl"), []).append(Link(
                 index=int(connection.get("linkIndex")), from_edge=ends[0], lane=int(connection.get("fromLane")),
                 to_edge=ends[1], turn=connection.get("dir", "s").lower()))
-    logics = {logic.get("id"): logic for file in (root, *map(_parsed, additional)) for logic in file.iter("tlLogic")}
+    logics = {logic.get("id"): logic for file in (root, *map(read_xml, additional)) for logic in file.iter("tlLogic")}
     simple, others = [], []
     for name, logic in logics.items():
         found = _simple(logic, tuple(links.get(name, ())))
@@ -71,11 +79,6 @@ def read_signals(city: City, additional: Iterable[Path] = ()) -> tuple[list[Sign
         else:
             others.append(name)
     return sorted(simple, key=lambda signal: signal.id), sorted(others)
-
-
-def _parsed(path: Path) -> ElementTree.Element:
-    with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as stream:
-        return ElementTree.parse(stream).getroot()
 
 
 def _simple(logic: ElementTree.Element, links: tuple[Link, ...]) -> Signal | None:

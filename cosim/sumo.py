@@ -1,14 +1,37 @@
-"""The SUMO session: the only file that imports libsumo. At most one simulation per process."""
+"""The SUMO session: the only file that imports libsumo. At most one simulation per process.
 
+libsumo has no window: where one is asked for, sumo-gui runs beside this process and traci, which has libsumo's
+functions, talks to it.
+"""
+
+import io
+import subprocess
+import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import libsumo
+import traci
 
 from cosim.originals import BOUND
 from nmfd.errors import InputError
+from nmfd.workers import RunFailed
+
+REFUSALS = (libsumo.TraCIException, traci.TraCIException)  # of one order: the simulation goes on
+FATAL = (libsumo.FatalTraCIError, traci.FatalTraCIError)
+LOST = (traci.FatalTraCIError, ConnectionError)  # what every order raises once the window was closed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """Run in sumo-gui: its command line options, and additional files to draw. program: of eclipse-sumo."""
+
+    options: tuple[str, ...] = ()
+    additional: tuple[Path, ...] = ()
+    program: str = "sumo-gui"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,61 +69,84 @@ class Session:
     def __init__(
         self, net_file: Path, route_file: Path | Sequence[Path], *, seed: int, step_length: float = 1.0,
         time_to_teleport: float = -1.0, collision_action: str = "warn", options: tuple[str, ...] = (),
+        window: Window | None = None,
     ):
         """Raises RuntimeError if another session is open in this process, InputError if SUMO refuses to start."""
         if Session._open:
             raise RuntimeError("a SUMO session is already open in this process; close it first")
-        self.sumo_time, self.step_length = 0.0, step_length
+        self.sumo_time, self.step_length, self._exits = 0.0, step_length, False
         routes = ",".join(map(str, [route_file] if isinstance(route_file, Path) else route_file))
         self.command = [
             "sumo", "--net-file", str(net_file), "--route-files", routes, "--seed", str(seed),
             "--step-length", str(step_length), "--time-to-teleport", str(time_to_teleport), "--collision.action",
             collision_action, "--no-step-log", "true", "--no-warnings", "true", "--duration-log.disable", "true",
             *options]
+        self._sumo = sumo = libsumo if window is None else traci
         try:
-            libsumo.start(self.command)
-        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+            if window is None:
+                libsumo.start(self.command)
+            else:
+                _start(window, self.command)
+        except (*REFUSALS, *FATAL) as error:
+            if window is not None:
+                raise InputError(
+                    f"{window.program} cannot show {net_file}: {_one_line(error)}; check DISPLAY, or use `cosim run` "
+                    "and `cosim video`") from None
             raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {_one_line(error)}") from None
         Session._open = True
-        self.time = libsumo.simulation.getTime()
+        self.time = sumo.simulation.getTime()
+        # Asked so often that a Python call around them would cost as much as SUMO's answer:
+        # road(vehicle), the edge it is on, normal or internal; route(vehicle), its edges.
+        self.road, self.route = sumo.vehicle.getRoadID, sumo.vehicle.getRoute
+        # Edges: the vehicles on one and their number, mean speed [m/s] (the limit if empty), vehicles under 0.1 m/s.
+        self.vehicles_on, self.vehicle_count = sumo.edge.getLastStepVehicleIDs, sumo.edge.getLastStepVehicleNumber
+        self.mean_speed, self.halting = sumo.edge.getLastStepMeanSpeed, sumo.edge.getLastStepHaltingNumber
+        # Lanes: the same, for max-pressure control, which asks for a thousand of them every few seconds.
+        self.lane_vehicles = sumo.lane.getLastStepVehicleNumber
+        self.lane_halting = sumo.lane.getLastStepHaltingNumber
+        # Loop detectors: the share of the last step in which a vehicle was on one [%].
+        self.loop_occupancy = sumo.inductionloop.getLastStepOccupancy
 
     def close(self) -> None:
         if Session._open:
             Session._open = False
-            libsumo.close()
+            with suppress(*LOST):  # the window may be gone
+                self._sumo.close()
 
     def step(self) -> None:
-        """Advance by one simulation step."""
+        """Advance by one simulation step. RunFailed, with its own words, if SUMO gives up."""
         before = time.perf_counter()
         try:
-            libsumo.simulationStep()
-        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-            raise RuntimeError(f"SUMO stopped at {self.time:g} s: {_one_line(error)}") from None
+            if self._exits:
+                raise libsumo.FatalTraCIError("ordered by the fault sumo-exits")
+            self._sumo.simulationStep()
+        except (libsumo.FatalTraCIError, *REFUSALS) as error:
+            raise RunFailed(f"SUMO stopped at {self.time:g} s: {_one_line(error)}") from None
         self.sumo_time += time.perf_counter() - before
-        self.time = libsumo.simulation.getTime()
+        self.time = self._sumo.simulation.getTime()
 
     # Vehicles: what happened in the last step.
 
     def loaded(self) -> tuple[str, ...]:
-        return libsumo.simulation.getLoadedIDList()
+        return self._sumo.simulation.getLoadedIDList()
 
     def departed(self) -> tuple[str, ...]:
-        return libsumo.simulation.getDepartedIDList()
+        return self._sumo.simulation.getDepartedIDList()
 
     def arrived(self) -> tuple[str, ...]:
-        return libsumo.simulation.getArrivedIDList()
+        return self._sumo.simulation.getArrivedIDList()
 
     def started_teleport(self) -> tuple[str, ...]:
-        return libsumo.simulation.getStartingTeleportIDList()
+        return self._sumo.simulation.getStartingTeleportIDList()
 
     def ended_teleport(self) -> tuple[str, ...]:
-        return libsumo.simulation.getEndingTeleportIDList()
+        return self._sumo.simulation.getEndingTeleportIDList()
 
     # Vehicles: the present state.
 
     def running(self) -> tuple[str, ...]:
         """On the road; teleporting ones are not."""
-        return libsumo.vehicle.getIDList()
+        return self._sumo.vehicle.getIDList()
 
     def teleports(self) -> int:
         """How many there were so far, by SUMO's own count: the mesoscopic model has no events for them."""
@@ -112,74 +158,110 @@ class Session:
 
     def pending(self) -> tuple[str, ...]:
         """Due to depart, but not yet inserted: the backlog."""
-        return libsumo.simulation.getPendingVehicles()
-
-    # Asked so often that a Python call around them would cost as much as SUMO's answer:
-    # road(vehicle), the edge it is on, normal or internal; route(vehicle), its edges.
-    road = staticmethod(libsumo.vehicle.getRoadID)
-    route = staticmethod(libsumo.vehicle.getRoute)
+        return self._sumo.simulation.getPendingVehicles()
 
     def is_free(self, vehicle: str) -> bool:
         """Whether its driver may choose another way: no public transport, and nothing to do on the way."""
         return (
-            libsumo.vehicle.getVehicleClass(vehicle) not in BOUND and not libsumo.vehicle.getLine(vehicle)
-            and not libsumo.vehicle.getStops(vehicle, 1))
+            self._sumo.vehicle.getVehicleClass(vehicle) not in BOUND and not self._sumo.vehicle.getLine(vehicle)
+            and not self._sumo.vehicle.getStops(vehicle, 1))
 
     def route_index(self, vehicle: str) -> int:
         """Where on its route a vehicle is."""
-        return libsumo.vehicle.getRouteIndex(vehicle)
+        return self._sumo.vehicle.getRouteIndex(vehicle)
 
     def emission_class(self, vehicle_type: str) -> str:
-        return libsumo.vehicletype.getEmissionClass(vehicle_type)
+        return self._sumo.vehicletype.getEmissionClass(vehicle_type)
 
     def set_route(self, vehicle: str, edges: list[str]) -> bool:
         """Give a vehicle on edges[0] a new route; False where SUMO refuses it (the old route then stays)."""
         try:
-            libsumo.vehicle.setRoute(vehicle, edges)
-        except libsumo.TraCIException:
+            self._sumo.vehicle.setRoute(vehicle, edges)
+        except REFUSALS:
             return False
         return True
 
     def reroutes(self, vehicle: str) -> bool:
         """Whether it has SUMO's rerouting device."""
-        return libsumo.vehicle.getParameter(vehicle, "has.rerouting.device") == "true"
-
-    # Edges: the vehicles on one and their number, mean speed [m/s] (the limit if empty), vehicles under 0.1 m/s.
-    vehicles_on = staticmethod(libsumo.edge.getLastStepVehicleIDs)
-    vehicle_count = staticmethod(libsumo.edge.getLastStepVehicleNumber)
-    mean_speed = staticmethod(libsumo.edge.getLastStepMeanSpeed)
-    halting = staticmethod(libsumo.edge.getLastStepHaltingNumber)
-
-    # Lanes: the same, for max-pressure control, which asks for a thousand of them every few seconds.
-    lane_vehicles = staticmethod(libsumo.lane.getLastStepVehicleNumber)
-    lane_halting = staticmethod(libsumo.lane.getLastStepHaltingNumber)
-
-    # Loop detectors: the share of the last step in which a vehicle was on one [%].
-    loop_occupancy = staticmethod(libsumo.inductionloop.getLastStepOccupancy)
+        return self._sumo.vehicle.getParameter(vehicle, "has.rerouting.device") == "true"
 
     # Signals.
 
     def programme(self, signal: str) -> Programme:
         """The programme that runs on `signal` now."""
-        active = libsumo.trafficlight.getProgram(signal)
-        for logic in libsumo.trafficlight.getAllProgramLogics(signal):
+        active = self._sumo.trafficlight.getProgram(signal)
+        for logic in self._sumo.trafficlight.getAllProgramLogics(signal):
             if logic.programID == active:
-                elapsed = sum(p.duration for p in logic.phases[:libsumo.trafficlight.getPhase(signal) + 1])
-                left = libsumo.trafficlight.getNextSwitch(signal) - libsumo.simulation.getTime()
+                elapsed = sum(p.duration for p in logic.phases[:self._sumo.trafficlight.getPhase(signal) + 1])
+                left = self._sumo.trafficlight.getNextSwitch(signal) - self._sumo.simulation.getTime()
                 return Programme(
                     signal=signal, phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
                     position=elapsed - left,
-                    static=logic.type == libsumo.constants.TRAFFICLIGHT_TYPE_STATIC)
+                    static=logic.type == self._sumo.constants.TRAFFICLIGHT_TYPE_STATIC)
         raise RuntimeError(f"signal {signal} has no programme {active}")
 
     def signals(self) -> tuple[str, ...]:
-        return libsumo.trafficlight.getIDList()
+        return self._sumo.trafficlight.getIDList()
 
     def signal_state(self, signal: str) -> str:
-        return libsumo.trafficlight.getRedYellowGreenState(signal)
+        return self._sumo.trafficlight.getRedYellowGreenState(signal)
 
-    def set_signal_state(self, signal: str, state: str) -> None:
-        libsumo.trafficlight.setRedYellowGreenState(signal, state)
+    def set_signal_state(self, signal: str, state: str) -> bool:
+        """False where SUMO does not take it."""
+        try:
+            self._sumo.trafficlight.setRedYellowGreenState(signal, state)
+        except REFUSALS:
+            return False
+        return True
+
+    # Incidents.
+    def restart_programme(self, signal: str) -> None:
+        """Let a signal run the programme again that it had in the beginning."""
+        lights = self._sumo.trafficlight
+        own = next(logic.programID for logic in lights.getAllProgramLogics(signal) if logic.programID != "online")
+        lights.setProgram(signal, own)
+
+    def limit_speed(self, edge: str, limits: list[float]) -> list[float]:
+        """Set the speed limits [m/s] of the lanes of an edge, one for each or one for all; those before."""
+        lanes = [f"{edge}_{n}" for n in range(self._sumo.edge.getLaneNumber(edge))]
+        before = [self._sumo.lane.getMaxSpeed(lane) for lane in lanes]
+        for lane, limit in zip(lanes, limits * len(lanes) if len(limits) == 1 else limits, strict=True):
+            self._sumo.lane.setMaxSpeed(lane, limit)
+        return before
+
+    def exit_at_next_step(self) -> None:
+        """As if SUMO gave up by itself."""
+        self._exits = True
+
+    # What is drawn in the window.
+
+    def paint(self, colours: Mapping[str, tuple[int, int, int]]) -> None:
+        """Give points of interest, by id, a colour (red, green, blue)."""
+        for mark, colour in colours.items():
+            self._sumo.poi.setColor(mark, (*colour, 255))
+
+
+def _start(window: Window, command: list[str]) -> None:
+    """As libsumo.start, with `window`. Raises FatalTraCIError with what the program has said."""
+    import sumo
+    from sumolib.miscutils import getFreeSocketPort
+
+    program = str(Path(sumo.SUMO_HOME) / "bin" / window.program)
+    with tempfile.TemporaryFile("w+") as said:
+        port = getFreeSocketPort()
+        process = subprocess.Popen(
+            [program, *command[1:], *window.options, "--remote-port", str(port)], stdout=said, stderr=said)
+        try:
+            with redirect_stdout(io.StringIO()):  # traci prints every attempt to connect
+                traci.init(port, proc=process)
+        except BaseException as error:
+            process.kill()
+            process.wait()
+            if not isinstance(error, (*REFUSALS, *FATAL)):
+                raise
+            said.seek(0)
+            words = [line for line in said.read().splitlines() if line.strip()]
+            raise traci.FatalTraCIError(words[-1] if words else _one_line(error)) from None
 
 
 def _one_line(error: Exception) -> str:

@@ -92,7 +92,7 @@ def statistics(rows: pd.DataFrame, reference: str | None = None) -> pd.DataFrame
                 "teleports": int(part["teleports"].sum()),
                 "gateway_queue_max_veh": part["gateway_queue_max_veh"].max(),
                 "control_step_ms_max": part["control_step_ms_max"].max(),
-                "late_decisions": int(part["late_decisions"].sum()),
+                "late_decisions": part["late_decisions"].sum(min_count=1),  # unknown in runs of an older version
                 "fallbacks": int(part["solver_failures"].sum())}
             out.append(row)
     return pd.DataFrame(out)

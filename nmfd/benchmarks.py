@@ -9,12 +9,12 @@ from pathlib import Path
 import torch
 from scipy.special import stdtrit
 
-from nmfd import closed_loop, runs
+from nmfd import closed_loop, faults, runs
 from nmfd.controllers import registry
 from nmfd.plant import AcyclicPlant, NmfdPlant
 from nmfd.scenario import Scenario
 from nmfd.types import Trajectory
-from nmfd.workers import Failure, RunFailed, attempt, outcomes
+from nmfd.workers import Failure, attempt, ended, outcomes
 
 PLANTS = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
@@ -49,6 +49,7 @@ def benchmark(
     failed, which the message names. Every finished run is kept, whatever happens to the others.
     """
     policies = policies or {}
+    faults.without_city(faults.of(scenario), f"{scenario.name}: faults")
     for name in controllers:
         registry.make(name, scenario, policy=policies.get(name))
     common, settings = configuration(scenario, controllers, plant, policies)
@@ -61,13 +62,13 @@ def benchmark(
         work = partial(run_one, scenario=scenario, plant=plant, policies=policies)
         for run, outcome in results(work, todo, workers, scenario.steps, progress, label=_label):
             if isinstance(outcome, Failure):
-                failures.append(f"controller {_label(run)}: {outcome.reason}")
+                failures.append((f"controller {_label(run)}", outcome))
             else:
                 folder.add(outcome)
         if folder.finished:
             draw(folder.path, scenario, folder.trajectories())
         if failures:
-            raise RunFailed("; ".join(failures))
+            raise ended(failures)
         return folder.rows()
 
 
@@ -76,7 +77,7 @@ def configuration(scenario: Scenario, controllers, plant: str, policies) -> tupl
     settings = {}
     for name in controllers:
         policy = registry.policy_path(name, scenario, policies.get(name))
-        settings[name] = {} if policy is None else {"policy_hash": runs.file_hash(policy)}
+        settings[name] = registry.fingerprint(name, policy)
     common = {
         "scenario": scenario.name, "scenario_hash": runs.scenario_hash(scenario), "network": scenario.network.name,
         "network_hash": scenario.network.hash, "plant": plant, "step_s": scenario.step, "steps": scenario.steps,

@@ -30,7 +30,7 @@ CONTROLLER_COLOURS = {
     "dpc-pc-guarded": "#c9a0dc", "dpc-pcrg-guarded": "#6a3d9a", "bound-pc": "#9aa33c", "bound-pcrg": "#4d6600",
 }
 CITY_COLOURS = {  # what a city may do without a regional controller
-    "webster": "#8c6d31", "actuated": "#a6761d", "max-pressure": "#009e73", "rerouting-30": "#7f7f7f",
+    "webster": "#00838f", "actuated": "#7e57c2", "max-pressure": "#009e73", "rerouting-30": "#7f7f7f",
     "rerouting-100": "#b5a642",
 }
 OTHER_COLOURS = ("#17becf", "#5254a3", "#843c39", "#66c2a5", "#bc80bd", "#1b5e20", "#fb8072", "#556b2f")
@@ -141,7 +141,8 @@ def region_estimate(ax: Axes, network: Network, region: int, trajectory: Traject
 def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> Axes:
     """Outflow against accumulation, over the green band and the red zone.
 
-    samples: label -> (n, 2) of accumulation [veh] and outflow [veh/s], such as {"loading": ..., "unloading": ...}
+    samples: label -> (n, 2) of accumulation [veh] and outflow [veh/s], such as {"loading": ..., "unloading": ...}, or
+        by controller
     """
     clouds = {label: np.asarray(cloud) for label, cloud in (samples or {}).items() if len(cloud)}
     jam = mfd.jam if np.isfinite(mfd.jam) else 2.0 * mfd.critical
@@ -151,6 +152,7 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> 
         right = min(right, max([1.25 * optimal_band(mfd)[1], *(1.1 * cloud[:, 0].max() for cloud in clouds.values())]))
     _zones(ax.axvspan, mfd, right)
     for (label, cloud), tone in zip(clouds.items(), _tones(len(clouds)), strict=True):
+        tone = (CONTROLLER_COLOURS | CITY_COLOURS).get(label, tone)
         ax.scatter(cloud[:, 0], cloud[:, 1], s=7, color=tone, alpha=0.6, linewidths=0, label=label)
     grid = np.linspace(0.0, right, 1001)
     ax.plot(grid, mfd.outflow(grid), color="black", linewidth=1.8, label="MFD")

@@ -95,6 +95,20 @@ def test_green_falls_from_the_original_to_the_minimum():
     assert (np.diff(green) >= 2).all()
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_an_opened_link_keeps_its_original_green(mode):
+    """The other gateway link of the signal is held all the same."""
+    signal = GatewaySignal(programme(SINGLE), {0: (0, 1), 1: (0, 1)}, min_green=MIN_GREEN, mode=mode, start=0.0)
+    signal.command(np.zeros((2, 2)), opened={0})
+    states = []
+    for second in range(180):
+        states.append(signal.update(float(second)))
+    check(states, SINGLE)
+    green = [sum(state[link] == "G" for state in states[90:]) for link in (0, 1)]
+    assert green[0] == 42
+    assert green[1] == MIN_GREEN if mode == "hold-back" else green[1] < 42
+
+
 def test_hold_back_touches_the_gateway_only():
     held = play(PHASES, {0: (0, 1)}, "hold-back", [np.zeros((2, 2))] * 3)
     free = play(PHASES, {0: (0, 1)}, "hold-back", [np.ones((2, 2))] * 3)

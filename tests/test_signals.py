@@ -14,7 +14,7 @@ from cosim.flows import turning_flows
 from cosim.green_wave import offsets
 from cosim.max_pressure import MIN_GREEN, Junction, Roads, transition
 from cosim.plant import Settings, SumoPlant
-from cosim.regions import load_city
+from cosim.regions import gateway_room_taken, load_city
 from cosim.signals import Link, Signal, read_signals
 from cosim.sumo import Phase
 from cosim.trips import make_trips
@@ -203,6 +203,23 @@ def test_perimeter_control_over_max_pressure(scenario, plant_of):
     assert np.nanmean(green) < 0.3 * np.nanmean(seen["open"][1].gateway_green)
     flows = [seen[name][1].gateway_flow.sum() for name in ("open", "closed")]
     assert flows[1] < 0.6 * flows[0]
+
+
+@pytest.mark.parametrize("signals", ["fixed", "max-pressure"])
+def test_queue_override(scenario, plant_of, signals):
+    """Closed gateways open where the edge before them is full, in the next interval, and nowhere else."""
+    plant = plant_of(signals=signals, queue_override=0.3)
+    _, _, record = drive(plant, scenario, 4, u=0.1)
+    full = gateway_room_taken(record.edge_vehicles.astype(float), plant.city) >= 0.3
+    green = record.gateway_green
+    assert full[:-1].any() and not full.all()
+    assert (green[1:][~full[:-1]] <= 2 * MIN_GREEN + 1.0).all()  # two windows in a cycle, at most
+    opened = green[1:][full[:-1]]
+    assert opened.mean() > 3.0 * green[1:][~full[:-1]].mean()
+    plant.close()
+    strict = plant_of(signals=signals)
+    _, _, held = drive(strict, scenario, 4, u=0.1)
+    assert held.gateway_flow.sum() < record.gateway_flow.sum()
 
 
 def test_max_pressure_is_safe(scenario, plant_of):

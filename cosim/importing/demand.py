@@ -9,10 +9,11 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from cosim.importing.case import Case, read_xml, seconds
+from cosim.importing.case import Case, seconds
 from cosim.importing.od import Cell, read_od, relations, trips
 from cosim.importing.streets import Streets
 from cosim.originals import BOUND
+from cosim.xml_files import read_xml
 from nmfd.errors import InputError
 
 DRIVERS = ("vehicle", "trip", "flow")

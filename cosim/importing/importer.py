@@ -166,7 +166,11 @@ def _folders(order: Order):
         for temporary, folder in made:
             temporary.chmod(0o755)
             folder.mkdir(exist_ok=True)
-            for file in sorted(temporary.iterdir()):
+            # Without its toml file a folder counts as nothing: it goes first and comes last.
+            for old in folder.glob("*.toml"):
+                if (temporary / old.name).exists():
+                    old.unlink()
+            for file in sorted(temporary.iterdir(), key=lambda file: (file.suffix == ".toml", file.name)):
                 os.replace(file, folder / file.name)
     finally:
         for temporary, _ in made:

@@ -12,12 +12,12 @@ from cosim.importing.case import Case, seconds
 from cosim.importing.demand import Traffic
 from cosim.importing.regions import digraph, names, positions
 from cosim.importing.streets import Streets
+from cosim.regions import JAM_SPACING
 from nmfd.mfd import Mfd
 from nmfd.network import Network
 
 # The shape of the published MFD, g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam, for want of anything measured.
 ALPHA, BETA = 0.98405, -1.97190
-JAM_SPACING = 7.5      # m of lane per standing vehicle
 JAM_SHARE = 0.6        # of the lanes that can fill up
 SIGNAL_DELAY = 0.5     # speed with signals over the speed limit
 DEFAULT_CYCLE = 90.0   # s

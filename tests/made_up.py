@@ -1,0 +1,63 @@
+"""Made-up runs on grid7_peak in real folders: nothing is simulated, everything is drawn from the seed."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim import evaluate, experiment
+from cosim.city import ensure_built
+from cosim.regions import load_city
+from cosim.simulate import FACTS, Result, scenario_of
+from nmfd.scenario import load_scenario
+from nmfd.types import Trajectory
+
+SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
+STEPS = 5
+SHARE = {"no-control": 1.0, "pi-gating": 0.8, "dpc-pcrg": 0.5}  # of the vehicles without control
+
+
+def result(task, city) -> Result:
+    scenario = scenario_of(task)
+    network, steps = scenario.network, scenario.steps
+    regions, random = network.regions, np.random.default_rng([task.seed, len(task.controller)])
+    size = 40.0 * task.demand_factor * SHARE[task.controller]
+    shape = np.minimum(np.arange(steps + 1), steps - np.arange(steps + 1)) + 0.0
+    accumulation = size * shape[:, None, None] * random.uniform(0.9, 1.1, (steps + 1, regions, regions))
+    acts, guides = task.controller != "no-control", "rg" in task.controller
+    perimeter = random.uniform(0.3, 0.9, (steps, regions, regions)) if acts else np.full((steps, regions, regions), 0.9)
+    crossings = random.integers(0, 9, (steps, regions, regions, regions)) * network.split_mask
+    trajectory = Trajectory(
+        controller=task.controller, plant="sumo", seed=task.seed, step=scenario.step, accumulation=accumulation,
+        backlog=np.zeros_like(accumulation), completed=100.0 * np.arange(steps + 1), perimeter=perimeter,
+        splits=np.repeat(network.nominal_splits[None], steps, axis=0),
+        decision_time=random.uniform(0.001, 0.01, steps), status=("ok",) * steps, wall_time=1.0)
+    edges, gateways = len(city.edges), len(city.gateways)
+    original = np.full((steps, gateways), 30.0)
+    record = {
+        "departures": random.integers(0, 9, (steps, regions, regions)), "crossings": crossings,
+        "arrivals": random.integers(0, 50, (steps, regions)),
+        "edge_vehicles": random.uniform(0.0, 20.0, (steps, edges)).astype(np.float16),
+        "gateway_green": original * (0.7 if acts else 1.0), "gateway_original_green": original,
+        "gateway_flow": random.uniform(0.0, 9.0, (steps, gateways)),
+        "gateway_queue": random.uniform(0.0, 9.0, (steps, gateways)),
+        "guided": crossings * guides}
+    facts = {name: random.uniform(0.1, 100.0) for name in FACTS} | {
+        "controller": task.controller, "seed": task.seed, "trips": 600, "late_decisions": 0,
+        "teleports": 3 * (task.controller == "pi-gating"),
+        "fallbacks": "1 x <script>alert(1)</script>" if guides else "", "final_backlog_veh": 20}
+    return Result(trajectory=trajectory, record=record, facts=facts)
+
+
+def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1.0,)) -> Path:
+    """An evaluation whose runs are made up."""
+    scenario = load_scenario(SCENARIO)
+    files = ensure_built(scenario.network)
+    city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(experiment, "outcomes", lambda function, todo, workers, *, fresh: (
+            (task, result(task, city)) for task in todo))
+        patch.setattr(evaluate.report, "draw_all", lambda *_: None)
+        evaluate.evaluate(evaluate.Evaluation(
+            scenario=SCENARIO, controllers=controllers, seeds=seeds, levels=levels, steps=STEPS, out=out))
+    return out

@@ -1,0 +1,250 @@
+"""The report: a valid page that needs nothing else, holds every number, and says in words what the numbers say."""
+
+import base64
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import made_up
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+from test_tables import rows_of
+
+from cosim import finished, markup, page, story, tables
+from cosim.cli import main
+
+VOID = {"meta", "link", "img", "br"}
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+def cosim(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def error_line(result):
+    assert result.exit_code == 2, result.output + str(result.exception)
+    assert result.stderr.startswith("cosim: error: ") and result.stderr.count("\n") == 1, result.stderr
+    return result.stderr
+
+
+class Page(HTMLParser):
+    """The texts of table cells and of everything, what is referred to, and whether all that opens is closed."""
+
+    def __init__(self, content: str):
+        super().__init__()
+        self.open, self.links, self.ids, self.tags = [], [], [], []
+        self.tables, self.words, self.rows = {}, "", None
+        self.feed(content)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, name, attributes):
+        values = dict(attributes)
+        self.tags.append(name)
+        self.links += [values[key] for key in ("src", "href", "srcset", "data", "action") if key in values]
+        self.ids += [values["id"]] if "id" in values else []
+        if name not in VOID:
+            self.open.append(name)
+        if name == "div" and values.get("role") == "region":
+            self.rows = self.tables.setdefault(values["aria-label"], [])
+        elif name == "tr":
+            self.rows.append([])
+        elif name in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_endtag(self, name):
+        assert self.open.pop() == name
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.words += data
+        if self.open and self.open[-1] in ("td", "th"):
+            self.rows[-1][-1] += data
+
+
+@pytest.fixture(scope="module")
+def evaluation(tmp_path_factory):
+    """Two levels and three controllers, in a folder with a name that is no HTML."""
+    return made_up.folder(tmp_path_factory.mktemp("runs") / "a<b>&c", levels=(0.8, 1.0))
+
+
+@pytest.fixture(scope="module")
+def content(evaluation):
+    """The page, with pictures at demand 1 only: they take most of the time."""
+    draw, more = page.report.draw, page.report.draw_more
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page.report, "draw", lambda *a: draw(*a) if a[3]["demand"].iloc[0] == 1 else None)
+        patch.setattr(page.report, "draw_more", lambda *a: more(*a) if a[3]["demand"].iloc[0] == 1 else None)
+        result = cosim("report", evaluation, "--reference", "pi-gating")
+    assert result.exit_code == 0, result.output + str(result.exception)
+    return (evaluation / "report.html").read_text()
+
+
+def test_the_page_is_valid_and_needs_nothing_else(content):
+    read = Page(content)
+    assert content.startswith("<!DOCTYPE html>") and read.tags.count("html") == read.tags.count("main") == 1
+    assert len(read.ids) == len(set(read.ids)) and "script" not in read.tags
+    pictures = [link for link in read.links if link.startswith("data:image/png;base64,")]
+    assert len(pictures) == 2 + 8
+    assert all(base64.b64decode(link.partition(",")[2]).startswith(b"\x89PNG") for link in pictures)
+    for link in set(read.links) - set(pictures):
+        assert link == "data:," or (link.startswith("#") and link[1:] in read.ids)
+    plain = re.sub(r"base64,[\w+/=]+", "", content)
+    assert "//" not in plain and "url(" not in plain and "@import" not in plain
+    assert len(content) < 8_000_000
+
+
+def test_names_and_reasons_are_escaped(content):
+    assert "<script" not in content and "a<b>" not in content and "a<b>&c" in Page(content).words
+    assert "1 x <script>alert(1)</script>" in Page(content).words
+
+
+def test_every_number_of_the_tables_is_there(content, evaluation):
+    read = Page(content)
+    runs = pd.read_csv(evaluation / "runs.csv", keep_default_na=False, dtype=str)
+    header = read.tables["runs"][0]
+    every = [row for row in read.tables["runs"] if row[0] != "controller"]
+    assert set(header) == set(runs.columns) and len(every) == len(runs)
+    for shown, row in zip(every, runs[header].itertuples(index=False), strict=True):
+        for value, wanted in zip(shown, row, strict=True):
+            try:
+                assert float(value) == pytest.approx(float(wanted), rel=1e-6)
+            except ValueError:
+                assert value == (wanted or "–")
+    statistics = pd.read_csv(evaluation / "evaluate.csv")
+    for level in (0.8, 1.0):
+        cells = sum(read.tables[f"What came of it, demand times {level:g}"], [])
+        for row in statistics[statistics["demand"] == level].to_dict("records"):
+            half = row["change_half_interval_percent"]
+            assert f"{row['mean_' + tables.TTS]:.3e} ± {row['half_interval_' + tables.TTS]:.1e}" in cells
+            assert row["controller"] == "no-control" or any(
+                cell.startswith(f"{row['change_percent']:+.1f} ± {half:.1f} %") for cell in cells)
+    assert "against pi-gating" in read.tables["What came of it, demand times 1"][0]
+    for word in ("demand_hash", "libsumo", "2000 to 2001", "outflow_share"):
+        assert word in read.words
+
+
+def test_it_says_what_was_best_and_on_which_seeds(content):
+    words = " ".join(Page(content).words.split()).replace("\N{NO-BREAK SPACE}", " ")
+    assert "At demand times 0.8: The best strategy was dpc-pcrg" in words and "seeds 2000 to 2001" in words
+    assert "pi-gating 6" in words and "Trips not completed at the end, mean per run: no-control 100 of 600" in words
+    assert "Pictures of single runs show seed 2000 and, where two are compared, no-control and dpc-pcrg" in words
+
+
+@pytest.fixture
+def blind(monkeypatch):
+    for name in ("draw", "draw_more", "region_map"):
+        monkeypatch.setattr(page.report, name, lambda *_: None)
+
+
+def test_several_folders_and_one_level_on_a_page(evaluation, tmp_path, blind):
+    one = evaluation / "demand-1"
+    arguments = ("report", one, one, "--out", tmp_path / "x.html")
+    assert cosim(*arguments).exit_code == 0
+    read = Page((tmp_path / "x.html").read_text())
+    assert [link for link in read.links if link.startswith("#")] == ["#run-0", "#run-1"] == [f"#{i}" for i in read.ids]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["x.html"]
+
+
+def test_an_old_folder_and_a_changed_city_give_a_page_with_what_there_is(evaluation, tmp_path, monkeypatch):
+    one = tmp_path / "one"
+    shutil.copytree(evaluation / "demand-1", one)
+    facts = pd.read_csv(one / "sumo.csv").drop(columns=["co2_kg", "late_decisions"])
+    facts.to_csv(one / "sumo.csv", index=False)
+    text = (one / "manifest.json").read_text()
+    (one / "manifest.json").write_text(re.sub(r'"net_file_hash": "\w+"', '"net_file_hash": "0"', text))
+    assert cosim("report", one).exit_code == 0
+    read = Page((one / "report.html").read_text())
+    assert "has changed since the runs were made" in read.words and "nan" not in read.words.split()
+    assert {row[3] for row in read.tables["How, demand times 1"][1:]} == {"–"}  # CO2
+    assert "there is no map of the runs any more" in error_line(cosim("video", one))
+
+
+def test_a_failure_leaves_the_old_page(evaluation, tmp_path, monkeypatch):
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(page.report, "draw", fail)
+    (tmp_path / "report.html").write_text("old")
+    assert cosim("report", evaluation, "--out", tmp_path / "report.html").exit_code == 130
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
+
+
+@pytest.mark.parametrize("name, arguments, expected", [
+    ("none", (), "holds no finished runs; give a folder of `cosim run` or `cosim evaluate`"),
+    ("one", ("--reference", "mpc-pc"), "--reference: 'mpc-pc' is not in these runs; choose from dpc-pcrg"),
+    ("one", ("--scenario", made_up.SCENARIO.with_name("economic_mpc")), "the runs are of grid7_peak"),
+    ("lost", (), "scenario_folder: there is no gone; give it with --scenario"),
+    ("broken", (), "manifest.json: is no manifest of runs in SUMO"),
+])
+def test_error_lines(evaluation, tmp_path, name, arguments, expected):
+    folder = tmp_path / name
+    if name != "none":
+        shutil.copytree(evaluation / "demand-1", folder)
+    manifest = folder / "manifest.json"
+    if name == "lost":
+        manifest.write_text(re.sub(r'"scenario_folder": "[^"]+"', '"scenario_folder": "gone"', manifest.read_text()))
+    if name == "broken":
+        manifest.write_text("{}")
+    assert expected in error_line(cosim("report", folder, *arguments))
+    assert not (folder / "report.html").exists()
+
+
+def rows(**times):
+    return rows_of({(1.0, name.replace("_", "-")): values for name, values in times.items()}).assign(
+        trips=100, completed_veh=100.0, teleports=0)
+
+
+def test_the_words_of_worked_examples():
+    three = rows(no_control={1: 100.0, 2: 200.0, 3: 300.0}, pi_gating={1: 90.0, 2: 160.0, 3: 210.0})
+    text = story.best(three)  # -20 ± 4.302653 * 10 / sqrt(3) %
+    assert "best strategy was pi-gating" in text and "20.0 % less than without control" in text
+    assert "paired over 3 seeds, is -44.8 to +4.8 % and includes zero" in text and "flattered" not in text
+    sure = story.best(rows(no_control={1: 100.0, 2: 200.0}, pi_gating={1: 50.0, 2: 101.0}, mpc_pc={1: 99.0, 2: 199.0}))
+    assert "excludes zero: more than chance" in sure and "chosen among 2 on these very runs (seeds 1 to 2)" in sure
+    assert "there is no interval" in story.best(rows(no_control={1: 100.0}, pi_gating={1: 90.0}))
+    worse = story.best(rows(no_control={1: 100.0, 2: 100.0}, pi_gating={1: 110.0, 2: 112.0}))
+    assert "No strategy was better than no control" in worse and "11.0 % more" in worse
+    assert "no run of no-control with the same seed" in story.best(rows(pi_gating={1: 1.0}, no_control={2: 1.0}))
+    assert story.seeds([3, 1, 2, 7]) == "1 to 3, 7"
+
+
+def test_the_words_name_what_is_uneven_late_or_lost():
+    table = rows(no_control={1: 100.0, 2: 200.0}, pi_gating={1: 50.0})
+    assert "Every trip was completed" in story.head(table) and "No vehicle was teleported" in story.head(table)
+    assert any("Not all strategies have all 2 seeds (pi-gating 1)" in text for text in story.details(table))
+    table.loc[0, ["teleports", "completed_veh"]] = 5, 40.0
+    table["late_decisions"], table["solver_failures"] = [0, 0, 2], [0, 0, 1]
+    head = story.head(table)
+    assert "no-control 30 of 100. The others completed all." in head and head.endswith("no-control 5.")
+    assert any("pi-gating 1 by a fallback, pi-gating 2 late" in text for text in story.details(table))
+
+
+def test_minus_signs_and_units():
+    assert markup.typeset("rerouting-30: -5.1 to +2 %") == "rerouting-30: \N{MINUS SIGN}5.1 to +2\N{NO-BREAK SPACE}%"
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
+@pytest.mark.parametrize("width", [390, 1280])
+def test_nothing_is_wider_than_the_screen(content, tmp_path, width):
+    (tmp_path / "page.html").write_text(content)
+    (tmp_path / "frame.html").write_text(
+        f'<!DOCTYPE html><iframe id="f" style="width:{width}px;height:900px;border:0"></iframe><p id="o"></p><script>'
+        "f.onload = () => { const e = f.contentDocument.scrollingElement; if (e.querySelector('h1'))"
+        "o.textContent = `needs ${e.scrollWidth} of ${e.clientWidth}; ${[...f.contentDocument.images].every("
+        "i => i.naturalWidth > 100)}`; }; f.src = 'page.html'</script>")
+    done = subprocess.run(
+        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+         "--disable-background-networking", "--disable-component-update", "--disable-sync",
+         f"--user-data-dir={tmp_path / 'profile'}", "--allow-file-access-from-files", "--virtual-time-budget=10000",
+         "--dump-dom", (tmp_path / "frame.html").as_uri()], capture_output=True, text=True, timeout=120)
+    needs, has, pictures = re.search(r"needs (\d+) of (\d+); (\w+)", done.stdout).groups()
+    assert int(needs) <= int(has) <= width and pictures == "true"
+
+
+def test_finished_prefers_the_level_of_the_scenario(evaluation):
+    found = finished.read(evaluation)
+    assert found.level(None).demand == 1.0 and found.level(0.8).folder == evaluation / "demand-0.8"
+    assert len(found.rows) == 12 and found.evaluation and found.city is not None
