@@ -28,6 +28,7 @@ from nmfd.errors import InputError
 from nmfd.network import Network
 
 NET = "city.net.xml.gz"
+LITTLE = 0.3  # of the flow over the boundaries passes no signal under control: worth a word
 FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz", "additional": "city.add.xml.gz"}
 
 
@@ -300,6 +301,9 @@ def _report(order: Order, case: Case, streets: Streets, traffic: Traffic, clock:
                      f"({left[skipped[0]]}); see gateways.csv")
     if several := sum(len(logics) > 1 for logics in streets.logics.values()):
         lines.append(f"{several} signals have several programmes: the last that is loaded runs, as in SUMO")
+    if found.uncontrolled > LITTLE:
+        lines.append(f"perimeter control reaches only {100 * (1 - found.uncontrolled):.0f} % of the flow over the "
+                     "boundaries: other regions (--regions, --method, your own) may have more signals between them")
     if not any(g["control"] == "controlled" for g in found.gateways):
         lines.append("no gateway has a signal that perimeter control can use: only route guidance can do anything here")
     if baseline is not None:
