@@ -276,7 +276,7 @@ def test_import_at_a_congested_level(config, tmp_path):
     total = scenario.demand.sum() * scenario.step
     assert total == pytest.approx(scenario.demand_factor * len(vehicles.depart), rel=1e-4)
     line = error_line(cosim("import", config, "--regions", 2, "--level", "twice", "--out", tmp_path / "networks" / "x"))
-    assert "--level: expected numbers above 0" in line
+    assert "--level: expected a number above 0 up to 10, or auto, got 'twice' instead" in line
 
 
 def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
