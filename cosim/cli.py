@@ -492,7 +492,11 @@ def _level(text: str, no_run: bool) -> float | None:
         if no_run:
             raise InputError("--level: auto simulates the city, which --no-run forbids; leave one of them away")
         return None
-    return _levels("--level", text)[0] if "," not in text else _levels("--level", "")[0]
+    try:
+        (found,) = _levels("--level", text)
+    except (InputError, ValueError):
+        raise InputError(f"--level: expected a number above 0 up to 10, or auto, got {text!r} instead") from None
+    return found
 
 
 def _levels(option: str, text: str) -> list[float]:
