@@ -96,7 +96,7 @@ def scene(city: City, results: dict[str, Result], title: str) -> tuple:
     bar = drawing.colorbar(figures.DENSITIES, ax=maps, shrink=0.8, aspect=30)
     bar.set_label("vehicles per km and lane")
     plots.total_accumulation(below, [result.trajectory for result in results.values()])
-    below.legend(frameon=False, fontsize="small", loc="upper right")
+    below.legend(frameon=False, fontsize="small", loc="upper left")
     hand = below.axvline(0.0, color=plots.RED, linewidth=1.2)
     step = next(iter(results.values())).trajectory.step
     ends = step * max(len(result.trajectory.perimeter) for result in results.values())
