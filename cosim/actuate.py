@@ -11,7 +11,7 @@ unchanged cycle and unchanged intergreens (redistribute).
 """
 
 from bisect import bisect_right
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import accumulate
 
 import numpy as np
@@ -44,12 +44,15 @@ class GatewaySignal:
         self._yellow = {link: yellow_time(programme.phases, link) for link in movements}
         self._cycle_start = start - programme.position
         self._ends = list(accumulate(self._original))
-        self._share: dict[tuple[int, int], float] = {}
         self._shown, self._since, self.next_change = "", start, start
 
-    def command(self, share: np.ndarray) -> None:
-        """(R, R) [-]: (u - u_min) / (u_max - u_min) for the windows (hold-back) or cycles that begin from now on."""
-        self._share = {m.pair: float(share[m.pair]) for m in self._movements.values()}
+    def command(self, share: np.ndarray, opened: Collection[int] = ()) -> None:
+        """(R, R) [-]: (u - u_min) / (u_max - u_min) for the windows (hold-back) or cycles that begin from now on.
+
+        opened: links that keep their original green whatever `share` says
+        """
+        for link, movement in self._movements.items():
+            movement.share = 1.0 if link in opened else float(share[movement.pair])
 
     def update(self, now: float) -> str:
         """The state to show from `now` [s] on; call at every `next_change`, and not earlier than the last call."""
@@ -79,7 +82,7 @@ class GatewaySignal:
         shares: dict[int, float] = {}
         for link, movement in self._movements.items():
             for phase in self._phases_of(link):
-                shares[phase] = max(shares.get(phase, 0.0), self._share.get(movement.pair, 1.0))
+                shares[phase] = max(shares.get(phase, 0.0), movement.share)
         takers = [
             phase for phase, state in enumerate(self._states)
             if phase not in shares and GREEN & set(state) and "y" not in state]
@@ -124,7 +127,7 @@ class GatewaySignal:
 
     def _green(self, movement: "_Movement", full: float) -> float:
         """Seconds to keep of a window of `full` seconds."""
-        share, least = self._share.get(movement.pair, 1.0), min(self._min_green, full)
+        share, least = movement.share, min(self._min_green, full)
         return full if share >= 1.0 else least + round(share * (full - least))
 
 
@@ -132,7 +135,7 @@ class _Movement:
     """What a gateway link carries from one update to the next."""
 
     def __init__(self, pair: tuple[int, int]):
-        self.pair, self.green_time = pair, 0.0
+        self.pair, self.green_time, self.share = pair, 0.0, 1.0
         self.open, self.opened_at, self.cut_at = False, -float("inf"), float("inf")
 
 
@@ -182,11 +185,10 @@ class Actuator:
         """show(signal, state) puts a state on a signal."""
         self._signals, self._show = signals, show
 
-    def command(self, perimeter: np.ndarray, u_min: float, u_max: float) -> None:
-        """perimeter: (R, R) [-], [i, h] = u_ih."""
-        share = np.clip((perimeter - u_min) / (u_max - u_min), 0.0, 1.0)
+    def command(self, share: np.ndarray, opened: Mapping[str, Collection[int]]) -> None:
+        """share: (R, R) [-], [i, h] = (u_ih - u_min) / (u_max - u_min); opened: signal -> links that it spares."""
         for signal in self._signals:
-            signal.command(share)
+            signal.command(share, opened.get(signal.signal, ()))
 
     def play(self, now: float) -> None:
         """Show what holds from `now` [s] on; call before every simulation step."""

@@ -105,6 +105,7 @@ def _built(recipe_file: Path, network: Network) -> SumoFiles:
             files.regions_csv.is_file()):
         return files
     folder.mkdir(exist_ok=True)
+    stamp_file.unlink(missing_ok=True)  # nothing here counts until it is written again
     net, regions = build(recipe, str(recipe_file))
     # the stamp comes last: whoever sees it finds the files that belong to it
     for file, content in ((files.net_file, net), (files.regions_csv, regions), (stamp_file, stamp.encode())):
@@ -128,7 +129,7 @@ def read_recipe(path: Path, regions: int) -> Recipe:
     region = centre.integer("region", high=regions - 1)
     centre_x, centre_y = _lines(centre, "x"), _lines(centre, "y")
     outer_x, outer_y = _lines(outer, "x"), _lines(outer, "y")
-    picture = [line.split() for line in outer.text("regions").strip().splitlines()][::-1]
+    picture = [line.split() for line in outer.lines("regions")][::-1]
     if [len(row) for row in picture] != [len(outer_x)] * len(outer_y):
         raise outer.error("regions", f"expected {len(outer_y)} rows of {len(outer_x)} regions or dots; correct it")
     nodes = {}
@@ -234,8 +235,11 @@ def _plain_xml(recipe: Recipe) -> tuple[str, str, str, dict[str, int]]:
             target = first[b, turns[turn]]
             for lane, into in zip(lanes_of_turn, _into(turn, len(lanes_of_turn), lanes[target]), strict=True):
                 connection_rows += [_link(source, target, lane, number) for number in into]
-    parts = (("nodes", node_rows), ("edges", edge_rows), ("connections", connection_rows))
-    return *(f"<{tag}>\n{''.join(rows)}</{tag}>\n" for tag, rows in parts), region_of
+    return _file("nodes", node_rows), _file("edges", edge_rows), _file("connections", connection_rows), region_of
+
+
+def _file(tag: str, rows: list[str]) -> str:
+    return f"<{tag}>\n{''.join(rows)}</{tag}>\n"
 
 
 def _leads_in(recipe: Recipe, a: str, b: str) -> bool:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from cosim import bands
 from cosim.simulate import Result
 from nmfd import closed_loop, plots, runs
 from nmfd.dynamics import advance, parameters
@@ -46,7 +47,7 @@ def predict(scenario: Scenario, result: Result) -> Trajectory:
     """
     same = replace(
         scenario, steps=len(result.trajectory.perimeter), demand=result.record["departures"] / scenario.step,
-        measurement_std=0.0)
+        measurement_std=0.0, faults=())
     trajectory = closed_loop.run(NmfdPlant(same), Replay(result.trajectory), same, seed=result.trajectory.seed)
     return replace(trajectory, plant="nmfd")
 
@@ -157,7 +158,7 @@ def write(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
     """Compare, and add compare-<run>.csv and two pictures to the run folder; returns the rows of `errors`."""
     predicted = predict(scenario, result)
     rows = pd.DataFrame(errors(scenario, result, predicted), columns=COLUMNS)
-    name = f"{result.trajectory.controller}-{result.trajectory.seed}"
+    name = runs.run_name(result.trajectory.controller, result.trajectory.seed)
     with runs.atomic(folder / f"compare-{name}.csv") as temporary:
         rows.to_csv(temporary, index=False)
     drawing, axes = plots.panels(scenario.network.regions + 1)
@@ -176,11 +177,15 @@ def write(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
     return rows
 
 
-def draw_mfds(path: Path, network: Network, samples: Sequence[Mapping[str, np.ndarray]]) -> None:
-    """The MFD of every region over its outflow samples, as one picture."""
+def draw_mfds(
+    path: Path, network: Network, samples: Sequence[Mapping[str, np.ndarray]], found: Sequence[np.ndarray] = (),
+) -> None:
+    """The MFD of every region over its outflow samples, as one picture. found: by region, a `bands.band` to draw."""
     drawing, axes = plots.panels(network.regions)
     for region, ax in enumerate(axes):
         plots.mfd(ax, network.mfds[region], samples[region])
+        if len(found):
+            bands.draw_band(ax, found[region])
         ax.set_title(f"{region} {network.region_names[region]}", fontsize="medium")
     plots.legend_below(drawing, axes)
     plots.save(drawing, path)

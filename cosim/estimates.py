@@ -50,7 +50,7 @@ def write(folder: Path, network: Network, trajectories: Sequence[Trajectory]) ->
     with runs.atomic(folder / "estimation.csv") as temporary:
         rows.to_csv(temporary, index=False)
     for trajectory in estimated:
-        path = folder / f"estimate-{trajectory.controller}-{trajectory.seed}.png"
+        path = folder / f"estimate-{runs.run_name(trajectory.controller, trajectory.seed)}.png"
         if not path.exists():
             drawing, axes = plots.panels(network.regions)
             for region, ax in enumerate(axes):

@@ -1,7 +1,8 @@
 """The evaluation: controllers x seeds x demand levels in SUMO, paired by seed, with tables and figures.
 
     <folder>/demand-<level>/    the run folder of a demand level (cosim.experiment)
-    <folder>/evaluate.md, evaluate.csv, pairs.csv, runs.csv    the tables (cosim.tables), new after every run
+    <folder>/evaluate.md, evaluate.csv, pairs.csv, runs.csv    the tables (cosim.tables), new after every run; in the
+        first, at the end, why (cosim.reasons)
     pictures of a level in its folder, those across levels here (cosim.report)
 """
 
@@ -12,10 +13,12 @@ from pathlib import Path
 
 import pandas as pd
 
-from cosim import experiment, report, tables
+from cosim import experiment, reasons, report, tables
 from cosim.simulate import Task
+from nmfd import runs
 from nmfd.errors import InputError
 from nmfd.scenario import load_scenario
+from nmfd.workers import ended
 
 FIRST_SEED = 2000  # these seeds are kept for evaluations: nothing was chosen, trained or identified on them
 
@@ -65,8 +68,13 @@ def evaluate(
     rows, table = all_runs(evaluation), pd.DataFrame()
     if len(rows):
         table = tables.write(out, rows, evaluation.reference)
-        report.draw_all(out, level_folders(out), load_scenario(evaluation.scenario), rows)
-    return table, [f"{experiment.label(task)}: {reason}" for task, reason in failures]
+        scenario = load_scenario(evaluation.scenario)
+        why = reasons.text(level_folders(out), scenario.network, rows)
+        runs.write_text(out / "evaluate.md", tables.markdown(table, evaluation.reference) + "\n" + why)
+        report.draw_all(out, level_folders(out), scenario, rows)
+    if failures and table.empty and all(failure.mistake for _, failure in failures):
+        raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])
+    return table, [f"{experiment.label(task)}: {failure.reason}" for task, failure in failures]
 
 
 def level_folders(out: Path) -> dict[float, Path]:

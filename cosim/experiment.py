@@ -10,19 +10,21 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cosim import estimates
+from cosim import estimates, incidents
 from cosim.city import ensure_built
-from cosim.plant import Settings, settings
+from cosim.plant import Settings, own_vehicles, settings
 from cosim.regions import check_adjacency, load_city
+from cosim.signals import read_signals
 from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
-from cosim.strategy import parse
-from nmfd import runs
+from cosim.strategy import configured, parse
+from cosim.xml_files import read_xml
+from nmfd import faults, runs
 from nmfd.benchmarks import REFERENCE, draw_accumulations, interval
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.scenario import Scenario, as_modelled
 from nmfd.types import Trajectory
-from nmfd.workers import Failure, RunFailed, attempt, outcomes
+from nmfd.workers import Failure, attempt, ended, outcomes
 
 # Of loading runs: whether they guide routes, and so depend on the drivers' own split ratios.
 LOADING = {"probing-pc": False, "probing-pcrg": True, "route-guidance": True}
@@ -45,25 +47,32 @@ def experiment(
         draw_accumulations(out, scenario, kept)
         estimates.write(out, scenario.network, kept)
     if failures:
-        raise RunFailed("; ".join(f"{label(task)}: {reason}" for task, reason in failures))
+        raise ended([(label(task), failure) for task, failure in failures])
     return overview(out)
 
 
 def perform(
     plan: Sequence[tuple[Path, Task]], *, workers: int = 1, fresh: bool = False,
     progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
-    kept: Callable[[], None] | None = None,
-) -> list[tuple[Task, str]]:
+    kept: Callable[[], object] | None = None, failed: Callable[[Task, str], None] | None = None,
+    source: Callable[[Sequence[Task]], Iterator[tuple[Task, Result | Failure]]] | None = None,
+) -> list[tuple[Task, Failure]]:
     """Run every task, in this order, that is not yet in its run folder; returns those that failed, and why.
 
     The tasks of one folder share scenario, steps and demand. Every finished run is kept at once, whatever happens to
     the others. A kept run stays valid as long as the city, its demand and what its own controller depends on
     (`dependencies`) stay as they are.
 
+    A run that was interrupted starts again from its beginning. SUMO's saved states are no way round that: they hold
+    neither the vehicles that are not loaded yet, nor what perimeter control shows at the signals, nor what is known
+    here of every vehicle (ledger, guidance, detectors) and in the controller; a run that was put together from all
+    these would have to be proven the same to the byte, to save the minute or two that it takes.
+
     fresh: every run in a process of its own
     progress: called with what is done and to do, and what is running
     tell: takes one line where the runs of a controller do not count any more because it changed; None: an InputError
-    kept: called after every run that was kept
+    kept: called after every run that was kept; failed: with every one that failed, and why
+    source: runs the tasks elsewhere and gives their outcomes as they finish, instead of `workers` processes here
 
     Raises InputError, before anything is written, for a city or controller that cannot be made, and for a folder that
     holds runs of another city or demand.
@@ -80,10 +89,14 @@ def perform(
                 order=[(task.controller, task.seed) for task in tasks], renew=tell,
                 session={"scenario_folder": str(tasks[0].scenario), "workers": workers}))
         there = {path: _finished(folder) for path, folder in folders.items()}
-        todo = [task for task in where if (task.controller, task.seed) not in there[where[task]]]
-        for task, outcome in _outcomes(todo, workers, fresh, progress):
+        todo = [task for task in where if (task.controller, task.seed) not in there[where[task]] or not all(
+            file.is_file() for _, file in task.sumo_output)]
+        found = _outcomes(todo, workers, fresh, progress) if source is None else _reported(source, todo, progress)
+        for task, outcome in found:
             if isinstance(outcome, Failure):
-                failures.append((task, outcome.reason))
+                failures.append((task, outcome))
+                if failed:
+                    failed(task, outcome.reason)
                 continue
             folder = folders[where[task]]
             write_record(record_path(folder.path, task.controller, task.seed), outcome)
@@ -106,20 +119,24 @@ def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> d
     on none of these, and loading runs only on their options and the split ratios that they start from. Raises
     InputError for a controller that cannot be made.
     """
-    controller = parse(name).controller
-    registry.make(controller, scenario, policy=policy)
+    controller, variant = parse(name).controller, configured(name, scenario.controller_options)
+    registry.make(variant, scenario, policy=policy)
     if controller == REFERENCE:
         return {}
-    options = scenario.controller_options.get(controller, {})
+    tables = scenario.controller_options
+    options = {**tables.get(controller, {}), **tables.get(variant, {})}
     if controller in LOADING:
         splits = scenario.network.nominal_splits if LOADING[controller] else np.empty(0)
         return {"options": options, "splits_hash": hashlib.sha256(splits.round(9).tobytes()).hexdigest()[:16]}
-    path = registry.policy_path(controller, scenario, policy)
-    network = as_modelled(scenario, controller).network
+    path = registry.policy_path(variant, scenario, policy)
+    if registry.is_own(controller):
+        variant, scenario = registry.configured_own(controller, scenario)
+        options = scenario.controller_options.get(variant, {})
+    network = as_modelled(scenario, variant).network
     model = json.dumps([network.hash, scenario.integrator, scenario.substeps, scenario.protected])
     return {
         "options": options,
-        "policy_hash": None if path is None else runs.file_hash(path),
+        "policy_hash": None, **registry.fingerprint(controller, path),
         "model_hash": hashlib.sha256(model.encode()).hexdigest()[:16], "torch": metadata.version("torch")}
 
 
@@ -129,15 +146,22 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
     scenario = scenario_of(first)
     controllers = {task.controller: dependencies(task.controller, scenario_of(task), task.policy)
                    for task in {task.controller: task for task in tasks}.values()}
+    chosen = settings(scenario)
     files = ensure_built(scenario.network)
-    check_adjacency(load_city(files.net_file, files.regions_csv, scenario.network.regions), scenario.network)
+    city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
+    check_adjacency(city, scenario.network)
+    read_signals(city)
+    own_vehicles(scenario, chosen, city)
+    incidents.check(faults.of(scenario), city, "faults")
+    for name in (*chosen.background, *chosen.additional):
+        read_xml(scenario.folder / name)
     configuration = {
         "scenario": scenario.name, "network": scenario.network.name, "plant": "sumo", "step_s": scenario.step,
         "steps": scenario.steps, "demand_factor": first.demand_factor,
         "demand_hash": hashlib.sha256(np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16],
         "net_file_hash": runs.file_hash(files.net_file), "regions_hash": runs.file_hash(files.regions_csv),
-        "measurement_std_veh": scenario.measurement_std, "sumo": _plain(settings(scenario), scenario.folder),
-        "libsumo": metadata.version("libsumo")}
+        "measurement_std_veh": scenario.measurement_std, "sumo": _plain(chosen, scenario.folder),
+        "libsumo": metadata.version("libsumo"), **({"faults": list(scenario.faults)} if scenario.faults else {})}
     return configuration, controllers
 
 
@@ -174,8 +198,17 @@ def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress) -> Iter
         yield task, outcome
 
 
+def _reported(source, todo: Sequence[Task], progress) -> Iterator[tuple]:
+    """What comes from `source`, with a word to `progress` of each."""
+    report = progress or (lambda done, total, note: None)
+    report(0, len(todo), "")
+    for done, (task, outcome) in enumerate(source(todo) if todo else (), start=1):
+        report(done, len(todo), f"{'failed' if isinstance(outcome, Failure) else 'last'} {label(task)}")
+        yield task, outcome
+
+
 def record_path(folder: Path, controller: str, seed: int) -> Path:
-    return folder / f"{controller}-{seed}.record.npz"
+    return folder / f"{runs.run_name(controller, seed)}.record.npz"
 
 
 def write_record(path: Path, result: Result) -> None:
@@ -192,22 +225,22 @@ def read_run(folder: Path, controller: str, seed: int) -> Result:
             record = {name: file[name] for name in file.files}
     except FileNotFoundError:
         raise InputError(f"{path}: no such run; choose a controller and seed of {folder / 'sumo.csv'}") from None
-    except (OSError, ValueError, EOFError) as error:
+    except runs.DAMAGED as error:
         raise InputError(f"{path}: is no record of a run ({error}); delete it and run again") from None
-    trajectory = runs.read_trajectory(folder / f"{controller}-{seed}.npz")
+    trajectory = runs.read_trajectory(folder / f"{runs.run_name(controller, seed)}.npz")
     return Result(trajectory=trajectory, record=record, facts={})
 
 
 def trajectories(folder: Path) -> list[Trajectory]:
     """The finished runs of the run folder. Raises InputError."""
     return [
-        runs.read_trajectory(folder / f"{row['controller']}-{row['seed']}.npz")
+        runs.read_trajectory(folder / f"{runs.run_name(row['controller'], row['seed'])}.npz")
         for row in runs.read_summary(folder / "summary.csv")]
 
 
 def _write_facts(folder: runs.RunFolder, result: Result) -> None:
     path = folder.path / "sumo.csv"
-    rows = pd.read_csv(path) if path.is_file() else pd.DataFrame(columns=FACTS)
+    rows = read_facts(path) if path.is_file() else pd.DataFrame(columns=FACTS)
     same = (rows["controller"] == result.facts["controller"]) & (rows["seed"] == result.facts["seed"])
     rows = pd.DataFrame([*rows[~same].to_dict("records"), result.facts], columns=FACTS)
     with runs.atomic(path) as temporary:
@@ -217,7 +250,18 @@ def _write_facts(folder: runs.RunFolder, result: Result) -> None:
 def overview(folder: Path) -> pd.DataFrame:
     """summary.csv and sumo.csv joined, one row per finished run. Raises InputError."""
     return pd.DataFrame(runs.read_summary(folder / "summary.csv")).merge(
-        pd.read_csv(folder / "sumo.csv"), on=["controller", "seed"])
+        read_facts(folder / "sumo.csv"), on=["controller", "seed"])
+
+
+def read_facts(path: Path) -> pd.DataFrame:
+    """The rows of sumo.csv. Raises InputError."""
+    try:
+        rows = pd.read_csv(path)
+        return rows.astype({"controller": str, "seed": int})
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; delete the folder and run again") from None
+    except (OSError, ValueError, KeyError) as error:  # pandas' own errors are ValueErrors
+        raise InputError(f"{path}: is no table of runs ({error}); delete the folder and run again") from None
 
 
 def table(rows: pd.DataFrame) -> str:

@@ -6,11 +6,10 @@ from collections.abc import Collection
 import numpy as np
 
 from cosim.plant import Record
-from cosim.regions import City, Gateway
+from cosim.regions import City, Gateway, gateway_room_taken
 from cosim.trip_facts import TripFacts
 from nmfd.types import Trajectory
 
-JAM_SPACING = 7.5  # m, length of a standing vehicle with its gap
 FULL = 0.8         # share of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards
 
 
@@ -44,16 +43,9 @@ def upstream_gateways(city: City) -> list[int]:
     return list(first.values())
 
 
-def edge_room(city: City) -> np.ndarray:
-    """(E,) [veh]: how many stand on each edge at JAM_SPACING."""
-    return np.array([max(city.lanes[edge] * city.length[edge] / JAM_SPACING, 1.0) for edge in city.edges])
-
-
 def gateway_full(edge_vehicles: np.ndarray, city: City) -> np.ndarray:
     """(T, G) bool: the edge before the gateway holds at least FULL of its room, by edge_vehicles (T, E) [veh]."""
-    index = {edge: n for n, edge in enumerate(city.edges)}
-    before = [index[gateway.from_edge] for gateway in city.gateways]
-    return edge_vehicles[:, before].astype(float) >= FULL * edge_room(city)[before]
+    return gateway_room_taken(edge_vehicles.astype(float), city) >= FULL
 
 
 def decision_facts(trajectory: Trajectory) -> dict:

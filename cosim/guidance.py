@@ -62,9 +62,16 @@ class Guide:
         self._index = {edge: n for n, edge in enumerate(city.edges)}
         self._region = np.array([city.region_of[edge] for edge in city.edges])
         moves = [(e, f) for e, after in city.successors.items() for f in after]
-        self._from, self._to = np.array([(self._index[e], self._index[f]) for e, f in moves]).T
-        self._turn = np.array([city.turn_time[move] for move in moves])
-        self._turn_time = dict(zip(zip(self._from.tolist(), self._to.tolist(), strict=True), self._turn, strict=True))
+        first, second = np.array([(self._index[e], self._index[f]) for e, f in moves]).T
+        turn = np.array([city.turn_time[move] for move in moves])
+        self._turn_time = dict(zip(zip(first.tolist(), second.tolist(), strict=True), turn.tolist(), strict=True))
+        here = [self._region == region for region in range(city.regions)]
+        self._within = [_Moves(first, second, turn, allowed=allowed, reverse=True) for allowed in here]
+        self._without = [_Moves(first, second, turn, allowed=~allowed, reverse=False) for allowed in here]
+        self._gateways = [
+            np.array([(self._index[g.from_edge], self._index[g.to_edge], g.target)
+                      for g in city.gateways if g.source == region], dtype=int).reshape(-1, 3).T
+            for region in range(city.regions)]
         self._taste = np.exp(SPREAD * random.standard_normal((TASTES, len(city.edges))))
         self._length = np.array([city.length[edge] for edge in city.edges])
         self._free = self._length / np.array([city.speed[edge] for edge in city.edges])
@@ -98,8 +105,10 @@ class Guide:
             return
         for event in events:
             if event.free and self._random.random() < self._compliance:
-                taste, target = int(self._random.integers(TASTES)), self._index[event.edge]
+                taste, target = int(self._random.integers(TASTES)), self._index.get(event.edge)
                 here = self._index.get(self._session.road(event.vehicle))
+                if target is None:  # it may use roads that are closed to cars, a taxi on its way to a bus road
+                    continue
                 if here is None or self._region[here] != event.region:  # on a junction already: too late to turn
                     continue
                 if event.region == event.destination:
@@ -111,17 +120,16 @@ class Guide:
         """The fastest way inside the region of destination."""
         if (event.region, taste) not in self._inside:
             time = self._time * self._taste[taste]
-            self._inside[event.region, taste] = time, self._graph(time, self._region == event.region, reverse=True)
+            self._inside[event.region, taste] = time, self._within[event.region].costing(time)
         time, inside = self._inside[event.region, taste]
+        moves = self._within[event.region]
+        first, last = moves.number[here], moves.number[target]
         if (taste, target) not in self._home:
-            self._home[taste, target] = dijkstra(inside, indices=target, return_predecessors=True)
+            self._home[taste, target] = dijkstra(inside, indices=last, return_predecessors=True)
         cost, after = self._home[taste, target]
-        if here == target or not np.isfinite(cost[here]) or self._keeps(event.vehicle, here, time, cost[here]):
+        if first == last or not np.isfinite(cost[first]) or self._keeps(event.vehicle, here, time, cost[first]):
             return
-        way = [here]
-        while way[-1] != target:
-            way.append(int(after[way[-1]]))
-        self._send(event.vehicle, way)
+        self._send(event.vehicle, moves.path(after, first, last))
 
     def _guide_on(self, event: Event, here: int, target: int, taste: int) -> None:
         """The next region, and the fastest way through it."""
@@ -151,8 +159,10 @@ class Guide:
 
     def _keeps(self, vehicle: str, here: int, time: np.ndarray, cost: float, following: int | None = None) -> bool:
         """Whether the driver's present way, at `time` (E,) [s], is about as good as one of `cost` [s], and leads into
-        the region `following` next, if that is given."""
+        the region `following` next, if that is given; so it is where the way uses roads that are closed to cars."""
         route = self._session.route(vehicle)[self._session.route_index(vehicle):]
+        if any(edge not in self._index for edge in route):
+            return True
         way = [self._index[edge] for edge in route]
         if way[0] != here:
             return False
@@ -171,22 +181,41 @@ class Guide:
     def _ways_from(self, region: int, taste: int) -> "_Ways":
         if (region, taste) not in self._ways:
             time = self._time * self._taste[taste]
-            gateways = [g for g in self._city.gateways if g.source == region]
             self._ways[region, taste] = _Ways(
-                first=np.array([self._index[g.from_edge] for g in gateways]),
-                second=np.array([self._index[g.to_edge] for g in gateways]),
-                next_region=np.array([g.target for g in gateways]),  # sorted, as the gateways are
-                inside=self._graph(time, self._region == region, reverse=True),
-                outside=self._graph(time, self._region != region, reverse=False), time=time)
+                *self._gateways[region], inside=self._within[region], outside=self._without[region], time=time)
         return self._ways[region, taste]
 
-    def _graph(self, time: np.ndarray, allowed: np.ndarray, *, reverse: bool) -> csr_array:
-        """Moves between allowed edges; a move costs the time of the turn and of the edge that it leads to."""
-        keep = allowed[self._from] & allowed[self._to]
-        rows, columns = self._from[keep], self._to[keep]
-        cost = np.maximum(time[columns] + self._turn[keep], 1e-3)
-        size = len(time)
-        return csr_array((cost, (columns, rows) if reverse else (rows, columns)), shape=(size, size))
+
+class _Moves:
+    """The moves between allowed edges as a graph of these edges, from first[n] to second[n] or, reversed, back.
+
+    number: edge -> its node, -1 for edges that are not allowed
+    """
+
+    def __init__(self, first: np.ndarray, second: np.ndarray, turn: np.ndarray, *, allowed: np.ndarray, reverse: bool):
+        """turn: [s], the time of a move; allowed: (E,), edges"""
+        self.edges = np.flatnonzero(allowed)
+        self.number = np.full(len(allowed), -1)
+        self.number[self.edges] = np.arange(len(self.edges))
+        rows, columns = (self.number[part] for part in ((second, first) if reverse else (first, second)))
+        kept = np.flatnonzero(allowed[first] & allowed[second])
+        kept = kept[np.lexsort((columns[kept], rows[kept]))]
+        self._second, self._turn, self._columns = second[kept], turn[kept], columns[kept].astype(np.int32)
+        self._begins = np.searchsorted(rows[kept], np.arange(len(self.edges) + 1)).astype(np.int32)
+        self._ids = self.edges.tolist()
+
+    def costing(self, time: np.ndarray) -> csr_array:
+        """A move costs the time of the turn and `time` (E,) [s] of the edge that it leads to."""
+        cost = np.maximum(time[self._second] + self._turn, 1e-3)
+        return csr_array((cost, self._columns, self._begins), shape=(len(self.edges),) * 2)
+
+    def path(self, before: np.ndarray, first: int, last: int) -> list[int]:
+        """The edges from node `first` to node `last` by the predecessors `before` of a search from `last`."""
+        way = [self._ids[first]]
+        while first != last:
+            first = before[first]
+            way.append(self._ids[first])
+        return way
 
 
 class _Ways:
@@ -195,26 +224,28 @@ class _Ways:
     Gateways begins[n] to ends[n] - 1 lead into region neighbours[n].
     """
 
-    def __init__(self, *, first, second, next_region, inside, outside, time):
-        self.time = time
-        self._first, self._second, self._enter = first, second, time[second]
+    def __init__(self, first, second, next_region, *, inside: _Moves, outside: _Moves, time: np.ndarray):
+        """first, second, next_region: (G,), the last in rising order; time: (E,) [s]"""
+        self.time, self._inside, self._outside = time, inside, outside
+        self._first, self._second = inside.number[first], outside.number[second]
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))
-        firsts, self._in = np.unique(first, return_inverse=True)  # several gateways share an edge
-        seconds, self._out = np.unique(second, return_inverse=True)
-        self._to_gateway, self._after = dijkstra(inside, indices=firsts, return_predecessors=True)
-        self._from_gateway, self._before = dijkstra(outside, indices=seconds, return_predecessors=True)
+        firsts, self._in = np.unique(self._first, return_inverse=True)  # several gateways share an edge
+        seconds, self._out = np.unique(self._second, return_inverse=True)
+        to_gateway, self._after = dijkstra(inside.costing(time), indices=firsts, return_predecessors=True)
+        from_gateway, self._before = dijkstra(outside.costing(time), indices=seconds, return_predecessors=True)
+        # (nodes, G): the rows are what `cost` adds up
+        self._there = np.ascontiguousarray((to_gateway[self._in] + time[second][:, None]).T)
+        self._onward = np.ascontiguousarray(from_gateway[self._out].T)
 
     def cost(self, here: int, target: int) -> np.ndarray:
         """(G,) [s] from the end of edge `here` to the end of edge `target`; infinite where there is no way."""
-        return self._to_gateway[self._in, here] + self._enter + self._from_gateway[self._out, target]
+        return self._there[self._inside.number[here]] + self._onward[self._outside.number[target]]
 
     def route(self, here: int, gateway: int, target: int) -> list[int]:
         """The edges from `here` to `target` through `gateway`."""
-        to_gateway = [here]
-        while to_gateway[-1] != self._first[gateway]:
-            to_gateway.append(int(self._after[self._in[gateway], to_gateway[-1]]))
-        back = [target]
-        while back[-1] != self._second[gateway]:
-            back.append(int(self._before[self._out[gateway], back[-1]]))
+        to_gateway = self._inside.path(
+            self._after[self._in[gateway]], self._inside.number[here], self._first[gateway])
+        back = self._outside.path(
+            self._before[self._out[gateway]], self._outside.number[target], self._second[gateway])
         return to_gateway + back[::-1]

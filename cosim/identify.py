@@ -8,13 +8,13 @@ runs by prediction error (nmfd.identification).
 import csv
 import io
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from cosim import experiment
+from cosim import bands, experiment
 from cosim.compare import HELD_UP, draw_mfds, outflow_samples
 from cosim.simulate import Result, Task
 from nmfd import identification, mfd, runs, toml
@@ -22,7 +22,7 @@ from nmfd.errors import InputError
 from nmfd.identification import Observed
 from nmfd.network import Network
 from nmfd.scenario import Scenario, load_scenario
-from nmfd.workers import RunFailed
+from nmfd.workers import ended
 
 FEWEST = 30.0   # vehicles that must have crossed before their split ratios count
 AHEAD = 900.0   # s, of the longer prediction that is judged
@@ -34,6 +34,7 @@ PATHS = ("recipe", "net", "regions")  # keys of [sumo] in network.toml
 class Loading:
     """levels: multiples of the scenario's demand; seeds: of the runs at every level
     guided: with route guidance, first towards the drivers' own split ratios, then probing; else without
+    options: of the strategies (cosim.strategy.OPTIONS), of a city that has, say, max-pressure signals
     network: the folder whose network.toml is written, None for the scenario's own
     iterations: of the fit
     """
@@ -41,13 +42,15 @@ class Loading:
     levels: Sequence[float]
     seeds: Sequence[int]
     guided: bool = False
+    options: Sequence[str] = ()
     network: Path | None = None
     iterations: int = identification.ITERATIONS
 
     @property
     def stages(self) -> tuple[str, str]:
-        """The controllers of the two stages."""
-        return ("route-guidance", "probing-pcrg") if self.guided else ("no-control", "probing-pc")
+        """The strategies of the two stages."""
+        first, second = ("route-guidance", "probing-pcrg") if self.guided else ("no-control", "probing-pc")
+        return "+".join([first, *self.options]), "+".join([second, *self.options])
 
 
 def identify(
@@ -62,17 +65,17 @@ def identify(
     """
     loaded = load_scenario(scenario)
     target = loaded.network.folder if loading.network is None else loading.network
-    if loading.guided and target.resolve() == loaded.network.folder.resolve():
+    if (loading.guided or loading.options) and target.resolve() == loaded.network.folder.resolve():
         raise InputError(
-            f"--guided: {loaded.name} runs on {target}, whose model must stay that of its own drivers; name another "
-            "folder with --network")
+            f"{'--guided' if loading.guided else '--with'}: {loaded.name} runs on {target}, whose model must stay that "
+            "of its own drivers and signals; name another folder with --network")
     first, second = loading.stages
     found = _load(scenario, loading, first, {}, out, workers, progress)
     network = static_model(loaded, found, guided=loading.guided)
     set_point = tuple(network.mfds[region].critical for region in loaded.protected)
     found += _load(scenario, loading, second, {"set_point": set_point}, out, workers, progress)
     held_out = [result for result in found if len(loading.seeds) > 1 and result.trajectory.seed == loading.seeds[-1]]
-    scheme = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
+    scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
     def fitted(results: Sequence[Result], what: str) -> Network:
         def tell(done, total, note):
@@ -84,13 +87,15 @@ def identify(
 
     model = fitted(found, "fitting")
     samples = samples_of(network, found)
-    text = fit_table(model, samples)
+    text = fit_table(model, samples) + unreached(model, [result.trajectory.accumulation for result in found])
     if held_out:
         kept = [result for result in found if not any(result is other for other in held_out)]
         text += "\n" + prediction_table(
             fitted(kept, "fitting without the last seed"), [observed(result) for result in held_out], scheme)
     _write_samples(out / "samples.csv", samples)
-    draw_mfds(out / "mfd.png", model, samples)
+    by_run = [[own_points(cloud) for cloud in samples_of(network, [result])] for result in found]
+    draw_mfds(out / "mfd.png", model, samples, [bands.band(runs) for runs in zip(*by_run, strict=True)])
+    bands.draw_production(out / "production.png", model, [result.record for result in found])
     levels, seeds = ", ".join(f"{level:g}" for level in loading.levels), f"{min(loading.seeds)} to {max(loading.seeds)}"
     target.mkdir(parents=True, exist_ok=True)
     runs.write_text(target / "network.toml", network_toml(
@@ -110,7 +115,7 @@ def _load(
         for level in loading.levels for seed in loading.seeds]
     failures = experiment.perform(plan, workers=workers, progress=progress, tell=lambda line: None)
     if failures:
-        raise RunFailed("; ".join(f"{experiment.label(task)}: {reason}" for task, reason in failures))
+        raise ended([(experiment.label(task), failure) for task, failure in failures])
     return [experiment.read_run(folder, controller, task.seed) for folder, task in plan]
 
 
@@ -197,6 +202,17 @@ def fit_table(network: Network, samples: Sequence[dict]) -> str:
     return "\n".join(lines)
 
 
+def unreached(network: Network, accumulations: Sequence[np.ndarray]) -> str:
+    """A line on the regions whose critical accumulation no loading run reached, each run (T+1, R, R) [veh]; or none."""
+    most = np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
+    short = [f"{region} {network.region_names[region]} ({100 * most[region] / curve.critical:.0f} % of it)"
+             for region, curve in enumerate(network.mfds) if most[region] < curve.critical]
+    if not short:
+        return ""
+    return (f"\nnever beyond the critical accumulation: {', '.join(short)}; what lies beyond is a guess there.\n"
+            "Give higher --levels, or take it that perimeter control has nothing to protect there")
+
+
 def prediction_table(network: Network, held_out: Sequence[Observed], scheme: dict) -> str:
     """RMSE of the accumulation one control interval and AHEAD seconds ahead, in runs that the fit did not see."""
     critical = np.array([curve.critical for curve in network.mfds])
@@ -220,7 +236,7 @@ def _sumo_table(folder: Path, target: Path) -> dict[str, str]:
         for key, value in table.items()}
 
 
-def network_toml(network: Network, sumo: dict[str, str], comment: str) -> str:
+def network_toml(network: Network, sumo: Mapping[str, str], comment: str) -> str:
     """network.toml of `network` with this table [sumo]."""
     out = io.StringIO()
     out.write(f"# {comment}\nname = \"{network.name}\"\n\n")

@@ -3,18 +3,20 @@
 A movement from road l to road m has the weight w(l, m) = x(l, m) - sum_p r(m, p) x(m, p): the vehicles that want to
 make it, minus those that stand in the way behind it, by turning shares r. A stage (a green phase of the original
 programme) has the pressure sum c(l, m) max(w(l, m), 0) over its movements, c their saturation flows. The stage with
-the highest pressure gets the green, after the original yellow and all-red.
+the highest pressure gets the green, after the original yellow and all-red. Perimeter control rations the green of the
+gateway movements (cosim.rationing); one whose ration is spent exerts no pressure.
 
 x counts vehicles per lane, as loops and cameras see them; on lanes that several movements share, and upstream of the
 turn lanes, they are shared out by r, from the demand's static routes.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 from scipy.sparse import csr_array
 
 from cosim.actuate import yellow_time
+from cosim.rationing import NEVER, Ration
 from cosim.regions import City
 from cosim.signals import GREEN, Link, Signal, is_stage
 from cosim.sumo import Phase, Session
@@ -35,12 +37,26 @@ class MaxPressure:
         controls, but whose queues count as well."""
         self._session = session
         roads = Roads(city, [*signals, *others], flows)
-        self._lanes, self._weights = roads.lanes, roads.weights
+        self._lanes, self._weights, self._movements = roads.lanes, roads.weights, roads.movements
         self._gain, self._begins = roads.stages(signals)
-        self._junctions = [Junction(signal, session.time) for signal in signals]
+        pairs: dict[str, dict[int, tuple[int, int]]] = {}
+        for gateway in city.gateways:
+            for link in gateway.links if gateway.signal is not None else ():
+                pairs.setdefault(gateway.signal, {})[link] = (gateway.source, gateway.target)
+        self._junctions = [Junction(signal, session.time, pairs.get(signal.id)) for signal in signals]
         self._next = session.time
         for junction in self._junctions:
             session.set_signal_state(junction.signal, junction.state)
+
+    def command(self, share: np.ndarray, opened: Mapping[str, Collection[int]]) -> None:
+        """share: (R, R) [-], (u - u_min) / (u_max - u_min); opened: signal -> gateway links without a ration."""
+        for junction in self._junctions:
+            junction.command(share, opened.get(junction.signal, ()))
+
+    def green_time(self) -> dict[str, dict[int, float]]:
+        """Signal -> gateway link -> seconds of green shown so far."""
+        now = self._session.time
+        return {junction.signal: junction.green_time(now) for junction in self._junctions if junction.rationed}
 
     def play(self, now: float) -> None:
         """Show what holds from `now` [s] on."""
@@ -61,18 +77,45 @@ class MaxPressure:
     def _pressure(self) -> np.ndarray:
         count = self._session.lane_vehicles
         present = np.array([count(lane) for lane in self._lanes], dtype=float)
-        return self._gain @ np.maximum(self._weights @ present, 0.0)
+        weight = np.maximum(self._weights @ present, 0.0)
+        for junction in self._junctions:
+            for movement in junction.exhausted():
+                weight[self._movements[movement]] = 0.0
+        return self._gain @ weight
 
 
 class Junction:
     """What one signal shows, second by second: a stage, or the way from one stage to the next."""
 
-    def __init__(self, signal: Signal, now: float):
+    def __init__(self, signal: Signal, now: float, gateways: Mapping[int, tuple[int, int]] | None = None):
+        """gateways: link index -> (i, h), of the links whose green is rationed."""
         self.signal, self._phases, self._numbers = signal.id, signal.phases, signal.stages
         self.stages, self.stage = len(signal.stages), 0
-        self.state = signal.phases[signal.stages[0]].state
-        self._green_since, self.next_change = now, float("inf")
+        self._base = signal.phases[signal.stages[0]].state
+        self._green_since = now
+        cycle = sum(phase.duration for phase in signal.phases)
+        self._rations = {
+            link: Ration(pair, cycle=cycle, min_green=MIN_GREEN, yellow=yellow_time(signal.phases, link), start=now)
+            for link, pair in (gateways or {}).items()}
+        self._movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
         self._coming: list[tuple[float, str]] = []
+        self.state = self._base
+        self.next_change = now if self._rations else NEVER  # until then, commands hold from the first second on
+
+    @property
+    def rationed(self) -> bool:
+        return bool(self._rations)
+
+    def command(self, share: np.ndarray, opened: Collection[int] = ()) -> None:
+        for link, ration in self._rations.items():
+            ration.command(1.0 if link in opened else float(share[ration.pair]))
+
+    def exhausted(self) -> set[tuple[str, str]]:
+        """(edge, next edge) of the gateway movements that get no more green for now."""
+        return {self._movement[link] for link, ration in self._rations.items() if ration.exhausted}
+
+    def green_time(self, now: float) -> dict[int, float]:
+        return {link: ration.green_time(now) for link, ration in self._rations.items()}
 
     def may_switch(self, now: float) -> bool:
         return not self._coming and now >= self._green_since + MIN_GREEN - 1e-6
@@ -88,9 +131,18 @@ class Junction:
         return self.advance(now)
 
     def advance(self, now: float) -> str:
+        """The state from `now` [s] on; call at every `next_change`."""
         while self._coming and now >= self._coming[0][0] - 1e-6:
-            self.state = self._coming.pop(0)[1]
-        self.next_change = self._coming[0][0] if self._coming else float("inf")
+            self._base = self._coming.pop(0)[1]
+        self.next_change = self._coming[0][0] if self._coming else NEVER
+        shown = list(self._base)
+        for link, ration in self._rations.items():
+            lasting = all(state[link] in GREEN for _, state in self._coming)
+            shown[link], again = ration.show(shown[link], now, lasting=lasting)
+            self.next_change = min(self.next_change, again)
+            if ration.opened(now):  # in the middle of a stage, perhaps: it gets its minimum green, too
+                self._green_since = max(self._green_since, now)
+        self.state = "".join(shown)
         return self.state
 
 
@@ -120,7 +172,8 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
 class Roads:
     """Vehicles by lane -> weights of the movements -> pressures of the stages, as two sparse matrices.
 
-    lanes: (L,) names; weights: (M, L) [-], of the movements at `signals`; roads that end at none of them are full too
+    lanes: (L,) names; movements: (edge, next edge) at `signals` -> their number; weights: (M, L) [-], of these; roads
+    that end at none of the signals are full too
     """
 
     def __init__(self, city: City, signals: Iterable[Signal], flows: Mapping[tuple[str, str], float]):
@@ -135,14 +188,14 @@ class Roads:
         for signal in signals:
             for link in signal.links:
                 self._links.setdefault(link.from_edge, []).append(link)
-        self._movements = sorted({(link.from_edge, link.to_edge) for links in self._links.values() for link in links})
-        self._number = {movement: n for n, movement in enumerate(self._movements)}
+        movements = sorted({(link.from_edge, link.to_edge) for links in self._links.values() for link in links})
+        self.movements = {movement: n for n, movement in enumerate(movements)}
         rows = []
-        for edge, target in self._movements:
+        for edge, target in self.movements:
             row = self._queue(edge, target)
             end = self._chain(target)[-1]
-            for after, share in self._shares(end, self._targets(end)).items():
-                for lane, part in self._queue(end, after).items():
+            for onward, share in self._shares(end, self._targets(end)).items():
+                for lane, part in self._queue(end, onward).items():
                     row[lane] = row.get(lane, 0.0) - share * part
             rows.append(row)
         self.weights = _sparse(rows, len(self.lanes))
@@ -158,10 +211,10 @@ class Roads:
                     if state[link.index] in GREEN:
                         share = self._lane_shares(link.from_edge, link.lane)[link.to_edge]
                         gain = share * (1.0 if state[link.index] == "G" else PERMISSIVE)
-                        movement = self._number[link.from_edge, link.to_edge]
+                        movement = self.movements[link.from_edge, link.to_edge]
                         row[movement] = row.get(movement, 0.0) + gain
                 rows.append(row)
-        return _sparse(rows, len(self._movements)), begins
+        return _sparse(rows, len(self.movements)), begins
 
     def _queue(self, edge: str, to: str) -> dict[int, float]:
         """Lane -> share of its vehicles that want to go from `edge` to `to`."""

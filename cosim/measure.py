@@ -1,16 +1,14 @@
 """What the city is doing: the accumulations x_ij with an exact vehicle ledger, and every crossing of a boundary."""
 
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 
 from cosim.regions import City
 from cosim.sumo import Session
-
-
-class LedgerError(RuntimeError):
-    """Vehicles appeared or vanished: the figures of this run cannot be trusted."""
+from nmfd.ledger import LedgerError
 
 
 @dataclass
@@ -107,10 +105,12 @@ class Meter:
         events.sort(key=lambda event: (event.source is not None, event.vehicle))  # set order is not reproducible
         return events
 
-    def accumulation(self) -> np.ndarray:
+    def accumulation(self, step: int = 0) -> np.ndarray:
         """x_ij (R, R) [veh]: every vehicle counted where it is now, on junctions too. LedgerError if the count differs
-        from departures minus arrivals, in total or in any (i, j) as followed from crossing to crossing."""
+        from departures minus arrivals, in total or in any (i, j) as followed from crossing to crossing; it names the
+        control step `step`."""
         counted = np.zeros_like(self._running)
+        self.teleports = max(self.teleports, self._session.teleports())
         on_road = self._session.running()
         for vehicle in on_road:
             known = self._vehicles[vehicle]
@@ -121,11 +121,24 @@ class Meter:
             known = self._vehicles[vehicle]
             counted[known.region, known.destination] += 1
         balance = int(self.departures.sum() - self.arrivals.sum())
+        if counted.sum() < balance:
+            for vehicle in self._held(on_road):
+                known = self._vehicles[vehicle]
+                counted[known.region, known.destination] += 1
         if counted.sum() != balance or (counted != self._running).any():
+            i, j = np.unravel_index(int(np.abs(counted - self._running).argmax()), counted.shape)
             raise LedgerError(
-                f"at {self._session.time:g} s {counted.sum()} vehicles are in the city, but departures minus arrivals "
-                f"are {balance}, and {self._running.sum()} were followed across the boundaries")
+                f"vehicle ledger broken at control step {step}, {self._session.time:g} s: {counted.sum()} vehicles are "
+                f"in the city, but {self.departures.sum()} departures minus {self.arrivals.sum()} arrivals are "
+                f"{balance}; in region {i} bound for {j} there are {counted[i, j]}, and {self._running[i, j]} were "
+                "followed there")
         return counted.astype(float)
+
+    def _held(self, on_road: Collection[str]) -> set[str]:
+        """The vehicles that the mesoscopic model has taken off a jammed road without a word, until there is room for
+        them further on: on their way, neither on the road nor teleporting, but still known to SUMO."""
+        under_way = {vehicle for vehicle, known in self._vehicles.items() if known.region is not None}
+        return under_way.difference(on_road, self._teleporting).intersection(self._session.known())
 
     def backlog(self) -> np.ndarray:
         """(R, R) [veh]: due to depart from i for j, but not inserted yet."""

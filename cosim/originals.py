@@ -1,6 +1,6 @@
 """The city's own vehicles, as its route file has them: read once, then varied by seed and by demand factor."""
 
-import gzip
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,10 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from cosim.regions import City
+from cosim.xml_files import read_xml
 from nmfd import runs
 from nmfd.errors import InputError
 
 STREAM = 7102  # keeps these random numbers apart from others of the same seed
+MESOSCOPIC = ("--mesosim", "true", "--meso-junction-control", "true")  # options of SUMO
 # Vehicle classes that keep to their lines, or do not use the road as cars do.
 BOUND = frozenset({
     "bus", "coach", "tram", "rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car", "ship",
@@ -33,27 +36,57 @@ def read_originals(paths: Sequence[Path]) -> Originals:
     """
     elements = []
     for path in paths:
-        try:
-            with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as stream:
-                elements += [(path, element) for element in ElementTree.parse(stream).getroot()]
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such file; give an existing SUMO route file in sumo.routes") from None
-        except (OSError, EOFError, ElementTree.ParseError) as error:
-            raise InputError(f"{path}: is not a SUMO route file ({error}); write it with cosim import") from None
-    departs = np.empty(len(elements))
+        root = read_xml(path)
+        if root.tag != "routes":
+            raise InputError(f"{path}: expected a SUMO route file, got a file of <{root.tag}> instead")
+        elements += [(path, element) for element in root]
+    departs, ids = np.empty(len(elements)), set()
     for n, (path, element) in enumerate(elements):
         if element.tag not in ("vehicle", "trip"):
             raise InputError(
                 f"{path}: expected vehicle and trip elements only, got {element.tag} instead; move it to a file in "
                 "sumo.background or sumo.additional, or let cosim import do so")
+        name = element.get("id")
+        if not name or name in ids:
+            raise InputError(f"{path}: {element.tag} {n}: id: expected one that no other has, got {name!r} instead")
+        ids.add(name)
         try:
-            departs[n] = float(element.get("depart"))
-        except (TypeError, ValueError):
+            departs[n] = float(element.attrib["depart"])
+            if not 0.0 <= departs[n] < math.inf:
+                raise ValueError
+        except (KeyError, ValueError):
             raise InputError(
-                f"{path}: vehicle {element.get('id')}: depart: expected a time in seconds, got "
+                f"{path}: vehicle {element.get('id')}: depart: expected a time from 0 s up, got "
                 f"{element.get('depart')!r} instead; move it to a file in sumo.background") from None
     order = np.argsort(departs, kind="stable")
     return Originals(depart=departs[order], elements=tuple(elements[n][1] for n in order))
+
+
+def check_edges(originals: Originals, city: City, where: str) -> None:
+    """InputError for a vehicle on an edge that the city does not have: SUMO would leave it out without a word."""
+    for element in originals.elements:
+        route = element.find("route")
+        ends = [element.get(key) for key in ("from", "to") if element.get(key)]
+        edges = [*ends, *element.get("via", "").split(), *("" if route is None else route.get("edges", "")).split()]
+        for edge in edges:
+            if edge not in city.region_of:
+                raise InputError(
+                    f"{where}: {element.tag} {element.get('id')}: edge {edge} is not in {city.net_file}; remove the "
+                    "vehicle, or give the routes of this network")
+def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
+    """Name -> edges of the routes that additional files define for vehicles to share; of a distribution, its first."""
+    found: dict[str, tuple[str, ...]] = {}
+    for path in paths:
+        root = read_xml(path)
+        for route in root.iter("route"):
+            if route.get("id") and route.get("edges"):
+                found[route.get("id")] = tuple(route.get("edges").split())
+        for distribution in root.iter("routeDistribution"):
+            routes = [tuple(r.get("edges").split()) for r in distribution.iter("route") if r.get("edges")]
+            routes += [found[name] for name in distribution.get("routes", "").split() if name in found]
+            if routes:
+                found[distribution.get("id")] = routes[0]
+    return found
 
 
 def draw(

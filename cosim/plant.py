@@ -2,29 +2,30 @@
 
 import tempfile
 from collections import Counter
-from collections.abc import Set
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from cosim import webster
+from cosim import sumo_output, webster
 from cosim.actuate import GREEN, Actuator, GatewaySignal
 from cosim.actuated import actuated_row
 from cosim.city import ensure_built
 from cosim.detectors import EVERY, Detectors, instruments, lay_out, probes, write_loops
-from cosim.flows import turning_flows
+from cosim.flows import own_flows, turning_flows
 from cosim.guidance import Guide
+from cosim.incidents import Incidents
 from cosim.max_pressure import MaxPressure
 from cosim.measure import Meter
-from cosim.originals import Originals, read_originals, write_originals
-from cosim.regions import City, Gateway, check_adjacency, load_city
+from cosim.originals import MESOSCOPIC, Originals, check_edges, read_originals, read_routes, write_originals
+from cosim.regions import City, Gateway, check_adjacency, gateway_room_taken, load_city
 from cosim.signals import Signal, read_signals, write_programmes
 from cosim.strategy import ACTUATED, FIXED, HOLD_BACK, MAX_PRESSURE, MODES, SIGNALS, WEBSTER
 from cosim.sumo import Session, Window
 from cosim.trip_facts import TripFacts, read_trip_facts, trip_options
 from cosim.trips import write_trips
-from nmfd import toml
+from nmfd import faults, toml
 from nmfd.errors import InputError
 from nmfd.estimation import Estimator
 from nmfd.scenario import Scenario, read_tables
@@ -45,13 +46,15 @@ class Settings:
 
     step_length: of SUMO [s]; time_to_teleport: [s], -1 for never; collision_action: SUMO's
     actuation: "hold-back" or "redistribute"; min_green: of a gateway movement [s]
+    queue_override: a gateway whose edge held this share of its room in the last control interval is left open, 0 for
+        never [-]
     compliance: share of the decisions in which a driver follows the route guidance [-]
     most_detour: a driver does not follow route guidance into a next region that costs him more than this [s]
     rerouting: share of the drivers with SUMO's own rerouting device [-]
     measurement: "exact", or "estimate": controllers see what detectors and probes tell (cosim/detectors.py)
     detector_share: of the links, with loop detectors [-]; probe_share: of the vehicles [-]
     signals: one of cosim.strategy.SIGNALS; gateways_fixed (of the strategy, no key of the table): whether signals with
-        a gateway movement stay fixed-time, for perimeter control, where the others are actuated or max-pressure
+        a gateway movement stay fixed-time, for perimeter control, where the others are actuated
 
     Of a city with vehicles of its own (cosim import), files relative to the scenario's folder:
     routes: their route files; without any, trips are drawn from the scenario's demand
@@ -70,6 +73,7 @@ class Settings:
     collision_action: str = "warn"
     actuation: str = HOLD_BACK
     min_green: float = 5.0
+    queue_override: float = 0.0
     compliance: float = 1.0
     most_detour: float = 60.0
     rerouting: float = 0.0
@@ -100,6 +104,7 @@ def settings(scenario: Scenario) -> Settings:
             "collision_action", default.collision_action, ("none", "warn", "teleport", "remove")),
         actuation=table.text("actuation", default.actuation, MODES),
         min_green=table.number("min_green", default.min_green, low=1.0),
+        queue_override=table.number("queue_override", default.queue_override, low=0.0, high=1.0),
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
         most_detour=table.number("most_detour", default.most_detour, low=0.0),
         rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0),
@@ -125,6 +130,13 @@ def settings(scenario: Scenario) -> Settings:
             f"{path}: sumo.step_length: expected a divisor of the control interval {scenario.step:g} s, got "
             f"{chosen.step_length:g} instead")
     return chosen
+
+
+def own_vehicles(scenario: Scenario, chosen: Settings, city: City) -> Originals:
+    """The vehicles of the route files that [sumo] names. Raises InputError."""
+    originals = read_originals([scenario.folder / name for name in chosen.routes])
+    check_edges(originals, city, f"{scenario.folder / 'scenario.toml'}: sumo.routes")
+    return originals
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,12 +178,18 @@ class SumoPlant:
     since the reset.
     """
 
-    def __init__(self, scenario: Scenario, *, overrides: Settings | None = None, window: Window | None = None):
+    def __init__(
+        self, scenario: Scenario, *, overrides: Settings | None = None, outputs: Mapping[str, Path] | None = None,
+        window: Window | None = None,
+    ):
         """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network.
 
-        window: to watch; the simulation is the same, only slower.
+        outputs: kind (cosim.sumo_output) -> file, of SUMO's own outputs; complete after `trip_facts` or `close`
+        window: to watch; the simulation is the same, only slower
         """
-        self._scenario, self._originals, self._window = scenario, None, window
+        self._scenario, self._window = scenario, window
+        self._originals: Originals | None = None
+        self._outputs = dict(outputs or {})
         self._settings = overrides or settings(scenario)
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
@@ -182,7 +200,10 @@ class SumoPlant:
         self._net_file = files.net_file
         self._layout = lay_out(self.city, self._settings.detector_share)
         self._instruments = instruments(self.city, self._layout, self._settings.probe_share)
-        self.simple_signals, self.other_signals = read_signals(self.city)
+        simple, others = read_signals(self.city, self._additional())
+        left = set(self._settings.leave_signals)
+        self.simple_signals = [signal for signal in simple if signal.id not in left]
+        self.other_signals = sorted({*others, *(signal.id for signal in simple if signal.id in left)})
         if self._settings.signals != FIXED and not self.simple_signals:
             raise InputError(
                 f"{files.net_file}: sumo.signals: {self._settings.signals} needs fixed-time signals with several green "
@@ -197,26 +218,29 @@ class SumoPlant:
         scenario, chosen = self._scenario, self._settings
         routes = Path(self._folder.name) / "trips.rou.xml"
         self._vehicles, files = self._write_vehicles(routes, seed), [routes]
-        self._trip_file = routes.with_name("tripinfo.xml")
-        steered = [s for s in self.simple_signals if s.id not in chosen.leave_signals and not (
-            chosen.gateways_fixed and s.id in self._gateway_ids)]
+        self._trip_file = self._outputs.get("tripinfo", routes.with_name("tripinfo.xml"))
+        steered = [s for s in self.simple_signals if not (
+            chosen.gateways_fixed and chosen.signals == ACTUATED and s.id in self._gateway_ids)]
         options = [
-            *trip_options(self._trip_file), "--begin", str(chosen.begin), "--ignore-route-errors",
-            str(bool(chosen.routes)).lower()]
+            *trip_options(self._trip_file), *sumo_output.options(self._outputs), "--begin", str(chosen.begin),
+            "--ignore-route-errors", str(bool(chosen.routes)).lower()]
         if chosen.rerouting > 0:
             options += [*REROUTING, "--device.rerouting.probability", str(chosen.rerouting)]
         if chosen.mesoscopic:
-            options += ["--mesosim", "true", "--meso-junction-control", "true"]
+            options += MESOSCOPIC
         additional = self._signal_plan(steered)
         if scenario.folder is not None:
             files += [scenario.folder / name for name in chosen.background]
-            additional = [scenario.folder / name for name in chosen.additional] + additional
+            additional = self._additional() + additional
         estimating = chosen.measurement == ESTIMATE
         if estimating:
             loops = Path(self._folder.name) / "loops.add.xml"
             write_loops(self.city, self._layout, scenario.step, loops)
             additional.append(loops)
         additional += self._window.additional if self._window else ()
+        if "edgedata" in self._outputs:
+            additional.append(sumo_output.write_edge_data(
+                routes.with_name("edgedata.add.xml"), self._outputs["edgedata"], scenario.step))
         if additional:
             options += ["--additional-files", ",".join(map(str, additional))]
         self._session = Session(
@@ -232,22 +256,32 @@ class SumoPlant:
         self._guide = Guide(
             self._session, self.city, scenario.network.nominal_splits, compliance=chosen.compliance,
             most_detour=chosen.most_detour, random=np.random.default_rng([seed, 0x67756964]))
-        self._max_pressure, steered_ids = None, set()
+        self._max_pressure, self._rationed = None, {}
         if chosen.signals == MAX_PRESSURE:
-            flows = turning_flows(self.city, scenario.demand, scenario.step)
+            flows = self._own_flows()
+            if flows is None:
+                flows = turning_flows(self.city, scenario.demand, scenario.step)
             others = [signal for signal in self.simple_signals if signal not in steered]
             self._max_pressure = MaxPressure(self._session, self.city, steered, flows, others=others)
-            steered_ids = {signal.id for signal in steered}
-        self._signals = self._gateway_signals(without=steered_ids)
+            self._rationed = {signal.id: signal for signal in steered if signal.id in self._gateway_ids}
+        self._signals = self._gateway_signals()
         self._original_green = self._programmed_green()
-        self._actuator = Actuator(list(self._signals.values()), self._session.set_signal_state)
-        self._k, self._rows, self._speed = 0, [], None
+        self._incidents = Incidents(faults.of(scenario), self._session, self.city)
+        self._actuator = Actuator(list(self._signals.values()), self._incidents.show)
+        self._speed: np.ndarray | None = None
+        self._k, self._rows, self._opened = 0, [], {}
         return self._estimated(self._measurement()) if estimating else self._measurement()
 
     def step(self, controls: Controls) -> Measurement:
         network, session, meter = self._scenario.network, self._session, self._meter
         before = self._totals()
-        self._actuator.command(controls.perimeter, network.u_min, network.u_max)
+        self._incidents.begin(self._k)
+        if self._detectors:
+            self._detectors.silence(self._incidents.silent_loops)
+        share = np.clip((controls.perimeter - network.u_min) / (network.u_max - network.u_min), 0.0, 1.0)
+        self._actuator.command(share, self._opened)
+        if self._max_pressure is not None:
+            self._max_pressure.command(share, self._opened)
         self._guide.command(controls.splits, self._speed)
         begin, steps = session.time, round(self._scenario.step / session.step_length)
         every, often = (
@@ -274,16 +308,23 @@ class SumoPlant:
             self._estimator.step(
                 controls, self._detectors.observation(after["gateway_flow"] - before["gateway_flow"]))
             measurement = self._estimated(measurement)
+        measurement = replace(measurement, problem=self._incidents.problem(estimating=self._estimator is not None))
         row = {key: after[key] - before[key] for key in after}
         with np.errstate(invalid="ignore"):
-            self._speed = metres / vehicles
+            speed = metres / vehicles
+        speed[self._incidents.closed] = 0.0  # nobody is sent through a street because it is empty
+        self._speed = speed
         row["production"], row["mean_accumulation"] = (
             np.bincount(self._edge_region, amount, network.regions) / len(queues) for amount in (metres, vehicles))
+        self._opened = self._overridden(vehicles / len(queues))
         row["edge_vehicles"] = (vehicles / len(queues)).astype(np.float16)  # to 0.1 % and as small as an integer
         queues = np.array(queues).reshape(len(queues), len(self._upstream))
         row["gateway_queue"], row["gateway_queue_max"] = (
             queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))
         row["gateway_original_green"] = self._original_green
+        for n, gateway in enumerate(self.city.gateways):
+            if self._incidents.refused(gateway.signal):
+                row["gateway_green"][n] = self._original_green[n]
         self._rows.append(row)
         return measurement
 
@@ -314,7 +355,7 @@ class SumoPlant:
 
     def leaks(self) -> list[Gateway]:
         """Gateways that no fixed-time signal controls: perimeter control does not reach them."""
-        return [g for g in self.city.gateways if g.signal not in self._signals]
+        return [g for g in self.city.gateways if g.signal not in self._signals and g.signal not in self._rationed]
 
     @property
     def trips(self) -> int:
@@ -329,10 +370,20 @@ class SumoPlant:
         if not chosen.routes:
             return [f"v{n}" for n in range(write_trips(self.city, scenario.demand, scenario.step, seed, path))]
         if self._originals is None:
-            self._originals: Originals | None = read_originals([scenario.folder / name for name in chosen.routes])
+            self._originals = own_vehicles(scenario, chosen, self.city)
         return write_originals(
             self._originals, path, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
             begin=chosen.begin)
+
+    def _additional(self) -> list[Path]:
+        """The city's own additional files."""
+        return [self._scenario.folder / name for name in self._settings.additional] if self._scenario.folder else []
+
+    def _own_flows(self) -> Mapping[tuple[str, str], float] | None:
+        """Turning flows of the city's own vehicles; None where trips are drawn from the scenario's demand."""
+        if self._originals is None:
+            return None
+        return own_flows(self.city, self._originals, read_routes(self._additional()), self._scenario.demand_factor)
 
     def _end_session(self) -> None:
         if self._session is not None:
@@ -344,7 +395,7 @@ class SumoPlant:
         if self._settings.signals == WEBSTER:
             path = webster.plan(
                 self.city, self.simple_signals, self._scenario.demand, self._scenario.step,
-                folder=self._scenario.network.folder / "build")
+                folder=self._scenario.network.folder / "build", flows=self._own_flows())
         elif self._settings.signals == ACTUATED:
             path = Path(self._folder.name) / "actuated.add.xml"
             write_programmes(path, [actuated_row(signal) for signal in signals])
@@ -352,10 +403,10 @@ class SumoPlant:
             return []
         return [path]
 
-    def _gateway_signals(self, *, without: Set[str]) -> dict[str, GatewaySignal]:
+    def _gateway_signals(self) -> dict[str, GatewaySignal]:
         movements: dict[str, dict[int, tuple[int, int]]] = {}
         for gateway in self.city.gateways:
-            if gateway.signal is not None and gateway.signal not in without:
+            if gateway.signal is not None and gateway.signal not in self._rationed:
                 for link in gateway.links:
                     movements.setdefault(gateway.signal, {})[link] = (gateway.source, gateway.target)
         signals = {}
@@ -369,20 +420,29 @@ class SumoPlant:
                     mode=self._settings.actuation, start=self._session.time)
         return signals
 
+    def _overridden(self, edge_vehicles: np.ndarray) -> dict[str, set[int]]:
+        """Signal -> links of the gateways that stay open because of their queue. edge_vehicles: (E,) [veh], mean."""
+        limit, links = self._settings.queue_override, {}
+        for n in np.flatnonzero(gateway_room_taken(edge_vehicles, self.city) >= limit) if limit else ():
+            gateway = self.city.gateways[n]
+            links.setdefault(gateway.signal, set()).update(gateway.links)
+        return links
+
     def _programmed_green(self) -> np.ndarray:
         """(G,) [s] per control interval, as Record.gateway_original_green."""
         green = np.full(len(self.city.gateways), np.nan)
         for n, gateway in enumerate(self.city.gateways):
-            if gateway.signal in self._signals:
-                programme = self._session.programme(gateway.signal)
+            if gateway.signal in self._signals or gateway.signal in self._rationed:
+                plan = self._rationed.get(gateway.signal) or self._session.programme(gateway.signal)
                 lasting = [phase.duration * (phase.state[link] in GREEN)
-                           for phase in programme.phases for link in gateway.links]
-                green[n] = sum(lasting) / len(gateway.links) * self._scenario.step / programme.cycle
+                           for phase in plan.phases for link in gateway.links]
+                cycle = sum(phase.duration for phase in plan.phases)
+                green[n] = sum(lasting) / len(gateway.links) * self._scenario.step / cycle
         return green
 
     def _measurement(self) -> Measurement:
         return Measurement(
-            step=self._k, time=self._k * self._scenario.step, accumulation=self._meter.accumulation(),
+            step=self._k, time=self._k * self._scenario.step, accumulation=self._meter.accumulation(self._k),
             backlog=self._meter.backlog())
 
     def _estimated(self, measurement: Measurement) -> Measurement:
@@ -402,6 +462,7 @@ class SumoPlant:
         # Several movements may lead from one region to one edge: they share its flow.
         alike = Counter((g.source, g.to_edge) for g in self.city.gateways)
         green = {signal: filtered.green_time() for signal, filtered in self._signals.items()}
+        green |= self._max_pressure.green_time() if self._max_pressure is not None else {}
         return {
             "departures": self._meter.departures.copy(), "arrivals": self._meter.arrivals.copy(),
             "crossings": self._meter.crossings.copy(), "teleports": np.array(self._meter.teleports),

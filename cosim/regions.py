@@ -1,7 +1,7 @@
 """Partition of a SUMO network: edge -> region, and the gateways between regions."""
 
 import csv
-import gzip
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,8 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from cosim.xml_files import BROKEN, opened
 from nmfd.errors import InputError
 from nmfd.network import Network
+
+JAM_SPACING = 7.5  # m of lane per standing vehicle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +139,7 @@ def check_adjacency(city: City, network: Network) -> None:
 def edge_shapes(city: City) -> list[np.ndarray]:
     """(n, 2) [m] for every edge of the city: its line on the map, midway between its outermost lanes."""
     shapes: dict[str, np.ndarray] = {}
-    with (gzip.open if city.net_file.suffix == ".gz" else open)(city.net_file, "rb") as stream:
+    with opened(city.net_file) as stream:
         for _, element in ElementTree.iterparse(stream):
             if element.tag == "edge":
                 lanes = [
@@ -156,33 +159,45 @@ def _read_net(path: Path):
     internal: dict[str, float] = {}
     connections: list[_Connection] = []
     try:
-        with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as stream:
+        with opened(path) as stream:
             for _, element in ElementTree.iterparse(stream):
                 if element.tag == "edge":
-                    lanes = [(float(lane.get("length")), float(lane.get("speed")), lane.get("id"))
+                    lanes = [(size(lane, "length"), size(lane, "speed"), lane.attrib["id"])
                              for lane in element.iter("lane") if for_cars(lane)]
                     if element.get("function", "normal") in ("normal", "connector"):
-                        lanes_of[element.get("id")] = lanes
+                        lanes_of[element.attrib["id"]] = lanes
                         cars |= {(element.get("id"), int(lane.get("index")))
                                  for lane in element.iter("lane") if for_cars(lane)}
                     else:
-                        internal[element.get("id")] = max((length / speed for length, speed, _ in lanes), default=0.0)
+                        internal[element.attrib["id"]] = max(
+                            (length / speed for length, speed, _ in lanes), default=0.0)
                     element.clear()
                 elif element.tag == "connection":
                     connections.append(_Connection(
-                        element.get("from"), element.get("to"), element.get("via"), element.get("tl"),
+                        element.attrib["from"], element.attrib["to"], element.get("via"), element.get("tl"),
                         int(element.get("linkIndex", -1)), int(element.get("fromLane")),
                         int(element.get("toLane"))))
                     element.clear()
                 elif element.tag in ("junction", "tlLogic"):
                     element.clear()
+        for connection in connections:
+            if connection.via and connection.via.rpartition("_")[0] not in internal:
+                raise LookupError(f"connection from {connection.source} by way of {connection.via}: no such edge")
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; give the path of an existing SUMO network") from None
-    except (OSError, ElementTree.ParseError, TypeError, ValueError) as error:
+    except BROKEN as error:
         raise InputError(f"{path}: is not a SUMO network ({error}); build it with netconvert") from None
     if not lanes_of:
         raise InputError(f"{path}: has no edges; build it with netconvert")
     return lanes_of, cars, internal, connections
+
+
+def size(lane: ElementTree.Element, name: str) -> float:
+    """The length [m] or speed [m/s] of a <lane>; ValueError unless it is above 0 and finite."""
+    value = float(lane.attrib[name])
+    if not 0.0 < value < math.inf:
+        raise ValueError(f"lane {lane.get('id')}: {name}: expected a number above 0, got {value:g} instead")
+    return value
 
 
 def for_cars(lane: ElementTree.Element) -> bool:
@@ -205,7 +220,7 @@ def _read_regions(path: Path, regions: int) -> dict[str, int]:
         raise InputError(f"{path}: line 1: expected edge,region, got {found} instead")
     region_of: dict[str, int] = {}
     for number, row in enumerate(rows[1:], start=2):
-        if len(row) != 2 or not row[1].isdecimal() or int(row[1]) >= regions:
+        if len(row) != 2 or not row[1].isdecimal() or len(row[1]) > 9 or int(row[1]) >= regions:
             raise InputError(
                 f"{path}: line {number}: expected an edge and a region from 0 to {regions - 1}, got {','.join(row)} "
                 "instead")
@@ -247,3 +262,15 @@ def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gate
                 lanes=tuple(sorted({link.lane for link in members})),
                 shared=tuple(sorted({link.lane for link in members if len(onward[key[2], link.lane]) > 1})))
         for key, members in sorted(movements.items()))
+
+
+def edge_room(city: City) -> np.ndarray:
+    """(E,) [veh]: how many stand on each edge at JAM_SPACING."""
+    return np.array([max(city.lanes[edge] * city.length[edge] / JAM_SPACING, 1.0) for edge in city.edges])
+
+
+def gateway_room_taken(edge_vehicles: np.ndarray, city: City) -> np.ndarray:
+    """(..., G) [-]: the share of the room on the edge before each gateway that edge_vehicles (..., E) [veh] take."""
+    index = {edge: n for n, edge in enumerate(city.edges)}
+    before = [index[gateway.from_edge] for gateway in city.gateways]
+    return edge_vehicles[..., before] / edge_room(city)[before]

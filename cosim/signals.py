@@ -1,8 +1,6 @@
 """Signals as the network file describes them, and other programmes for them as an additional file of SUMO."""
 
-import gzip
 import xml.etree.ElementTree as ElementTree
-from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +8,9 @@ from xml.sax.saxutils import quoteattr
 
 from cosim.regions import City
 from cosim.sumo import Phase
+from cosim.xml_files import BROKEN, read_xml
 from nmfd import runs
+from nmfd.errors import InputError
 
 GREEN = frozenset("Gg")
 
@@ -48,13 +48,21 @@ def is_stage(state: str) -> bool:
     return bool(GREEN & set(state)) and "y" not in state
 
 
-def read_signals(city: City) -> tuple[list[Signal], list[str]]:
+def read_signals(city: City, additional: Iterable[Path] = ()) -> tuple[list[Signal], list[str]]:
     """The simple signals of the city, and the names of all others, which no signal plan here touches: already actuated,
-    several programmes, fewer than two stages, or lights other than red, yellow and green."""
-    path = city.net_file
-    with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as stream:
-        root = ElementTree.parse(stream).getroot()
-    programmes = Counter(logic.get("id") for logic in root.iter("tlLogic"))
+    fewer than two stages, phases out of order, or lights other than red, yellow and green.
+
+    Of several programmes the one that is read last counts, as in SUMO: those of the network file come first, then those
+    of the `additional` files.
+    """
+    try:
+        return _signals(city, additional)
+    except BROKEN as error:
+        raise InputError(f"{city.net_file}: its signals cannot be read ({error}); build it with netconvert") from None
+
+
+def _signals(city: City, additional: Iterable[Path]) -> tuple[list[Signal], list[str]]:
+    root = read_xml(city.net_file)
     links: dict[str, list[Link]] = {}
     for connection in root.iter("connection"):
         ends = connection.get("from"), connection.get("to")
@@ -62,18 +70,25 @@ def read_signals(city: City) -> tuple[list[Signal], list[str]]:
             links.setdefault(connection.get("tl"), []).append(Link(
                 index=int(connection.get("linkIndex")), from_edge=ends[0], lane=int(connection.get("fromLane")),
                 to_edge=ends[1], turn=connection.get("dir", "s").lower()))
+    logics = {logic.get("id"): logic for file in (root, *map(read_xml, additional)) for logic in file.iter("tlLogic")}
     simple, others = [], []
-    for logic in root.iter("tlLogic"):
-        phases = tuple(Phase(duration=float(p.get("duration")), state=p.get("state")) for p in logic.iter("phase"))
-        lights = set("".join(phase.state for phase in phases))
-        signal = Signal(id=logic.get("id"), offset=float(logic.get("offset")), phases=phases,
-                        links=tuple(links.get(logic.get("id"), ())))
-        fixed = programmes[signal.id] == 1 and logic.get("type") == "static" and lights <= set("Ggyr")
-        if fixed and len(signal.stages) > 1 and signal.links:
-            simple.append(signal)
+    for name, logic in logics.items():
+        found = _simple(logic, tuple(links.get(name, ())))
+        if found is not None:
+            simple.append(found)
         else:
-            others.append(signal.id)
-    return sorted(simple, key=lambda signal: signal.id), sorted(set(others))
+            others.append(name)
+    return sorted(simple, key=lambda signal: signal.id), sorted(others)
+
+
+def _simple(logic: ElementTree.Element, links: tuple[Link, ...]) -> Signal | None:
+    rows = list(logic.iter("phase"))
+    if logic.get("type", "static") != "static" or any(row.get("next") for row in rows) or not links:
+        return None
+    phases = tuple(Phase(duration=float(row.get("duration")), state=row.get("state")) for row in rows)
+    signal = Signal(id=logic.get("id"), offset=float(logic.get("offset", 0.0)), phases=phases, links=links)
+    plain = set("".join(phase.state for phase in phases)) <= set("Ggyr")
+    return signal if plain and len(signal.stages) > 1 else None
 
 
 def write_programmes(path: Path, rows: Iterable[str]) -> None:

@@ -2,15 +2,17 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from cosim.strategy import parse
+from cosim.strategy import Strategy, configured, parse
+from nmfd.faults import with_faults
 from nmfd.scenario import Scenario, load_scenario
-from nmfd.types import Trajectory
+from nmfd.types import Controller, Trajectory
 
 # Columns of sumo.csv, beside those of summary.csv.
 FACTS = (
@@ -25,7 +27,8 @@ FACTS = (
 class Task:
     """scenario: its folder; controller: a strategy (cosim.strategy); policy: of a DPC controller, instead of the
     scenario's own; steps: control intervals, all if None; demand_factor: multiplies all flows;
-    options: of the controller, instead of those of the scenario."""
+    options: of the controller, instead of those of the scenario; sumo_output: kind (cosim.sumo_output) and file of
+    SUMO's own outputs; faults: besides those of the scenario."""
 
     scenario: Path
     controller: str
@@ -34,6 +37,8 @@ class Task:
     steps: int | None = None
     demand_factor: float = 1.0
     options: tuple[tuple[str, object], ...] = ()
+    sumo_output: tuple[tuple[str, Path], ...] = ()
+    faults: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +54,7 @@ def scenario_of(task: Task) -> Scenario:
     """The scenario with the horizon and demand of `task`. Raises InputError."""
     scenario = load_scenario(task.scenario)
     steps = scenario.steps if task.steps is None else min(task.steps, scenario.steps)
+    scenario = with_faults(scenario, task.faults)
     scenario = replace(
         scenario, steps=steps, demand=task.demand_factor * scenario.demand[:steps],
         demand_factor=task.demand_factor * scenario.demand_factor)
@@ -63,26 +69,44 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
     """Run `task` in this process, which must hold no other SUMO session. Raises InputError."""
     import torch
 
-    from cosim import facts
-    from cosim.plant import SumoPlant, settings
-    from nmfd import closed_loop, runs
     from nmfd.controllers import registry
 
     torch.set_num_threads(1)  # runs stand side by side, one core each
     begin = time.perf_counter()
     scenario, strategy = scenario_of(task), parse(task.controller)
-    controller = registry.make(strategy.controller, scenario, policy=task.policy)
-    plant = SumoPlant(scenario, overrides=replace(settings(scenario), **strategy.overrides))
-    try:
+    controller = registry.make(configured(task.controller, scenario.controller_options), scenario, policy=task.policy)
+    return drive(
+        scenario, strategy, controller, seed=task.seed, progress=progress, begin=begin, outputs=dict(task.sumo_output))
+
+
+def drive(
+    scenario: Scenario, strategy: Strategy, controller: Controller, *, seed: int,
+    progress: Callable[[int, int], None] | None = None, begin: float | None = None,
+    outputs: Mapping[str, Path] | None = None,
+) -> Result:
+    """The closed loop of `controller` in SUMO, filed under `strategy.name`, whose options the city takes.
+
+    begin: when the setting up began (time.perf_counter); outputs: SUMO's own, kind (cosim.sumo_output) -> file, there
+    only if all goes well. Raises InputError.
+    """
+    from cosim import facts
+    from cosim.plant import SumoPlant, settings
+    from nmfd import closed_loop, runs
+
+    begin = time.perf_counter() if begin is None else begin
+    with ExitStack() as stack:
+        files = {kind: stack.enter_context(runs.atomic(path)) for kind, path in (outputs or {}).items()}
+        plant = SumoPlant(scenario, overrides=replace(settings(scenario), **strategy.overrides), outputs=files)
+        stack.callback(plant.close)
         trajectory = runs.labelled(
-            closed_loop.run(plant, controller, scenario, seed=task.seed, progress=progress),
-            controller=task.controller, plant="sumo")
+            closed_loop.run(plant, controller, scenario, seed=seed, progress=progress),
+            controller=strategy.name, plant="sumo")
         record = plant.record()
         departed = int(record.departures.sum())
         backlog = trajectory.backlog.sum(axis=(1, 2))
         sumo_time, leaks = plant.sumo_time, set(plant.leaks())
         row = {
-            "controller": task.controller, "seed": task.seed, "trips": plant.trips, "departed_veh": departed,
+            "controller": strategy.name, "seed": seed, "trips": plant.trips, "departed_veh": departed,
             "final_backlog_veh": int(backlog[-1]), "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
             "teleports": int(record.teleports.sum()), **facts.trip_facts(plant.trip_facts()),
             **facts.queue_facts(record, plant.city), **facts.decision_facts(trajectory),
@@ -91,8 +115,6 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
             "signals_left_alone": len(plant.other_signals)}
-    finally:
-        plant.close()
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
 
 

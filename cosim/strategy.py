@@ -1,10 +1,13 @@
 """Strategies by name: CONTROLLER[+OPTION...], a regional controller and what else the city does.
 
-    dpc-pc+max-pressure      DPC at the gateways, max-pressure at the other signals
+    dpc-pc+max-pressure      max-pressure at all signals, DPC limits the green of the gateways
     no-control+rerouting-30  nobody controls, 30 % of the drivers reroute; `rerouting-30` for short
+    mine.py:Gate+actuated    a controller of one's own (nmfd.controllers.own), actuated signals elsewhere
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 from nmfd.controllers import registry
 from nmfd.errors import InputError
@@ -16,9 +19,12 @@ HOLD_BACK, REDISTRIBUTE = "hold-back", "redistribute"
 MODES = (HOLD_BACK, REDISTRIBUTE)
 
 # Option -> (field of cosim.plant.Settings, its value).
-_WORDS = {name: ("signals", name) for name in SIGNALS[1:]} | {name: ("actuation", name) for name in MODES}
+_WORDS = {
+    **{name: ("signals", name) for name in SIGNALS[1:]}, **{name: ("actuation", name) for name in MODES},
+    "estimate": ("measurement", "estimate")}
 # Option with a number -> (field of cosim.plant.Settings, least percentage); at most 100.
-_PERCENTAGES = {"rerouting": ("rerouting", 1), "compliance": ("compliance", 0)}
+_PERCENTAGES = {
+    "rerouting": ("rerouting", 1), "compliance": ("compliance", 0), "queue-override": ("queue_override", 1)}
 OPTIONS = (*_WORDS, *(f"{name}-N" for name in _PERCENTAGES))
 
 
@@ -29,7 +35,7 @@ class Strategy:
 
     name: str
     controller: str
-    overrides: dict[str, object] = field(default_factory=dict)
+    overrides: dict[str, Any] = field(default_factory=dict)
 
     @property
     def model_free(self) -> bool:
@@ -39,13 +45,13 @@ class Strategy:
 
 def parse(name: str) -> Strategy:
     """The strategy `name`. InputError for a controller or option that there is not, and for contradictory ones."""
-    first, *words = name.split("+")
+    first, words = registry.split(name)
     controller = first
     if _option(first) is not None:
         controller, words = ALONE, [first, *words]
-    elif first not in registry.names():
+    elif not registry.known(first):
         raise _unknown(name, first, controllers=True)
-    overrides: dict[str, object] = {"gateways_fixed": controller != ALONE}
+    overrides: dict[str, Any] = {"gateways_fixed": controller != ALONE}
     chosen: dict[str, str] = {}
     for word in words:
         option = _option(word)
@@ -56,6 +62,16 @@ def parse(name: str) -> Strategy:
             raise InputError(f"strategy {name!r}: {chosen[key]} and {word} exclude each other; leave one of them out")
         chosen[key], overrides[key] = word, value
     return Strategy(name=name, controller=controller, overrides=overrides)
+
+
+def configured(name: str, tables: Iterable[str]) -> str:
+    """The controller of the strategy `name`, with as many of its options as one of the `tables` has in its name.
+
+    tables: names CONTROLLER+OPTION... of tables in [controllers], each with a regional model or a policy for that city
+    """
+    controller, words = parse(name).controller, set(name.split("+"))
+    fitting = [table for table in tables if table.startswith(f"{controller}+") and set(table.split("+")) <= words]
+    return max(fitting, key=lambda table: table.count("+"), default=controller)
 
 
 def _option(word: str) -> tuple[str, object] | None:
@@ -72,5 +88,5 @@ def _option(word: str) -> tuple[str, object] | None:
 def _unknown(name: str, word: str, *, controllers: bool) -> InputError:
     where = f"controller {name!r}" if word == name else f"strategy {name!r}: {word!r}"
     ranges = ", ".join(f"{stem}-N from {least} to 100" for stem, (_, least) in _PERCENTAGES.items())
-    first = f"{', '.join(registry.names())}, with options joined by +: " if controllers else ""
+    first = f"{', '.join(registry.choice())} or file.py:Class, with options joined by +: " if controllers else ""
     return InputError(f"{where} is unknown; choose from {first}{', '.join(OPTIONS)} (in whole percent, {ranges})")

@@ -18,6 +18,7 @@ import traci
 
 from cosim.originals import BOUND
 from nmfd.errors import InputError
+from nmfd.workers import RunFailed
 
 REFUSALS = (libsumo.TraCIException, traci.TraCIException)  # of one order: the simulation goes on
 FATAL = (libsumo.FatalTraCIError, traci.FatalTraCIError)
@@ -73,7 +74,7 @@ class Session:
         """Raises RuntimeError if another session is open in this process, InputError if SUMO refuses to start."""
         if Session._open:
             raise RuntimeError("a SUMO session is already open in this process; close it first")
-        self.sumo_time, self.step_length = 0.0, step_length
+        self.sumo_time, self.step_length, self._exits = 0.0, step_length, False
         routes = ",".join(map(str, [route_file] if isinstance(route_file, Path) else route_file))
         self.command = [
             "sumo", "--net-file", str(net_file), "--route-files", routes, "--seed", str(seed),
@@ -113,12 +114,14 @@ class Session:
                 self._sumo.close()
 
     def step(self) -> None:
-        """Advance by one simulation step."""
+        """Advance by one simulation step. RunFailed, with its own words, if SUMO gives up."""
         before = time.perf_counter()
         try:
+            if self._exits:
+                raise libsumo.FatalTraCIError("ordered by the fault sumo-exits")
             self._sumo.simulationStep()
         except (libsumo.FatalTraCIError, *REFUSALS) as error:
-            raise RuntimeError(f"SUMO stopped at {self.time:g} s: {_one_line(error)}") from None
+            raise RunFailed(f"SUMO stopped at {self.time:g} s: {_one_line(error)}") from None
         self.sumo_time += time.perf_counter() - before
         self.time = self._sumo.simulation.getTime()
 
@@ -144,6 +147,14 @@ class Session:
     def running(self) -> tuple[str, ...]:
         """On the road; teleporting ones are not."""
         return self._sumo.vehicle.getIDList()
+
+    def teleports(self) -> int:
+        """How many there were so far, by SUMO's own count: the mesoscopic model has no events for them."""
+        return int(self._sumo.simulation.getParameter("", "stats.teleports.total"))
+
+    def known(self) -> tuple[str, ...]:
+        """All that were loaded and have not arrived, wherever they are."""
+        return self._sumo.vehicle.getLoadedIDList()
 
     def pending(self) -> tuple[str, ...]:
         """Due to depart, but not yet inserted: the backlog."""
@@ -195,8 +206,32 @@ class Session:
     def signal_state(self, signal: str) -> str:
         return self._sumo.trafficlight.getRedYellowGreenState(signal)
 
-    def set_signal_state(self, signal: str, state: str) -> None:
-        self._sumo.trafficlight.setRedYellowGreenState(signal, state)
+    def set_signal_state(self, signal: str, state: str) -> bool:
+        """False where SUMO does not take it."""
+        try:
+            self._sumo.trafficlight.setRedYellowGreenState(signal, state)
+        except REFUSALS:
+            return False
+        return True
+
+    # Incidents.
+    def restart_programme(self, signal: str) -> None:
+        """Let a signal run the programme again that it had in the beginning."""
+        lights = self._sumo.trafficlight
+        own = next(logic.programID for logic in lights.getAllProgramLogics(signal) if logic.programID != "online")
+        lights.setProgram(signal, own)
+
+    def limit_speed(self, edge: str, limits: list[float]) -> list[float]:
+        """Set the speed limits [m/s] of the lanes of an edge, one for each or one for all; those before."""
+        lanes = [f"{edge}_{n}" for n in range(self._sumo.edge.getLaneNumber(edge))]
+        before = [self._sumo.lane.getMaxSpeed(lane) for lane in lanes]
+        for lane, limit in zip(lanes, limits * len(lanes) if len(limits) == 1 else limits, strict=True):
+            self._sumo.lane.setMaxSpeed(lane, limit)
+        return before
+
+    def exit_at_next_step(self) -> None:
+        """As if SUMO gave up by itself."""
+        self._exits = True
 
     # What is drawn in the window.
 

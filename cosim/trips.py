@@ -73,12 +73,12 @@ def make_trips(city: City, demand: np.ndarray, step: float, seed: int) -> Trips:
     draws = rng.random((len(depart), 2))
     tastes = rng.integers(TASTES, size=len(depart))
     positions = rng.random(len(depart))
-    trees = _Trees(city, rng)
+    trees = Ways(city, rng)
     number = {edge: n for n, edge in enumerate(city.edges)}
     first, last = np.empty(len(depart), dtype=int), np.empty(len(depart), dtype=int)
     for n, (i, j) in enumerate(zip(origin, destination, strict=True)):
-        first[n] = number[_draw(*starts[i], draws[n, 0])]
-        last[n] = number[_draw(*goals[j], draws[n, 1])]
+        first[n] = number[_draw(starts[i], draws[n, 0])]
+        last[n] = number[_draw(goals[j], draws[n, 1])]
     for n in np.flatnonzero(first == last):
         edges, _ = goals[destination[n]]
         other = (edges.index(city.edges[first[n]]) + 1) % len(edges)
@@ -157,11 +157,12 @@ def _is_pocket(city: City, edge: str, before: list[str]) -> bool:
         city.successors[before[0]] == (edge,))
 
 
-def _draw(edges: list[str], weights: np.ndarray, uniform: float) -> str:
+def _draw(ends: tuple[list[str], np.ndarray], uniform: float) -> str:
+    edges, weights = ends
     return edges[min(int(np.searchsorted(weights, uniform, side="right")), len(edges) - 1)]
 
 
-class _Trees:
+class Ways:
     """Shortest paths over the edges as nodes: an arc costs the junction and the edge after it."""
 
     def __init__(self, city: City, rng):

@@ -67,8 +67,10 @@ def optimised(city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, s
 
 def plan(
     city: City, signals: Sequence[Signal], demand: np.ndarray, step: float, *, folder: Path,
+    flows: Mapping[tuple[str, str], float] | None = None,
 ) -> Path:
-    """The additional file for SUMO with `signals` optimised for the peak of `demand` (T, R, R) [veh/s].
+    """The additional file for SUMO with `signals` optimised for the peak of `demand` (T, R, R) [veh/s], or for `flows`
+    where these are known.
 
     Kept in `folder` under a name that changes with all that it depends on. InputError if it cannot be written there.
     """
@@ -78,9 +80,11 @@ def plan(
     content.update(city.net_file.read_bytes())
     content.update(repr((step, sorted(city.region_of.items()))).encode())
     content.update(np.ascontiguousarray(demand).tobytes())
+    if flows is not None:
+        content.update(repr((sorted(flows.items()), signals)).encode())
     path = folder / f"webster-{content.hexdigest()[:16]}.add.xml"
     if not path.is_file():
-        flows = cosim.flows.turning_flows(city, demand, step)
+        flows = cosim.flows.turning_flows(city, demand, step) if flows is None else flows
         rows = [programme_row(signal, "static") for signal in optimised(city, signals, flows)]
         try:
             folder.mkdir(exist_ok=True)
@@ -155,8 +159,8 @@ def _delay(signal: Signal, durations: list[float], lanes: list[_Lane], opposing,
                 if light == "G":
                     headway += share / rate
                 elif light == "g":
-                    against = opposing.get((n, lane.edge), (SATURATION, SATURATION))
-                    headway += share / min(_permitted(*against, durations[n], cycle), rate)
+                    flow, fullest = opposing.get((n, lane.edge), (SATURATION, SATURATION))
+                    headway += share / min(_permitted(flow, fullest, durations[n], cycle), rate)
                 else:
                     headway = math.inf
             if headway < math.inf:

@@ -1,1 +1,48 @@
-"""Regional (NMFD) traffic model, controllers on it, and the closed loop."""
+"""Regional (NMFD) traffic model, controllers on it, and the closed loop.
+
+    import nmfd
+
+    scenario = nmfd.load_scenario("scenarios/economic_mpc")
+    trajectory = nmfd.run(scenario, "dpc-pcrg", seed=1)
+    print(nmfd.summary(trajectory)["total_time_spent_veh_s"])
+
+`run` is one closed loop, `benchmark` many with a run folder, `train` makes a DPC policy, `controller` gives a
+controller by name. A controller of your own is any object with `reset` and `act` (see `Controller`; `nmfd
+new-controller` writes a template). Names here are imported when they are first used.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from nmfd.api import benchmark, controller, run, train
+    from nmfd.benchmarks import table
+    from nmfd.errors import InputError
+    from nmfd.metrics import summary, total_time_spent
+    from nmfd.network import Network, load_network
+    from nmfd.plant import AcyclicPlant, NmfdPlant
+    from nmfd.runs import read_trajectory, write_trajectory
+    from nmfd.scenario import Scenario, load_scenario
+    from nmfd.types import Controller, Controls, Measurement, Plant, Trajectory
+
+__all__ = [
+    "AcyclicPlant", "Controller", "Controls", "InputError", "Measurement", "Network", "NmfdPlant", "Plant", "Scenario",
+    "Trajectory", "benchmark", "controller", "load_network", "load_scenario", "read_trajectory", "run", "summary",
+    "table", "total_time_spent", "train", "write_trajectory"]
+_MODULES = {
+    "api": ("benchmark", "controller", "run", "train"), "benchmarks": ("table",), "errors": ("InputError",),
+    "metrics": ("summary", "total_time_spent"), "network": ("Network", "load_network"),
+    "plant": ("AcyclicPlant", "NmfdPlant"), "runs": ("read_trajectory", "write_trajectory"),
+    "scenario": ("Scenario", "load_scenario"),
+    "types": ("Controller", "Controls", "Measurement", "Plant", "Trajectory")}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str):
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'nmfd' has no attribute {name!r}")
+    return getattr(import_module(f"nmfd.{_MODULE_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

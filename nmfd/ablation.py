@@ -18,7 +18,7 @@ from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.scenario import Scenario
-from nmfd.workers import Failure, RunFailed
+from nmfd.workers import Failure, ended
 
 METHODS = {"alternating": True, "joint": False}
 VALIDATION_COLUMNS = {"method": str, "seed": int, "adam_step": int, "total_time_spent_veh_s": float}
@@ -133,7 +133,7 @@ def _kept(
         missing = [run for run in todo if run not in done]
         for run, outcome in results(work, missing, workers, length, progress, label=lambda r: f"{r[0]} {r[1]}"):
             if isinstance(outcome, Failure):
-                failures.append(f"{run[0]} {run[1]}: {outcome.reason}")
+                failures.append((f"{run[0]} {run[1]}", outcome))
                 continue
             for file, kinds in columns.items():  # the last makes the run count: others may be there already
                 kept = [row for row in rows[file] if _run(row) != run]
@@ -142,7 +142,7 @@ def _kept(
         if rows[name]:
             draw(out, rows)
     if failures:
-        raise RunFailed("; ".join(failures))
+        raise ended(failures)
     return rows
 
 

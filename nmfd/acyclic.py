@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nmfd.dynamics import SCHEMES
 from nmfd.network import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, Network
 
 # Less than this share of theta left after removing h = g and h = o counts as nothing: what remains is then the
@@ -154,6 +155,23 @@ def advance(model: Acyclic, x, demand, perimeter, theta, step: float, *, integra
     for _ in range(substeps):
         x = INTEGRATORS[integrator](model, x, demand, perimeter, theta, step / substeps)
     return x
+
+
+def advance_counted(
+    model: Acyclic, x, demand, perimeter, theta, step: float, *, integrator="euler", substeps=1,
+) -> tuple[np.ndarray, float]:
+    """As `advance`, and the trips [veh] that ended meanwhile, by the same scheme: for the ledger."""
+    step, ended, ends = step / substeps, 0.0, model.region == model.destination
+    for _ in range(substeps):
+        slope, total = np.zeros_like(x), np.zeros_like(x)
+        for weight, place in zip(*SCHEMES[integrator], strict=True):
+            at = x + place * step * slope
+            slope = derivative(model, at, demand, perimeter, theta)
+            total += weight * slope
+            leaving = model.exit_rates[ends] * rate(model, at)[model.region[ends]] * at[ends]
+            ended += step * weight * float(leaving.sum())
+        x = x + step * total
+    return x, ended
 
 
 def translate(model: Acyclic, x: np.ndarray) -> np.ndarray:

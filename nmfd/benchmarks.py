@@ -9,14 +9,14 @@ from pathlib import Path
 import torch
 from scipy.special import stdtrit
 
-from nmfd import closed_loop, runs
+from nmfd import closed_loop, faults, runs
 from nmfd.controllers import registry
 from nmfd.plant import AcyclicPlant, NmfdPlant
 from nmfd.scenario import Scenario
-from nmfd.types import Trajectory
-from nmfd.workers import Failure, RunFailed, attempt, outcomes
+from nmfd.types import Plant, Trajectory
+from nmfd.workers import Failure, attempt, ended, outcomes
 
-PLANTS = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
+PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
 CAPTION = (
     "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against no-control; control: time of all\n"
@@ -61,22 +61,24 @@ def benchmark(
         work = partial(run_one, scenario=scenario, plant=plant, policies=policies)
         for run, outcome in results(work, todo, workers, scenario.steps, progress, label=_label):
             if isinstance(outcome, Failure):
-                failures.append(f"controller {_label(run)}: {outcome.reason}")
+                failures.append((f"controller {_label(run)}", outcome))
             else:
                 folder.add(outcome)
         if folder.finished:
             draw(folder.path, scenario, folder.trajectories())
         if failures:
-            raise RunFailed("; ".join(failures))
+            raise ended(failures)
         return folder.rows()
 
 
 def configuration(scenario: Scenario, controllers, plant: str, policies) -> tuple[dict, dict]:
-    """What all runs have in common, and what each controller depends on besides."""
+    """What all runs have in common, and what each controller depends on besides. InputError for a fault that the
+    regional model cannot have."""
+    faults.without_city(faults.of(scenario), f"{scenario.name}: faults")
     settings = {}
     for name in controllers:
         policy = registry.policy_path(name, scenario, policies.get(name))
-        settings[name] = {} if policy is None else {"policy_hash": runs.file_hash(policy)}
+        settings[name] = registry.fingerprint(name, policy)
     common = {
         "scenario": scenario.name, "scenario_hash": runs.scenario_hash(scenario), "network": scenario.network.name,
         "network_hash": scenario.network.hash, "plant": plant, "step_s": scenario.step, "steps": scenario.steps,
@@ -89,7 +91,7 @@ def _label(run: tuple[str, int]) -> str:
 
 
 def results(
-    work: Callable, todo: Sequence[tuple], workers: int, steps: int, progress, *, label: Callable[[tuple], str],
+    work: Callable, todo: Sequence[tuple], workers: int, steps: int, progress, *, label: Callable[..., str],
 ) -> Iterator[tuple]:
     """(run, result or Failure) of every run, in this process if there is one worker.
 

@@ -6,8 +6,9 @@ import click
 
 from nmfd.command_line import Commands, Interrupted
 from nmfd.errors import InputError
-from nmfd.experiments import ablation, bound, robustness, scaling
-from nmfd.options import FILE, FOLDER, controller_names, policy_files, quoted
+from nmfd.exchange import export, new_controller
+from nmfd.experiments import ablation, adaptation, bound, robustness, scaling
+from nmfd.options import COUNT, FILE, FOLDER, SEED, controller_names, fault_option, policy_files, quoted
 
 
 @click.group(name="nmfd", cls=Commands)
@@ -26,19 +27,22 @@ def main() -> None:
 @click.option("--controllers", required=True, metavar="A,B,...",
               help="Which to run: no-control, route-guidance, pi-gating, mpc-pc, mpc-pcrg, probing-pc, "
                    "probing-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, dpc-pcrg-robust, dpc-pc-guarded, "
-                   "dpc-pcrg-guarded, bound-pc, bound-pcrg.")
-@click.option("--seeds", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+                   "dpc-pcrg-guarded, dpc-pc-online, dpc-pcrg-online, bound-pc, bound-pcrg, or file.py:Class "
+                   "(see nmfd new-controller).")
+@click.option("--seeds", type=COUNT, default=1, show_default=True, metavar="N",
               help="Run seeds 0 to N-1 of the measurement noise.")
 @click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", show_default=True,
               help="The model that the controllers act on.")
-@click.option("--workers", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+@click.option("--workers", type=COUNT, default=1, show_default=True, metavar="N",
               help="Runs at a time, each on one core. Timings are cleanest with 1.")
 @click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
               help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.")
+@click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.frames).")
+@fault_option()
 @click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
 def benchmark(
     scenario: Path, controllers: str, seeds: int, plant: str, workers: int, policies: tuple[str, ...],
-    out: Path | None,
+    parquet: bool, faults: tuple[str, ...], out: Path | None,
 ) -> None:
     """Run controllers on a regional model; print a table and write a run folder.
 
@@ -56,10 +60,11 @@ def benchmark(
     files = policy_files(policies, names)
 
     from nmfd import benchmarks, runs
+    from nmfd.faults import with_faults
     from nmfd.progress import progress_line
     from nmfd.scenario import load_scenario
 
-    loaded = load_scenario(scenario)
+    loaded = with_faults(load_scenario(scenario), faults)
     out = runs.default_folder(loaded) if out is None else out
     try:
         with progress_line("benchmark") as progress:
@@ -70,6 +75,14 @@ def benchmark(
             raise Interrupted("interrupted before a run was finished; nothing is kept") from None
         raise Interrupted(
             f"interrupted; finished runs are in {out}: the same command with --out {quoted(out)} goes on") from None
+    if parquet:
+        import pandas as pd
+
+        from nmfd import frames
+
+        frames.write(out, [
+            runs.read_trajectory(out / f"{runs.run_name(row['controller'], row['seed'])}.npz") for row in rows],
+            {"summary": pd.DataFrame(rows)})
     click.echo(f"{loaded.name}, {plant} plant, {loaded.steps} control intervals of {loaded.step:g} s")
     click.echo(benchmarks.table(rows))
     click.echo(f"Written to {out}")
@@ -79,9 +92,9 @@ def benchmark(
 @click.argument("scenario", type=FOLDER)
 @click.option("--controller", required=True, metavar="NAME",
               help="dpc-pc, dpc-pcrg, dpc-pc-robust or dpc-pcrg-robust.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True,
+@click.option("--seed", type=SEED, default=0, show_default=True,
               help="Of the initial weights and the training scenarios.")
-@click.option("--steps", type=click.IntRange(min=1), metavar="N",
+@click.option("--steps", type=COUNT, metavar="N",
               help="Adam steps. [default: what scenario.toml says, else 400]")
 @click.option("--out", type=FILE, metavar="FILE", help="The policy file. [default: SCENARIO/NAME.pt]")
 @click.option("--resume", is_flag=True, help="Go on with an interrupted training.")
@@ -181,7 +194,7 @@ def _stamp(path: Path) -> int | None:
     return path.stat().st_mtime_ns if path.exists() else None
 
 
-for command in (bound, robustness, ablation, scaling):
+for command in (bound, robustness, adaptation, ablation, scaling, new_controller, export):
     main.add_command(command)
 
 

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from nmfd import faults
 from nmfd.scenario import Scenario
-from nmfd.types import Controller, Measurement, Plant, Trajectory
+from nmfd.types import Controller, Controls, Measurement, Plant, Trajectory
 
 
 def run(
@@ -18,19 +19,27 @@ def run(
 
     The controller sees every x_ij with Gaussian noise of `scenario.measurement_std`, drawn from `seed`, or the plant's
     estimate as it is; the trajectory holds the exact state. `progress(done, steps)` is called after every interval.
+    The faults that the scenario orders are injected (nmfd.faults). What was wrong with a measurement, or what the plant
+    could not do in an interval, is in the status of that decision.
     """
     random = np.random.default_rng([seed, 0x6E6F6973])
-    controller.reset(seed)
+    ordered, network = faults.of(scenario), scenario.network
+    sensors = faults.Sensors(ordered, seed)
+    watched = faults.Supervised(controller, ordered, np.where(network.adjacency, network.u_max, 0.0))
+    watched.reset(seed)
     states, controls, decision_time = [plant.reset(seed)], [], []
     completed = [plant.completed()]
     begin = time.perf_counter()
     for k in range(scenario.steps):
         noise = scenario.measurement_std * random.standard_normal(states[-1].accumulation.shape)
-        seen = what_is_seen(states[-1], noise)
+        seen, problem = sensors.see(
+            what_is_seen(states[-1], noise), estimated=states[-1].estimate is not None)
         before = time.perf_counter()
-        controls.append(controller.act(seen))
+        controls.append(watched.act(seen, problem))
         decision_time.append(time.perf_counter() - before)
         states.append(plant.step(controls[-1]))
+        if states[-1].problem:
+            controls[-1] = _noted(controls[-1], states[-1].problem)
         completed.append(plant.completed())
         if progress:
             progress(k + 1, scenario.steps)
@@ -42,6 +51,11 @@ def run(
         decision_time=np.array(decision_time),
         status=tuple(c.status for c in controls), wall_time=time.perf_counter() - begin,
         estimate=None if states[0].estimate is None else np.stack([s.estimate for s in states]))
+
+
+def _noted(controls: Controls, problem: str) -> Controls:
+    status = problem if controls.status == "ok" else f"{controls.status}; {problem}"
+    return replace(controls, status=status)
 
 
 def what_is_seen(state: Measurement, noise: np.ndarray) -> Measurement:

@@ -14,6 +14,7 @@ MEMORY = 20             # values that a step is compared with: some may rise
 SUFFICIENT = 1e-4       # of the decrease that the slope promises
 SHORTEST = 1e-10        # of a step, below which the line search gives up
 LONGEST = 1e10          # spectral step length
+AT_REST = "no further descent"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +73,7 @@ def minimise(
                 break
             if share < SHORTEST:
                 return Minimum(
-                    point=best[0], value=best[1], gap=least, evaluations=evaluations, reason="no further descent")
+                    point=best[0], value=best[1], gap=least, evaluations=evaluations, reason=AT_REST)
             lowest = -0.5 * share**2 * slope / (other_value - value - share * slope)  # of the parabola through both
             share = lowest if 0.1 * share <= lowest <= 0.5 * share else 0.5 * share
         moved, turned = other - point, other_gradient - gradient

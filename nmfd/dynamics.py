@@ -98,6 +98,8 @@ def rk4(p: Parameters, x, demand, perimeter, splits, step: float) -> torch.Tenso
 
 
 INTEGRATORS = {"euler": euler, "rk4": rk4}
+# Weights of the slopes of each, and where each slope is taken, in steps along the slope before it.
+SCHEMES = {"euler": ((1.0,), (0.0,)), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0))}
 
 
 def advance(p: Parameters, x, demand, perimeter, splits, step: float, *, integrator="euler", substeps=1):
@@ -105,3 +107,18 @@ def advance(p: Parameters, x, demand, perimeter, splits, step: float, *, integra
     for _ in range(substeps):
         x = INTEGRATORS[integrator](p, x, demand, perimeter, splits, step / substeps)
     return x
+
+
+def advance_counted(
+    p: Parameters, x, demand, perimeter, splits, step: float, *, integrator="euler", substeps=1,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """As `advance`, and the trips (...) [veh] that ended meanwhile, by the same scheme: for the ledger."""
+    step, ended = step / substeps, torch.zeros(x.shape[:-2], dtype=x.dtype)
+    for _ in range(substeps):
+        slope, total, completed = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(ended)
+        for weight, place in zip(*SCHEMES[integrator], strict=True):
+            completions, transfers = flows(p, x + place * step * slope, perimeter, splits)
+            slope = demand - torch.diag_embed(completions) - transfers.sum(-2) + transfers.sum(-3)
+            total, completed = total + weight * slope, completed + weight * completions.sum(-1)
+        x, ended = x + step * total, ended + step * completed
+    return x, ended

@@ -291,7 +291,8 @@ class _Model:
         The last R^2 are no measurements, but keep a wrong model from going astray: that the probes are a share of the
         vehicles. A draw of probes lasts until they leave, MEMORY at most, so the longer, the less it counts each time.
         """
-        known, here, to = self._instruments, *self._boundaries.T
+        known = self._instruments
+        here, to = self._boundaries.T
         mean, expansion, counts = z[self._mean], z[self._expansion], z[self._crossings]
         share = np.maximum(known.detector_share, 1e-6)
         boundary, gateways = (

@@ -6,7 +6,7 @@ import click
 
 from nmfd.command_line import Interrupted
 from nmfd.errors import InputError
-from nmfd.options import FILE, FOLDER, controller_names, policy_files, quoted
+from nmfd.options import COUNT, FILE, FOLDER, POSITIVE, controller_names, policy_files, quoted, whole_numbers
 
 
 @click.command()
@@ -15,14 +15,14 @@ from nmfd.options import FILE, FOLDER, controller_names, policy_files, quoted
               help="Which to run besides no-control; the names as in nmfd benchmark.")
 @click.option("--sigmas", default="0,0.25,0.5,0.75,1,1.5,2,3,5", show_default=True, metavar="S,...",
               help="Standard deviations of the noise [veh/s].")
-@click.option("--scenarios", type=click.IntRange(min=1), default=20, show_default=True, metavar="N",
+@click.option("--scenarios", type=COUNT, default=20, show_default=True, metavar="N",
               help="Draws of the noise for every sigma.")
 @click.option("--where", type=click.Choice(["planned", "pairs", "all"]), default="pairs", show_default=True,
               help="What is perturbed: planned demand while it lasts, its pairs of regions all the time, or all pairs. "
                    "Clipping at zero makes the last two add many trips.")
 @click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="acyclic", show_default=True,
               help="The model that the controllers act on.")
-@click.option("--workers", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+@click.option("--workers", type=COUNT, default=1, show_default=True, metavar="N",
               help="Runs at a time, each on one core.")
 @click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
               help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.")
@@ -69,11 +69,62 @@ def robustness(
 
 @click.command()
 @click.argument("scenario", type=FOLDER)
+@click.option("--controllers", default="no-control,dpc-pcrg,dpc-pcrg-online", show_default=True, metavar="A,B,...",
+              help="Made for the scenario as it is; those in -online are fine-tuned between control steps.")
+@click.option("--cases", default="nominal,more,one-origin,later,rain", show_default=True, metavar="A,B,...",
+              help="What comes differently: more demand, more from one origin, all of it later, capacity minus 20 %.")
+@click.option("--seeds", type=COUNT, default=1, show_default=True, metavar="N",
+              help="Of the measurement noise.")
+@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", show_default=True)
+@click.option("--workers", type=COUNT, default=1, show_default=True, metavar="N",
+              help="Runs at a time, each on one core. Timings are cleanest with 1.")
+@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
+              help="The file of a policy, if not SCENARIO/NAME.pt. May be repeated.")
+@click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-adaptation]")
+def adaptation(
+    scenario: Path, controllers: str, cases: str, seeds: int, plant: str, workers: int, policies: tuple[str, ...],
+    out: Path | None,
+) -> None:
+    """Compare controllers where demand or capacity is not what they were made for; print a table.
+
+    The run folder holds adaptation.csv and manifest.json; what is there is not run again.
+
+    \b
+    Examples:
+      nmfd adaptation scenarios/economic_mpc
+      nmfd adaptation scenarios/economic_mpc --controllers dpc-pc,dpc-pc-online,pi-gating --cases rain,more
+    """
+    names = controller_names(controllers)
+    files = policy_files(policies, names)
+
+    from nmfd import adaptation as method
+    from nmfd import runs
+    from nmfd.progress import progress_line
+    from nmfd.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    out = Path("runs") / f"{runs.file_name(loaded.name)}-adaptation" if out is None else out
+    chosen = list(dict.fromkeys(case.strip() for case in cases.split(",")))
+    try:
+        with progress_line("adaptation") as progress:
+            rows = method.adaptation(
+                loaded, names, chosen, range(seeds), out=out, plant=plant, policies=files, workers=workers,
+                progress=progress)
+    except KeyboardInterrupt:
+        if not (out / "adaptation.csv").exists():
+            raise Interrupted("interrupted before a run was finished; nothing is kept") from None
+        raise Interrupted(f"interrupted; finished runs are in {out}: the same command goes on") from None
+    click.echo(method.table(rows))
+    click.echo(f"Written to {out}")
+
+
+@click.command()
+@click.argument("scenario", type=FOLDER)
 @click.option("--controller", required=True, metavar="NAME", help="bound-pc or bound-pcrg.")
 @click.option("--from", "starts", metavar="A,B,...",
               help="Controllers whose closed loops it starts from, besides open and half-closed perimeters. "
                    "[default: pi-gating and the DPC policies there are]")
-@click.option("--iterations", type=click.IntRange(min=1), metavar="N", help="Adam steps. [default: 1500]")
+@click.option("--iterations", type=COUNT, metavar="N", help="Adam steps. [default: 1500]")
 @click.option("--out", type=FILE, metavar="FILE", help="The plan file. [default: SCENARIO/NAME.npz]")
 def bound(scenario: Path, controller: str, starts: str | None, iterations: int | None, out: Path | None) -> None:
     """Compute the bound: the best control of the regional model that knows all demand.
@@ -120,16 +171,16 @@ def _sigmas(text: str) -> list[float]:
 @click.command()
 @click.argument("what", type=click.Choice(["training", "horizon"]))
 @click.argument("scenario", type=FOLDER)
-@click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, metavar="N",
+@click.option("--seeds", type=COUNT, default=3, show_default=True, metavar="N",
               help="training: seeds 0 to N-1 with each method.")
 @click.option("--controller", default="dpc-pcrg", show_default=True, metavar="NAME", help="training: what is trained.")
-@click.option("--steps", type=click.IntRange(min=1), metavar="N", help="training: Adam steps. [default: scenario.toml]")
+@click.option("--steps", type=COUNT, metavar="N", help="training: Adam steps. [default: scenario.toml]")
 @click.option("--horizons", default="2,3,4,6,8,10,12,16,20,25,30", show_default=True, metavar="H,...",
               help="horizon: control intervals that MPC looks ahead.")
 @click.option("--controllers", default="mpc-pc,mpc-pcrg", show_default=True, metavar="A,B", help="horizon: which MPC.")
 @click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="acyclic", show_default=True,
               help="The model that MPC and the trained policies act on.")
-@click.option("--workers", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+@click.option("--workers", type=COUNT, default=1, show_default=True, metavar="N",
               help="Runs at a time, each on one core. Timings are cleanest with 1.")
 @click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
 def ablation(
@@ -150,7 +201,7 @@ def ablation(
       nmfd ablation training scenarios/economic_mpc --seeds 3 --out runs/alternating
       nmfd ablation horizon scenarios/economic_mpc --controllers mpc-pc --out runs/horizon
     """
-    names, lengths = controller_names(controllers), _lengths(horizons)
+    names, lengths = controller_names(controllers), whole_numbers("--horizons", horizons, "2,8")
 
     from nmfd import ablation as method
     from nmfd import runs
@@ -177,15 +228,6 @@ def ablation(
     click.echo(f"Written to {out}")
 
 
-def _lengths(text: str) -> list[int]:
-    """Horizons in a list separated by commas. InputError for anything but whole numbers from 2 up."""
-    parts = [part.strip() for part in text.split(",")]
-    values = [int(part) if part.isdecimal() else 0 for part in parts]
-    if min(values) < 2 or len(set(values)) < len(values):
-        raise InputError(f"--horizons: expected different whole numbers from 2 up, such as 2,8, got {text!r} instead")
-    return values
-
-
 @click.command()
 @click.option("--regions", metavar="N,...", help="Numbers of regions. [default: 2,4,8,... to 64, hexagonal to 256]")
 @click.option("--controllers", default="dpc-pc,dpc-pcrg,mpc-pc,mpc-pcrg", show_default=True, metavar="A,B,...",
@@ -194,11 +236,11 @@ def _lengths(text: str) -> list[int]:
               help="Every region adjacent to every other, as published, or a plane city.")
 @click.option("--load", type=click.Choice(["published", "congested"]), default="published", show_default=True,
               help="Initial states: 0 to 100 vehicles bound for every region, or regions up to beyond their jam.")
-@click.option("--workers", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+@click.option("--workers", type=COUNT, default=1, show_default=True, metavar="N",
               help="Cases at a time, each in a process on one core. Timings are cleanest with 1.")
-@click.option("--memory", type=click.FloatRange(min=0.0, min_open=True), default=16.0, show_default=True,
+@click.option("--memory", type=POSITIVE, default=16.0, show_default=True,
               metavar="GIB", help="That a case may take.")
-@click.option("--time-limit", type=click.FloatRange(min=0.0, min_open=True), default=600.0, show_default=True,
+@click.option("--time-limit", type=POSITIVE, default=600.0, show_default=True,
               metavar="S", help="That a case may take.")
 @click.option("--out", type=FOLDER, default=Path("runs/scaling"), show_default=True, metavar="DIR",
               help="The run folder.")
@@ -218,7 +260,7 @@ def scaling(
       nmfd scaling --family hexagonal --load congested --controllers dpc-pcrg,mpc-pcrg --regions 7,19,37
     """
     names = controller_names(controllers)
-    counts = () if regions is None else _counts(regions)
+    counts = () if regions is None else whole_numbers("--regions", regions, "2,4,8")
 
     from nmfd import scaling as method
     from nmfd.progress import progress_line
@@ -234,12 +276,3 @@ def scaling(
         raise Interrupted(f"interrupted; finished cases are in {out}: the same command goes on") from None
     click.echo(method.table(rows))
     click.echo(f"Written to {out}")
-
-
-def _counts(text: str) -> list[int]:
-    """Numbers of regions in a list separated by commas. InputError for anything but whole numbers from 2 up."""
-    parts = [part.strip() for part in text.split(",")]
-    values = [int(part) if part.isdecimal() else 0 for part in parts]
-    if min(values) < 2 or len(set(values)) < len(values):
-        raise InputError(f"--regions: expected different whole numbers from 2 up, such as 2,4,8, got {text!r} instead")
-    return values

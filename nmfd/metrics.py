@@ -12,7 +12,7 @@ def total_time_spent(trajectory: Trajectory) -> float:
 
 
 def summary(trajectory: Trajectory) -> dict[str, float | int | str]:
-    """One row of summary.csv."""
+    """One row of summary.csv: column (with its unit in the name) -> value, such as "total_time_spent_veh_s"."""
     total = trajectory.accumulation.sum(axis=(1, 2))
     decision_ms = 1e3 * trajectory.decision_time
     return {

@@ -53,7 +53,10 @@ class Mfd:
             return f"jam must be positive, got {self.jam:g}"
         if np.isfinite(self.jam):
             grid = np.linspace(0.0, self.jam, 2001)
-            rate = self.rate(grid)
+            with np.errstate(all="ignore"):
+                rate, most = self.rate(grid), self.capacity
+            if not np.isfinite(rate).all() or not np.isfinite(most):
+                return f"the outflow is not finite up to jam = {self.jam:g}"
             if rate.min() <= 0:
                 return f"the outflow is not positive at {grid[rate.argmin()]:.0f} veh, below jam = {self.jam:g}"
         return None

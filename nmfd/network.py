@@ -19,6 +19,8 @@ from nmfd.mfd import Mfd
 SHARPNESS = 4
 LEAST_ROOM = 0.03    # of the capacity, into a region however full: it never locks for good
 LEAST_LIMIT = 1e-6   # veh/s, against a division by zero
+MOST = 1e9           # veh in a region: beyond, it is a mistake
+LONGEST_NAME = 100   # characters: names become file names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +122,7 @@ def load_network(folder: Path | str) -> Network:
     """
     folder = Path(folder)
     root = toml.read(folder / "network.toml")
-    name = root.text("name")
+    name = root.text("name", longest=LONGEST_NAME)
     perimeter = root.table("perimeter")
     u_min = perimeter.number("min", low=0.0, high=1.0)
     u_max = perimeter.number("max", low=0.0, high=1.0)
@@ -133,7 +135,7 @@ def load_network(folder: Path | str) -> Network:
         raise root.error("regions", "empty; add at least one [[regions]] table")
     names, positions, neighbours, barred, onward, mfds, boundaries = [], [], [], [], [], [], []
     for number, row in enumerate(rows):
-        names.append(row.text("name", str(number)))
+        names.append(row.text("name", str(number), longest=LONGEST_NAME))
         positions.append(row.numbers("position", length=2))
         neighbours.append(row.integers("adjacent", high=len(rows) - 1))
         barred.append(row.integers("no_way_to", (), high=len(rows) - 1))
@@ -179,10 +181,10 @@ def _shares(row: toml.Table, neighbours: tuple[int, ...]) -> dict[int, float]:
 
 def _boundary(row: toml.Table, regions: int, adjacent: tuple[int, ...]) -> dict:
     """The options of one region: exit_rates (R,), capacity (one per region it leads to), storage; None if absent."""
-    found = {
+    found: dict = {
         "exit_rates": row.numbers("exit_rates", length=regions) if row.has("exit_rates") else None,
         "capacity": row.numbers("capacity", length=len(adjacent)) if row.has("capacity") else None,
-        "storage": row.number("storage", above=0.0) if row.has("storage") else None}
+        "storage": row.number("storage", above=0.0, high=MOST) if row.has("storage") else None}
     for key in ("exit_rates", "capacity"):
         if found[key] is not None and min(found[key], default=1.0) <= 0:
             raise row.error(key, f"expected numbers above 0, got {list(found[key])} instead")
@@ -208,7 +210,8 @@ def _boundaries(root: toml.Table, neighbours: list[tuple], rows: list[dict]) -> 
 
 
 def _mfd(table: toml.Table) -> Mfd:
-    mfd = Mfd(a=table.number("a"), b=table.number("b"), c=table.number("c"), jam=table.number("jam", above=0.0))
+    mfd = Mfd(a=table.number("a"), b=table.number("b"), c=table.number("c"),
+              jam=table.number("jam", above=0.0, high=MOST))
     table.close()
     if problem := mfd.problem():
         raise table.error("c" if mfd.c <= 0 else "jam", problem)

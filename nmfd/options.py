@@ -1,5 +1,6 @@
 """Command-line values that several commands of `nmfd` share."""
 
+import math
 import shlex
 from pathlib import Path
 
@@ -9,6 +10,35 @@ from nmfd.errors import InputError
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 FILE = click.Path(path_type=Path, dir_okay=False)
+SEED = click.IntRange(0, 2**31 - 1)  # SUMO's are 32 bits long
+COUNT = click.IntRange(1, 10**6)
+
+
+class Positive(click.FloatRange):
+    """Above 0, or from it, and up to `most`; not NaN, which click lets pass."""
+
+    def __init__(self, most: float, *, zero: bool = False):
+        super().__init__(0.0, most, min_open=not zero)
+
+    def convert(self, value, param, ctx):
+        number = super().convert(value, param, ctx)
+        if math.isnan(number):
+            self.fail(f"{value} is not in the range {self._describe_range()}.", param, ctx)
+        return number
+
+
+POSITIVE = Positive(1e6)
+LEVEL = Positive(10.0)  # of demand
+
+
+def fault_option(more: str = ""):
+    """--fault, which may be repeated. more: kinds besides those of every plant"""
+    kinds = ("frozen, delayed:N, missing:REGION, detectors:SHARE, off:FACTOR, solver-fails, solver-diverges, "
+             "solver-late, ")
+    return click.option(
+        "--fault", "faults", multiple=True, metavar="KIND[:VALUE][@FROM-TO]",
+        help=f"Inject a fault, in the control intervals FROM to TO - 1: {kinds}policy-nan{', ' if more else ''}{more}. "
+             "May be repeated; what is done instead is in the status of every decision.")
 
 
 def controller_names(controllers: str) -> list[str]:
@@ -40,3 +70,13 @@ def policy_files(options: tuple[str, ...], names: list[str]) -> dict[str, Path]:
 
 def quoted(path: Path) -> str:
     return shlex.quote(str(path))
+
+
+def whole_numbers(option: str, text: str, example: str) -> list[int]:
+    """Different whole numbers from 2 up in a list separated by commas. InputError for anything else."""
+    parts = [part.strip() for part in text.split(",")]
+    values = [int(part) if part.isdecimal() and len(part) < 7 else 0 for part in parts]
+    if min(values) < 2 or len(set(values)) < len(values):
+        raise InputError(
+            f"{option}: expected different whole numbers from 2 up, such as {example}, got {text!r} instead")
+    return values

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from nmfd import acyclic, dynamics
+from nmfd import acyclic, dynamics, ledger
 from nmfd.scenario import Scenario
 from nmfd.types import Controls, Measurement
 
@@ -18,22 +18,26 @@ class NmfdPlant:
 
     def reset(self, seed: int) -> Measurement:
         """Empty network; the model is deterministic, `seed` changes nothing."""
-        self._k, self._entered = 0, 0.0
+        self._k, self._entered, self._ended = 0, 0.0, 0.0
         self._x = torch.zeros_like(self._demand[0])
         return self._measurement()
 
     def step(self, controls: Controls) -> Measurement:
         demand = self._demand[self._k]
         splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
-        self._x = dynamics.advance(
+        self._x, ended = dynamics.advance_counted(
             self._parameters, self._x, demand, torch.from_numpy(controls.perimeter), torch.from_numpy(splits),
             self._scenario.step, integrator=self._scenario.integrator, substeps=self._scenario.substeps)
         self._entered += float(demand.sum()) * self._scenario.step
+        self._ended += float(ended)
         self._k += 1
+        ledger.check(
+            self._k, self._k * self._scenario.step, entered=self._entered, ended=self._ended,
+            inside=float(self._x.sum()), least=float(self._x.min()))
         return self._measurement()
 
     def completed(self) -> float:
-        return self._entered - float(self._x.sum())
+        return self._ended
 
     def close(self) -> None:
         pass
@@ -53,7 +57,7 @@ class AcyclicPlant:
 
     def reset(self, seed: int) -> Measurement:
         """Empty network; the model is deterministic, `seed` changes nothing."""
-        self._k, self._entered, self._forced = 0, 0.0, 0.0
+        self._k, self._entered, self._ended, self._forced = 0, 0.0, 0.0, 0.0
         self._x = np.zeros(len(self._model.region))
         return self._measurement()
 
@@ -79,15 +83,19 @@ class AcyclicPlant:
             leaving = model.exit_rates * acyclic.rate(model, self._x)[model.region] * self._x
             passing = acyclic.transfers(model, self._x, leaving, controls.perimeter, theta)
             self._forced += scenario.step * float(passing[model.fallback[forced]].sum())
-        self._x = acyclic.advance(
+        self._x, ended = acyclic.advance_counted(
             model, self._x, demand, controls.perimeter, theta, scenario.step, integrator=scenario.integrator,
             substeps=scenario.substeps)
         self._entered += float(demand.sum()) * scenario.step
+        self._ended += ended
         self._k += 1
+        ledger.check(
+            self._k, self._k * scenario.step, entered=self._entered, ended=self._ended, inside=float(self._x.sum()),
+            least=float(self._x.min()))
         return self._measurement()
 
     def completed(self) -> float:
-        return self._entered - float(self._x.sum())
+        return self._ended
 
     def close(self) -> None:
         pass

@@ -18,7 +18,7 @@ from nmfd.controllers import registry
 from nmfd.demand_noise import perturbed
 from nmfd.metrics import summary
 from nmfd.scenario import Scenario
-from nmfd.workers import Failure, RunFailed
+from nmfd.workers import Failure, ended
 
 COLUMNS = {
     "sigma_veh_per_s": float, "scenario": int, "controller": str, "trips_veh": float,
@@ -77,14 +77,14 @@ def robustness(
         work = partial(run_one, scenario=scenario, plant=plant, where=where, policies=policies)
         for run, outcome in results(work, todo, workers, scenario.steps, progress, label=_label):
             if isinstance(outcome, Failure):
-                failures.append(f"{_label(run)}: {outcome.reason}")
+                failures.append((_label(run), outcome))
             else:
                 rows[run] = outcome
                 runs.write_rows(file, COLUMNS, [rows[run] for run in sorted(rows)])
         if rows:
             draw(out, [rows[run] for run in sorted(rows)])
     if failures:
-        raise RunFailed("; ".join(failures))
+        raise ended(failures)
     return [rows[run] for run in sorted(rows)]
 
 
@@ -113,9 +113,10 @@ def improvements(rows: Sequence[Mapping], controller: str) -> dict[float, tuple[
 
 
 def compared(rows: Sequence[Mapping]) -> list[str]:
-    """The controllers in `rows` but no control, in the order of the registry."""
-    there = {row["controller"] for row in rows}
-    return [name for name in registry.names() if name in there and name != REFERENCE]
+    """The controllers in `rows` but no control, in the order of the registry, others behind."""
+    there = dict.fromkeys(row["controller"] for row in rows)
+    order = dict.fromkeys([*(name for name in registry.names() if name in there), *there])
+    return [name for name in order if name != REFERENCE]
 
 
 def trips(rows: Sequence[Mapping]) -> dict[float, float]:

@@ -6,6 +6,8 @@
 """
 
 import csv
+import errno
+import fcntl
 import hashlib
 import json
 import math
@@ -14,12 +16,14 @@ import platform
 import re
 import subprocess
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
 from importlib import metadata
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 
@@ -33,7 +37,11 @@ COLUMNS = {
     "max_accumulation_veh": float, "completed_veh": float, "evaluation_time_s": float,
     "control_step_ms_median": float, "control_step_ms_max": float, "solver_failures": int,
 }
+LOCK = ".lock"  # of a run folder
+TEMPORARY = re.compile(r"\.(?P<stem>.+)-\d+\.tmp(\.\w+)?")  # names that `atomic` gives
 PACKAGES = ("numpy", "torch", "casadi", "libsumo", "perimeter-cosim")
+# What NumPy raises for a file that is no .npz, cut off, changed, or without an array that it should have.
+DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 _ARRAYS = ("accumulation", "backlog", "completed", "perimeter", "splits")
 
 
@@ -41,16 +49,64 @@ _ARRAYS = ("accumulation", "backlog", "completed", "perimeter", "splits")
 def atomic(path: Path) -> Iterator[Path]:
     """A temporary name in the folder of `path` to write to; it becomes `path` if all goes well, else it goes.
 
-    The suffix of `path` is kept, because matplotlib and NumPy choose the format by it.
+    The suffix of `path` is kept, because matplotlib and NumPy choose the format by it. A process that is killed leaves
+    the temporary file behind; `sweep` removes it.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem}-{os.getpid()}{path.suffix}")
+    temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+    except BaseException as error:
+        if isinstance(error, OSError) and error.filename is None:  # a full disk is met without a name
+            error.filename = str(path)
+        with suppress(OSError):
+            temporary.unlink()
         raise
+
+
+def sweep(folder: Path, stems: Collection[str] | None = None) -> None:
+    """Remove what killed processes left half-written in `folder`, of files with these stems, or of all.
+
+    To be called by whoever has the folder or the files to himself (`locked`).
+    """
+    for path in folder.iterdir():
+        name = TEMPORARY.fullmatch(path.name)
+        if name and (stems is None or name["stem"] in stems):
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
+def locked(file: Path, what: Path) -> Iterator[None]:
+    """`what` to oneself: InputError if another process has it.
+
+    file: the lock, which holds process and host. The system lets go of it when the process ends, however it ends.
+    """
+    while True:
+        handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.read(handle, 200).decode(errors="replace") or "another process"
+            os.close(handle)
+            raise InputError(
+                f"{what}: {holder} is writing to it; wait for its end, or choose another name with --out") from None
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+                os.close(handle)
+                raise
+        with suppress(FileNotFoundError):  # whoever had it may have removed it meanwhile
+            if os.path.samestat(os.fstat(handle), os.stat(file)):
+                break
+        os.close(handle)
+    try:
+        os.ftruncate(handle, 0)
+        os.write(handle, f"process {os.getpid()} on {platform.node()}".encode())
+        yield
+    finally:
+        with suppress(OSError):
+            os.unlink(file)
+        os.close(handle)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -81,7 +137,7 @@ def read_trajectory(path: Path) -> Trajectory:
                 **{name: file[name] for name in _ARRAYS})
     except FileNotFoundError:
         raise InputError(f"{path}: no such trajectory; run it again") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGED as error:
         raise InputError(f"{path}: is no trajectory ({error}); delete it and run it again") from None
 
 
@@ -95,19 +151,35 @@ def write_rows(path: Path, columns: Mapping[str, type], rows: Sequence[Mapping])
 
 def read_rows(path: Path, columns: Mapping[str, type]) -> list[dict]:
     """The rows of a csv file with `columns`: name -> type. Raises InputError."""
-    with Path(path).open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        if reader.fieldnames != list(columns):
-            raise InputError(f"{path}: expected the columns {', '.join(columns)}; delete the folder and run again")
-        try:
+    try:
+        with Path(path).open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            if reader.fieldnames != list(columns):
+                raise ValueError(f"expected the columns {', '.join(columns)}")
             return [{name: convert(row[name]) for name, convert in columns.items()} for row in reader]
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{path}: {error}; delete the folder and run again") from None
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; delete the folder and run again") from None
+    except (OSError, TypeError, ValueError, csv.Error) as error:
+        raise InputError(f"{path}: {error}; delete the folder and run again") from None
 
 
 def write_summary(path: Path, rows: list[dict]) -> None:
     """`rows` of metrics.summary as summary.csv, atomically."""
     write_rows(path, COLUMNS, rows)
+
+
+def read_manifest(path: Path) -> dict:
+    """manifest.json of a run folder: configuration, controllers, sessions. Raises InputError."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(content["configuration"], dict) or not isinstance(content["controllers"], dict):
+            raise TypeError
+        [session.keys() for session in content["sessions"]]
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give a folder that a run was written to") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise InputError(f"{path}: is no manifest of a run; choose another folder with --out") from None
+    return content
 
 
 def read_summary(path: Path) -> list[dict]:
@@ -122,6 +194,8 @@ def scenario_hash(scenario: Scenario) -> str:
         scenario.substeps, scenario.protected, scenario.controller_options]
     if scenario.forecast_error:
         settings.append([scenario.forecast_error, scenario.forecast_seed])
+    if scenario.faults:
+        settings.append(scenario.faults)
     text = json.dumps(settings, sort_keys=True, default=str)
     return hashlib.sha256(text.encode() + np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16]
 
@@ -160,6 +234,11 @@ def file_name(name: str) -> str:
     return re.sub(r"[^\w.-]+", "-", name)
 
 
+def run_name(controller: str, seed: int) -> str:
+    """What the files of a run are called; of a controller in a file, path/to/file.py:Class, without the / and :."""
+    return f"{quote(controller, safe='+,-._ ')}-{seed}"
+
+
 def default_folder(scenario: Scenario) -> Path:
     """runs/<scenario>-<timestamp> in the current folder, a name not taken yet."""
     stem = f"{file_name(scenario.name)}-{datetime.now():%Y%m%d-%H%M%S}"
@@ -181,7 +260,7 @@ class RunFolder:
         return [run for run in self._order if run in self._rows and self.trajectory_path(*run).is_file()]
 
     def trajectory_path(self, controller: str, seed: int) -> Path:
-        return self.path / f"{controller}-{seed}.npz"
+        return self.path / f"{run_name(controller, seed)}.npz"
 
     def add(self, trajectory: Trajectory) -> None:
         """Write a finished run at once: its trajectory, then summary.csv, which is what makes it count."""
@@ -251,43 +330,51 @@ def manifest(
     renew: takes the controllers that changed, and what of them, before the manifest says so; without it they are an
         error
     results: the file in `path` that holds what is finished. If the body fails at the first opening before this file
-    is there, everything made here is removed again. Raises InputError as `open_folder`.
+    is there, everything made here is removed again. Raises InputError as `open_folder`, and while another process has
+    the folder.
     """
     path = Path(path)
     configuration, controllers = json.loads(json.dumps([configuration, controllers or {}]))
     file, sessions = path / "manifest.json", []
-    if file.is_file():
-        sessions, controllers, changed = _continued(file, configuration, controllers, renewable=renew is not None)
-        if changed:
-            renew(changed)
-    elif path.exists() and not path.is_dir():
+    if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; choose another folder with --out")
-    elif path.is_dir() and any(path.iterdir()):
+    if path.is_dir() and not file.is_file() and any(
+            found.name != LOCK and not TEMPORARY.fullmatch(found.name) for found in path.iterdir()):
         raise InputError(f"{path}: is not empty and holds no manifest.json; choose another folder with --out")
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
-    sessions.append({**provenance(), **(session or {})})
-    content = {"configuration": configuration, "controllers": controllers, "sessions": sessions}
     try:
         path.mkdir(parents=True, exist_ok=True)
-        write_text(file, json.dumps(content, indent=2) + "\n")
-        yield
+        with locked(path / LOCK, path):
+            sweep(path)
+            if file.is_file():
+                sessions, controllers, changed = _continued(
+                    file, configuration, controllers, renewable=renew is not None)
+                if changed:
+                    renew(changed)
+            first = not sessions
+            sessions.append({**provenance(), **(session or {})})
+            content = {"configuration": configuration, "controllers": controllers, "sessions": sessions}
+            try:
+                write_text(file, json.dumps(content, indent=2) + "\n")
+                yield
+            finally:
+                if not results.exists() and first:
+                    with suppress(OSError):
+                        file.unlink()
     finally:
-        if not results.exists() and len(sessions) == 1:
+        for parent in made:  # those that are empty
             with suppress(OSError):
-                file.unlink()
-            for parent in made:
-                with suppress(OSError):
-                    parent.rmdir()
+                parent.rmdir()
 
 
-def _continued(manifest_path: Path, configuration: dict, controllers: dict, *, renewable: bool) -> tuple:
+def _continued(manifest_path: Path, configuration: Mapping, controllers: Mapping, *, renewable: bool) -> tuple:
     """The sessions so far, the controllers there and in `controllers`, and those that changed -> what of them.
 
     InputError where the configurations, or without `renewable` the controllers, do not agree.
     """
+    manifest = read_manifest(manifest_path)
+    sessions, known = manifest["sessions"], manifest["controllers"]
     try:
-        manifest = json.loads(manifest_path.read_text(encoding="utf-8"))
-        sessions, known = list(manifest["sessions"]), dict(manifest["controllers"])
         there = {**{name: known.get(name, controllers[name]) for name in controllers}, **manifest["configuration"]}
         changed = {
             name: ", ".join(key for key in {**known[name], **wanted} if known[name].get(key) != wanted.get(key))

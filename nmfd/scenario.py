@@ -10,8 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from nmfd import toml
+from nmfd.controllers import registry
 from nmfd.errors import InputError
-from nmfd.network import Network, check_step, load_network
+from nmfd.network import LONGEST_NAME, Network, check_step, load_network
+
+MOST_NUMBERS = 2 * 10**8  # of a demand table: more would not fit into memory
+LONGEST_STEP = 86_400.0   # s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +34,7 @@ class Scenario:
     forecast_error: standard deviation of the logarithm of what a controller is told of the demand, over the truth [-]
     forecast_seed: of that error
     controller_options: controller name -> its table in [controllers], checked by that controller
+    faults: injected into every run (nmfd.faults)
     folder: where scenario.toml was, or None
     """
 
@@ -46,6 +51,7 @@ class Scenario:
     demand_factor: float = 1.0
     forecast_error: float = 0.0
     forecast_seed: int = 0
+    faults: tuple[str, ...] = ()
     folder: Path | None = None
 
     @cached_property
@@ -114,26 +120,27 @@ def _completed(content: dict, base: dict) -> dict:
 
 
 def load_scenario(folder: Path | str) -> Scenario:
-    """Read `folder`/scenario.toml and its network. Raises InputError; the table [sumo] is left to cosim."""
+    """Read `folder`/scenario.toml and its network, and check the options of every controller in it. Raises InputError;
+    the table [sumo] is left to cosim."""
     folder = Path(folder)
     root = read_tables(folder)
-    name = root.text("name")
+    name = root.text("name", longest=LONGEST_NAME)
     network = load_network(folder / root.text("network"))
-    step = root.number("step", above=0.0)
-    steps = root.integer("steps", low=1)
+    step = root.number("step", above=0.0, high=LONGEST_STEP)
+    steps = root.integer("steps", low=1, high=MOST_NUMBERS // network.regions**2)
     integrator = root.text("integrator", "euler", ("euler", "rk4"))
-    substeps = root.integer("substeps", 1, low=1)
+    substeps = root.integer("substeps", 1, low=1, high=1000)
     protected = root.integers("protected", (), high=network.regions - 1)
     noise = root.table("noise", None)
-    measurement_std = noise.number("measurement_std", 0.0, low=0.0)
+    measurement_std = noise.number("measurement_std", 0.0, low=0.0, high=1e6)
     noise.close()
-    factor = root.number("demand_factor", 1.0, low=0.0)
+    factor = root.number("demand_factor", 1.0, low=0.0, high=1000.0)
     demand = np.zeros((steps, network.regions, network.regions))
     time = step * np.arange(steps)
     for row in root.tables("demand", () if root.has("demand_file") else ...):
         pair = [_region(row, key, network) for key in ("from", "to")]
         rate = trapezoid(
-            time, start=row.number("start", low=0.0), peak=row.number("peak", low=0.0),
+            time, start=row.number("start", low=0.0), peak=row.number("peak", low=0.0, high=1e6),
             ramp_up=row.number("ramp_up", low=0.0), flat=row.number("flat", low=0.0),
             ramp_down=row.number("ramp_down", low=0.0))
         demand[:, pair[0], pair[1]] += rate
@@ -145,14 +152,23 @@ def load_scenario(folder: Path | str) -> Scenario:
     forecast = root.table("forecast", None)
     forecast_error, forecast_seed = forecast.number("error", 0.0, low=0.0, high=2.0), forecast.integer("seed", 0)
     forecast.close()
-    controller_options = root.raw_table("controllers")
+    controller_options, ordered = root.raw_table("controllers"), root.texts("faults", ())
     root.raw_table("sumo")
     root.close()
     check_step(network, step / substeps, str(folder / "scenario.toml"))
-    return Scenario(
+    scenario = Scenario(
         name=name, network=network, step=step, steps=steps, demand=factor * demand, measurement_std=measurement_std,
         integrator=integrator, substeps=substeps, protected=protected, controller_options=controller_options,
-        demand_factor=factor, forecast_error=forecast_error, forecast_seed=forecast_seed, folder=folder)
+        demand_factor=factor, forecast_error=forecast_error, forecast_seed=forecast_seed, faults=ordered, folder=folder)
+    registry.check_options(scenario)
+    _check_faults(scenario)
+    return scenario
+
+
+def _check_faults(scenario: Scenario) -> None:
+    from nmfd import faults
+
+    faults.of(scenario)
 
 
 def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
@@ -174,13 +190,13 @@ def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
     for number, row in enumerate(rows[1:], start=2):
         try:
             k, i, j, rate = int(row[0]), int(row[1]), int(row[2]), float(row[3])
-            good = len(row) == 4 and k >= 0 and 0 <= i < regions and 0 <= j < regions and 0.0 <= rate < np.inf
+            good = len(row) == 4 and k >= 0 and 0 <= i < regions and 0 <= j < regions and 0.0 <= rate <= 1e6
         except (ValueError, IndexError):
             good = False
         if not good:
             raise InputError(
                 f"{path}: line {number}: expected an interval from 0 up, two regions from 0 to {regions - 1} and "
-                f"veh/s >= 0, got {','.join(row)} instead")
+                f"veh/s from 0 to 1e6, got {','.join(row)} instead")
         if k < steps:
             demand[k, i, j] += rate
     return demand
@@ -189,11 +205,14 @@ def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
 def as_modelled(scenario: Scenario, controller: str) -> Scenario:
     """`scenario` with the regional model that `controller` plans with: the network that its option `model` names.
 
-    Drivers who are guided, or who reroute by themselves, make another model of the same city. Raises InputError.
+    Drivers who are guided, or who reroute by themselves, make another model of the same city. A controller "NAME+..."
+    is NAME with the options of [controllers."NAME+..."] over those of [controllers.NAME]. Raises InputError.
     """
-    options = dict(scenario.controller_options.get(controller, {}))
+    name, tables = controller.partition("+")[0], scenario.controller_options
+    options = {**tables.get(name, {}), **tables.get(controller, {})}
+    configured = replace(scenario, controller_options={**tables, name: options})
     if "model" not in options or scenario.folder is None:
-        return scenario
+        return configured
     table = toml.Table(options, scenario.folder / "scenario.toml", f"controllers.{controller}.")
     model = load_network(scenario.folder / table.text("model"))
     if not np.array_equal(model.adjacency, scenario.network.adjacency):
@@ -201,8 +220,7 @@ def as_modelled(scenario: Scenario, controller: str) -> Scenario:
                           "; identify one for the same city with 'cosim identify'")
     del options["model"]
     check_step(model, scenario.step / scenario.substeps, f"{model.folder}")
-    return replace(
-        scenario, network=model, controller_options={**scenario.controller_options, controller: options})
+    return replace(configured, network=model)
 
 
 def _region(row: toml.Table, key: str, network: Network) -> int:

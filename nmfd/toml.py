@@ -1,9 +1,15 @@
 """Reading TOML tables with checked keys, types and ranges: the edge at which files are validated."""
 
+import math
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 
 from nmfd.errors import InputError
+
+MOST = 10**9        # of a whole number without a limit of its own
+LONGEST = 1000      # characters of a text
+SHOWN = 60          # characters of a wrong value that a message repeats
 
 
 def read(path: Path) -> "Table":
@@ -21,12 +27,23 @@ def read(path: Path) -> "Table":
         raise InputError(f"{path}: is not UTF-8 text; save it as UTF-8") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: is not valid TOML: {error}; correct the line named") from None
+    except RecursionError:
+        raise InputError(f"{path}: is not valid TOML: nested too deeply; write it anew") from None
+
+
+def shown(value) -> str:
+    """A wrong value as a message repeats it: not more than the beginning of a long one."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python refuses to print whole numbers of thousands of digits
+        text = "a number of thousands of digits"
+    return text if len(text) <= SHOWN else text[:SHOWN] + "..."
 
 
 class Table:
     """One TOML table. Every key is taken once; `close` complains of the keys that nobody took."""
 
-    def __init__(self, values: dict, path: Path, prefix: str = ""):
+    def __init__(self, values: Mapping, path: Path | str, prefix: str = ""):
         self._values, self._path, self._prefix = dict(values), path, prefix
         self._known: list[str] = []
         self._taken: dict = {}
@@ -50,59 +67,67 @@ class Table:
             raise self.error(key, f"missing; add {key} = {required_as}")
         return default
 
-    def text(self, key: str, default=..., choices: tuple[str, ...] | None = None) -> str:
+    def text(self, key: str, default=..., choices: tuple[str, ...] | None = None, *, longest: int = LONGEST) -> str:
         value = self._take(key, default, f'"{choices[0]}"' if choices else '"..."')
         if value is None:
             return value
         if not isinstance(value, str):
-            raise self.error(key, f"expected text in quotes, got {value!r} instead")
+            raise self.error(key, f"expected text in quotes, got {shown(value)} instead")
         if choices and value not in choices:
-            raise self.error(key, f"expected one of {', '.join(choices)}, got {value!r} instead")
+            raise self.error(key, f"expected one of {', '.join(choices)}, got {shown(value)} instead")
+        if not _is_line(value, longest):
+            raise self.error(key, f"expected 1 to {longest} printable characters, got {shown(value)} instead")
         return value
+
+    def lines(self, key: str) -> list[str]:
+        """The lines of a text, without those that are empty."""
+        value = self._take(key, ..., '"""..."""')
+        if not isinstance(value, str):
+            raise self.error(key, f"expected text in quotes, got {shown(value)} instead")
+        return [line for line in value.splitlines() if line.strip()]
 
     def number(self, key: str, default=..., *, low=-float("inf"), high=float("inf"), above=None) -> float:
         """A finite number in [low, high], and above `above` if that is given."""
         value = self._take(key, default, "<number>")
         if value is default and not isinstance(value, (int, float)):
             return value
-        allowed = f"a number above {above:g}" if above is not None else f"a number in [{low:g}, {high:g}]"
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise self.error(key, f"expected {allowed}, got {value!r} instead")
-        if not low <= value <= high or abs(value) == float("inf") or (above is not None and value <= above):
-            raise self.error(key, f"expected {allowed}, got {value!r} instead")
+        allowed = f"a number in [{low:g}, {high:g}]"
+        if above is not None:
+            allowed = f"a number above {above:g}" + ("" if high == math.inf else f" up to {high:g}")
+        if not _is_number(value) or not low <= value <= high or (above is not None and value <= above):
+            raise self.error(key, f"expected {allowed}, got {shown(value)} instead")
         return float(value)
 
-    def integer(self, key: str, default=..., *, low: int = 0, high: int | None = None) -> int:
+    def integer(self, key: str, default=..., *, low: int = 0, high: int = MOST) -> int:
         value = self._take(key, default, "<whole number>")
         if value is default and not isinstance(value, int):
             return value
-        allowed = f"a whole number from {low}" + (f" to {high}" if high is not None else " up")
-        if isinstance(value, bool) or not isinstance(value, int) or value < low or (high is not None and value > high):
-            raise self.error(key, f"expected {allowed}, got {value!r} instead")
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise self.error(key, f"expected a whole number from {low} to {high}, got {shown(value)} instead")
         return value
 
     def flag(self, key: str, default=...) -> bool:
         value = self._take(key, default, "true or false")
         if not isinstance(value, bool):
-            raise self.error(key, f"expected true or false, got {value!r} instead")
+            raise self.error(key, f"expected true or false, got {shown(value)} instead")
         return value
 
     def numbers(self, key: str, default=..., *, length: int | None = None) -> tuple[float, ...]:
         value = self._take(key, default, "[<number>, ...]")
         if value is default and not isinstance(value, (list, tuple)):
             return value
-        good = isinstance(value, (list, tuple)) and all(
-            isinstance(v, (int, float)) and not isinstance(v, bool) for v in value)
+        good = isinstance(value, (list, tuple)) and all(map(_is_number, value))
         if not good or (length is not None and len(value) != length):
-            raise self.error(key, f"expected a list of {length or ''} numbers, got {value!r} instead")
+            count = "" if length is None else f"{length} "
+            raise self.error(key, f"expected a list of {count}numbers, got {shown(value)} instead")
         return tuple(float(v) for v in value)
 
     def texts(self, key: str, default=...) -> tuple[str, ...]:
         """Distinct texts."""
         value = self._take(key, default, '["...", ...]')
-        good = isinstance(value, (list, tuple)) and all(isinstance(v, str) for v in value)
+        good = isinstance(value, (list, tuple)) and all(isinstance(v, str) and _is_line(v) for v in value)
         if not good or len(set(value)) != len(value):
-            raise self.error(key, f"expected a list of distinct texts in quotes, got {value!r} instead")
+            raise self.error(key, f"expected a list of distinct texts in quotes, got {shown(value)} instead")
         return tuple(value)
 
     def integers(self, key: str, default=..., *, high: int) -> tuple[int, ...]:
@@ -111,13 +136,14 @@ class Table:
         good = isinstance(value, (list, tuple)) and all(
             isinstance(v, int) and not isinstance(v, bool) and 0 <= v <= high for v in value)
         if not good or len(set(value)) != len(value):
-            raise self.error(key, f"expected a list of distinct whole numbers from 0 to {high}, got {value!r} instead")
+            raise self.error(
+                key, f"expected a list of distinct whole numbers from 0 to {high}, got {shown(value)} instead")
         return tuple(value)
 
     def table(self, key: str, default=...) -> "Table":
         value = self._take(key, {} if default is None else default, "a table")
         if not isinstance(value, dict):
-            raise self.error(key, f"expected a table [{key}], got {value!r} instead")
+            raise self.error(key, f"expected a table [{key}], got {shown(value)} instead")
         return Table(value, self._path, f"{self._prefix}{key}.")
 
     def raw_table(self, key: str) -> dict:
@@ -128,7 +154,7 @@ class Table:
     def tables(self, key: str, default=...) -> list["Table"]:
         value = self._take(key, default, f"a list of tables [[{key}]]")
         if not isinstance(value, (list, tuple)) or not all(isinstance(v, dict) for v in value):
-            raise self.error(key, f"expected a list of tables [[{key}]], got {value!r} instead")
+            raise self.error(key, f"expected a list of tables [[{key}]], got {shown(value)} instead")
         return [Table(v, self._path, f"{self._prefix}{key}[{n}].") for n, v in enumerate(value)]
 
     def close(self) -> None:
@@ -136,3 +162,17 @@ class Table:
         if self._values:
             key = next(iter(self._values))
             raise self.error(key, f"unknown key; allowed here: {', '.join(self._known)}; remove or correct it")
+
+
+def _is_number(value) -> bool:
+    """A number that is finite as a float: not NaN, not infinite, not of four hundred digits."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False
+
+
+def _is_line(value: str, longest: int = LONGEST) -> bool:
+    return 0 < len(value) <= longest and value.isprintable()

@@ -4,6 +4,7 @@ Random initial states and demand keep gradients alive (a rollout that gridlocks 
 validation on the scenario itself is kept. The same seed gives the same weights.
 """
 
+import io
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -14,15 +15,19 @@ import torch
 
 from nmfd import toml
 from nmfd.controllers import guarded
-from nmfd.controllers.dpc import ACTIVATIONS, Architecture, Policy, checkpoint
+from nmfd.controllers.dpc import ACTIVATIONS, DEEPEST, WIDEST, Architecture, Policy, checkpoint
 from nmfd.errors import InputError
+from nmfd.network import Network
 from nmfd.rollout import Rollout, compiled_step
-from nmfd.runs import atomic
+from nmfd.runs import atomic, locked, sweep
 from nmfd.scenario import Scenario, as_modelled
+from nmfd.workers import RunFailed
 
 VALIDATE_EVERY = 20  # Adam steps
+MOST_STEPS = 10**7
 ROBUST_NOISE = 3.0     # veh/s, of the policies whose name ends in -robust
 WORTH_COMPILING = 200  # Adam steps
+WEAK, OPEN, RARE = 0.1, 3.0, 1e-3  # of the first policy from no control: factor of weights, logit of u, least theta
 VALIDATIONS = 16       # perturbed scenarios in a validation, if training perturbs the demand
 NAMES = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
 
@@ -43,6 +48,7 @@ class Training:
         rollout has its own sigma, evenly between 0 and `noise` (demand_noise.WHERE, "pairs")
     detour_cost: what a vehicle loses that is guided off the drivers' own split ratios, in the objective [s]
     mfd_spread: of the regional model that every rollout has for itself (Rollout.draw_model) [-]
+    from_no_control: the first policy is nearly no control, so that what training finds no reason to change stays open
     noise_all: the same of the noise on every pair of regions ("all"), in every other rollout, instead of `noise`
     """
 
@@ -61,6 +67,7 @@ class Training:
     noise_all: float = 0.0
     mfd_spread: float = 0.0
     detour_cost: float = 0.0
+    from_no_control: bool = False
 
     @property
     def levels(self) -> tuple[float, float]:
@@ -68,28 +75,39 @@ class Training:
 
 
 def settings(scenario: Scenario, controller: str, steps: int | None = None) -> Training:
-    """The training settings of `controller` in `scenario`, checked; `steps` overrides."""
-    if controller not in NAMES:
+    """The training settings of `controller` in `scenario`, checked; `steps` overrides.
+
+    controller: one of NAMES, or "NAME+..." if the scenario has a table of that name (nmfd.scenario.as_modelled)
+    """
+    name, variant, _ = controller.partition("+")
+    if name not in NAMES:
         raise InputError(f"--controller: {controller!r} cannot be trained; choose one of {', '.join(NAMES)}")
+    if variant and controller not in scenario.controller_options:
+        raise InputError(
+            f"--controller: {controller!r} needs a table [controllers.\"{controller}\"] in {scenario.folder}/"
+            f"scenario.toml that says what is different from {name}; add one, or train {name}")
     scenario = as_modelled(scenario, controller)
-    default = Training(noise=ROBUST_NOISE if controller.endswith("-robust") else 0.0)
+    default = Training(noise=ROBUST_NOISE if name.endswith("-robust") else 0.0)
     table = toml.Table(
-        scenario.controller_options.get(controller, {}), scenario.folder / "scenario.toml" if scenario.folder else
+        scenario.controller_options.get(name, {}), scenario.folder / "scenario.toml" if scenario.folder else
         Path("scenario"), f"controllers.{controller}.")
     chosen = Training(
-        width=table.integer("width", default.width, low=1), layers=table.integer("layers", default.layers, low=1),
+        width=table.integer("width", default.width, low=1, high=WIDEST),
+        layers=table.integer("layers", default.layers, low=1, high=DEEPEST),
         activation=table.text("activation", default.activation, tuple(ACTIVATIONS)),
-        steps=table.integer("steps", default.steps, low=1), batch=table.integer("batch", default.batch, low=1),
-        learning_rate=table.number("learning_rate", default.learning_rate, above=0.0),
+        steps=table.integer("steps", default.steps, low=1, high=MOST_STEPS),
+        batch=table.integer("batch", default.batch, low=1, high=100_000),
+        learning_rate=table.number("learning_rate", default.learning_rate, above=0.0, high=1.0),
         alternating=table.flag("alternating", default.alternating),
         demand_spread=table.number("demand_spread", default.demand_spread, low=0.0, high=1.0),
         demand_low=table.number("demand_low", default.demand_low, above=0.0, high=1.0),
-        demand_high=table.number("demand_high", default.demand_high, low=1.0),
+        demand_high=table.number("demand_high", default.demand_high, low=1.0, high=100.0),
         initial_share=table.number("initial_share", default.initial_share, low=0.0, high=1.0),
-        noise=table.number("noise", default.noise, low=0.0),
-        noise_all=table.number("noise_all", default.noise_all, low=0.0),
+        noise=table.number("noise", default.noise, low=0.0, high=1e6),
+        noise_all=table.number("noise_all", default.noise_all, low=0.0, high=1e6),
         mfd_spread=table.number("mfd_spread", default.mfd_spread, low=0.0, high=1.0),
-        detour_cost=table.number("detour_cost", default.detour_cost, low=0.0))
+        detour_cost=table.number("detour_cost", default.detour_cost, low=0.0, high=1e6),
+        from_no_control=table.flag("from_no_control", default.from_no_control))
     table.close()
     return chosen if steps is None else Training(**{**asdict(chosen), "steps": steps})
 
@@ -106,68 +124,86 @@ def train(
     device: str = "cpu", compiled: bool = False, progress: Callable[[int, int, str], None] | None = None,
     log: Callable[[int, float], None] | None = None,
 ) -> Path:
-    """Train `controller`, one of NAMES, on the regional model and write the policy to `out`.
+    """Train `controller`, one that `settings` knows, on the regional model and write the policy to `out`.
 
     `out` holds the best policy so far after every validation; `out`.resume beside it holds what `resume` needs and
     goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done, TTS)` after
     every validation. `compiled` makes a step about twice as fast, after up to a minute or two of compilation; the
     weights differ by rounding.
     """
-    scenario = as_modelled(scenario, controller)
     chosen = settings(scenario, controller, steps)
+    scenario = as_modelled(scenario, controller)
     configuration = {
         "controller": controller, "scenario": scenario.name, "seed": seed, "compiled": compiled, **asdict(chosen)}
     torch.set_num_threads(1)  # the matrices are small: more threads only wait for one another
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
+    guidance = NAMES[controller.partition("+")[0]]
     architecture = Architecture(
-        width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=NAMES[controller])
-    policy = Policy(scenario.network, architecture).to(device)
+        width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=guidance)
+    policy = Policy(scenario.network, architecture)
+    if chosen.from_no_control:
+        begin_as_no_control(policy, scenario.network)
+    policy = policy.to(device)
     rollout = Rollout(scenario, device=device, detour_cost=chosen.detour_cost)
     advance = compiled_step(rollout.step) if compiled else rollout.step
     optimizer = torch.optim.Adam(policy.parameters(), lr=chosen.learning_rate)
     first, best, history = 0, float("inf"), []
     state_file = out.with_name(out.name + ".resume")
-    if resume:
-        first, best, history = _restore(state_file, configuration, policy, optimizer, generator)
-    for step in range(first, chosen.steps):
-        for group in optimizer.param_groups:
-            cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
-            group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
-        rollout.draw_model(chosen.batch, chosen.mfd_spread, generator)
-        x, demand = rollout.random_start(
-            chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
-        demand = rollout.perturb(
-            demand, torch.rand(chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
-        # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
-        loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        if architecture.guidance and chosen.alternating:
-            # Not by requires_grad, which would compile the step once for each decoder.
-            for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
-                weights.grad = None
-        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
-        optimizer.step()
-        last = step + 1 == chosen.steps
-        if (step + 1) % VALIDATE_EVERY == 0 or last:
-            score = validate(policy, rollout, seed, chosen)
-            history.append([step + 1, math.exp(loss.item()), score])
-            if log:
-                log(step + 1, score)
-            if score < best:
-                best = score
-                states = guarded.statistics(visited(policy, rollout, chosen, seed))
-                _write(checkpoint(
-                    policy, scenario.network, {**configuration, "validation_veh_s": best}, states), out)
-            if not last:
-                _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
-        if progress:
-            progress(step + 1, chosen.steps, f"best {best:.4g} veh s")
-    if not math.isfinite(best):
-        raise RuntimeError(f"{controller}: every validation of {chosen.steps} steps diverged; lower the learning rate")
-    state_file.unlink(missing_ok=True)
+    with locked(out.with_name(f".{out.name}.lock"), out):
+        sweep(out.parent, {out.stem, state_file.stem})
+        if resume:
+            first, best, history = _restore(state_file, configuration, policy, optimizer, generator)
+        for step in range(first, chosen.steps):
+            for group in optimizer.param_groups:
+                cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
+                group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
+            rollout.draw_model(chosen.batch, chosen.mfd_spread, generator)
+            x, demand = rollout.random_start(
+                chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
+            demand = rollout.perturb(
+                demand, torch.rand(chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
+            # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
+            loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            if architecture.guidance and chosen.alternating:
+                # Not by requires_grad, which would compile the step once for each decoder.
+                for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
+                    weights.grad = None
+            torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+            optimizer.step()
+            last = step + 1 == chosen.steps
+            if (step + 1) % VALIDATE_EVERY == 0 or last:
+                score = validate(policy, rollout, seed, chosen)
+                history.append([step + 1, math.exp(loss.item()), score])
+                if log:
+                    log(step + 1, score)
+                if score < best:
+                    best = score
+                    states = guarded.statistics(visited(policy, rollout, chosen, seed))
+                    _write(checkpoint(
+                        policy, scenario.network, {**configuration, "validation_veh_s": best}, states), out)
+                if not last:
+                    _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
+            if progress:
+                progress(step + 1, chosen.steps, f"best {best:.4g} veh s")
+        if not math.isfinite(best):
+            raise RunFailed(
+                f"{controller}: every validation of {chosen.steps} steps diverged; lower the learning rate")
+        state_file.unlink(missing_ok=True)
     return out
+
+
+def begin_as_no_control(policy: Policy, network: Network) -> None:
+    """Let `policy` hardly depend on the state, with nearly open gateways and nearly the drivers' own split ratios."""
+    with torch.no_grad():
+        policy.perimeter_decoder.weight.mul_(WEAK)
+        policy.perimeter_decoder.bias.fill_(OPEN)
+        if policy.architecture.guidance:
+            own = torch.tensor(network.nominal_splits[np.arange(network.regions)[:, None], policy.onward.numpy()])
+            policy.splits_decoder.weight.mul_(WEAK)
+            policy.splits_decoder.bias.copy_(own.clamp(min=RARE).log().flatten())
 
 
 def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> float:
@@ -217,17 +253,25 @@ def _restore(state_file: Path, configuration, policy, optimizer, generator) -> t
         raise InputError(f"{state_file}: nothing to resume; train without --resume") from None
     except Exception:
         raise InputError(f"{state_file}: is damaged; remove it and train without --resume") from None
-    for key, value in configuration.items():
-        if state["configuration"].get(key) != value:
-            raise InputError(
-                f"{state_file}: {key}: was {state['configuration'].get(key)!r}, now {value!r}; resume with the same "
-                "settings or train without --resume")
-    policy.load_state_dict(state["policy"])
-    optimizer.load_state_dict(state["optimizer"])
-    generator.set_state(state["generator"])
-    return state["step"], state["best"], state["history"]
+    try:
+        there = dict(state["configuration"])
+        for key, value in configuration.items():
+            if there.get(key) != value:
+                raise InputError(
+                    f"{state_file}: {key}: was {there.get(key)!r}, now {value!r}; resume with the same settings or "
+                    "train without --resume")
+        policy.load_state_dict(state["policy"])
+        optimizer.load_state_dict(state["optimizer"])
+        generator.set_state(state["generator"])
+        return int(state["step"]), float(state["best"]), list(state["history"])
+    except InputError:
+        raise
+    except Exception:
+        raise InputError(f"{state_file}: is damaged; remove it and train without --resume") from None
 
 
 def _write(content: dict, path: Path) -> None:
+    buffer = io.BytesIO()  # given a path, torch would write its name into the file: never the same bytes twice
+    torch.save(content, buffer)
     with atomic(path) as temporary:
-        torch.save(content, temporary)
+        temporary.write_bytes(buffer.getvalue())

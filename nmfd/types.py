@@ -1,9 +1,12 @@
 """What plants, controllers and the closed loop hand to one another."""
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,6 +18,7 @@ class Measurement:
     accumulation: (R, R) [veh], [i, j] = in region i bound for j
     backlog: (R, R) [veh], [i, j] = waiting outside the network to enter region i, bound for j; zero in the NMFD
     estimate, estimated_backlog: (R, R) [veh], what a controller sees instead where the plant only estimates them
+    problem: what the plant could not do in the interval that has just ended, "" if nothing
     """
 
     step: int
@@ -23,6 +27,7 @@ class Measurement:
     backlog: np.ndarray
     estimate: np.ndarray | None = None
     estimated_backlog: np.ndarray | None = None
+    problem: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,3 +104,28 @@ class Trajectory:
     status: tuple[str, ...] = field(repr=False)
     wall_time: float
     estimate: np.ndarray | None = None
+
+    def to_frame(self) -> "pd.DataFrame":
+        """The states as a table: one row per time and pair of regions, (T+1) R R rows.
+
+        Columns controller, plant, seed; time_s; region, destination (x_ij: in region i, bound for j);
+        accumulation_veh; backlog_veh (waiting to enter region i).
+        """
+        return self._table(self.accumulation, ("region", "destination"), {
+            "accumulation_veh": self.accumulation, "backlog_veh": self.backlog})
+
+    def controls_frame(self) -> "pd.DataFrame":
+        """The perimeter controls as a table: one row per control interval and pair of regions, T R R rows.
+
+        Columns controller, plant, seed; time_s, when the interval begins; region, next_region (u_ih: from i to h);
+        perimeter [-]; 0 between regions that are not adjacent.
+        """
+        return self._table(self.perimeter, ("region", "next_region"), {"perimeter": self.perimeter})
+
+    def _table(self, like: np.ndarray, axes: tuple[str, ...], values: dict[str, np.ndarray]) -> "pd.DataFrame":
+        import pandas as pd
+
+        interval, *regions = (index.ravel() for index in np.indices(like.shape))
+        return pd.DataFrame({
+            "controller": self.controller, "plant": self.plant, "seed": self.seed, "time_s": self.step * interval,
+            **dict(zip(axes, regions, strict=True)), **{name: array.ravel() for name, array in values.items()}})

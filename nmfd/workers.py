@@ -2,6 +2,7 @@
 
 import math
 import multiprocessing
+import os
 import signal
 import threading
 import time
@@ -12,22 +13,35 @@ from dataclasses import dataclass
 from multiprocessing.connection import wait
 from pathlib import Path
 
+from nmfd.errors import InputError
+
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a task has no result, in one line."""
+    """Why a task has no result, in one line. mistake: the user can cure it (it was an InputError)."""
 
     reason: str
+    mistake: bool = False
 
 
 class RunFailed(Exception):
     """Some runs ended in an error. The message names them in one line."""
 
 
+def ended(failures: Sequence[tuple[str, Failure]]) -> Exception:
+    """What to raise for (run, Failure) pairs: an InputError if the user can cure them all, else RunFailed."""
+    text = "; ".join(f"{run}: {failure.reason}" for run, failure in failures)
+    return InputError(text) if all(failure.mistake for _, failure in failures) else RunFailed(text)
+
+
 def attempt(function: Callable, task):
     """`function(task)`, or the Failure that it ended in."""
     try:
         return function(task)
+    except InputError as error:
+        return Failure(str(error), mistake=True)
+    except RunFailed as error:
+        return Failure(str(error))
     except Exception as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
         return Failure(f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})")
@@ -42,7 +56,8 @@ def outcomes(
     seconds: wall time after which a task is ended; it needs `fresh`
 
     The processes are spawned, so `function` and the tasks must be picklable. A process that dies (out of memory, a
-    crash in a library) is the Failure of the task it was at. Closing the iterator ends the processes at once.
+    crash in a library) is the Failure of the task it was at. Closing the iterator ends the processes at once, and so
+    does the end of this process, however it comes.
     """
     todo, busy, deadlines = list(tasks)[::-1], {}, {}
     try:
@@ -99,6 +114,12 @@ def _spawn(function: Callable) -> tuple:
     return here, process
 
 
+def _end_with(parent) -> None:
+    """End this process when its parent has ended, which has no chance to say so when it is killed."""
+    wait([parent.sentinel])
+    os._exit(1)
+
+
 @contextmanager
 def _interrupts_ignored():
     """Processes started in here inherit it: Ctrl-C is the parent's business, and it ends its workers."""
@@ -113,6 +134,7 @@ def _interrupts_ignored():
 
 
 def _serve(function: Callable, connection) -> None:
+    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     while True:
         try:
             task = connection.recv()

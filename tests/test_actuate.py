@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from cosim.actuate import GatewaySignal
+from cosim.actuate import YELLOW, Actuator, GatewaySignal, _apportion, yellow_time
 from cosim.strategy import MODES
 from cosim.sumo import Phase, Programme
 
@@ -95,6 +95,20 @@ def test_green_falls_from_the_original_to_the_minimum():
     assert (np.diff(green) >= 2).all()
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_an_opened_link_keeps_its_original_green(mode):
+    """The other gateway link of the signal is held all the same."""
+    signal = GatewaySignal(programme(SINGLE), {0: (0, 1), 1: (0, 1)}, min_green=MIN_GREEN, mode=mode, start=0.0)
+    signal.command(np.zeros((2, 2)), opened={0})
+    states = []
+    for second in range(180):
+        states.append(signal.update(float(second)))
+    check(states, SINGLE)
+    green = [sum(state[link] == "G" for state in states[90:]) for link in (0, 1)]
+    assert green[0] == 42
+    assert green[1] == MIN_GREEN if mode == "hold-back" else green[1] < 42
+
+
 def test_hold_back_touches_the_gateway_only():
     held = play(PHASES, {0: (0, 1)}, "hold-back", [np.zeros((2, 2))] * 3)
     free = play(PHASES, {0: (0, 1)}, "hold-back", [np.ones((2, 2))] * 3)
@@ -117,3 +131,48 @@ def test_green_time_is_what_was_shown():
             shown = signal.update(float(second))
         green += shown[0] in "Gg" and second < 270
     assert signal.green_time()[0] == green > 0
+
+
+def test_u_max_is_the_original_programme_to_the_fraction_of_a_second():
+    phases = [("Gr", 42.4), ("yr", 3), ("rG", 41.6), ("ry", 3)]
+    signal = GatewaySignal(programme(phases), {0: (0, 1)}, min_green=MIN_GREEN, mode="hold-back", start=0.0)
+    signal.command(np.ones((2, 2)))
+    while signal.next_change < 270.0:
+        signal.update(signal.next_change)
+    assert signal.green_time()[0] == pytest.approx(3 * 42.4)
+
+
+@pytest.mark.parametrize("total, weights, shares", [
+    (10, [1, 1, 1], [4, 3, 3]), (7, [2, 1], [5, 2]), (5, [1, 3], [1, 4]), (0, [1, 2], [0, 0]), (7.5, [1, 1], [4.5, 3]),
+    (11, [5, 3, 3], [5, 3, 3]), (2, [1, 1, 1, 1], [1, 1, 0, 0]), (9, [4], [9])])
+def test_seconds_are_shared_out_whole_and_all(total, weights, shares):
+    assert _apportion(total, weights) == shares
+
+
+@pytest.mark.parametrize("states, expected", [
+    ([("G", 30), ("y", 2), ("y", 3), ("r", 55)], 5), ([("G", 30), ("r", 60)], YELLOW), ([("G", 30), ("y", 4)], 4),
+    ([("g", 9), ("y", 3), ("r", 5), ("G", 9), ("y", 4), ("r", 5)], 4), ([("y", 3), ("r", 9)], YELLOW),
+    ([("y", 2), ("r", 9), ("G", 9), ("y", 3)], 5)])
+def test_the_longest_yellow_after_a_green(states, expected):
+    assert yellow_time(programme(states).phases, 0) == expected
+
+
+def test_the_actuator_commands_all_signals_and_shows_what_is_due():
+    class Noted:
+        def __init__(self, name, next_change):
+            self.signal, self.next_change, self.commands = name, next_change, []
+
+        def command(self, share, opened):
+            self.commands.append((share.tolist(), tuple(opened)))
+
+        def update(self, now):
+            self.next_change = now + 10.0
+            return f"{self.signal} at {now:g}"
+
+    signals, shown = [Noted("a", 0.0), Noted("b", 5.0)], []
+    actuator = Actuator(signals, lambda signal, state: shown.append((signal, state)))
+    actuator.command(np.full((1, 1), 0.25), {"b": [3]})
+    assert [signal.commands for signal in signals] == [[([[0.25]], ())], [([[0.25]], (3,))]]
+    for now in (0.0, 1.0, 5.0 - 1e-9, 9.0, 10.0):
+        actuator.play(now)
+    assert shown == [("a", "a at 0"), ("b", f"b at {5.0 - 1e-9:g}"), ("a", "a at 10")]

@@ -188,6 +188,19 @@ def test_another_seed_is_another_policy(tmp_path, scenario):
     assert not torch.equal(weights(paths[0])["backbone.0.weight"], weights(paths[1])["backbone.0.weight"])
 
 
+def test_training_may_begin_as_no_control():
+    """Whatever the state: gateways nearly open, split ratios nearly the drivers' own."""
+    torch.manual_seed(0)
+    first = Policy(NETWORK, Architecture(guidance=True))
+    training.begin_as_no_control(first, NETWORK)
+    x = 400.0 * torch.rand(20, 7, 7)
+    with torch.no_grad():
+        perimeter, splits = first(x)
+    opening = (perimeter - NETWORK.u_min) / (NETWORK.u_max - NETWORK.u_min)
+    assert opening[:, torch.tensor(NETWORK.adjacency)].min() > 0.9
+    assert (splits - torch.tensor(NETWORK.nominal_splits)).abs().max() < 0.1
+
+
 def test_training_lowers_the_total_time_spent(tmp_path, scenario):
     """An untrained policy holds the perimeter half closed, to no purpose."""
     trained = training.train(scenario, "dpc-pc", seed=0, out=tmp_path / "p.pt", steps=20)

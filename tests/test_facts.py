@@ -8,6 +8,7 @@ import pytest
 
 from cosim import facts
 from cosim.plant import SumoPlant
+from cosim.regions import edge_room
 from cosim.trip_facts import CLASS, read_trip_facts
 from nmfd.scenario import load_scenario
 from nmfd.types import Controls
@@ -80,7 +81,7 @@ def test_open_gateways_show_the_original_green(run):
 
 def test_full_edges_before_gateways(run):
     plant, record, _, _ = run
-    city, room = plant.city, facts.edge_room(plant.city)
+    city, room = plant.city, edge_room(plant.city)
     for share, expected in ((0.0, 0.0), (0.7, 0.0), (0.9, 1.0)):
         row = facts.queue_facts(replace(record, edge_vehicles=np.tile(share * room, (3, 1))), city)
         assert row["gateway_full_share"] == expected

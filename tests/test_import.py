@@ -12,9 +12,12 @@ import tiny_city
 from click.testing import CliRunner
 
 from cosim.cli import main
+from cosim.flows import own_flows
+from cosim.importing import level
 from cosim.importing.case import read_case
 from cosim.importing.demand import read_traffic
 from cosim.importing.streets import graph, read_streets
+from cosim.originals import read_originals, read_routes
 from cosim.plant import SumoPlant, settings
 from cosim.regions import load_city
 from nmfd.scenario import load_scenario
@@ -209,13 +212,35 @@ def test_mesoscopic_keeps_the_ledger(imported):
         plant.close()
 
 
+def test_signal_plans_know_the_city_s_own_vehicles(imported):
+    """Turning flows are those of its routes, and of fastest ways; every signal plan runs on its signals."""
+    scenario = replace(load_scenario(imported[0] / "scenarios" / "tiny"), steps=2)
+    own, additional = ([scenario.folder / name for name in names] for names in (
+        settings(scenario).routes, settings(scenario).additional))
+    files = scenario.network.folder
+    city = load_city(files / "city.net.xml.gz", files / "regions.csv", 3)
+    flows = own_flows(city, read_originals(own), read_routes(additional), 2.0)
+    assert flows["A1B1", "B1B0"] >= 2.0 / 900.0                       # the route that one vehicle names
+    assert 2.0 * 75 / 900 <= flows["B1C1", "C1D1"] < 2.0 * 120 / 900   # the flow straight on, of trips
+    assert all(b in city.successors[a] for a, b in flows)
+    for plan in ("max-pressure", "webster", "actuated"):
+        plant = SumoPlant(scenario, overrides=replace(settings(scenario), signals=plan))
+        try:
+            plant.reset(0)
+            for _ in range(2):
+                plant.step(Controls(perimeter=np.where(scenario.network.adjacency, 0.9, 0.0), splits=None))
+            assert plant.record().departures.sum() > 0
+        finally:
+            plant.close()
+
+
 @pytest.mark.parametrize("change, expected", [
     (lambda folder: (folder / "buses.rou.xml").unlink(), "route-files: no such file"),
     (lambda folder: (folder / "city.net.xml").write_text("<net><edge"), "is not a"),
     (lambda folder: (folder / "city.net.xml").write_text("<net></net>"), "has no edge that cars may use"),
     (lambda folder: (folder / "city.sumocfg").write_text("<routes/>"), "expected a sumocfg or a net.xml"),
     (lambda folder: (folder / "city.sumocfg").write_text(
-        '<configuration><net-file value="city.net.xml"/></configuration>'), "add --demand peak"),
+        '<configuration><net-file value="city.net.xml"/></configuration>'), "or add --od FILE or --demand peak"),
 ])
 def test_one_clear_line(config, tmp_path, change, expected):
     for file in config.parent.iterdir():
@@ -224,3 +249,61 @@ def test_one_clear_line(config, tmp_path, change, expected):
     line = error_line(cosim("import", tmp_path / "city.sumocfg", "--regions", 3, "--out", tmp_path / "networks" / "x"))
     assert expected in line
     assert not (tmp_path / "networks").exists() or not list((tmp_path / "networks").iterdir())
+
+
+def test_level_auto_finds_where_it_congests():
+    """Made-up paces: the search ends at the lowest level beyond the limit in the scenario's own model."""
+    asked = []
+
+    def pace(times, mesoscopic):
+        asked.append((times, mesoscopic))
+        return 2.0 + (3.0 if mesoscopic else 2.0) * max(times - 1.0, 0.0)  # 3 from 1.33 on, and from 1.5 on
+
+    assert level.congesting(pace, mesoscopic=True, tell=lambda line: None) == (1.44, True)
+    assert level.congesting(pace, mesoscopic=False, tell=lambda line: None) == (1.73, True)
+    assert asked[-1] == (1.73, False) and (1.44, False) in asked and (1.2, False) not in asked
+    assert level.congesting(lambda *_: 2.0, mesoscopic=True, tell=lambda line: None) == (2.99, False)
+
+
+def test_import_at_a_congested_level(config, tmp_path):
+    """The factor reaches the scenario: vehicles, demand and all; mesoscopic too."""
+    text = good(cosim("import", config, "--regions", 2, "--method", "geometric", "--mesoscopic", "--level", "auto",
+                      "--out", tmp_path / "networks" / "busy"))
+    scenario = load_scenario(tmp_path / "scenarios" / "busy")
+    assert "level: " in text and settings(scenario).mesoscopic
+    assert f"demand times {scenario.demand_factor:g}" in text
+    vehicles = read_originals([scenario.folder / "vehicles.rou.xml.gz"])
+    total = scenario.demand.sum() * scenario.step
+    assert total == pytest.approx(scenario.demand_factor * len(vehicles.depart), rel=1e-4)
+    line = error_line(cosim("import", config, "--regions", 2, "--level", "twice", "--out", tmp_path / "networks" / "x"))
+    assert "--level: expected a number above 0 up to 10, or auto, got 'twice' instead" in line
+
+
+def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
+    """Taxis over and to a bus road keep their way; cars in the same city are guided."""
+    net = tmp_path / "city.net.xml"
+    root = ElementTree.parse(config.parent / "city.net.xml")
+    for lane in root.iter("lane"):
+        if lane.get("id").startswith("C1D1_"):
+            lane.set("allow", "bus taxi")
+    root.write(net)
+    (tmp_path / "cars.rou.xml").write_text(
+        '<routes><vType id="taxi" vClass="taxi"/><route id="over" edges="A1B1 B1C1 C1D1 D1D2"/>'
+        '<flow id="over" type="taxi" begin="0" end="600" period="20" route="over"/>'
+        '<flow id="to" type="taxi" begin="0" end="600" period="20" from="A0A1" to="C1D1"/>'
+        '<flow id="car" begin="0" end="600" period="10" from="A0A1" to="D2D3"/></routes>')
+    (tmp_path / "city.sumocfg").write_text(
+        '<configuration><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></configuration>')
+    good(cosim("import", tmp_path / "city.sumocfg", "--regions", 2, "--method", "geometric", "--no-run", "--out",
+               tmp_path / "networks" / "taxis"))
+    scenario = replace(load_scenario(tmp_path / "scenarios" / "taxis"), steps=6)
+    network = scenario.network
+    plant = SumoPlant(scenario)
+    try:
+        plant.reset(0)
+        for _ in range(scenario.steps):
+            plant.step(Controls(
+                perimeter=np.where(network.adjacency, 0.9, 0.0), splits=network.nominal_splits))
+        assert plant.record().guided.sum() > 10
+    finally:
+        plant.close()

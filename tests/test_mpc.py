@@ -129,7 +129,10 @@ def test_nothing_is_demanded_after_the_end(states):
 @BOTH
 def test_a_solver_without_iterations_says_so_and_does_not_act(states, guidance):
     controls = EconomicMpc(with_options(max_iterations=0), guidance=guidance).act(states[30])
-    assert controls.status == "iteration limit: best plan so far used"
+    assert controls.status == "iteration limit: pi-gating in control"
+    controller = EconomicMpc(replace(with_options(max_iterations=0), protected=()), guidance=guidance)
+    controls = controller.act(states[30])
+    assert controls.status == "iteration limit: perimeter opened, nominal splits"
     assert (controls.perimeter[NETWORK.adjacency] == NETWORK.u_max).all()
     if guidance:
         np.testing.assert_array_equal(controls.splits, NETWORK.nominal_splits)
@@ -137,7 +140,7 @@ def test_a_solver_without_iterations_says_so_and_does_not_act(states, guidance):
 
 def test_a_time_limit_is_a_recorded_failure(states):
     controls = EconomicMpc(with_options(time_limit=1e-6), guidance=True).act(states[30])
-    assert controls.status == "time limit: best plan so far used"
+    assert controls.status == "time limit: pi-gating in control"
     assert_admissible(controls, True)
 
 

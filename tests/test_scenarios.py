@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import tiny
 
+from nmfd import training
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.scenario import as_modelled, load_scenario
@@ -65,6 +66,34 @@ def test_a_controller_plans_with_the_model_that_it_names(base, tmp_path):
     assert planned.network.mfds[0].jam == 800.0 and planned.controller_options["mpc-pc"] == {"horizon": 4}
     assert as_modelled(scenario, "mpc-pcrg").network.mfds[0].jam == 1000.0
     assert registry.make("mpc-pc", scenario).options.horizon == 4
+
+
+def test_a_variant_has_options_model_and_policy_of_its_own(base, tmp_path):
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 800.0"))
+    folder = beside(base, """name = "x"
+base = "../scenario"
+[controllers.dpc-pc]
+steps = 3
+width = 8
+layers = 1
+[controllers."dpc-pc+max-pressure"]
+model = "../model"
+width = 16
+""")
+    scenario = load_scenario(folder)
+    chosen = training.settings(scenario, "dpc-pc+max-pressure")
+    assert (chosen.steps, chosen.width, chosen.layers) == (3, 16, 1)
+    assert training.settings(scenario, "dpc-pc").width == 8
+    for name in ("dpc-pc", "dpc-pc+max-pressure"):
+        training.train(scenario, name, seed=0, out=folder / f"{name}.pt", steps=1)
+        assert registry.policy_path(name, scenario) == folder / f"{name}.pt"
+        assert registry.make(name, scenario).name == "dpc-pc"
+    assert registry.make("dpc-pc-guarded+max-pressure", scenario).name == "dpc-pc-guarded"
+    with pytest.raises(InputError, match="network"):  # each was trained on its own model
+        registry.make("dpc-pc", scenario, policy=folder / "dpc-pc+max-pressure.pt")
+    with pytest.raises(InputError, match="'dpc-pc\\+webster' needs a table"):
+        training.settings(scenario, "dpc-pc+webster")
 
 
 def test_a_model_of_another_city_is_refused(base, tmp_path):

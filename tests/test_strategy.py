@@ -5,7 +5,7 @@ from dataclasses import fields
 import pytest
 
 from cosim.plant import Settings
-from cosim.strategy import ALONE, OPTIONS, parse
+from cosim.strategy import ALONE, OPTIONS, configured, parse
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 
@@ -17,6 +17,7 @@ from nmfd.errors import InputError
     ("max-pressure+rerouting-100", "no-control",
      {"gateways_fixed": False, "signals": "max-pressure", "rerouting": 1.0}),
     ("dpc-pc+rerouting-30+webster", "dpc-pc", {"gateways_fixed": True, "signals": "webster", "rerouting": 0.3}),
+    ("pi-gating+estimate", "pi-gating", {"gateways_fixed": True, "measurement": "estimate"}),
     ("dpc-pcrg+redistribute+compliance-0", "dpc-pcrg",
      {"gateways_fixed": True, "actuation": "redistribute", "compliance": 0.0}),
 ])
@@ -34,6 +35,16 @@ def test_every_controller_and_option_is_a_strategy():
         option = option.replace("-N", "-50")
         assert parse(option).overrides == parse(f"no-control+{option}").overrides
         assert set(parse(f"mpc-pc+{option}").overrides) <= names
+
+
+def test_a_strategy_uses_the_table_that_fits_it_best():
+    tables = ["dpc-pc", "dpc-pc+max-pressure", "dpc-pc+max-pressure+rerouting-30", "dpc-pcrg+max-pressure"]
+    for name, expected in (
+            ("dpc-pc", "dpc-pc"), ("dpc-pc+webster", "dpc-pc"), ("dpc-pc+max-pressure", "dpc-pc+max-pressure"),
+            ("dpc-pc+compliance-50+max-pressure", "dpc-pc+max-pressure"),
+            ("dpc-pc+rerouting-30+max-pressure", "dpc-pc+max-pressure+rerouting-30"),
+            ("max-pressure", "no-control"), ("mpc-pc+max-pressure", "mpc-pc")):
+        assert configured(name, tables) == expected
 
 
 @pytest.mark.parametrize("name, expected", [

@@ -25,6 +25,7 @@ class Baseline:
     ways: the edges that vehicles drove to the end, one after the other, and the last edge of their route, alike ones
         together -> how many
     teleports; waiting: vehicles not inserted at the end; running: on the road at the end
+    delay: of departures, all vehicles [veh s]
     """
 
     presence: np.ndarray
@@ -32,6 +33,13 @@ class Baseline:
     teleports: int
     waiting: int
     running: int
+    delay: float = 0.0
+
+    def pace(self, streets: Streets) -> float:
+        """Time that vehicles spent, running and waiting to enter, over what it takes at the speed limits [-]."""
+        free = streets.length / streets.speed
+        needed = sum(vehicles * free[list(way)].sum() for (way, _), vehicles in self.ways.items())
+        return float(self.presence.sum() + self.delay) / max(float(needed), 1.0)
 
     def density(self, streets: Streets) -> np.ndarray:
         """(E,) [veh/m of lane] in the quarter of an hour with the most vehicles; 0 on edges without car lanes."""
@@ -88,13 +96,16 @@ def run_baseline(
             "--ignore-route-errors", "true", "--vehroute-output", str(folder / "ways.xml"),
             "--vehroute-output.exit-times", "true", "--vehroute-output.last-route", "true",
             "--vehroute-output.write-unfinished", "true", "--statistic-output", str(folder / "statistic.xml"),
+            "--duration-log.statistics", "true",
             *options, where=str(streets.path))
         statistic = ElementTree.parse(folder / "statistic.xml").getroot()
-        vehicles = statistic.find("vehicles")
+        vehicles, trips = statistic.find("vehicles"), statistic.find("vehicleTripStatistics")
+        waiting = int(vehicles.get("waiting"))
         return Baseline(
             presence=_presence(edges, streets, begin, end), ways=_ways(folder / "ways.xml", streets),
-            teleports=int(statistic.find("teleports").get("total")), waiting=int(vehicles.get("waiting")),
-            running=int(vehicles.get("running")))
+            teleports=int(statistic.find("teleports").get("total")), waiting=waiting,
+            running=int(vehicles.get("running")),
+            delay=float(trips.get("totalDepartDelay")) + waiting * max(float(trips.get("departDelayWaiting")), 0.0))
 
 
 def run_sumo(program: str, *arguments: str, where: str) -> None:

@@ -1,11 +1,12 @@
 """What the user gives: a sumocfg with all it names, or a bare network."""
 
-import gzip
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from cosim.xml_files import BROKEN, opened, read_xml
 from nmfd.errors import InputError
 
 # Names that SUMO gives the same option.
@@ -74,7 +75,7 @@ def seconds(text: str, where: str) -> float:
     """A SUMO time, in seconds or as [days:]hours:minutes:seconds, in seconds. InputError names `where`."""
     try:
         parts = [float(part) for part in text.split(":")]
-        if not 1 <= len(parts) <= 4 or len(parts) == 2 or any(part != part for part in parts):
+        if not 1 <= len(parts) <= 4 or len(parts) == 2 or not all(map(math.isfinite, parts)):
             raise ValueError
     except ValueError:
         raise InputError(f"{where}: expected seconds or hours:minutes:seconds, got {text!r} instead") from None
@@ -82,29 +83,13 @@ def seconds(text: str, where: str) -> float:
     return -size if text.startswith("-") else size
 
 
-def read_xml(path: Path) -> ElementTree.Element:
-    """The root of an XML file, gzipped or not. Raises InputError."""
-    try:
-        with opened(path) as stream:
-            return ElementTree.parse(stream).getroot()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give the path of an existing one") from None
-    except (OSError, EOFError, ElementTree.ParseError) as error:
-        raise InputError(f"{path}: is not an XML file that SUMO could read ({error}); correct or replace it") from None
-
-
 def root_of(path: Path) -> ElementTree.Element:
     """The root element of an XML file, with its attributes only. Raises InputError."""
     try:
         with opened(path) as stream:
-            for _, element in ElementTree.iterparse(stream, events=("start",)):
-                return element
+            _, element = next(iter(ElementTree.iterparse(stream, events=("start",))))
+            return element
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; give the path of an existing one") from None
-    except (OSError, EOFError, ElementTree.ParseError) as error:
+    except BROKEN as error:
         raise InputError(f"{path}: is not an XML file that SUMO could read ({error}); correct or replace it") from None
-
-
-def opened(path: Path):
-    """A binary stream of a file, unzipped if its name ends in .gz."""
-    return (gzip.open if path.suffix == ".gz" else open)(path, "rb")

@@ -2,15 +2,18 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from cosim.importing.case import Case, read_xml, seconds
+from cosim.importing.case import Case, seconds
+from cosim.importing.od import Cell, read_od, relations, trips
 from cosim.importing.streets import Streets
 from cosim.originals import BOUND
+from cosim.xml_files import read_xml
 from nmfd.errors import InputError
 
 DRIVERS = ("vehicle", "trip", "flow")
@@ -41,10 +44,13 @@ class Traffic:
     notes: Mapping[str, int] = field(default_factory=dict)
 
 
-def read_traffic(case: Case, streets: Streets, seed: int) -> Traffic:
-    """All route and additional files of the case. Flows become single vehicles, and TAZ and junctions the edges drawn
-    for them (by `seed`); all else stays as it is. Raises InputError for a file that is no XML or a broken time."""
-    return _Reader(case, streets, np.random.default_rng([seed, 0x696D70])).read()
+def read_traffic(
+    case: Case, streets: Streets, seed: int, od: Sequence[Path] = (), zones: Sequence[Path] = (),
+) -> Traffic:
+    """All route and additional files of the case, and the OD matrices `od` between TAZ of these or of `zones`. Flows
+    and matrices become single vehicles, and TAZ and junctions the edges drawn for them (by `seed`); all else stays as
+    it is. Raises InputError for a file that is no XML, a broken time, and matrices beside vehicles."""
+    return _Reader(case, streets, np.random.default_rng([seed, 0x696D70])).read(od, zones)
 
 
 class _Reader:
@@ -56,14 +62,19 @@ class _Reader:
         self._zones: dict[str, dict[str, list[tuple[str, float]]]] = {}
         self._notes: Counter[str] = Counter()
 
-    def read(self) -> Traffic:
+    def read(self, od: Sequence[Path], zones: Sequence[Path]) -> Traffic:
         shared, drivers, others, switched = [], [], [], []
+        cells: list[Cell] = []
+        for path in zones:
+            self._learn(read_xml(path))
         for path in (*self._case.additional, *self._case.routes):
             for element in read_xml(path):
                 if element.tag in DRIVERS:
                     drivers.append((element, path))
                 elif element.tag in OTHERS:
                     others.append(element)
+                elif element.tag == "interval":
+                    cells += relations(wrapped([element], "data"), path)
                 elif element.tag not in DROPPED:
                     self._learn(element)
                     switched += [e.get("junctionID") for e in element.iter("wautJunction")]
@@ -77,7 +88,26 @@ class _Reader:
                 vehicles += [(single, path) for single in self._expand(element, path)]
             else:
                 vehicles.append((element, path))
+        vehicles += self._from_matrices(cells, od, len(vehicles))
         return self._checked(vehicles, background, shared, switched)
+
+    def _from_matrices(self, cells: list[Cell], od: Sequence[Path], vehicles: int) -> list[tuple[Element, Path]]:
+        """Trips of the matrices, those of the case's own files only where it has no vehicles."""
+        if vehicles and od:
+            raise InputError(
+                f"--od: {self._case.source} has {vehicles:,} vehicles of its own; leave --od away, or give the network "
+                "alone")
+        if vehicles and cells:
+            self._notes["relations between zones, left out: there are vehicles"] = len(cells)
+            return []
+        cells = cells + [cell for path in od for cell in read_od(path)]
+        for cell in cells:
+            for name in (cell.origin, cell.destination):
+                if name not in (self._zones if cell.zones else self._streets.number):
+                    kind, remedy = ("TAZ", "define it in a file for --zones") if cell.zones else ("edge", "correct it")
+                    raise InputError(f"{cell.where}: {kind} {name!r} is unknown; {remedy}")
+        made = trips(cells, self._random, self._classes.keys(), self._notes.__setitem__) if cells else []
+        return [(trip, self._case.source) for trip in made]
 
     def _learn(self, element: Element) -> None:
         """Types, routes and zones that vehicles refer to."""
@@ -96,9 +126,9 @@ class _Reader:
             if element.tag == "routeDistribution":
                 self._routes[element.get("id")] = self._likeliest(element)
         for zone in element.iter("taz"):
-            members = [(edge, 1.0) for edge in zone.get("edges", "").split()]
+            inside = [(edge, 1.0) for edge in zone.get("edges", "").split()]
             self._zones[zone.get("id")] = {
-                key: members + [(e.get("id"), float(e.get("weight", 1.0))) for e in zone.iter(tag)]
+                key: inside + [(e.get("id"), float(e.get("weight", 1.0))) for e in zone.iter(tag)]
                 for key, tag in (("from", "tazSource"), ("to", "tazSink"))}
 
     def _likeliest(self, distribution: Element) -> list[str]:
@@ -206,7 +236,7 @@ class _Reader:
         """An edge of the zone, or at the junction, where a trip begins or ends."""
         zone, junction = (element.get(name) for name in alike)
         if zone in self._zones:
-            options = [(edge, weight) for edge, weight in self._zones[zone][key] if edge in self._streets.number]
+            options = self._usable(self._zones[zone][key], key)
         else:
             place = self._streets.places.get(junction or "", -1)
             at = self._streets.junctions[:, 0 if key == "from" else 1] == place
@@ -215,6 +245,13 @@ class _Reader:
         if not options or weights[-1] <= 0:
             return None
         return options[int(np.searchsorted(weights, self._random.random() * weights[-1], side="right"))][0]
+
+    def _usable(self, options: list[tuple[str, float]], key: str) -> list[tuple[str, float]]:
+        """Of the edges of a zone those of cars; of these, if there are any, those that are joined to the rest."""
+        number, joined = self._streets.number, self._streets.onward if key == "from" else self._streets.reached
+        options = [(edge, weight) for edge, weight in options
+                   if edge in number and self._streets.drivable[number[edge]]]
+        return [option for option in options if joined[number[option[0]]]] or options
 
     def _reachable(self, kept: list[tuple]) -> list[tuple]:
         """Without trips whose end cannot be reached from their beginning by any vehicle."""

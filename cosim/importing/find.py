@@ -12,7 +12,7 @@ def scenario_of(target: Path) -> Path:
     if (target / "scenario.toml").exists() or not (target / "network.toml").exists():
         return target
     scenarios = target.resolve().parent.parent / "scenarios"
-    found = sorted(file.parent for file in scenarios.glob("*/scenario.toml") if _is_on(file, target))
+    found = sorted(file.parent for file in scenarios.glob("[!.]*/scenario.toml") if _is_on(file, target))
     same = [folder for folder in found if folder.name == target.resolve().name]
     if len(same or found) == 1:
         return (same or found)[0]

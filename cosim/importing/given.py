@@ -6,9 +6,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from cosim.importing.case import read_xml
 from cosim.importing.layers import area
 from cosim.importing.streets import Streets
+from cosim.xml_files import read_xml
 from nmfd.errors import InputError
 
 
@@ -38,7 +38,7 @@ def _edges(streets: Streets, path: Path) -> np.ndarray:
             f"{path}: line 1: expected edge,region, got {','.join(rows[0]) if rows else 'nothing'} instead")
     labels = np.full(len(streets.edges), -1)
     for number, row in enumerate(rows[1:], start=2):
-        if len(row) != 2 or not row[1].strip().isdecimal():
+        if len(row) != 2 or not row[1].strip().isdecimal() or len(row[1].strip()) > 6:
             raise InputError(
                 f"{path}: line {number}: expected an edge and a region from 0 up, got {','.join(row)} instead")
         _assign(labels, streets, row[0].strip(), int(row[1]), f"{path}: line {number}")

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from cosim.importing import atlas, layers, model, quality
+from cosim.importing import atlas, layers, level, model, quality
 from cosim.importing.baseline import Baseline, run_baseline
 from cosim.importing.case import Case, read_case, seconds
 from cosim.importing.demand import Traffic, read_traffic, wrapped
@@ -22,11 +22,14 @@ from cosim.importing.generated import morning_peak
 from cosim.importing.partition import partition
 from cosim.importing.regions import positions
 from cosim.importing.streets import Streets, read_streets
+from cosim.originals import MESOSCOPIC, read_originals, write_originals
 from cosim.regions import City, load_city
 from nmfd.errors import InputError
 from nmfd.network import Network
 
 NET = "city.net.xml.gz"
+LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
+LITTLE = 0.3  # of the flow over the boundaries passes no signal under control: worth a word
 FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz", "additional": "city.add.xml.gz"}
 
 
@@ -36,8 +39,11 @@ class Order:
 
     method: see partition.METHODS; given: the file of regions of a method that reads one
     run: simulate the city without control first
-    level: of a generated morning peak, instead of route files
+    peak: generate a morning peak, instead of route files
+    level: times the vehicles, or the usual peak; None for the lowest that congests (cosim.importing.level)
+    mesoscopic: the scenario uses SUMO's queue model
     begin, end [s]: instead of the sumocfg's
+    od: matrices between the TAZ of the sumocfg or of `zones`
     """
 
     source: Path
@@ -48,10 +54,14 @@ class Order:
     given: Path | None = None
     seed: int = 0
     run: bool = True
-    level: float | None = None
+    peak: bool = False
+    level: float | None = 1.0
+    mesoscopic: bool = False
     force: bool = False
     begin: float | None = None
     end: float | None = None
+    od: tuple[Path, ...] = ()
+    zones: tuple[Path, ...] = ()
 
 
 def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) -> str:
@@ -62,13 +72,20 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
     case = _windowed(read_case(order.source), order)
     streets = read_streets(case.net, case.additional)
     traffic = _traffic(case, streets, order)
+    if order.begin is None:
+        case = model.without_idle(case, traffic)
     clock = model.clock(case, streets, traffic)
     with _folders(order) as (net_folder, folder):
         files = _write_traffic(folder, traffic)
-        baseline = None
+        simulate = _Baselines(streets, case, clock, folder, files)
+        mesoscopic = order.mesoscopic or streets.drivable.sum() > LARGE
+        factor, congests, baseline = 1.0 if order.peak else order.level, True, None
+        if order.level is None:
+            factor, congests = level.congesting(
+                lambda times, meso: simulate.run(times, meso).pace(streets), mesoscopic=mesoscopic, tell=tell)
         if order.run:
             tell("simulating without control")
-            baseline = _baseline(streets, case, clock, folder, files)
+            baseline = simulate.run(factor, mesoscopic)
         left = left_alone(streets, traffic)
         tell("partition")
         regions, asked = partition(
@@ -87,26 +104,31 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
         (folder / "scenario.toml").write_text(model.scenario_text(
             network, clock, case, name=order.scenario.name, files=files, leave=traffic.switched,
             network_path=os.path.relpath(order.out, order.scenario).replace(os.sep, "/"),
-            protected=_protected(streets, regions, baseline, network)))
+            protected=_protected(streets, regions, baseline, network), factor=factor, mesoscopic=order.mesoscopic))
         report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
+        report += _level_line(order, factor, congests)
+        if mesoscopic and order.run:
+            report += "\nsimulated by SUMO's mesoscopic model" + (
+                "" if order.mesoscopic else f": the city has more than {LARGE:,} edges for cars")
         (net_folder / "import.txt").write_text(report + "\n")
     return report
 
 
 def _traffic(case: Case, streets: Streets, order: Order) -> Traffic:
     """The city's own vehicles, or a generated demand beside what else its files hold."""
-    traffic = read_traffic(case, streets, order.seed)
-    if order.level is None:
+    zones = order.zones or ((order.given,) if order.od and order.method == "taz" else ())
+    traffic = read_traffic(case, streets, order.seed, order.od, zones)
+    if not order.peak:
         if not len(traffic.depart):
             raise InputError(
                 f"{order.source}: names no vehicles for the streets of cars{_notes(traffic)}; give a sumocfg with "
-                "route-files, or add --demand peak")
+                "route-files, or add --od FILE or --demand peak")
         return traffic
     if len(traffic.depart):
         raise InputError(
             f"--demand: {order.source} has {len(traffic.depart):,} vehicles of its own; leave --demand away, or give "
             "the network alone")
-    peak = morning_peak(streets, level=order.level, begin=case.begin, seed=order.seed)
+    peak = morning_peak(streets, level=order.level or 1.0, begin=case.begin, seed=order.seed)
     return replace(
         peak, background=traffic.background, shared=traffic.shared + peak.shared, switched=traffic.switched,
         notes={**traffic.notes, **peak.notes})
@@ -150,19 +172,51 @@ def _folders(order: Order):
         for temporary, folder in made:
             temporary.chmod(0o755)
             folder.mkdir(exist_ok=True)
-            for file in sorted(temporary.iterdir()):
+            # Without its toml file a folder counts as nothing: it goes first and comes last.
+            for old in folder.glob("*.toml"):
+                if (temporary / old.name).exists():
+                    old.unlink()
+            for file in sorted(temporary.iterdir(), key=lambda file: (file.suffix == ".toml", file.name)):
                 os.replace(file, folder / file.name)
     finally:
         for temporary, _ in made:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _baseline(streets: Streets, case: Case, clock: model.Clock, folder: Path, files: Mapping) -> Baseline:
-    options = ["--step-length", case.options.get("step-length", "1"),
-               "--time-to-teleport", case.options.get("time-to-teleport", "300")]
-    return run_baseline(
-        streets, routes=[folder / name for key in ("routes", "background") for name in files[key]],
-        additional=[folder / name for name in files["additional"]], begin=clock.begin, end=clock.end, options=options)
+class _Baselines:
+    """Runs without control at any multiple of the demand; the last one is kept."""
+
+    def __init__(self, streets: Streets, case: Case, clock: model.Clock, folder: Path, files: Mapping):
+        self._streets, self._clock, self._files = streets, clock, files
+        self._routes, self._background, self._additional = (
+            [folder / name for name in files[key]] for key in ("routes", "background", "additional"))
+        self._options = ["--step-length", case.options.get("step-length", "1"),
+                         "--time-to-teleport", case.options.get("time-to-teleport", "300")]
+        self._last: tuple[tuple[float, bool], Baseline] | None = None
+
+    def run(self, factor: float, mesoscopic: bool) -> Baseline:
+        if self._last is None or self._last[0] != (factor, mesoscopic):
+            with tempfile.TemporaryDirectory(prefix="cosim-import-") as name:
+                routes = self._routes
+                if factor != 1.0:
+                    routes = [Path(name) / "vehicles.rou.xml"]
+                    write_originals(read_originals(self._routes), routes[0], seed=0, factor=factor, jitter=0.0,
+                                    begin=self._clock.begin)
+                self._last = (factor, mesoscopic), run_baseline(
+                    self._streets, routes=[*routes, *self._background], additional=self._additional,
+                    begin=self._clock.begin, end=self._clock.end,
+                    options=[*self._options, *(MESOSCOPIC if mesoscopic else ())])
+        return self._last[1]
+
+
+def _level_line(order: Order, factor: float, congests: bool) -> str:
+    """What came of --level, for the report."""
+    if order.level is not None:
+        return ""
+    if congests:
+        return (f"\nlevel: demand times {factor:g} is the lowest tried at which driving without control takes "
+                f"{level.CONGESTED:g} times as long as in light traffic")
+    return f"\nlevel: not even demand times {factor:g} congests this city without control"
 
 
 def _protected(streets: Streets, regions: np.ndarray, baseline: Baseline | None, network: Network) -> int:
@@ -252,11 +306,16 @@ def _report(order: Order, case: Case, streets: Streets, traffic: Traffic, clock:
                      f"({left[skipped[0]]}); see gateways.csv")
     if several := sum(len(logics) > 1 for logics in streets.logics.values()):
         lines.append(f"{several} signals have several programmes: the last that is loaded runs, as in SUMO")
+    if found.uncontrolled > LITTLE:
+        lines.append(f"perimeter control reaches only {100 * (1 - found.uncontrolled):.0f} % of the flow over the "
+                     "boundaries: other regions (--regions, --method, your own) may have more signals between them")
     if not any(g["control"] == "controlled" for g in found.gateways):
         lines.append("no gateway has a signal that perimeter control can use: only route guidance can do anything here")
-    if baseline is not None and (baseline.teleports or baseline.waiting):
-        lines.append(f"without control: {baseline.teleports} teleports, {baseline.running} vehicles on the road and "
-                     f"{baseline.waiting} waiting to enter at the end")
+    if baseline is not None:
+        lines.append(
+            f"without control: driving takes {baseline.pace(streets):.1f} times as long as at the speed limits; "
+            f"{baseline.teleports} teleports, {baseline.running} vehicles on the road and {baseline.waiting} waiting "
+            "to enter at the end")
     return "\n".join(lines)
 
 

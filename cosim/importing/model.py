@@ -12,16 +12,17 @@ from cosim.importing.case import Case, seconds
 from cosim.importing.demand import Traffic
 from cosim.importing.regions import digraph, names, positions
 from cosim.importing.streets import Streets
+from cosim.regions import JAM_SPACING
 from nmfd.mfd import Mfd
 from nmfd.network import Network
 
 # The shape of the published MFD, g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam, for want of anything measured.
 ALPHA, BETA = 0.98405, -1.97190
-JAM_SPACING = 7.5      # m of lane per standing vehicle
 JAM_SHARE = 0.6        # of the lanes that can fill up
 SIGNAL_DELAY = 0.5     # speed with signals over the speed limit
 DEFAULT_CYCLE = 90.0   # s
 CYCLES = (60.0, 180.0)  # s; shorter cycles are taken several times
+IDLE = 900.0           # s
 RECOVERY = 1800.0      # s after the last departure, for the network to empty
 
 
@@ -36,6 +37,12 @@ class Clock:
     @property
     def end(self) -> float:
         return self.begin + self.steps * self.step
+
+
+def without_idle(case: Case, traffic: Traffic) -> Case:
+    """The case, which begins later where nobody departs for more than IDLE: at the full IDLE before the first does."""
+    first = traffic.depart[0] if len(traffic.depart) else case.begin
+    return case if first - case.begin <= IDLE else replace(case, begin=float(first // IDLE * IDLE))
 
 
 def clock(case: Case, streets: Streets, traffic: Traffic) -> Clock:
@@ -95,7 +102,7 @@ def network_text(network: Network, sumo: Mapping[str, str], source: str) -> str:
 
 def scenario_text(
     network: Network, clock: Clock, case: Case, *, name: str, network_path: str, protected: int, files: Mapping,
-    leave: Sequence[str],
+    leave: Sequence[str], factor: float = 1.0, mesoscopic: bool = False,
 ) -> str:
     """scenario.toml; files: routes, background, additional -> file names beside it."""
     fastest = max(mfd.c for mfd in network.mfds)
@@ -107,12 +114,15 @@ def scenario_text(
         f"step = {clock.step:.1f}                 # s, control interval = most common signal cycle",
         f"steps = {clock.steps}", f"substeps = {substeps}",
         f"protected = [{protected}]             # the densest region; {network.region_names[protected]}",
-        'demand_file = "demand.csv"  # veh/s by interval and pair of regions, counted from the vehicles', "",
+        'demand_file = "demand.csv"  # veh/s by interval and pair of regions, counted from the vehicles',
+        f"demand_factor = {factor:g}         # vehicles are left out, or drive twice", "",
         "[forecast]", "error = 0.0                 # of what controllers are told of the demand, std of its logarithm",
         "", "[sumo]", f"begin = {clock.begin:.1f}", f"step_length = {_step_length(case, clock):g}",
         f"time_to_teleport = {seconds(teleport, 'time-to-teleport'):g}      # s; every table counts the teleports",
         "departure_jitter = 10.0     # s, either way: what seeds differ in, beside SUMO's own randomness",
         *(f"{key} = [{', '.join(_quoted(value) for value in values)}]" for key, values in files.items() if values)]
+    if mesoscopic:
+        lines.append("mesoscopic = true           # SUMO's queue model: fast, without lanes; for quick studies")
     if leave:
         lines.append(f"leave_signals = [{', '.join(_quoted(signal) for signal in leave)}]")
     return "\n".join(lines) + "\n"

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
-from cosim.importing.case import opened, read_xml, seconds
-from cosim.regions import for_cars
+from cosim.importing.case import seconds
+from cosim.regions import for_cars, size
+from cosim.xml_files import BROKEN, opened, read_xml
 from nmfd.errors import InputError
 
 
@@ -78,6 +79,22 @@ class Streets:
         """(E,) bool: the largest set of edges of which each can be reached from each."""
         return self._largest("strong")
 
+    @cached_property
+    def onward(self) -> np.ndarray:
+        """(E,) bool: the edges from which the core can be reached."""
+        return self._reached(self.links[:, ::-1])
+
+    @cached_property
+    def reached(self) -> np.ndarray:
+        """(E,) bool: the edges that can be reached from the core."""
+        return self._reached(self.links)
+
+    def _reached(self, links: np.ndarray) -> np.ndarray:
+        found = np.zeros(len(self.edges), dtype=bool)
+        found[breadth_first_order(graph(links, len(self.edges)), int(np.argmax(self.core)),
+                                  return_predecessors=False)] = True
+        return found
+
     def connected(self, pairs: Iterable[tuple[int, int]]) -> dict[tuple[int, int], bool]:
         """Whether a way leads from the first edge of each pair to its second, for a vehicle that may use every lane."""
         onward = graph(self.all_links, len(self.edges))
@@ -129,7 +146,7 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
                 if depth != 1:
                     continue
                 if element.tag == "edge" and element.get("function", "normal") in ("normal", "connector"):
-                    rows[element.get("id")] = _edge(element)
+                    rows[str(element.attrib["id"])] = _edge(element)
                 elif element.tag == "connection" and not element.get("from").startswith(":"):
                     links.append((element.get("from"), element.get("to"), int(element.get("fromLane")),
                                   int(element.get("toLane")), element.get("tl")))
@@ -141,7 +158,7 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
                     logics.setdefault(element.get("id"), []).append(_logic(element, net))
                 element.clear()
                 root.clear()
-    except (OSError, EOFError, ElementTree.ParseError, AttributeError, TypeError, ValueError) as error:
+    except (*BROKEN, AttributeError) as error:
         raise InputError(f"{net}: is not a SUMO network ({error}); build it with netconvert") from None
     for path in additional:
         for element in read_xml(path).iter("tlLogic"):
@@ -158,8 +175,8 @@ def _edge(element: ElementTree.Element) -> tuple:
     lane = next(iter(cars.values()), lanes[0])
     shape = element.get("shape") or lanes[len(lanes) // 2].get("shape")
     points = np.array([[float(x) for x in point.split(",")[:2]] for point in shape.split()])
-    speed = max(float(lane.get("speed")) for lane in cars.values() or lanes)
-    return frozenset(cars), float(lane.get("length")), speed, points, element.get("from"), element.get("to")
+    speed = max(size(lane, "speed") for lane in cars.values() or lanes)
+    return frozenset(cars), size(lane, "length"), speed, points, element.get("from"), element.get("to")
 
 
 def _logic(element: ElementTree.Element, path: Path) -> Logic:

@@ -19,6 +19,7 @@ from nmfd.scenario import Scenario
 from nmfd.types import Controls, Measurement
 
 FORMAT = 1
+WIDEST, DEEPEST = 10_000, 100  # units per layer, layers: of a policy that fits into memory
 
 
 class SoftExponential(nn.Module):
@@ -132,6 +133,7 @@ class DpcController:
     def __init__(self, policy: Policy):
         self._policy = policy.eval()
         self.name = "dpc-pcrg" if policy.architecture.guidance else "dpc-pc"
+        self.fault: str | None = None  # injected (nmfd.faults)
         self._onward = policy.onward.numpy() if policy.architecture.sparse else None
         self._u_max = self._full(policy.u_max * policy.adjacency.numpy())
 
@@ -143,6 +145,8 @@ class DpcController:
             x = torch.from_numpy(measurement.accumulation.astype(np.float32))
             perimeter, splits = self._policy.listed(x)
         perimeter = perimeter.numpy()
+        if self.fault == "policy-nan":
+            perimeter = np.full_like(perimeter, np.nan)
         if splits is not None:
             splits = splits.numpy().astype(float)
             sums = splits.sum(axis=1, keepdims=True)
@@ -196,9 +200,15 @@ def load_policy(path: Path, network: Network) -> tuple[Policy, dict]:
             raise InputError(
                 f"{path}: network_hash: the policy was trained for network {content['network']!r} "
                 f"({content['network_hash']}), not for {network.name!r} ({network.hash}); train one with 'nmfd train'")
-        policy = Policy(network, Architecture(**content["architecture"]))
+        architecture = Architecture(**content["architecture"])
+        flags = {type(architecture.guidance), type(architecture.sparse)}
+        if not (0 < architecture.width <= WIDEST and 0 < architecture.layers <= DEEPEST and flags == {bool}):
+            raise KeyError("architecture")
+        policy = Policy(network, architecture)
         policy.load_state_dict(content["weights"])
-    except (KeyError, TypeError, RuntimeError, AttributeError):
+    except (LookupError, TypeError, RuntimeError, AttributeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: is damaged or of another version; train it again with 'nmfd train'") from None
     return policy, content
 

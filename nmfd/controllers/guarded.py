@@ -64,11 +64,20 @@ class Guarded:
         self._own = torch.tensor(network.nominal_splits, dtype=torch.float32)
         self.reset()
 
+    @property
+    def fault(self) -> str | None:
+        """Of the policy, injected (nmfd.faults)."""
+        return self._policy.fault
+
+    @fault.setter
+    def fault(self, kind: str | None) -> None:
+        self._policy.fault = kind
+
     def reset(self, seed: int = 0) -> None:
         self._policy.reset(seed)
         self._left = 0          # intervals that PI gating keeps the control for
         self._error = 0.0       # squared, of the predictions so far
-        self._predicted = None  # accumulations (R,) at the end of this interval
+        self._predicted: np.ndarray | None = None  # accumulations (R,) at the end of this interval
 
     def distance(self, accumulation: np.ndarray) -> float:
         """Mahalanobis distance of accumulation (R, R) [veh] from the training states, as a share of its limit."""
@@ -142,4 +151,8 @@ def load(path: Path, scenario: Scenario, *, guidance: bool) -> Guarded:
     check_guidance(policy, path, guidance)
     if "states" not in content:
         raise InputError(f"{path}: holds no statistics of its training states; train it again with 'nmfd train'")
-    return Guarded(policy, content["states"], scenario)
+    try:
+        return Guarded(policy, content["states"], scenario)
+    except (KeyError, TypeError, AttributeError, RuntimeError):
+        raise InputError(
+            f"{path}: states: are damaged or of another version; train it again with 'nmfd train'") from None

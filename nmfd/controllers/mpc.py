@@ -7,13 +7,15 @@ simplex and acts linearly on the model, so that nearly all of them end at a boun
 gradients, while an interior-point method factorises the whole horizon some twenty times.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from nmfd import toml
-from nmfd.descent import Minimum, minimise
+from nmfd.controllers.gating import PiGating
+from nmfd.descent import AT_REST, Minimum, minimise
 from nmfd.network import Network
 from nmfd.scenario import Scenario
 from nmfd.turns import Turns, build, vehicle_steps, vehicles_at_stake
@@ -33,7 +35,8 @@ class Options:
 
     horizon: control intervals that the plan looks ahead
     max_iterations: of the solver, per decision
-    time_limit: of the solver, per decision [s]; default the control interval, as a later answer would be of no use
+    time_limit: deadline of the solver, per decision [s]; default the control interval, as a later answer would be of
+        no use
     """
 
     horizon: int
@@ -46,7 +49,8 @@ def options(scenario: Scenario, name: str) -> Options:
     where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
     table = toml.Table(scenario.controller_options.get(name, {}), where, f"controllers.{name}.")
     chosen = Options(
-        horizon=table.integer("horizon", 8, low=2), max_iterations=table.integer("max_iterations", 1000),
+        horizon=table.integer("horizon", 8, low=2, high=1000),
+        max_iterations=table.integer("max_iterations", 1000),
         time_limit=table.number("time_limit", scenario.step, above=0.0))
     table.close()
     return chosen
@@ -126,9 +130,10 @@ class EconomicMpc:
 
     The solver starts from its last plan, moved on by one interval, or from no control where that is better. Where it
     stops short of its tolerance, the status says why; the best plan that it has found, which is never worse than the
-    one that it started from, is used. Where the measurement is not a number, the last plan is used for as long as it
-    reaches, and then the perimeter opened with nominal splits. The backlog counts as demand of the first interval;
-    negative measurements count as 0.
+    one that it started from, is used. Where it finds none (it fails, diverges, or meets its deadline first), the last
+    plan is used, moved on, for as long as it reaches, and then PI gating takes over, or without a protected region the
+    open perimeter, until the solver is back. The backlog counts as demand of the first interval; negative measurements
+    count as 0.
     """
 
     def __init__(self, scenario: Scenario, *, guidance: bool):
@@ -144,31 +149,52 @@ class EconomicMpc:
         self._moves = horizon - 1 if blind else horizon
         self._model = build(network, self._used, guidance=guidance)
         rounded = replace(self._model, rounding=ROUNDING * min(mfd.jam for mfd in network.mfds))
-        scheme = {"step": scenario.step, "substeps": scenario.substeps, "integrator": scenario.integrator}
-        self._exact = partial(vehicle_steps, self._model, **scheme)
-        self._rounded = partial(vehicle_steps, rounded, gradient=True, **scheme)
-        self._at_stake = partial(vehicles_at_stake, self._model, **scheme)
+        scheme: dict = {"step": scenario.step, "substeps": scenario.substeps, "integrator": scenario.integrator}
+        self._exact: Callable = partial(vehicle_steps, self._model, **scheme)
+        self._rounded: Callable = partial(vehicle_steps, rounded, gradient=True, **scheme)
+        self._at_stake: Callable = partial(vehicles_at_stake, self._model, **scheme)
         self.admissible = Admissible(network, self._model, guidance=guidance)
         self._open = self.admissible.open(self._moves)
+        self._gating = PiGating(scenario) if scenario.protected else None
+        self.fault: str | None = None  # injected (nmfd.faults)
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
         self._plan, self._left = self._open, 0  # left: intervals of the plan that are still to come
+        self._gates = False  # PI gating is in control
 
     def act(self, measurement: Measurement) -> Controls:
         start, demand = self.forecast(measurement)
         last = np.concatenate([self._plan[1:], self._plan[-1:]]) if self._left else self._open
         if self._left and self._exact(start, demand, self._open)[0] < self._exact(start, demand, last)[0]:
             last = self._open
-        found = self._solve(start, demand, last)
-        self._plan = found.point
-        if found.reason is None or found.gap <= ACCEPTABLE * found.value:
-            self._left, status = self._moves - 1, "ok"
-        elif np.isfinite(found.gap):
-            self._left, status = self._moves - 1, f"{found.reason}: best plan so far used"
-        else:
-            status = f"{found.reason}: " + ("last plan used" if self._left else "perimeter opened, nominal splits")
-            self._left = max(self._left - 1, 0)
+        try:
+            found = self._solve(start, demand, last)
+        except (ArithmeticError, ValueError, RuntimeError) as error:  # of NumPy and SciPy, LinAlgError too
+            return self._without(measurement, last, f"solver failed ({type(error).__name__})")
+        known = np.isfinite(found.gap)
+        solved = found.reason is None or (known and found.gap <= ACCEPTABLE * found.value)
+        if not solved and (found.point is last or not known) and found.reason != AT_REST:
+            return self._without(measurement, last, found.reason)
+        self._plan, self._left, self._gates = found.point, self._moves - 1, False
+        return self._first(status="ok" if solved else f"{found.reason}: best plan so far used")
+
+    def _without(self, measurement: Measurement, last: np.ndarray, reason: str) -> Controls:
+        """The controls of an interval for which no plan was found."""
+        self._plan = last
+        if self._left:
+            self._left -= 1
+            return self._first(status=f"{reason}: last plan used")
+        if self._gating is None or not np.isfinite(measurement.accumulation).all():
+            return replace(self._first(), status=f"{reason}: perimeter opened, nominal splits")
+        if not self._gates:
+            self._gating.reset()
+        self._gates = True
+        _, splits = self.admissible.controls(self._open[0])
+        return replace(self._gating.act(measurement), splits=splits, status=f"{reason}: pi-gating in control")
+
+    def _first(self, status: str = "ok") -> Controls:
+        """The first interval of the plan."""
         perimeter, splits = self.admissible.controls(self._plan[0])
         return Controls(perimeter=perimeter, splits=splits, status=status)
 
@@ -188,7 +214,16 @@ class EconomicMpc:
 
     def _solve(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> Minimum:
         """The best plan found from `plan` (moves, E + V); its value, in vehicles, is that of the rounded model."""
+        if self.fault == "solver-fails":
+            raise FloatingPointError("ordered")
+        if self.fault == "solver-late":
+            return Minimum(point=plan, value=np.inf, gap=np.inf, evaluations=0, reason="time limit")
+        objective = _diverging if self.fault == "solver-diverges" else partial(self._rounded, start, demand)
         return minimise(
-            partial(self._rounded, start, demand), self.admissible.project, self.admissible.gap, plan,
+            objective, self.admissible.project, self.admissible.gap, plan,
             metric=(self._at_stake(start, demand, plan) + FEW) ** 2, tolerance=TOLERANCE,
             iterations=self.options.max_iterations, seconds=self.options.time_limit)
+
+
+def _diverging(plan: np.ndarray) -> tuple[float, np.ndarray]:
+    return np.nan, np.full_like(plan, np.nan)

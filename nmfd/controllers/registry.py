@@ -1,7 +1,11 @@
-"""Controllers by name. The module behind a name is imported only when that controller is made."""
+"""Controllers by name. The module behind a name is imported only when that controller is made.
+
+Besides those here there are controllers of the user's own (nmfd.controllers.own), by entry point or file.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -68,24 +72,77 @@ _WITHOUT_POLICY: dict[str, Callable[[Scenario], Controller]] = {
 _WITH_POLICY = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
 # The policy that is watched.
 _GUARDED = {"dpc-pc-guarded": "dpc-pc", "dpc-pcrg-guarded": "dpc-pcrg"}
+# The policy that goes on learning.
+_ONLINE = {"dpc-pc-online": "dpc-pc", "dpc-pcrg-online": "dpc-pcrg"}
 # Whether the plan guides routes too. The same as bound.NAMES.
 _WITH_PLAN = {"bound-pc": False, "bound-pcrg": True}
+OWN = "own"  # the table in [controllers] that holds those of controllers of the user's own
+_OWN = re.compile(r".+\.py:\w+(?=\+|$)")
 
 
 def names() -> tuple[str, ...]:
-    """Every controller."""
-    return (*_WITHOUT_POLICY, *_WITH_POLICY, *_GUARDED, *_WITH_PLAN)
+    """Every controller that is built in."""
+    return (*_WITHOUT_POLICY, *_WITH_POLICY, *_GUARDED, *_ONLINE, *_WITH_PLAN)
 
 
 def policy_names() -> tuple[str, ...]:
     """The controllers that need a trained policy."""
-    return (*_WITH_POLICY, *_GUARDED)
+    return (*_WITH_POLICY, *_GUARDED, *_ONLINE)
 
 
 def check(name: str) -> None:
     """InputError unless `name` is a controller."""
-    if name not in names():
-        raise InputError(f"controller {name!r} is unknown; choose from {', '.join(names())}")
+    if not known(name):
+        raise InputError(f"controller {name!r} is unknown; choose from {', '.join(choice())}, or file.py:Class")
+
+
+def split(name: str) -> tuple[str, list[str]]:
+    """The controller of NAME+OPTION+..., and its options; the path of a controller in a file may hold a + too."""
+    own = _OWN.match(name)
+    first, *rest = [own[0], *name[own.end():].split("+")[1:]] if own else name.split("+")
+    return first, rest
+
+
+def known(name: str) -> bool:
+    """Whether `name` is a controller. InputError for a file that is not there."""
+    if name in names():
+        return True
+    from nmfd.controllers import own
+
+    if own.is_file(name):
+        own.check(name)
+        return True
+    return name in own.entry_points()
+
+
+def choice() -> tuple[str, ...]:
+    """Every controller that has a name of its own, built in or installed."""
+    from nmfd.controllers import own
+
+    return (*names(), *(name for name in own.entry_points() if name not in names()))
+
+
+def is_own(name: str) -> bool:
+    """Whether `name`, which must be known, is a controller of the user's own."""
+    return name not in names()
+
+
+def configured_own(name: str, scenario: Scenario) -> tuple[str, Scenario]:
+    """Of a controller of the user's own: the name of its table, and `scenario` with the tables of all such."""
+    from nmfd.controllers import own
+
+    return own.table_name(name), own.with_tables(scenario)
+
+
+def fingerprint(name: str, policy: Path | None) -> dict[str, object]:
+    """What the runs of `name` depend on in files: its own source, or its `policy_path`."""
+    if is_own(name):
+        from nmfd.controllers import own
+
+        return own.fingerprint(name)
+    from nmfd.runs import file_hash
+
+    return {} if policy is None else {"policy_hash": file_hash(policy)}
 
 
 def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Path | None:
@@ -93,8 +150,9 @@ def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Pa
 
     InputError for an unknown name, for a `policy` that the controller has no use for, and for a missing file.
     """
+    variant, name = name, split(name)[0]
     check(name)
-    if name in _WITHOUT_POLICY:
+    if name in _WITHOUT_POLICY or is_own(name):
         if policy is not None:
             raise InputError(
                 f"{policy}: controller {name} reads no policy; only {', '.join((*policy_names(), *_WITH_PLAN))} do: "
@@ -103,7 +161,7 @@ def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Pa
     if policy is None and scenario.folder is None:
         raise InputError(f"controller {name}: scenario {scenario.name} has no folder with policies; give a file")
     kind, verb, suffix = ("plan", "compute", "npz") if name in _WITH_PLAN else ("policy", "train", "pt")
-    owner = _GUARDED.get(name, name)
+    owner = _owner(variant)
     path = scenario.folder / f"{owner}.{suffix}" if policy is None else Path(policy)
     if not path.is_file():
         scenario_text = "SCENARIO" if scenario.folder is None else scenario.folder
@@ -113,15 +171,27 @@ def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Pa
     return path
 
 
+def _owner(name: str) -> str:
+    """Whose policy and options `name` uses."""
+    name, rest = split(name)
+    return "+".join([{**_GUARDED, **_ONLINE}.get(name, name), *rest])
+
+
 def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Controller:
     """The controller `name` for `scenario`; `policy` is the file of a policy or plan instead of the scenario's own.
 
-    Raises InputError as `policy_path` does, and what the controller itself finds wrong with its options or policy.
+    A name "NAME+..." stands for NAME with options and a policy of its own (nmfd.scenario.as_modelled). Raises
+    InputError as `policy_path` does, and what the controller itself finds wrong with its options or policy.
     """
     from nmfd.scenario import as_modelled
 
     path = policy_path(name, scenario, policy)
-    scenario = as_modelled(scenario, _GUARDED.get(name, name))
+    variant, name = name, split(name)[0]
+    if is_own(name):
+        from nmfd.controllers import own
+
+        return own.make(name, scenario)
+    scenario = as_modelled(scenario, _owner(variant))
     if path is None:
         return _WITHOUT_POLICY[name](scenario)
     if name in _WITH_PLAN:
@@ -132,6 +202,54 @@ def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Contro
         from nmfd.controllers import guarded
 
         return guarded.load(path, scenario, guidance=_WITH_POLICY[_GUARDED[name]])
+    if name in _ONLINE:
+        from nmfd.controllers import online
+
+        return online.load(path, scenario, guidance=_WITH_POLICY[_ONLINE[name]])
     from nmfd.controllers import dpc
 
     return dpc.load(path, scenario, guidance=_WITH_POLICY[name])
+
+
+def check_options(scenario: Scenario) -> None:
+    """InputError for a wrong option of any controller in the scenario's [controllers], whether it is run or not.
+
+    An option of a controller that nobody runs today would else be found wrong in the middle of tomorrow's work. The
+    networks of other models are read only where they are used.
+    """
+    from dataclasses import replace
+
+    from nmfd import toml
+
+    where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
+    tables = toml.Table(scenario.controller_options, where, "controllers.")
+    for variant in scenario.controller_options:
+        if variant == OWN:  # checked by those controllers, if at all
+            tables.table(OWN)
+            continue
+        table, name = tables.table(variant), split(variant)[0]
+        if name not in names():
+            raise tables.error(variant, f"unknown controller; choose from {', '.join(names())}, or one of them with + "
+                               "and the options of a strategy; that of a controller of your own is "
+                               f"controllers.{OWN}.{variant}")
+        table.text("model", None)
+        options = {**scenario.controller_options.get(name, {}), **table.raw()}
+        options.pop("model", None)
+        own = replace(scenario, controller_options=dict.fromkeys((name, variant), options))
+        if name.startswith("mpc-"):
+            from nmfd.controllers import mpc
+
+            mpc.options(own, name)
+        elif name in _WITH_POLICY:
+            from nmfd import training
+
+            training.settings(own, variant)
+        elif name in _ONLINE:
+            from nmfd.controllers import online
+
+            online.options(own, name)
+        elif name in ("pi-gating", "probing-pc", "probing-pcrg"):
+            if scenario.protected:  # without a protected region gating cannot be made, and is not made
+                _WITHOUT_POLICY[name](own)
+        else:
+            table.close()

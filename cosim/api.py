@@ -1,0 +1,60 @@
+"""What `cosim run` does, as a function of a few arguments; exported by the package `cosim`."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from cosim.simulate import Result, drive
+from cosim.strategy import ALONE, configured, parse
+from cosim.sumo_output import check
+from nmfd.api import named
+from nmfd.errors import InputError
+from nmfd.scenario import Scenario, load_scenario
+from nmfd.types import Controller
+
+
+def run(
+    scenario: Scenario | Path | str, controller: str | Controller, *, seed: int = 0, steps: int | None = None,
+    demand_factor: float = 1.0, policy: Path | str | None = None, city: str = "",
+    sumo_output: Mapping[str, Path | str] | None = None, progress: Callable[[int, int], None] | None = None,
+) -> Result:
+    """One closed loop in SUMO, in this process and without a run folder.
+
+        result = cosim.run("scenarios/grid7_peak", "pi-gating+rerouting-30", seed=3)
+        result.trajectory.to_frame(), result.facts["mean_trip_time_s"], result.record["gateway_flow"]
+
+    scenario: the folder of a scenario.toml, or what nmfd.load_scenario made of it
+    controller: a strategy as on the command line, or an object with `reset` and `act` (nmfd.Controller)
+    seed: of the trips, the drivers and the guidance
+    steps: control intervals; the scenario's if None
+    demand_factor: multiplies all flows
+    policy: of a DPC controller by name, if not SCENARIO/NAME.pt
+    city: what else the city does, with a controller that is an object: "max-pressure+rerouting-30"
+    sumo_output: files of SUMO's own outputs: {"tripinfo": "trips.xml"}, also summary, edgedata, emission
+    progress: called as progress(done, steps) after every control interval
+
+    The result holds `trajectory` (nmfd.Trajectory), `record` (arrays, see cosim.plant.Record) and `facts` (the row of
+    sumo.csv). The same seed gives the same result, but for wall times. Raises InputError, and RuntimeError while
+    another simulation is open in this process.
+    """
+    scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    if steps is not None and steps < 1:
+        raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
+    if not 0.0 < demand_factor <= 10.0:
+        raise InputError(f"demand_factor: expected a number above 0 up to 10, got {demand_factor:g} instead")
+    steps = scenario.steps if steps is None else min(steps, scenario.steps)
+    scenario = replace(
+        scenario, steps=steps, demand=demand_factor * scenario.demand[:steps],
+        demand_factor=demand_factor * scenario.demand_factor)
+    if isinstance(controller, str):
+        strategy = parse(f"{controller}+{city}" if city else controller)
+        _, acting = named(configured(strategy.name, scenario.controller_options), scenario, policy)
+    else:
+        name, acting = named(controller, scenario, policy)
+        strategy = parse(city or ALONE)
+        strategy = replace(
+            strategy, name=f"{name}+{city}" if city else name, controller=name,
+            overrides={**strategy.overrides, "gateways_fixed": name != ALONE})
+    outputs = {kind: Path(file) for kind, file in (sumo_output or {}).items()}
+    check(outputs)
+    return drive(scenario, strategy, acting, seed=seed, progress=progress, outputs=outputs)

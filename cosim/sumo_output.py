@@ -1,0 +1,44 @@
+"""SUMO's own output files of a run, on request: for tools that read them, beside what is recorded here."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+from nmfd.errors import InputError
+from nmfd.runs import run_name
+
+# Kind -> ending of its file. The emissions of every vehicle in every step are gigabytes, unless compressed.
+KINDS = {
+    "tripinfo": "tripinfo.xml", "summary": "summary.xml", "edgedata": "edgedata.xml", "emission": "emission.xml.gz"}
+
+
+def parse(text: str) -> tuple[str, ...]:
+    """Kinds separated by commas. InputError for one that there is not."""
+    kinds = tuple(dict.fromkeys(kind.strip() for kind in text.split(",")))
+    check(kinds)
+    return kinds
+
+
+def check(kinds) -> None:
+    for kind in kinds:
+        if kind not in KINDS:
+            raise InputError(f"--sumo-output: {kind!r} is unknown; choose from {', '.join(KINDS)}, separated by commas")
+
+
+def paths(kinds: tuple[str, ...], folder: Path, controller: str, seed: int) -> tuple[tuple[str, Path], ...]:
+    """Kind and file in the run folder `folder`."""
+    return tuple((kind, folder / f"{run_name(controller, seed)}.{KINDS[kind]}") for kind in kinds)
+
+
+def options(outputs: Mapping[str, Path]) -> tuple[str, ...]:
+    """Options of SUMO for `summary` and `emission`; tripinfo is written anyway (trip_facts)."""
+    return tuple(part for kind in ("summary", "emission") if kind in outputs
+                 for part in (f"--{kind}-output", str(outputs[kind])))
+
+
+def write_edge_data(path: Path, target: Path, every: float) -> Path:
+    """An additional file that makes SUMO write means per edge over every `every` [s] to `target`."""
+    path.write_text(
+        f'<additional><edgeData id="edgedata" freq="{every:g}" excludeEmpty="true" '
+        f'file={quoteattr(str(target.resolve()))}/></additional>\n', encoding="utf-8")
+    return path

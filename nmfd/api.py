@@ -1,0 +1,111 @@
+"""What the command line `nmfd` does, as functions of a few arguments; exported by the package `nmfd`."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from nmfd import closed_loop, runs
+from nmfd.controllers import registry
+from nmfd.errors import InputError
+from nmfd.scenario import Scenario, load_scenario
+from nmfd.types import Controller, Plant, Trajectory
+
+
+def controller(name: str, scenario: Scenario | Path | str, *, policy: Path | str | None = None) -> Controller:
+    """The controller `name` for `scenario`, with `reset` and `act`.
+
+    name: as on the command line: "pi-gating", "dpc-pcrg", ..., or "path/to/file.py:Class"
+    policy: the file of a policy or plan, if not SCENARIO/NAME.pt or .npz
+
+    Raises InputError for an unknown name, a wrong option, or a policy that is missing or made for another network.
+    """
+    return registry.make(name, _loaded(scenario), policy=None if policy is None else Path(policy))
+
+
+def run(
+    scenario: Scenario | Path | str, controller: str | Controller, *, seed: int = 0, plant: str | Plant = "nmfd",
+    steps: int | None = None, policy: Path | str | None = None, progress: Callable[[int, int], None] | None = None,
+) -> Trajectory:
+    """One closed loop on a regional model.
+
+        trajectory = nmfd.run("scenarios/economic_mpc", "pi-gating")
+        trajectory.to_frame()
+
+    scenario: the folder of a scenario.toml, or what load_scenario made of it
+    controller: a name as on the command line, or an object with `reset` and `act` (nmfd.Controller)
+    seed: of the measurement noise
+    plant: "nmfd", "acyclic", or an object with `reset`, `step`, `completed` and `close` (nmfd.Plant)
+    steps: control intervals; the scenario's if None
+    policy: as in `nmfd.controller`
+    progress: called as progress(done, steps) after every control interval
+
+    The same seed gives the same trajectory (but for wall times). Raises InputError.
+    """
+    from nmfd.benchmarks import PLANTS
+
+    scenario = _loaded(scenario)
+    if steps is not None:
+        if steps < 1:
+            raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
+        steps = min(steps, scenario.steps)
+        scenario = replace(scenario, steps=steps, demand=scenario.demand[:steps])
+    if isinstance(plant, str) and plant not in PLANTS:
+        raise InputError(f"plant {plant!r} is unknown; choose from {', '.join(PLANTS)}, or give an object")
+    name, acting = named(controller, scenario, policy)
+    driven = PLANTS[plant](scenario) if isinstance(plant, str) else plant
+    trajectory = closed_loop.run(driven, acting, scenario, seed=seed, progress=progress)
+    return runs.labelled(
+        trajectory, controller=name, plant=plant if isinstance(plant, str) else type(plant).__name__)
+
+
+def benchmark(
+    scenario: Scenario | Path | str, controllers: Sequence[str], *, seeds: int | Sequence[int] = 1,
+    plant: str = "nmfd", out: Path | str | None = None, policies: Mapping[str, Path | str] | None = None,
+    workers: int = 1, progress: Callable[[int, int, str], None] | None = None,
+) -> list[dict]:
+    """`nmfd benchmark`: controllers x seeds with a run folder; returns the rows of its summary.csv.
+
+    seeds: how many, from 0, or which
+    out: the run folder, runs/<scenario>-<time> if None; finished runs in it are kept
+    policies: controller -> file, if not SCENARIO/NAME.pt
+
+    `nmfd.table(rows)` gives the text that the command prints. Raises InputError and nmfd.workers.RunFailed.
+    """
+    from nmfd import benchmarks
+
+    scenario = _loaded(scenario)
+    return benchmarks.benchmark(
+        scenario, list(controllers), range(seeds) if isinstance(seeds, int) else list(seeds), plant,
+        out=runs.default_folder(scenario) if out is None else Path(out),
+        policies={name: Path(file) for name, file in (policies or {}).items()}, workers=workers, progress=progress)
+
+
+def train(
+    scenario: Scenario | Path | str, controller: str, *, out: Path | str, seed: int = 0, steps: int | None = None,
+    resume: bool = False, progress: Callable[[int, int, str], None] | None = None,
+) -> Path:
+    """`nmfd train` on the CPU: train the DPC policy `controller` and write it to the file `out`, which is returned.
+
+    steps: Adam steps; what scenario.toml says, else 400, if None. Raises InputError.
+    """
+    from nmfd import training
+
+    return training.train(
+        _loaded(scenario), controller, seed=seed, out=Path(out), steps=steps, resume=resume, progress=progress)
+
+
+def named(controller: str | Controller, scenario: Scenario, policy: Path | str | None) -> tuple[str, Controller]:
+    """The name of `controller`, which may be an object already, and the object. Raises InputError."""
+    if isinstance(controller, str):
+        return controller, registry.make(controller, scenario, policy=None if policy is None else Path(policy))
+    if policy is not None:
+        raise InputError(f"policy: {policy}: is for a controller by name; this one is an object: leave policy out")
+    for method in ("reset", "act"):
+        if not callable(getattr(controller, method, None)):
+            raise InputError(
+                f"controller: expected a name or an object with reset and act, got {controller!r} without {method}")
+    return getattr(controller, "name", type(controller).__name__), controller
+
+
+def _loaded(scenario: Scenario | Path | str) -> Scenario:
+    return scenario if isinstance(scenario, Scenario) else load_scenario(scenario)

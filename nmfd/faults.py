@@ -1,0 +1,183 @@
+"""Faults to order: what sensors, solvers, policies, signals and streets may do in earnest, injected into a run.
+
+A fault is a text, KIND[:VALUE][@FROM-TO], in the list `faults` of scenario.toml or behind --fault; FROM and TO are
+control intervals, TO the first one that is well again; without them it lasts for the whole run. Whatever is done
+instead is in the status of every decision (trajectory, and the column failures of the tables).
+"""
+
+import re
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from nmfd.errors import InputError
+from nmfd.scenario import Scenario
+from nmfd.types import Controller, Controls, Measurement
+
+# Kind -> what its value is, or None. Of the measurements, of what computes the controls, and of the city.
+SENSORS = {"frozen": None, "delayed": "intervals", "missing": "region", "detectors": "share", "off": "factor"}
+COMPUTING = {"solver-fails": None, "solver-diverges": None, "solver-late": None, "policy-nan": None}
+CITY = {"closed": "edge", "signal": "signal", "sumo-exits": None}
+KINDS = {**SENSORS, **COMPUTING, **CITY}
+EXAMPLES = {
+    "intervals": "delayed:2", "region": "missing:3", "share": "detectors:0.2", "factor": "off:1.5",
+    "edge": "closed:A0A1", "signal": "signal:B1"}
+FORM = re.compile(r"(?P<kind>[a-z-]+)(:(?P<value>[^@]+))?(@(?P<begin>\d{1,6})-(?P<end>\d{1,6}))?")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fault:
+    """kind: one of KINDS; number, name: its value; begin, end: control intervals, begin <= k < end."""
+
+    kind: str
+    number: float = 0.0
+    name: str = ""
+    begin: int = 0
+    end: int = 10**9
+
+    def active(self, k: int) -> bool:
+        return self.begin <= k < self.end
+
+
+def parse(text: str, where: str, regions: int) -> Fault:
+    """The fault that `text` orders. InputError, which begins with `where`."""
+    match = FORM.fullmatch(text)
+    if match is None or match["kind"] not in KINDS:
+        raise InputError(
+            f"{where}: expected KIND[:VALUE][@FROM-TO] with a kind out of {', '.join(KINDS)}, got {text[:60]!r} "
+            "instead")
+    kind, value = match["kind"], match["value"]
+    begin, end = int(match["begin"] or 0), int(match["end"] or 10**9)
+    unit = KINDS[kind]
+    if end <= begin:
+        raise InputError(f"{where}: {text}: expected control intervals FROM-TO with FROM < TO, such as @10-20")
+    if (value is None) != (unit is None):
+        what = f"needs a {unit}, such as {EXAMPLES[unit]}" if unit else "takes no value"
+        raise InputError(f"{where}: {text}: {kind} {what}")
+    if unit in (None, "edge", "signal"):
+        return Fault(kind=kind, name=value or "", begin=begin, end=end)
+    low, high, whole = {"intervals": (1, 1000, True), "region": (0, regions - 1, True), "share": (0.0, 1.0, False),
+                        "factor": (0.0, 10.0, False)}[unit]
+    try:
+        number = float(value)
+    except ValueError:
+        number = np.nan
+    if not low <= number <= high or (whole and number != int(number)):
+        kind_of = "whole number" if whole else "number"
+        raise InputError(
+            f"{where}: {kind}: expected a {kind_of} from {low:g} to {high:g} as its {unit}, got {value[:60]!r} instead")
+    return Fault(kind=kind, number=number, begin=begin, end=end)
+
+
+def without_city(faults: Sequence[Fault], where: str) -> None:
+    """InputError for a fault that only a simulated city can have."""
+    for fault in faults:
+        if fault.kind in CITY:
+            raise InputError(
+                f"{where}: {fault.kind} is a fault of a city in SUMO, not of the regional model; leave it out")
+
+
+def of(scenario: Scenario) -> list[Fault]:
+    """The faults that the scenario orders. InputError."""
+    where = "scenario.toml" if scenario.folder is None else f"{scenario.folder / 'scenario.toml'}"
+    return [parse(text, f"{where}: faults", scenario.network.regions) for text in scenario.faults]
+
+
+def with_faults(scenario: Scenario, texts: Sequence[str]) -> Scenario:
+    """`scenario` with more faults, as the option --fault gives them. InputError."""
+    for text in texts:
+        parse(text, "--fault", scenario.network.regions)
+    return replace(scenario, faults=(*scenario.faults, *texts))
+
+
+class Sensors:
+    """What controllers see, with the faults of `SENSORS`; what is missing is what was seen last, 0 before the first.
+
+    Of estimates (of a plant that simulates detectors) missing detectors are the plant's own business.
+    """
+
+    def __init__(self, faults: Sequence[Fault], seed: int):
+        self._faults = [fault for fault in faults if fault.kind in SENSORS]
+        self._random = np.random.default_rng([seed, 0x6661756C])
+        longest = max((int(fault.number) for fault in self._faults if fault.kind == "delayed"), default=0)
+        self._seen: deque[Measurement] = deque(maxlen=longest + 1)
+        self._frozen: dict[int, Measurement] = {}
+        self._silent: np.ndarray | None = None
+        self._last: np.ndarray | None = None
+
+    def see(self, measurement: Measurement, *, estimated: bool) -> tuple[Measurement, str]:
+        """The measurement as it arrives, and what is wrong with it, "" if nothing is."""
+        problems, k = [], measurement.step
+        self._seen.append(measurement)
+        for number, fault in enumerate(self._faults):
+            if not fault.active(k):
+                continue
+            x, problem = measurement.accumulation, ""
+            match fault.kind:
+                case "frozen":
+                    measurement, problem = self._then(self._frozen.setdefault(number, measurement), k), "frozen"
+                case "delayed":
+                    late = min(int(fault.number), len(self._seen) - 1)
+                    measurement, problem = self._then(self._seen[-1 - late], k), f"{late} intervals late"
+                case "missing":
+                    measurement = replace(measurement, accumulation=np.where(
+                        np.arange(len(x))[:, None] == int(fault.number), np.nan, x))
+                case "detectors" if not estimated:
+                    if self._silent is None:
+                        self._silent = self._random.random(x.shape) < fault.number
+                    measurement = replace(measurement, accumulation=np.where(self._silent, np.nan, x))
+                case "off":
+                    measurement = replace(measurement, accumulation=fault.number * x, backlog=(
+                        fault.number * measurement.backlog))
+                    problem = f"off by a factor of {fault.number:g}"
+            problems += [problem] if problem else []
+        measurement, missing = self._filled(measurement)
+        problems += [f"{missing} of {measurement.accumulation.size} entries missing, last ones used"] if missing else []
+        return measurement, f"measurement {', '.join(problems)}" if problems else ""
+
+    @staticmethod
+    def _then(before: Measurement, k: int) -> Measurement:
+        """`before` as if it were of now: the controller does not know better."""
+        return replace(before, step=k)
+
+    def _filled(self, measurement: Measurement) -> tuple[Measurement, int]:
+        """With what was seen last in place of what is no number, and how many entries that were."""
+        x, backlog = measurement.accumulation, measurement.backlog
+        good = np.isfinite(x)
+        missing = int(x.size - good.sum())
+        if missing or not np.isfinite(backlog).all():
+            last = np.zeros_like(x) if self._last is None else self._last
+            measurement = replace(
+                measurement, accumulation=np.where(good, x, last), backlog=np.nan_to_num(backlog, posinf=0.0))
+        self._last = measurement.accumulation
+        return measurement, missing
+
+
+class Supervised:
+    """A controller with the faults of COMPUTING, whose controls are looked at before they go anywhere.
+
+    Controls that are no numbers are replaced by the open perimeter, without route guidance.
+    """
+
+    def __init__(self, controller: Controller, faults: Sequence[Fault], opened: np.ndarray):
+        """opened: (R, R) [-], the perimeter that is taken instead"""
+        self.name, self._controller, self._opened = controller.name, controller, opened
+        self._faults = [fault for fault in faults if fault.kind in COMPUTING]
+
+    def reset(self, seed: int = 0) -> None:
+        self._controller.reset(seed)
+
+    def act(self, measurement: Measurement, problem: str = "") -> Controls:
+        """problem: with the measurement, for the status"""
+        if self._faults and hasattr(self._controller, "fault"):  # others have no solver and no policy
+            kinds = [fault.kind for fault in self._faults if fault.active(measurement.step)]
+            self._controller.fault = kinds[0] if kinds else None
+        controls = self._controller.act(measurement)
+        if not np.isfinite(controls.perimeter).all() or (
+                controls.splits is not None and not np.isfinite(controls.splits).all()):
+            controls = Controls(
+                perimeter=self._opened, splits=None, status="the controls were no numbers: perimeter opened")
+        reasons = [reason for reason in (problem, "" if controls.status == "ok" else controls.status) if reason]
+        return replace(controls, status="; ".join(reasons)) if reasons else controls

@@ -1,0 +1,52 @@
+"""A scenario as a gymnasium environment: one agent for all regions."""
+
+import gymnasium
+import numpy as np
+
+from nmfd.plant import NmfdPlant
+from nmfd.rl.interface import Episode, Interface
+from nmfd.scenario import Scenario
+from nmfd.types import Plant
+
+
+class RegionalEnv(gymnasium.Env):
+    """One episode is the whole scenario; it ends by truncation after its T control intervals.
+
+        env = RegionalEnv(nmfd.load_scenario("scenarios/economic_mpc"), guidance=True)
+
+    Observations and actions: nmfd.rl.Interface. The reward of an interval is minus the vehicles in and before the city
+    when it begins, in `unit` (the sum of the critical accumulations): TTS = - sum of rewards * unit * scenario.step, as
+    in the benchmark table. `info` holds time_s, total_time_spent_veh_s and completed_veh so far.
+
+    plant: what is controlled, the NMFD if None; closed with the environment. One seed gives the closed loop of
+    nmfd.run with it.
+    """
+
+    metadata = {"render_modes": []}
+
+    def __init__(
+        self, scenario: Scenario, plant: Plant | None = None, *, guidance: bool = False, metering: bool = False,
+    ):
+        self.interface = Interface(scenario.network, guidance=guidance, metering=metering)
+        self._episode = Episode(scenario, NmfdPlant(scenario) if plant is None else plant)
+        self.unit = self._episode.unit
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.interface.observation_size,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.interface.action_size,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        """Without a seed, the next one of the sequence that the last seed began."""
+        super().reset(seed=seed)
+        seen = self._episode.reset(int(self.np_random.integers(2**31)) if seed is None else seed)
+        self._spent = 0.0
+        return self.interface.observed(seen), self._info(seen)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        seen, vehicles, over = self._episode.step(self.interface.controls(action))
+        self._spent += self._episode.scenario.step * float(vehicles.sum())
+        return self.interface.observed(seen), -float(vehicles.sum()) / self.unit, False, over, self._info(seen)
+
+    def close(self) -> None:
+        self._episode.close()
+
+    def _info(self, seen) -> dict:
+        return {"time_s": seen.time, "total_time_spent_veh_s": self._spent, "completed_veh": self._episode.completed}

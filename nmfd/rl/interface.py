@@ -1,0 +1,131 @@
+"""What an agent sees and does, as vectors of numbers."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nmfd.network import Network
+from nmfd.types import Controls, Measurement
+
+LOGITS = 5.0  # actions in [-1, 1] times this are the logits of the split ratios: up to e^10 between two ways
+
+
+class Interface:
+    """Observations and actions of an agent for some regions of a network; all regions by default.
+
+    Observation, float32: for all regions x_ij of every pair and the backlog of every region; for some, x_ij and the
+    backlog of these, and the accumulation of every region. All divided by the region's critical accumulation.
+
+    Action, in [-1, 1]: u_ih of every boundary out of these regions, from u_min to u_max, or with `metering` one for all
+    entries of a region h alike, as gating does, which is easier to explore; with guidance also a logit for every next
+    region h of theta_ihj where there is a choice, of which the softmax is taken. Admissible whatever it is.
+
+    observation_size, action_size
+    """
+
+    def __init__(
+        self, network: Network, *, guidance: bool = False, metering: bool = False,
+        regions: Sequence[int] | None = None,
+    ):
+        self._network, self._guidance = network, guidance
+        chosen = np.arange(network.regions) if regions is None else np.array(regions)
+        self._chosen, self._all = chosen, regions is None
+        self._critical = np.array([mfd.critical for mfd in network.mfds])
+        mine = np.isin(np.arange(network.regions), chosen)
+        self._boundaries = np.nonzero(network.adjacency & mine[:, None])
+        choice = network.split_mask & (network.split_mask.sum(axis=1, keepdims=True) > 1) & mine[:, None, None]
+        self._ways = np.nonzero(choice) if guidance else None
+        entered, gate = np.unique(self._boundaries[1], return_inverse=True)
+        self._gate = gate if metering else np.arange(len(gate))  # which number of an action is u of each boundary
+        self._count = len(entered) if metering else len(gate)
+        self.action_size = self._count + (len(self._ways[0]) if guidance else 0)
+        self.observation_size = len(chosen) * (network.regions + 1) + (0 if self._all else network.regions)
+        self._open = np.where(network.adjacency, network.u_max, 0.0)
+        # The split ratios of these regions that no action decides: where there is one way only.
+        self._rest = np.where(network.split_mask & ~choice & mine[:, None, None], network.nominal_splits, 0.0)
+
+    def observation(self, accumulation: np.ndarray, backlog: np.ndarray) -> np.ndarray:
+        """(..., observation_size) of accumulation (..., R, R) and backlog (..., R, R) [veh]."""
+        batch, chosen = accumulation.shape[:-2], self._chosen
+        parts = [
+            (accumulation / self._critical[:, None])[..., chosen, :].reshape(*batch, -1),
+            (backlog.sum(axis=-1) / self._critical)[..., chosen]]
+        if not self._all:
+            parts.append(accumulation.sum(axis=-1) / self._critical)
+        return np.concatenate(parts, axis=-1, dtype=np.float32)
+
+    def observed(self, measurement: Measurement) -> np.ndarray:
+        """(observation_size,) of what a controller sees."""
+        return self.observation(measurement.accumulation, measurement.backlog)
+
+    def perimeter(self, action: np.ndarray) -> np.ndarray:
+        """(..., R, R) [-] of actions (..., action_size); u_max at the boundaries of other regions."""
+        network = self._network
+        share = 0.5 * (np.clip(np.asarray(action, dtype=float)[..., :self._count], -1.0, 1.0) + 1.0)
+        perimeter = np.broadcast_to(self._open, (*share.shape[:-1], *self._open.shape)).copy()
+        perimeter[..., *self._boundaries] = (
+            network.u_min + (network.u_max - network.u_min) * share[..., self._gate])
+        return perimeter
+
+    def splits(self, action: np.ndarray) -> np.ndarray | None:
+        """(..., R, R, R) [-] of actions (..., action_size), 0 in other regions; None without guidance."""
+        if not self._guidance:
+            return None
+        action = np.clip(np.asarray(action, dtype=float)[..., self._count:], -1.0, 1.0)
+        weight = np.zeros((*action.shape[:-1], *self._rest.shape))
+        weight[..., *self._ways] = np.exp(LOGITS * action)
+        sums = weight.sum(axis=-2, keepdims=True)
+        return self._rest + weight / np.where(sums > 0, sums, 1.0)
+
+    def controls(self, action: np.ndarray) -> Controls:
+        """Of one action (action_size,)."""
+        return Controls(perimeter=self.perimeter(action), splits=self.splits(action))
+
+
+def combined(parts: dict[int, Controls], network: Network) -> Controls:
+    """The controls of all regions: of each those of its own agent, without one an open perimeter and own ways."""
+    perimeter, splits = np.where(network.adjacency, network.u_max, 0.0), network.nominal_splits.copy()
+    for region, controls in parts.items():
+        perimeter[region] = controls.perimeter[region]
+        if controls.splits is not None:
+            splits[region] = controls.splits[region]
+    guided = any(controls.splits is not None for controls in parts.values())
+    return Controls(perimeter=perimeter, splits=splits if guided else None)
+
+
+class Episode:
+    """A closed loop that is stepped from outside, with the noise and states of nmfd.closed_loop.run of one seed."""
+
+    def __init__(self, scenario, plant):
+        self.scenario, self._plant = scenario, plant
+        self.unit = sum(mfd.critical for mfd in scenario.network.mfds)  # [veh]
+        self._state = None
+
+    def reset(self, seed: int) -> Measurement:
+        """What the agent sees at the beginning."""
+        self._random = np.random.default_rng([seed, 0x6E6F6973])
+        self._state, self.steps = self._plant.reset(seed), 0
+        return self._seen()
+
+    def step(self, controls: Controls) -> tuple[Measurement, np.ndarray, bool]:
+        """What the agent sees next; vehicles (R,) [veh] in and before each region when the interval began; the end."""
+        spent = (self._state.accumulation + self._state.backlog).sum(axis=1)
+        self._state = self._plant.step(controls)
+        self.steps += 1
+        return self._seen(), spent, self.steps >= self.scenario.steps
+
+    @property
+    def completed(self) -> float:
+        """[veh]"""
+        return self._plant.completed()
+
+    def close(self) -> None:
+        if self._plant is not None:
+            self._plant.close()
+            self._plant = None
+
+    def _seen(self) -> Measurement:
+        from nmfd.closed_loop import what_is_seen
+
+        noise = self.scenario.measurement_std * self._random.standard_normal(self._state.accumulation.shape)
+        return what_is_seen(self._state, noise)

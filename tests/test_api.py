@@ -1,0 +1,117 @@
+"""The packages as libraries: the lines of the README, lazy imports, help, and agreement with the command line."""
+
+import json
+import pydoc
+import re
+import subprocess
+import sys
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+from click.testing import CliRunner
+
+import cosim
+import nmfd
+from nmfd import runs
+from nmfd.cli import main
+
+ROOT = Path(__file__).parents[1]
+# As they stand in the README; there, without `steps`.
+LINES = """
+import cosim, nmfd
+trajectory = nmfd.run("scenarios/economic_mpc", "dpc-pcrg", seed=1)                # regional model
+result = cosim.run("scenarios/grid7_peak", "pi-gating+rerouting-30", seed=1)       # SUMO
+print(nmfd.summary(trajectory)["total_time_spent_veh_s"], result.facts["mean_trip_time_s"])
+print(result.trajectory.to_frame().groupby("time_s")["accumulation_veh"].sum())
+"""
+
+
+def readme_lines():
+    """The python block of the README that uses both packages; LINES as long as there is none."""
+    blocks = re.findall(r"^( +import cosim, nmfd\n(?: +.*\n)+)", (ROOT / "README.md").read_text(), re.MULTILINE)
+    return re.sub(r"^ +", "", blocks[0], flags=re.MULTILINE) if blocks else LINES
+
+
+def test_the_lines_of_the_readme(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    exec(readme_lines().replace("seed=1)", "seed=1, steps=3)"), {})
+    out = capsys.readouterr().out
+    assert float(out.split()[0]) > 0 and re.search(r"^270\.0 +\d", out, re.MULTILINE)
+
+
+def test_importing_the_packages_imports_nothing_heavy():
+    code = ("import sys, json, nmfd, cosim; nmfd.__all__, cosim.__all__; print(json.dumps([m for m in "
+            "('torch', 'numpy', 'pandas', 'libsumo', 'casadi', 'matplotlib') if m in sys.modules]))")
+    assert json.loads(subprocess.check_output([sys.executable, "-c", code], text=True)) == []
+
+
+@pytest.mark.parametrize("package", [nmfd, cosim])
+def test_every_public_name_is_there_with_help_and_types(package):
+    for name in package.__all__:
+        thing = getattr(package, name)
+        assert len(pydoc.getdoc(thing)) > 25, name
+        assert name in dir(package)
+    assert resources.files(package).joinpath("py.typed").is_file()
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        package.nothing  # noqa: B018
+
+
+def test_the_wheel_takes_py_typed_along():
+    import tomllib
+
+    setting = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    assert "py.typed" in setting["nmfd"] and "py.typed" in setting["cosim"]
+
+
+def test_run_and_benchmark_agree_with_the_command_line(tmp_path):
+    folder, out = tiny.write(tmp_path), tmp_path / "out"
+    done = CliRunner().invoke(main, [
+        "benchmark", str(folder), "--controllers", "pi-gating", "--seeds", "2", "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    trajectory = nmfd.run(folder, "pi-gating", seed=1)
+    nmfd.write_trajectory(tmp_path / "same.npz", trajectory)
+    assert (tmp_path / "same.npz").read_bytes() == (out / "pi-gating-1.npz").read_bytes()
+    rows = nmfd.benchmark(folder, ["pi-gating"], seeds=2, out=out)
+    assert rows == runs.read_summary(out / "summary.csv") and nmfd.table(rows) in done.output
+
+
+class Half:
+    name = "half"
+
+    def reset(self, seed=0):
+        pass
+
+    def act(self, measurement):
+        return nmfd.Controls(perimeter=np.full(measurement.accumulation.shape, 0.5), splits=None)
+
+
+def test_a_controller_and_a_plant_as_objects(tmp_path):
+    scenario = nmfd.load_scenario(tiny.write(tmp_path))
+    trajectory = nmfd.run(scenario, Half(), steps=5, plant=nmfd.NmfdPlant(scenario))
+    assert (trajectory.controller, trajectory.plant) == ("half", "NmfdPlant")
+    assert trajectory.perimeter.shape == (5, 2, 2) and (trajectory.perimeter == 0.5).all()
+
+
+@pytest.mark.parametrize("arguments, options, expected", [
+    (("nobody",), {}, "controller 'nobody' is unknown"),
+    (("pi-gating",), {"plant": "sumo"}, "plant 'sumo' is unknown; choose from nmfd, acyclic"),
+    (("pi-gating",), {"steps": 0}, "steps: expected 1 or more"),
+    ((Half(),), {"policy": "x.pt"}, "policy: x.pt: is for a controller by name"),
+    ((3,), {}, "got 3 without reset"),
+])
+def test_mistakes_are_input_errors(tmp_path, arguments, options, expected):
+    with pytest.raises(nmfd.InputError, match=re.escape(expected)):
+        nmfd.run(tiny.write(tmp_path), *arguments, **options)
+
+
+def test_frames_hold_what_the_arrays_hold(tmp_path):
+    trajectory = nmfd.run(tiny.write(tmp_path), "pi-gating")
+    frame, controls = trajectory.to_frame(), trajectory.controls_frame()
+    assert frame["accumulation_veh"].sum() == pytest.approx(trajectory.accumulation.sum())
+    row = frame[(frame["time_s"] == 90.0) & (frame["region"] == 0) & (frame["destination"] == 1)]
+    assert row["accumulation_veh"].item() == trajectory.accumulation[3, 0, 1]
+    row = controls[(controls["time_s"] == 90.0) & (controls["region"] == 0) & (controls["next_region"] == 1)]
+    assert row["perimeter"].item() == trajectory.perimeter[3, 0, 1]

@@ -1,0 +1,322 @@
+"""The meter on a session that is made up: every vehicle followed by hand from loading to arrival."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from cosim.measure import Event, Meter
+from cosim.regions import City, Gateway
+from nmfd.ledger import LedgerError
+
+# a0 -> b0 -> b1 -> c0 in a row, regions 0, 1, 1, 2, and a way back c0 -> a0. Entries: b0, c0 and a0.
+EDGES = {"a0": 0, "b0": 1, "b1": 1, "c0": 2}
+GATEWAYS = (("a0", "b0"), ("b1", "c0"), ("c0", "a0"))
+
+
+def city(length=100.0, speed=10.0):
+    return City(
+        net_file=Path("none"), regions=3, region_of={**EDGES, ":j_0": 1}, edges=tuple(EDGES),
+        length=dict.fromkeys(EDGES, length), lanes=dict.fromkeys(EDGES, 1), lane_ids={}, successors={}, turn_time={},
+        speed=dict.fromkeys(EDGES, speed), signals={}, gateways=tuple(
+            Gateway(source=EDGES[a], target=EDGES[b], from_edge=a, to_edge=b, signal=None, links=())
+            for a, b in GATEWAYS))
+
+
+class Streets:
+    """A session in which vehicles are moved by hand. places: vehicle -> edge; routes: vehicle -> edges."""
+
+    step_length = 1.0
+
+    def __init__(self):
+        self.time, self.places, self.routes, self.waiting, self.bound = 0.0, {}, {}, [], set()
+        self.held, self.jumped = set(), 0
+        self.clear()
+
+    def clear(self):
+        self.new, self.gone, self.loads, self.jumps, self.lands = [], [], [], [], []
+
+    # What the meter asks for.
+    def loaded(self):
+        return tuple(self.loads)
+
+    def departed(self):
+        return tuple(self.new)
+
+    def arrived(self):
+        return tuple(self.gone)
+
+    def started_teleport(self):
+        return tuple(self.jumps)
+
+    def ended_teleport(self):
+        return tuple(self.lands)
+
+    def teleports(self):
+        return self.jumped
+
+    def known(self):
+        return (*self.places, *self.held)
+
+    def running(self):
+        return tuple(self.places)
+
+    def pending(self):
+        return tuple(self.waiting)
+
+    def road(self, vehicle):
+        return self.places[vehicle]
+
+    def route(self, vehicle):
+        return self.routes[vehicle]
+
+    def is_free(self, vehicle):
+        return vehicle not in self.bound
+
+    def vehicles_on(self, edge):
+        return tuple(sorted(vehicle for vehicle, place in self.places.items() if place == edge))
+
+
+@pytest.fixture
+def play():
+    """A function that makes one simulation step: new=, move=, gone= and so on; the meter's events of it."""
+    session = Streets()
+    meter = Meter(session, city(), probes=frozenset({"p"}))
+
+    def step(*, new=(), move=None, gone=(), loads=(), jumps=(), lands=(), waiting=None):
+        session.clear()
+        session.time += 1.0
+        for vehicle in loads:
+            session.loads.append(vehicle)
+        for vehicle in new:
+            session.new.append(vehicle)
+            session.places[vehicle] = session.routes[vehicle][0]
+        session.places.update(move or {})
+        for vehicle in (*gone, *jumps):
+            session.places.pop(vehicle, None)
+        session.gone, session.jumps, session.lands = list(gone), list(jumps), list(lands)
+        session.waiting = session.waiting if waiting is None else list(waiting)
+        return meter.observe()
+
+    return SimpleNamespace(session=session, meter=meter, step=step)
+
+
+def x(*entries):
+    """(3, 3) with these [i, j] counted."""
+    found = np.zeros((3, 3))
+    for entry in entries:
+        found[entry] += 1
+    return found
+
+
+def test_a_trip_through_three_regions(play):
+    play.session.routes = {"v": ("a0", "b0", "b1", "c0")}
+    assert play.step(new=["v"]) == [Event(vehicle="v", source=None, region=0, destination=2, edge="c0", free=True)]
+    assert (play.meter.accumulation() == x((0, 2))).all() and (play.meter.departures == x((0, 2))).all()
+    events = [event for _ in range(3) for event in play.step(move={"v": "b0"})]
+    assert events == [Event(vehicle="v", source=0, region=1, destination=2, edge="c0", free=True)]
+    assert (play.meter.accumulation() == x((1, 2))).all()
+    play.step(move={"v": "b1"})
+    events = [event for _ in range(3) for event in play.step(move={"v": "c0"})]
+    assert [(event.source, event.region) for event in events] == [(1, 2)]
+    assert (play.meter.accumulation() == x((2, 2))).all()
+    play.step(gone=["v"])
+    assert (play.meter.accumulation() == 0).all() and (play.meter.arrivals == [0, 0, 1]).all()
+    assert play.meter.crossings[0, 1, 2] == play.meter.crossings[1, 2, 2] == 1 and play.meter.crossings.sum() == 2
+    assert dict(play.meter.entry_flow) == {(0, "b0"): 1, (1, "c0"): 1} and play.meter.teleports == 0
+    assert play.meter._vehicles == {}  # nothing is kept of who has gone
+
+
+def test_a_region_that_is_first_seen_at_the_count(play):
+    """On a junction, where no edge is polled; the entry is an event all the same, and its source is where it was."""
+    play.session.routes = {"v": ("a0", "b0", "b1")}
+    play.step(new=["v"])
+    play.session.places["v"] = ":j_0"
+    assert (play.meter.accumulation() == x((1, 1))).all() and play.meter.crossings[0, 1, 1] == 1
+    events = [event for _ in range(3) for event in play.step(move={"v": "b0"})]
+    assert [(event.source, event.region) for event in events] == [(0, 1)]
+    assert play.meter.crossings.sum() == 1 and dict(play.meter.entry_flow) == {(0, "b0"): 1}
+
+
+def test_an_unknown_edge_counts_where_the_vehicle_was(play):
+    play.session.routes = {"v": ("a0", "b0")}
+    play.step(new=["v"])
+    play.session.places["v"] = ":crossing"
+    assert (play.meter.accumulation() == x((0, 1))).all()
+
+
+def test_a_vehicle_that_arrives_unseen_has_crossed_too(play):
+    play.session.routes = {"v": ("a0", "b0")}
+    play.step(new=["v"])
+    play.step(gone=["v"])
+    assert (play.meter.accumulation() == 0).all() and play.meter.crossings[0, 1, 1] == 1
+    assert (play.meter.arrivals == [0, 1, 0]).all()
+
+
+def test_teleporting_vehicles_stay_where_they_were(play):
+    play.session.routes = {"v": ("a0", "b0", "b1", "c0"), "w": ("a0", "b0")}
+    play.step(new=["v", "w"])
+    play.step(jumps=["v"])
+    assert (play.meter.accumulation() == x((0, 2), (0, 1))).all() and play.meter.teleports == 1
+    play.step(move={"v": "b1"}, lands=["v"])
+    assert (play.meter.accumulation() == x((1, 2), (0, 1))).all() and play.meter.teleports == 1
+    assert play.meter._teleporting == set()
+    play.step(jumps=["v"])
+    play.step(gone=["v"])
+    assert (play.meter.accumulation() == x((0, 1))).all() and play.meter.teleports == 2
+    assert play.meter._teleporting == set()
+
+
+def test_vehicles_that_the_mesoscopic_model_holds_stay_where_they_were(play):
+    """Taken off the road without a word, but not forgotten; one that SUMO does not know any more is lost."""
+    play.session.routes = {"v": ("a0", "b0", "b1", "c0"), "w": ("a0", "b0"), "u": ("a0", "b0")}
+    play.step(new=["v", "w"], loads=["u"], waiting=["u"])
+    play.session.places.pop("v")
+    play.session.held = {"v", "u"}
+    assert (play.meter.accumulation() == x((0, 2), (0, 1))).all()
+    play.session.held = set()
+    with pytest.raises(LedgerError, match="1 vehicles are in the city, but 2 departures"):
+        play.meter.accumulation()
+
+
+def test_teleports_that_nobody_reported_count(play):
+    play.session.routes = {"v": ("a0", "b0")}
+    play.step(new=["v"])
+    play.session.jumped = 3
+    play.meter.accumulation()
+    assert play.meter.teleports == 3
+    play.session.jumped = 1
+    play.meter.accumulation()
+    assert play.meter.teleports == 3
+
+
+def test_a_teleporting_vehicle_enters_nothing(play):
+    play.session.routes = {"v": ("a0", "b0")}
+    play.step(new=["v"])
+    play.step(jumps=["v"])
+    play.session.places["v"] = "b0"  # on the edge already, but not yet ended
+    assert [event for _ in range(3) for event in play.step()] == []
+
+
+def test_who_waits_to_enter_is_backlog(play):
+    play.session.routes = {"v": ("a0", "b0", "b1", "c0"), "w": ("b0", "b1")}
+    play.step(loads=["v", "w"], waiting=["v", "w"])
+    assert (play.meter.backlog() == x((0, 2), (1, 1))).all() and (play.meter.accumulation() == 0).all()
+    play.step(new=["v"], waiting=["w"])
+    assert (play.meter.backlog() == x((1, 1))).all() and (play.meter.accumulation() == x((0, 2))).all()
+
+
+def test_a_vehicle_that_gives_up_before_it_departs_was_never_there(play):
+    play.session.routes = {"v": ("a0", "b0")}
+    play.step(loads=["v"], waiting=["v"])
+    play.step(gone=["v"], waiting=[])
+    assert (play.meter.accumulation() == 0).all() and play.meter.arrivals.sum() == play.meter.departures.sum() == 0
+    assert (play.meter.backlog() == 0).all() and play.meter.crossings.sum() == 0
+
+
+def test_probes_are_counted_apart(play):
+    play.session.routes = {"p": ("a0", "b0", "b1"), "v": ("a0", "b0", "b1")}
+    play.step(loads=["p", "v"], waiting=["p", "v"])
+    assert (play.meter.probes() == 0).all() and (play.meter.probe_backlog() == x((0, 1))).all()
+    play.step(new=["p", "v"], waiting=[])
+    assert (play.meter.probes() == x((0, 1))).all() and (play.meter.probe_departures == x((0, 1))).all()
+    assert (play.meter.departures == 2 * x((0, 1))).all() and (play.meter.probe_backlog() == 0).all()
+    play.session.routes["w"] = ("b0", "b1")
+    play.step(new=["w"])
+    assert (play.meter.probe_departures == x((0, 1))).all()
+    play.step(gone=["p", "v"])
+    assert (play.meter.probes() == 0).all()
+
+
+def test_back_into_a_region_is_an_entry_again(play):
+    play.session.routes = {"v": ("a0", "b0", "b1", "c0", "a0")}
+    play.step(new=["v"])
+    regions = []
+    for edge in ("b0", "b1", "c0", "a0"):
+        regions += [event.region for _ in range(3) for event in play.step(move={"v": edge})]
+    assert regions == [1, 2, 0]
+    assert (play.meter.accumulation() == x((0, 0))).all()
+
+
+def test_staying_on_an_entry_is_no_second_entry(play):
+    play.session.routes = {"v": ("a0", "b0", "b1")}
+    play.step(new=["v"])
+    assert len([event for _ in range(12) for event in play.step(move={"v": "b0"})]) == 1
+    assert play.meter.entry_flow[0, "b0"] == 1
+
+
+def test_departures_come_before_entries_and_both_by_name(play):
+    play.session.routes = {name: ("a0", "b0", "b1") for name in "wvut"}
+    play.step(new=["w", "v"])
+    play.step(move={"w": "b0", "v": "b0"})
+    found = play.step(new=["u", "t"])
+    assert [(event.vehicle, event.source) for event in found] == [("t", None), ("u", None), ("v", 0), ("w", 0)]
+
+
+def test_who_starts_on_an_entry_has_not_entered(play):
+    play.session.routes = {"v": ("b0", "b1")}
+    events = play.step(new=["v"]) + [event for _ in range(4) for event in play.step()]
+    assert [event.source for event in events] == [None]
+    assert not play.meter.entry_flow
+
+
+def test_public_transport_is_not_free(play):
+    play.session.routes, play.session.bound = {"bus": ("a0", "b0")}, {"bus"}
+    assert [event.free for event in play.step(new=["bus"])] == [False]
+    assert [event.free for _ in range(3) for event in play.step(move={"bus": "b0"})] == [False]
+
+
+def test_routes_from_streets_without_a_region_count_as_region_0(play):
+    play.session.routes = {"v": ("somewhere", "b0"), "w": ("b0", "somewhere")}
+    play.step(new=["v", "w"])
+    assert (play.meter.departures == x((0, 1), (1, 0))).all()
+
+
+@pytest.mark.parametrize("length, speed, every", [(100.0, 10.0, 3), (20.0, 10.0, 1), (40.0, 10.0, 2), (10.0, 50.0, 1)])
+def test_short_entries_are_polled_more_often(length, speed, every):
+    """At least twice while a vehicle drives along them, at most every step, at least every three seconds."""
+    session = Streets()
+    meter, session.routes = Meter(session, city(length, speed)), {"v": ("a0", "b0")}
+    session.new, session.places = ["v"], {"v": "a0"}
+    meter.observe()
+    session.clear()
+    session.places["v"] = "b0"
+    steps = next(n for n in range(2, 9) if meter.observe())
+    assert meter._poll_every == every and steps == max(every, 2)
+
+
+def test_the_shortest_entry_decides():
+    streets = city()
+    streets = City(**{**vars(streets), "length": {**streets.length, "b0": 20.0, "a0": 900.0}})
+    assert Meter(Streets(), streets)._poll_every == 1
+
+
+def test_finer_steps_are_polled_as_often_in_time():
+    session = Streets()
+    session.step_length = 0.5
+    assert Meter(session, city())._poll_every == 6
+
+
+def test_a_city_without_boundaries_is_measured_too():
+    session = Streets()
+    alone = city()
+    alone = City(**{**vars(alone), "gateways": ()})
+    meter, session.routes = Meter(session, alone), {"v": ("a0", "b0")}
+    session.new, session.places = ["v"], {"v": "a0"}
+    assert len(meter.observe()) == 1 and meter.accumulation().sum() == 1
+
+
+@pytest.mark.parametrize("break_it, numbers", [
+    (lambda play: play.session.places.pop("v"), r"1 vehicles are in the city, but 2 departures minus 0 arrivals are 2; "
+     r"in region 0 bound for 2 there are 0, and 1 were followed there"),
+    (lambda play: play.meter.departures.__setitem__((0, 0), 1), "2 vehicles are in the city, but 3 departures minus 0"),
+    (lambda play: play.meter._running.__setitem__((1, 1), 1), "region 1 bound for 1 there are 0, and 1 were"),
+])
+def test_the_ledger_names_step_and_numbers(play, break_it, numbers):
+    play.session.routes = {"v": ("a0", "b0", "b1", "c0"), "w": ("a0", "b0")}
+    play.step(new=["v", "w"])
+    play.meter.accumulation(6)
+    break_it(play)
+    with pytest.raises(LedgerError, match=f"vehicle ledger broken at control step 7, 1 s: .*{numbers}"):
+        play.meter.accumulation(7)

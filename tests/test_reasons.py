@@ -1,0 +1,89 @@
+"""Why a controller gains or not: made-up runs of which the reason is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import tiny
+
+from cosim import reasons
+from nmfd.network import load_network
+from nmfd.types import Trajectory
+
+
+@pytest.fixture
+def network(tmp_path):
+    tiny.write(tmp_path)
+    return load_network(tmp_path / "network")
+
+
+def run(network, load, u):
+    """A run of 10 intervals: every region holds `load` times its critical accumulation in the second half."""
+    count = network.regions
+    critical = np.array([mfd.critical for mfd in network.mfds])
+    state = np.zeros((11, count, count))
+    state[6:] = np.diag(load * critical)
+    perimeter = np.broadcast_to(np.where(network.adjacency, u, 0.0), (10, count, count))
+    return Trajectory(
+        controller="x", plant="sumo", seed=0, step=90.0, accumulation=state, backlog=np.zeros_like(state),
+        completed=np.zeros(11), perimeter=perimeter, splits=np.zeros((10, count, count, count)),
+        decision_time=np.zeros(10), status=("ok",) * 10, wall_time=1.0)
+
+
+def record(network, started, came, guided=0.0):
+    """Vehicles that departed in every region, and that entered it."""
+    count = network.regions
+    crossings = np.zeros((1, count, count, count))
+    crossings[0, ..., 0] = np.where(network.adjacency, came / np.maximum(network.adjacency.sum(axis=0), 1), 0.0)
+    return {"departures": np.full((1, count, count), started / count), "crossings": crossings,
+            "guided": np.array([guided])}
+
+
+def table(percent, full=0.01):
+    rows = [{"demand": 1.0, "controller": name, "seed": 2000 + n, "total_time_spent_veh_s": tts,
+             "gateway_full_share": share}
+            for name, values, share in (("no-control", [100.0, 110.0, 105.0], 0.01), ("pi-gating", percent, full))
+            for n, tts in enumerate(values)]
+    return pd.DataFrame(rows)
+
+
+BETTER, WORSE, ALIKE = [80.0, 88.0, 84.1], [120.0, 132.0, 126.1], [101.0, 108.0, 105.0]
+
+
+@pytest.mark.parametrize("values, most, leaking, u, started, full, expected", [
+    (BETTER, 2.0, 0.0, 0.3, 1, 0.01, "gains (-20.0 % in total time spent ± 0.1 over 3 seeds); it held back in 100 %"),
+    (ALIKE, 0.5, 0.0, 0.9, 1, 0.01, "no region is ever critical"),
+    (ALIKE, 2.0, 0.8, 0.3, 1, 0.01, "no control authority at the boundaries, 80 % of the flow"),
+    (ALIKE, 2.0, 0.0, 0.9, 1, 0.01, "it never held back and never guided"),
+    (WORSE, 2.0, 0.0, 0.3, 900, 0.01, "starts there, where no gateway holds it back"),
+    (WORSE, 2.0, 0.0, 0.3, 1, 0.20, "fill the streets before the gateways (20 % of the time, 1 % without"),
+])
+def test_known_reasons(network, values, most, leaking, u, started, full, expected):
+    rows = table(values, full)
+    found = reasons.load(network, [run(network, most, 0.9)], [record(network, started, 100)])
+    done = reasons.deeds(network, [run(network, most, u)], [record(network, started, 100)])
+    line = reasons.verdict(rows, 1.0, "pi-gating", found, leaking, done, network)
+    assert expected in line
+    kind = {tuple(BETTER): "gains (", tuple(WORSE): "loses (", tuple(ALIKE): "gains nothing"}[tuple(values)]
+    assert line.startswith(kind), line
+    if expected.startswith(("no region", "it never")):
+        assert "queues" not in line and "authority" not in line
+
+
+def test_load_and_deeds_are_counted(network):
+    found = reasons.load(network, [run(network, 2.0, 0.9), run(network, 1.2, 0.9)], [record(network, 50, 150)])
+    assert found.most == pytest.approx(1.6) and found.beyond == pytest.approx(5 / 11)
+    entered = network.adjacency.any(axis=0)
+    assert found.inside[entered] == pytest.approx(0.25) and list(found.critical) == list(range(network.regions))
+    half = run(network, 1.0, 0.9)
+    half = replace(half, perimeter=np.concatenate([half.perimeter[:5], run(network, 1.0, 0.2).perimeter[:5]]))
+    done = reasons.deeds(network, [half], [record(network, 50, 150, guided=100.0 * network.regions)])
+    assert done.held == 0.5 and done.guided == pytest.approx(2.0)
+
+
+def test_nothing_to_compare_with(network):
+    rows = table(ALIKE)[lambda frame: frame["controller"] != "no-control"]
+    found = reasons.load(network, [run(network, 2.0, 0.9)], [])
+    line = reasons.verdict(rows, 1.0, "pi-gating", found, 0.0, reasons.Deeds(held=0.1, guided=0.0), network)
+    assert "no common seed with no-control" in line and np.isnan(found.inside).all()

@@ -1,0 +1,185 @@
+"""cosim sweep: one tidy table, failures as rows, resumption; and on a Dask cluster, one worker killed in mid-run."""
+
+import os
+import re
+import shutil
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+
+from cosim import remote, sweeps
+from cosim.cli import main
+from cosim.simulate import FACTS, Result, Task
+from nmfd.errors import InputError
+from nmfd.types import Trajectory
+from nmfd.workers import Failure
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def peak(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("city")
+    shutil.copytree(ROOT / "networks" / "grid7", folder / "networks" / "grid7")
+    shutil.copytree(ROOT / "scenarios" / "grid7_peak", folder / "scenarios" / "peak",
+                    ignore=shutil.ignore_patterns("reference"))
+    file = folder / "scenarios" / "peak" / "scenario.toml"
+    file.write_text(re.sub(r"ramp_up = [\d.]+", "ramp_up = 90.0", file.read_text()))
+    return folder / "scenarios" / "peak"
+
+
+def sweep(*arguments):
+    return CliRunner().invoke(main, ["sweep", *(str(argument) for argument in arguments)])
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """SUMO is not started: the tasks that would be run, and which of them fail."""
+    tasks, failing = [], set()
+
+    def outcomes(todo, *, workers):
+        for task in todo:
+            tasks.append((task.controller, task.seed, task.demand_factor))
+            yield task, Failure("SUMO fell over") if (task.controller, task.seed) in failing else made_up(task)
+
+    monkeypatch.setattr(sweeps, "_local", outcomes)
+    return tasks, failing
+
+
+def made_up(task) -> Result:
+    trajectory = Trajectory(
+        controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=np.ones((3, 7, 7)),
+        backlog=np.zeros((3, 7, 7)), completed=np.arange(3.0), perimeter=np.zeros((2, 7, 7)),
+        splits=np.zeros((2, 7, 7, 7)), decision_time=np.ones(2), status=("ok", "ok"), wall_time=1.0)
+    facts = {**dict.fromkeys(FACTS, 1.0), "controller": task.controller, "seed": task.seed}
+    return Result(trajectory=trajectory, record={"production": np.zeros((2, 7))}, facts=facts)
+
+
+def test_a_failed_run_is_a_row_and_is_tried_again(peak, tmp_path, ran):
+    tasks, failing = ran
+    failing.add(("dpc-pc+compliance-50", 1))
+    arguments = (
+        peak, "--controllers", "no-control,dpc-pc", "--seeds", 2, "--demand", "0.8,1.0", "--compliance", "50,100",
+        "--out", tmp_path / "out")
+    done = sweep(*arguments)
+    assert done.exit_code == 0 and "2 of 16 runs failed" in done.stderr, done.output + str(done.exception)
+    rows = pd.read_parquet(tmp_path / "out" / "sweep.parquet")
+    assert list(rows.columns[:7]) == ["strategy", "controller", "seed", "demand", "compliance", "status", "reason"]
+    assert len(rows) == 16 and not rows.duplicated(["controller", "seed", "demand", "compliance"]).any()
+    bad = rows[rows["status"] == "failed"]
+    assert set(bad["reason"]) == {"SUMO fell over"} and set(bad["demand"]) == {0.8, 1.0}
+    assert (bad[["controller", "seed", "compliance"]] == ["dpc-pc", 1, 0.5]).all(axis=None)
+    assert bad["total_time_spent_veh_s"].isna().all()
+    good = rows[rows["status"] == "ok"]
+    assert (good["total_time_spent_veh_s"] == 2 * 90.0 * 49).all() and (good["co2_kg"] == 1.0).all()
+    tasks.clear(), failing.clear()
+    assert sweep(*arguments).exit_code == 0
+    assert sorted(tasks) == [("dpc-pc+compliance-50", 1, 0.8), ("dpc-pc+compliance-50", 1, 1.0)]
+    assert (pd.read_parquet(tmp_path / "out" / "sweep.parquet")["status"] == "ok").all()
+
+
+def test_more_is_added_and_an_interruption_keeps_what_is_there(peak, tmp_path, ran, monkeypatch):
+    tasks, failing = ran
+    failing.add(("no-control", 0))
+    out = tmp_path / "out"
+    done = sweep(peak, "--controllers", "no-control", "--out", out)
+    assert done.exit_code == 1 and "seed 0: SUMO fell over" in done.stderr  # all there was
+    plain = sweeps._local
+
+    def interrupted(todo, *, workers):
+        yield from list(plain(todo, workers=workers))[:1]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sweeps, "_local", interrupted)
+    done = sweep(peak, "--controllers", "pi-gating,max-pressure", "--out", out)
+    assert done.exit_code == 130 and "the same command goes on" in done.stderr
+    rows = pd.read_parquet(out / "sweep.parquet")
+    assert rows[["controller", "status"]].values.tolist() == [["no-control", "failed"], ["pi-gating", "ok"]]
+    assert rows["compliance"].tolist() == [1.0, 1.0]  # the scenario's
+
+
+def test_one_run_for_real(peak, tmp_path):
+    done = sweep(peak, "--controllers", "actuated", "--steps", 2, "--workers", 1, "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output + str(done.exception)
+    row = pd.read_parquet(tmp_path / "out" / "sweep.parquet").iloc[0]
+    assert row["status"] == "ok" and row["departed_veh"] - row["completed_veh"] == row["final_accumulation_veh"] > 0
+
+
+@pytest.mark.parametrize("arguments, expected", [
+    (("--controllers", "nobody"), "'nobody' is unknown"),
+    (("--controllers", "no-control", "--compliance", "0.5"), "--compliance: expected whole percentages"),
+    (("--controllers", "no-control", "--compliance", "5,05"), "names a percentage twice"),
+    (("--controllers", "dpc-pc+compliance-50", "--compliance", "0"), "exclude each other"),
+    (("--controllers", "no-control", "--workers", "2", "--scheduler", "tcp://x:1"), "leave one away"),
+])
+def test_mistakes(peak, tmp_path, arguments, expected):
+    done = sweep(peak, *arguments, "--out", tmp_path / "out")
+    assert done.exit_code == 2 and expected in done.stderr and done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_process_that_dies_is_a_failure(monkeypatch, tmp_path):
+    monkeypatch.setattr(remote.sys, "executable", shutil.which("false"))
+    task = Task(scenario=tmp_path, controller="no-control", seed=0)
+    assert remote.run(task, str(tmp_path)) == Failure("its process died (status 1)")
+
+
+def test_remote_gives_the_reason(tmp_path):
+    task = Task(scenario=Path("nowhere"), controller="no-control", seed=0)
+    outcome = remote.run(task, str(tmp_path))
+    assert "nowhere/scenario.toml: no such file" in outcome.reason and "\n" not in outcome.reason
+
+
+def test_no_scheduler_answers(peak, tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="the extra dask is not installed")
+    monkeypatch.setattr("cosim.cluster.PATIENCE", 0.5)
+    for address in ("tcp://127.0.0.1:9", "nonsense://x"):
+        done = sweep(peak, "--controllers", "no-control", "--scheduler", address, "--out", tmp_path / "out")
+        assert done.exit_code == 2 and "no Dask scheduler answers at" in done.stderr, done.output + str(done.exception)
+        assert done.stderr.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_two_dask_workers_one_killed_in_mid_run(peak, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="the extra dask is not installed")
+    with distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50, memory_limit=0) as cluster:
+        killed = []
+
+        def kill():
+            """The first worker that is at a run, a moment after it began."""
+            with distributed.Client(cluster.scheduler_address, set_as_default=False) as client:
+                pids = client.run(os.getpid)
+                deadline = time.monotonic() + 60
+                while not killed and time.monotonic() < deadline:
+                    busy = [worker for worker, tasks in client.processing().items() if tasks and worker in pids]
+                    if busy:
+                        time.sleep(1.0)
+                        os.kill(pids[busy[0]], signal.SIGKILL)
+                        killed.append(busy[0])
+                    time.sleep(0.05)
+
+        thread = threading.Thread(target=kill)
+        thread.start()
+        done = sweep(
+            peak, "--controllers", "no-control", "--seeds", 2, "--steps", 1, "--scheduler", cluster.scheduler_address,
+            "--out", tmp_path / "out")
+        thread.join()
+    assert killed and done.exit_code == 0, done.output + str(done.exception)
+    rows = pd.read_parquet(tmp_path / "out" / "sweep.parquet")
+    assert rows["seed"].tolist() == [0, 1] and set(rows["reason"]) == {""}
+    # The same code and the same bytes as here.
+    here = sweep(peak, "--controllers", "no-control", "--steps", 1, "--workers", 1, "--out", tmp_path / "here")
+    assert here.exit_code == 0
+    name = Path("demand-1") / "no-control-0.npz"
+    assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
+
+
+def test_compliance_needs_whole_percentages_from_python_too(peak, tmp_path):
+    with pytest.raises(InputError, match="compliance-57.5"):
+        sweeps.Sweep(scenario=peak, controllers=("dpc-pcrg",), seeds=[0], out=tmp_path, compliance=(0.575,)).plan()
