@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cosim import figures, report
-from cosim.experiment import read_run
+from cosim.experiment import read_run, record_path
 from cosim.finished import Finished, Level
 from cosim.regions import City, edge_shapes
 from cosim.simulate import Result
@@ -65,7 +65,7 @@ def film(
         for name, result in results.items():
             if "edge_vehicles" not in result.record:
                 raise InputError(
-                    f"{level.folder / f'{name}-{seed}.record.npz'}: holds no link densities, which this version "
+                    f"{record_path(level.folder, name, seed)}: holds no link densities, which this version "
                     "records; run it again")
         drawing, update = scene(finished.city, results, f"{finished.scenario.name}, demand times {level.demand:g}")
         steps = min(len(result.record["edge_vehicles"]) for result in results.values())
@@ -96,7 +96,7 @@ def scene(city: City, results: dict[str, Result], title: str) -> tuple:
     bar = drawing.colorbar(figures.DENSITIES, ax=maps, shrink=0.8, aspect=30)
     bar.set_label("vehicles per km and lane")
     plots.total_accumulation(below, [result.trajectory for result in results.values()])
-    below.legend(frameon=False, fontsize="small", loc="upper right")
+    below.legend(frameon=False, fontsize="small", loc="upper left")
     hand = below.axvline(0.0, color=plots.RED, linewidth=1.2)
     step = next(iter(results.values())).trajectory.step
     ends = step * max(len(result.trajectory.perimeter) for result in results.values())

@@ -15,7 +15,7 @@ from cosim.importing.layers import colour as region_colour
 from cosim.plant import SumoPlant, settings
 from cosim.regions import City, Gateway, edge_shapes
 from cosim.simulate import Task, scenario_of
-from cosim.strategy import parse
+from cosim.strategy import configured, parse
 from cosim.sumo import LOST, Window
 from nmfd import closed_loop, runs
 from nmfd.controllers import registry
@@ -66,7 +66,7 @@ def watch(
             "DISPLAY is not set: there is no screen to open a window on; record the run with `cosim run` and make a "
             "film of it with `cosim video RUN`")
     scenario, strategy = scenario_of(task), parse(task.controller)
-    controller = registry.make(strategy.controller, scenario, policy=task.policy)
+    controller = registry.make(configured(task.controller, scenario.controller_options), scenario, policy=task.policy)
     with tempfile.TemporaryDirectory(prefix="cosim-watch-") as scratch:
         drawn, view = Path(scratch) / "regions.add.xml", Path(scratch) / "view.xml"
         window = Window(
