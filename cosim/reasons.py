@@ -104,7 +104,7 @@ def text(folders: Mapping[float, Path], network: Network, rows: pd.DataFrame) ->
 
 def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Trajectory], Iterable[Mapping]]:
     """Trajectories and records of one controller."""
-    return ([runs.read_trajectory(folder / f"{name}-{seed}.npz") for seed in seeds],
+    return ([runs.read_trajectory(folder / f"{runs.run_name(name, seed)}.npz") for seed in seeds],
             (experiment.read_run(folder, name, seed).record for seed in seeds))
 
 
