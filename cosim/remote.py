@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 
 from cosim.simulate import Result, Task, simulate
 from nmfd.workers import Failure, attempt
@@ -28,7 +29,8 @@ def run(task: Task, folder: str) -> Result | Failure:
             process.stdin.write(len(message).to_bytes(HEADER) + message)
             process.stdin.flush()
         except BrokenPipeError:  # of a process that has just died; its status says why
-            pass
+            with suppress(BrokenPipeError):
+                process.stdin.close()
         outcome = process.stdout.read()  # stdin stays open as long as this process lives
     if process.returncode:
         return Failure(f"its process died (status {process.returncode})")

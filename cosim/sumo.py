@@ -150,11 +150,11 @@ class Session:
 
     def teleports(self) -> int:
         """How many there were so far, by SUMO's own count: the mesoscopic model has no events for them."""
-        return int(libsumo.simulation.getParameter("", "stats.teleports.total"))
+        return int(self._sumo.simulation.getParameter("", "stats.teleports.total"))
 
     def known(self) -> tuple[str, ...]:
         """All that were loaded and have not arrived, wherever they are."""
-        return libsumo.vehicle.getLoadedIDList()
+        return self._sumo.vehicle.getLoadedIDList()
 
     def pending(self) -> tuple[str, ...]:
         """Due to depart, but not yet inserted: the backlog."""

@@ -367,7 +367,7 @@ def nets(whole: str):
     yield "link index", re.sub(r' linkIndex="[^"]+"', ' linkIndex="x"', whole, count=1)
     yield "phase", re.sub(r'<phase duration="[^"]+"', '<phase duration="long"', whole, count=1)
     yield "state", re.sub(r'(<phase [^>]*) state="[^"]+"', r"\1", whole, count=1)
-    yield "offset", re.sub(r'(<tlLogic [^>]*) offset="[^"]+"', r'\1 offset="soon"', whole, count=1)
+    yield "offset", re.sub(r'(<tlLogic [^>]*) offset="[^"]+"', r'\1 offset="late"', whole, count=1)
     yield "edge id", re.sub(r'<edge id="A0A1"', "<edge", whole, count=1)
     for _ in range(5):
         at = draw.randrange(200, len(whole) - 200)

@@ -55,8 +55,8 @@ def test_factor_thins_and_duplicates(originals, factor, count):
 
 @pytest.mark.parametrize("text, expected", [
     ("<routes><flow id='f'/></routes>", "expected vehicle and trip elements only, got flow"),
-    ("<routes><trip id='t' depart='triggered'/></routes>", "expected a time in seconds, got 'triggered'"),
-    ("<routes><trip", "is not a SUMO route file"),
+    ("<routes><trip id='t' depart='triggered'/></routes>", "expected a time from 0 s up, got 'triggered'"),
+    ("<routes><trip", "is not an XML file that SUMO could read"),
 ])
 def test_route_files_that_are_none(tmp_path, text, expected):
     (tmp_path / "cars.rou.xml").write_text(text)

@@ -136,7 +136,7 @@ def test_a_mistake_in_mid_run_is_a_failed_run_with_its_line(place):
     failing = GOOD.replace("        return", "        assert measurement.step < 3\n        return")
     (place / "mine.py").write_text(failing)
     done = nmfd("benchmark", "scenario", "--controllers", "no-control,mine.py:Mine", "--out", "out")
-    assert done.exit_code == 1 and "mine.py:10: mine.py:Mine: act: AssertionError" in done.stderr
+    assert done.exit_code == 2 and "mine.py:10: mine.py:Mine: act: AssertionError" in done.stderr
     assert [row["controller"] for row in runs.read_summary(place / "out" / "summary.csv")] == ["no-control"]
 
 
