@@ -218,10 +218,7 @@ def sweep(
         raise Interrupted(f"interrupted; finished runs are in {order.out}: the same command goes on") from None
     click.echo(sweeps.text(rows))
     click.echo(f"Written to {order.out / 'sweep.parquet'}")
-    failed = int((rows["status"] == sweeps.FAILED).sum())
-    if failed == len(rows):
-        raise RunFailed(f"all {failed} runs failed, the first with: {rows.loc[0, 'reason']}")
-    if failed:
+    if failed := int((rows["status"] == sweeps.FAILED).sum()):
         _tell(f"{failed} of {len(rows)} runs failed, see the column reason; the same command tries them again")
 
 
@@ -495,7 +492,11 @@ def _level(text: str, no_run: bool) -> float | None:
         if no_run:
             raise InputError("--level: auto simulates the city, which --no-run forbids; leave one of them away")
         return None
-    return _levels("--level", text)[0] if "," not in text else _levels("--level", "")[0]
+    try:
+        (found,) = _levels("--level", text)
+    except (InputError, ValueError):
+        raise InputError(f"--level: expected a number above 0 up to 10, or auto, got {text!r} instead") from None
+    return found
 
 
 def _levels(option: str, text: str) -> list[float]:

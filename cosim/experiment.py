@@ -130,8 +130,8 @@ def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> d
         return {"options": options, "splits_hash": hashlib.sha256(splits.round(9).tobytes()).hexdigest()[:16]}
     path = registry.policy_path(variant, scenario, policy)
     if registry.is_own(controller):
-        variant = registry.table_name(controller)
-        options = tables.get(variant, {})
+        variant, scenario = registry.configured_own(controller, scenario)
+        options = scenario.controller_options.get(variant, {})
     network = as_modelled(scenario, variant).network
     model = json.dumps([network.hash, scenario.integrator, scenario.substeps, scenario.protected])
     return {

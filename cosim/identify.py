@@ -87,7 +87,7 @@ def identify(
 
     model = fitted(found, "fitting")
     samples = samples_of(network, found)
-    text = fit_table(model, samples)
+    text = fit_table(model, samples) + unreached(model, [result.trajectory.accumulation for result in found])
     if held_out:
         kept = [result for result in found if not any(result is other for other in held_out)]
         text += "\n" + prediction_table(
@@ -200,6 +200,17 @@ def fit_table(network: Network, samples: Sequence[dict]) -> str:
             f"{f'{region} {network.region_names[region]}':<16}{curve.critical:>10.0f}{curve.jam:>8.0f}{storage:>9.0f}"
             f"{curve.capacity:>13.3f}{len(points):>9}{explained:>7.2f}{100 * hysteresis(cloud):>10.0f} %")
     return "\n".join(lines)
+
+
+def unreached(network: Network, accumulations: Sequence[np.ndarray]) -> str:
+    """A line on the regions whose critical accumulation no loading run reached, each run (T+1, R, R) [veh]; or none."""
+    most = np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
+    short = [f"{region} {network.region_names[region]} ({100 * most[region] / curve.critical:.0f} % of it)"
+             for region, curve in enumerate(network.mfds) if most[region] < curve.critical]
+    if not short:
+        return ""
+    return (f"\nnever beyond the critical accumulation: {', '.join(short)}; what lies beyond is a guess there.\n"
+            "Give higher --levels, or take it that perimeter control has nothing to protect there")
 
 
 def prediction_table(network: Network, held_out: Sequence[Observed], scheme: dict) -> str:

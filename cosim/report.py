@@ -243,9 +243,9 @@ def region_map(path: Path, scenario: Scenario, city: City) -> None:
     regions = np.array([city.region_of.get(edge, -1) for edge in streets.edges])
     places = np.stack([streets.centre[streets.drivable & (regions == r)].mean(axis=0) for r in range(city.regions)])
     left_alone = settings(scenario).leave_signals
-    gateways = [{
-        "from_edge": g.from_edge, "control": "controlled" if g.signal is not None and g.signal not in left_alone and
-        streets.logics[g.signal][-1].kind == "static" else "left alone"} for g in city.gateways]
+    static = {signal for signal, logics in streets.logics.items() if logics[-1].kind == "static"} - set(left_alone)
+    gateways = [{"from_edge": g.from_edge, "control": "controlled" if g.signal in static else "left alone"}
+                for g in city.gateways]
     atlas.draw_map(path, streets, regions, scenario.network.region_names, places,
                    Tables(quality=(), gateways=gateways), None)
 

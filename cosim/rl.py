@@ -17,16 +17,17 @@ if TYPE_CHECKING:
 
 
 def gymnasium_env(
-    scenario: Scenario | Path | str, *, guidance: bool = False, steps: int | None = None, city: str = "",
+    scenario: Scenario | Path | str, *, guidance: bool = False, metering: bool = False, steps: int | None = None,
+    city: str = "",
 ) -> "RegionalEnv":
     """One agent for all regions (nmfd.rl.RegionalEnv) in SUMO.
 
-    guidance: whether the agent sends drivers too; steps: control intervals of an episode, the scenario's if None
+    guidance, metering: as of nmfd.rl.Interface; steps: control intervals of an episode, the scenario's if None
     city: what else the city does, such as "max-pressure+rerouting-30". Raises InputError.
     """
     from nmfd.rl import RegionalEnv
 
-    return RegionalEnv(*_city(scenario, steps, city), guidance=guidance)
+    return RegionalEnv(*_city(scenario, steps, city), guidance=guidance, metering=metering)
 
 
 def pettingzoo_env(

@@ -253,7 +253,7 @@ def _start(window: Window, command: list[str]) -> None:
             [program, *command[1:], *window.options, "--remote-port", str(port)], stdout=said, stderr=said)
         try:
             with redirect_stdout(io.StringIO()):  # traci prints every attempt to connect
-                traci.init(port, proc=process)
+                traci.init(port, numRetries=600, proc=process)  # one a second, while it reads its files
         except BaseException as error:
             process.kill()
             process.wait()

@@ -20,7 +20,7 @@ from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.frames import write_parquet
 from nmfd.scenario import load_scenario
-from nmfd.workers import Failure, outcomes
+from nmfd.workers import Failure, ended, outcomes
 
 OK, FAILED = "ok", "failed"
 KEYS = ["strategy", "seed", "demand"]
@@ -68,7 +68,8 @@ def sweep(
     Columns: strategy, controller (without its compliance), seed, demand, compliance, status ("ok" or "failed"),
     reason, and those of summary.csv and sumo.csv, which are empty where a run failed. Failed runs are tried again at
     the next call. `scheduler`: the address of a Dask scheduler, whose workers run all of it instead of `workers`
-    processes here. progress, tell: as in `experiment.perform`. Raises InputError.
+    processes here. progress, tell: as in `experiment.perform`. Raises InputError, and
+    RunFailed if no run at all went well.
     """
     if (order.out / "manifest.json").is_file():
         raise InputError(f"{order.out}: is the folder of another command; choose another folder with --out")
@@ -93,10 +94,13 @@ def sweep(
 
     if scheduler is not None:
         cluster.connect(scheduler).close()  # before anything is written
-    experiment.perform(
+    failed_now = experiment.perform(
         plan, workers=workers, progress=progress, tell=tell, kept=write, failed=failed,
         source=partial(_local, workers=workers) if scheduler is None else partial(cluster.outcomes, scheduler))
-    return write()
+    rows = write()
+    if failed_now and (rows["status"] == FAILED).all():
+        raise ended([(experiment.label(task), failure) for task, failure in failed_now[:1]])
+    return rows
 
 
 def _local(tasks: Sequence[Task], *, workers: int) -> Iterator[tuple[Task, Result | Failure]]:

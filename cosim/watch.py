@@ -3,7 +3,7 @@
 import os
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -75,8 +75,9 @@ def watch(
             additional=(drawn,), program=program)
         plant = SumoPlant(
             scenario, overrides=replace(settings(scenario), **strategy.overrides), window=window)
-        drawn.write_text(layers_xml(plant.city))
-        view.write_text(view_xml(plant.city, delay))
+        shapes = edge_shapes(plant.city)
+        drawn.write_text(layers_xml(plant.city, shapes))
+        view.write_text(view_xml(shapes, delay))
         try:
             return runs.labelled(
                 closed_loop.run(Painted(plant, scenario.network), controller, scenario, seed=task.seed,
@@ -131,28 +132,28 @@ def marked(city: City) -> dict[str, Gateway]:
     return {f"gateway{n}": gateway for n, gateway in enumerate(first.values())}
 
 
-def extent(city: City) -> float:
+def extent(shapes: Sequence[np.ndarray]) -> float:
     """Of the map, the longer side [m]."""
-    return float(np.ptp(np.concatenate(edge_shapes(city)), axis=0).max())
+    return float(np.ptp(np.concatenate(shapes), axis=0).max())
 
 
-def view_xml(city: City, delay: float) -> str:
+def view_xml(shapes: Sequence[np.ndarray], delay: float) -> str:
     """sumo-gui's settings: vehicles in the colour of their speed, larger than they are in a large city."""
-    size = extent(city)
+    size = extent(shapes)
     return VIEW.format(delay=delay, vehicles=min(max(size / 500.0, 1.0), 10.0), marks=MARK * size / POI_RADIUS)
 
 
-def layers_xml(city: City) -> str:
+def layers_xml(city: City, shapes: Sequence[np.ndarray]) -> str:
     """An additional file: a band under every edge in the colour of its region, and a grey mark where an edge ends at a
-    boundary."""
-    shapes = dict(zip(city.edges, edge_shapes(city), strict=True))
+    boundary. shapes: of the edges, (n, 2) [m]."""
+    width, lines_of = BAND * extent(shapes), dict(zip(city.edges, shapes, strict=True))
     lines = [
         f'  <poly id={quoteattr("region-" + edge)} color="{_rgb(city.region_of[edge])}" fill="0" layer="-1" '
-        f'lineWidth="{BAND * extent(city):.1f}" shape="{" ".join(f"{x:.1f},{y:.1f}" for x, y in shape)}"/>\n'
-        for edge, shape in shapes.items()]
+        f'lineWidth="{width:.1f}" shape="{" ".join(f"{x:.1f},{y:.1f}" for x, y in shape)}"/>\n'
+        for edge, shape in lines_of.items()]
     grey = ",".join(map(str, LEFT_ALONE))
     for mark, gateway in marked(city).items():
-        x, y = shapes[gateway.from_edge][-1]
+        x, y = lines_of[gateway.from_edge][-1]
         lines.append(
             f'  <poi id="{mark}" type="{gateway.source} &gt; {gateway.target}" color="{grey}" layer="5" x="{x:.1f}" '
             f'y="{y:.1f}"/>\n')

@@ -7,7 +7,7 @@ import click
 from nmfd.command_line import Commands, Interrupted
 from nmfd.errors import InputError
 from nmfd.exchange import export, new_controller
-from nmfd.experiments import ablation, bound, robustness, scaling
+from nmfd.experiments import ablation, adaptation, bound, robustness, scaling
 from nmfd.options import COUNT, FILE, FOLDER, SEED, controller_names, fault_option, policy_files, quoted
 
 
@@ -27,7 +27,8 @@ def main() -> None:
 @click.option("--controllers", required=True, metavar="A,B,...",
               help="Which to run: no-control, route-guidance, pi-gating, mpc-pc, mpc-pcrg, probing-pc, "
                    "probing-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, dpc-pcrg-robust, dpc-pc-guarded, "
-                   "dpc-pcrg-guarded, bound-pc, bound-pcrg, or file.py:Class (see nmfd new-controller).")
+                   "dpc-pcrg-guarded, dpc-pc-online, dpc-pcrg-online, bound-pc, bound-pcrg, or file.py:Class "
+                   "(see nmfd new-controller).")
 @click.option("--seeds", type=COUNT, default=1, show_default=True, metavar="N",
               help="Run seeds 0 to N-1 of the measurement noise.")
 @click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", show_default=True,
@@ -193,7 +194,7 @@ def _stamp(path: Path) -> int | None:
     return path.stat().st_mtime_ns if path.exists() else None
 
 
-for command in (bound, robustness, ablation, scaling, new_controller, export):
+for command in (bound, robustness, adaptation, ablation, scaling, new_controller, export):
     main.add_command(command)
 
 

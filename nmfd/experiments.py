@@ -69,6 +69,57 @@ def robustness(
 
 @click.command()
 @click.argument("scenario", type=FOLDER)
+@click.option("--controllers", default="no-control,dpc-pcrg,dpc-pcrg-online", show_default=True, metavar="A,B,...",
+              help="Made for the scenario as it is; those in -online are fine-tuned between control steps.")
+@click.option("--cases", default="nominal,more,one-origin,later,rain", show_default=True, metavar="A,B,...",
+              help="What comes differently: more demand, more from one origin, all of it later, capacity minus 20 %.")
+@click.option("--seeds", type=COUNT, default=1, show_default=True, metavar="N",
+              help="Of the measurement noise.")
+@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", show_default=True)
+@click.option("--workers", type=COUNT, default=1, show_default=True, metavar="N",
+              help="Runs at a time, each on one core. Timings are cleanest with 1.")
+@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
+              help="The file of a policy, if not SCENARIO/NAME.pt. May be repeated.")
+@click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-adaptation]")
+def adaptation(
+    scenario: Path, controllers: str, cases: str, seeds: int, plant: str, workers: int, policies: tuple[str, ...],
+    out: Path | None,
+) -> None:
+    """Compare controllers where demand or capacity is not what they were made for; print a table.
+
+    The run folder holds adaptation.csv and manifest.json; what is there is not run again.
+
+    \b
+    Examples:
+      nmfd adaptation scenarios/economic_mpc
+      nmfd adaptation scenarios/economic_mpc --controllers dpc-pc,dpc-pc-online,pi-gating --cases rain,more
+    """
+    names = controller_names(controllers)
+    files = policy_files(policies, names)
+
+    from nmfd import adaptation as method
+    from nmfd import runs
+    from nmfd.progress import progress_line
+    from nmfd.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    out = Path("runs") / f"{runs.file_name(loaded.name)}-adaptation" if out is None else out
+    chosen = list(dict.fromkeys(case.strip() for case in cases.split(",")))
+    try:
+        with progress_line("adaptation") as progress:
+            rows = method.adaptation(
+                loaded, names, chosen, range(seeds), out=out, plant=plant, policies=files, workers=workers,
+                progress=progress)
+    except KeyboardInterrupt:
+        if not (out / "adaptation.csv").exists():
+            raise Interrupted("interrupted before a run was finished; nothing is kept") from None
+        raise Interrupted(f"interrupted; finished runs are in {out}: the same command goes on") from None
+    click.echo(method.table(rows))
+    click.echo(f"Written to {out}")
+
+
+@click.command()
+@click.argument("scenario", type=FOLDER)
 @click.option("--controller", required=True, metavar="NAME", help="bound-pc or bound-pcrg.")
 @click.option("--from", "starts", metavar="A,B,...",
               help="Controllers whose closed loops it starts from, besides open and half-closed perimeters. "

@@ -9,7 +9,7 @@ import tiny
 import torch
 
 from cosim.compare import errors, held_up, outflow_samples, predict, predict_next
-from cosim.identify import network_toml, own_splits
+from cosim.identify import network_toml, own_splits, unreached
 from cosim.simulate import Result
 from nmfd import dynamics, mfd
 from nmfd.network import load_network
@@ -129,3 +129,13 @@ def test_held_up_is_who_collapsed_later():
     outflow = np.array([[1, 1, 1], [2, 2, 2], [2, 1, 2], [1, 1, 2], [1, 2, 2]], dtype=float)
     found = held_up(accumulation, outflow, adjacency)
     assert found.T.tolist() == [[False, False, True, True, False], [False] * 5, [False, False, True, True, False]]
+
+
+def test_regions_that_no_loading_run_filled_are_named(scenario):
+    network = scenario.network
+    critical = np.array([curve.critical for curve in network.mfds])
+    state = np.zeros((5, 7, 7))
+    state[2] = np.diag(critical * [1.1, 0.4, 1.2, 1.3, 1.5, 1.01, 2.0])
+    line = unreached(network, [state, 0.5 * state])
+    assert "1 " + network.region_names[1] + " (40 % of it)" in line and line.count("% of it") == 1
+    assert unreached(network, [3.0 * state]) == ""

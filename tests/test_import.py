@@ -12,11 +12,12 @@ import tiny_city
 from click.testing import CliRunner
 
 from cosim.cli import main
+from cosim.flows import own_flows
 from cosim.importing import level
 from cosim.importing.case import read_case
 from cosim.importing.demand import read_traffic
 from cosim.importing.streets import graph, read_streets
-from cosim.originals import read_originals
+from cosim.originals import read_originals, read_routes
 from cosim.plant import SumoPlant, settings
 from cosim.regions import load_city
 from nmfd.scenario import load_scenario
@@ -211,6 +212,28 @@ def test_mesoscopic_keeps_the_ledger(imported):
         plant.close()
 
 
+def test_signal_plans_know_the_city_s_own_vehicles(imported):
+    """Turning flows are those of its routes, and of fastest ways; every signal plan runs on its signals."""
+    scenario = replace(load_scenario(imported[0] / "scenarios" / "tiny"), steps=2)
+    own, additional = ([scenario.folder / name for name in names] for names in (
+        settings(scenario).routes, settings(scenario).additional))
+    files = scenario.network.folder
+    city = load_city(files / "city.net.xml.gz", files / "regions.csv", 3)
+    flows = own_flows(city, read_originals(own), read_routes(additional), 2.0)
+    assert flows["A1B1", "B1B0"] >= 2.0 / 900.0                       # the route that one vehicle names
+    assert 2.0 * 75 / 900 <= flows["B1C1", "C1D1"] < 2.0 * 120 / 900   # the flow straight on, of trips
+    assert all(b in city.successors[a] for a, b in flows)
+    for plan in ("max-pressure", "webster", "actuated"):
+        plant = SumoPlant(scenario, overrides=replace(settings(scenario), signals=plan))
+        try:
+            plant.reset(0)
+            for _ in range(2):
+                plant.step(Controls(perimeter=np.where(scenario.network.adjacency, 0.9, 0.0), splits=None))
+            assert plant.record().departures.sum() > 0
+        finally:
+            plant.close()
+
+
 @pytest.mark.parametrize("change, expected", [
     (lambda folder: (folder / "buses.rou.xml").unlink(), "route-files: no such file"),
     (lambda folder: (folder / "city.net.xml").write_text("<net><edge"), "is not a"),
@@ -253,7 +276,7 @@ def test_import_at_a_congested_level(config, tmp_path):
     total = scenario.demand.sum() * scenario.step
     assert total == pytest.approx(scenario.demand_factor * len(vehicles.depart), rel=1e-4)
     line = error_line(cosim("import", config, "--regions", 2, "--level", "twice", "--out", tmp_path / "networks" / "x"))
-    assert "--level: expected numbers above 0" in line
+    assert "--level: expected a number above 0 up to 10, or auto, got 'twice' instead" in line
 
 
 def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):

@@ -76,6 +76,16 @@ def test_the_template_holds_regions_at_their_set_points():
     assert MyController.name == "my-controller"
 
 
+def test_it_has_a_table_of_its_own(place):
+    with (place / "scenario" / "scenario.toml").open("a") as file:
+        file.write("\n[controllers.own.my-controller]\ngain = 0.0\n")
+    assert nmfd("new-controller", "mine.py").exit_code == 0
+    controller = own.make("mine.py:MyController", load_scenario(place / "scenario"))
+    full = np.full((2, 2), 900.0)
+    perimeter = controller.act(own.Measurement(step=0, time=0.0, accumulation=full, backlog=0 * full)).perimeter
+    assert perimeter[0, 1] == 0.9  # without gain nothing is held back
+
+
 def test_processes_and_sumo_take_it(place):
     (place / "mine.py").write_text(GOOD)
     shutil.copytree(ROOT / "networks" / "grid7", place / "networks" / "grid7")

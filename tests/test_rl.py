@@ -9,6 +9,7 @@ import pytest
 import tiny
 
 from nmfd import api
+from nmfd.controllers import own
 from nmfd.metrics import total_time_spent
 from nmfd.plant import AcyclicPlant
 from nmfd.scenario import load_scenario
@@ -83,6 +84,16 @@ def test_every_action_is_admissible_and_reaches_the_bounds(hexagon, guidance):
             np.testing.assert_allclose(splits.sum(axis=2)[:, network.split_mask.any(axis=1)], 1.0)
     assert (perimeter[:, network.adjacency] == network.u_max).all()
     assert guidance or splits is None
+
+
+def test_metering_closes_all_entries_of_a_region_alike(hexagon):
+    interface, network = rl.Interface(hexagon.network, metering=True), hexagon.network
+    assert interface.action_size == network.regions
+    action = np.ones(7)
+    action[3] = -1.0
+    perimeter = interface.perimeter(action)
+    assert (perimeter[network.adjacency[:, 3], 3] == network.u_min).all()
+    assert (perimeter[network.adjacency & (np.arange(7) != 3)] == network.u_max).all()
 
 
 class Constant:
@@ -167,3 +178,17 @@ def test_ppo_learns_with_the_adapter(scenario):
     model.learn(160)
     action, _ = model.predict(env.reset(), deterministic=True)
     assert action.shape == (4, env.env.interface.action_size)
+
+
+def test_the_ppo_example_is_a_controller_like_any_other_and_can_be_trained(hexagon, tmp_path, monkeypatch):
+    pytest.importorskip("stable_baselines3")
+    name = f"{ROOT}/scenarios/economic_mpc/ppo.py:Ppo"
+    totals = {each: total_time_spent(api.run(hexagon, each, seed=7)) for each in (name, "no-control")}
+    assert totals[name] < 0.9 * totals["no-control"]
+    example = own._module(Path(name.removesuffix(":Ppo")), name)
+    monkeypatch.setattr(example, "ENVS", 2)
+    with pytest.warns(UserWarning, match="mini-batch"):  # two scenarios at once are fewer than it is made for
+        example.train(1, 0, tmp_path / "weights.pt")
+    monkeypatch.setattr(example, "WEIGHTS", tmp_path / "weights.pt")
+    perimeter = api.run(hexagon, name, steps=3).perimeter
+    assert ((perimeter >= 0.0) & (perimeter <= hexagon.network.u_max)).all()

@@ -6,7 +6,6 @@ Without a screen SUMO's program without a window stands in for sumo-gui; it is d
 import re
 import shutil
 import subprocess
-import time
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from test_page import cosim, error_line
 from cosim import sumo, watch
 from cosim.city import ensure_built
 from cosim.plant import SumoPlant
-from cosim.regions import load_city
+from cosim.regions import edge_shapes, load_city
 from cosim.simulate import Task, simulate
 from nmfd.scenario import load_scenario
 
@@ -27,7 +26,7 @@ XVFB = shutil.which("Xvfb")
 
 @pytest.fixture(scope="module")
 def task(tmp_path_factory):
-    """Three control intervals of grid7 with the peak at the beginning and a gate that closes early."""
+    """Two control intervals of grid7 with the peak at the beginning and a gate that closes early."""
     folder = tmp_path_factory.mktemp("watch")
     shutil.copytree(ROOT / "networks" / "grid7", folder / "networks" / "grid7")
     text = (ROOT / "scenarios" / "grid7_peak" / "scenario.toml").read_text()
@@ -36,7 +35,7 @@ def task(tmp_path_factory):
     assert count == 1
     (folder / "scenarios" / "small").mkdir(parents=True)
     (folder / "scenarios" / "small" / "scenario.toml").write_text(text)
-    return Task(scenario=folder / "scenarios" / "small", controller="pi-gating", seed=3, steps=3)
+    return Task(scenario=folder / "scenarios" / "small", controller="pi-gating", seed=3, steps=2)
 
 
 def test_a_watched_run_is_the_run(task, monkeypatch):
@@ -49,7 +48,7 @@ def test_a_watched_run_is_the_run(task, monkeypatch):
     network = load_scenario(task.scenario).network
     files = ensure_built(network)
     marks = watch.marked(load_city(files.net_file, files.regions_csv, network.regions))
-    assert len(painted) == 3 and set(painted[0]) == set(marks)  # every gateway of grid7 has a signal
+    assert len(painted) == 2 and set(painted[0]) == set(marks)  # every gateway of grid7 has a signal
     for k, colours in enumerate(painted):
         for mark, gateway in marks.items():
             u = there.perimeter[k, gateway.source, gateway.target]
@@ -60,7 +59,7 @@ def test_marks_are_there_to_be_painted_and_every_street_lies_on_its_region(task)
     network = load_scenario(task.scenario).network
     files = ensure_built(network)
     city = load_city(files.net_file, files.regions_csv, network.regions)
-    root = ElementTree.fromstring(watch.layers_xml(city))
+    root = ElementTree.fromstring(watch.layers_xml(city, edge_shapes(city)))
     bands = {element.get("id"): element.get("color") for element in root.iter("poly")}
     assert set(bands) == {f"region-{edge}" for edge in city.edges}
     for region in range(city.regions):
@@ -68,7 +67,7 @@ def test_marks_are_there_to_be_painted_and_every_street_lies_on_its_region(task)
     assert len(set(bands.values())) == city.regions
     marks = {element.get("id"): element for element in root.iter("poi")}
     assert set(marks) == set(watch.marked(city)) and len(marks) > 20
-    ElementTree.fromstring(watch.view_xml(city, 20.0))
+    ElementTree.fromstring(watch.view_xml(edge_shapes(city), 20.0))
 
 
 def test_red_is_closed_and_green_is_open():
@@ -108,11 +107,10 @@ def test_in_a_window(task, monkeypatch):
                               stderr=subprocess.DEVNULL, text=True)
     try:
         monkeypatch.setenv("DISPLAY", f":{server.stdout.readline().strip()}")
-        begin = time.monotonic()
         result = cosim(
             "watch", task.scenario, "--controller", "pi-gating", "--seed", "3", "--steps", "1", "--delay", "1")
         assert result.exit_code == 0, result.output + str(result.exception)
-        assert "pi-gating, seed 3: total time spent" in result.stdout and time.monotonic() - begin < 100
+        assert "pi-gating, seed 3: total time spent" in result.stdout
     finally:
         server.terminate()
         server.wait()

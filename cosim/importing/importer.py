@@ -28,6 +28,8 @@ from nmfd.errors import InputError
 from nmfd.network import Network
 
 NET = "city.net.xml.gz"
+LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
+LITTLE = 0.3  # of the flow over the boundaries passes no signal under control: worth a word
 FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz", "additional": "city.add.xml.gz"}
 
 
@@ -76,13 +78,14 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
     with _folders(order) as (net_folder, folder):
         files = _write_traffic(folder, traffic)
         simulate = _Baselines(streets, case, clock, folder, files)
+        mesoscopic = order.mesoscopic or streets.drivable.sum() > LARGE
         factor, congests, baseline = 1.0 if order.peak else order.level, True, None
         if order.level is None:
             factor, congests = level.congesting(
-                lambda times, meso: simulate.run(times, meso).pace(streets), mesoscopic=order.mesoscopic, tell=tell)
+                lambda times, meso: simulate.run(times, meso).pace(streets), mesoscopic=mesoscopic, tell=tell)
         if order.run:
             tell("simulating without control")
-            baseline = simulate.run(factor, order.mesoscopic)
+            baseline = simulate.run(factor, mesoscopic)
         left = left_alone(streets, traffic)
         tell("partition")
         regions, asked = partition(
@@ -104,6 +107,9 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
             protected=_protected(streets, regions, baseline, network), factor=factor, mesoscopic=order.mesoscopic))
         report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
         report += _level_line(order, factor, congests)
+        if mesoscopic and order.run:
+            report += "\nsimulated by SUMO's mesoscopic model" + (
+                "" if order.mesoscopic else f": the city has more than {LARGE:,} edges for cars")
         (net_folder / "import.txt").write_text(report + "\n")
     return report
 
@@ -300,6 +306,9 @@ def _report(order: Order, case: Case, streets: Streets, traffic: Traffic, clock:
                      f"({left[skipped[0]]}); see gateways.csv")
     if several := sum(len(logics) > 1 for logics in streets.logics.values()):
         lines.append(f"{several} signals have several programmes: the last that is loaded runs, as in SUMO")
+    if found.uncontrolled > LITTLE:
+        lines.append(f"perimeter control reaches only {100 * (1 - found.uncontrolled):.0f} % of the flow over the "
+                     "boundaries: other regions (--regions, --method, your own) may have more signals between them")
     if not any(g["control"] == "controlled" for g in found.gateways):
         lines.append("no gateway has a signal that perimeter control can use: only route guidance can do anything here")
     if baseline is not None:

@@ -10,6 +10,7 @@ import inspect
 import re
 import sys
 import traceback
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
@@ -57,13 +58,19 @@ def fingerprint(name: str) -> dict[str, object]:
 
 
 def table_name(name: str) -> str:
-    """The `name` of the class: of its table in [controllers]."""
+    """The `name` of the class: of its table in [controllers.own]."""
     return str(getattr(_class(name), "name", name))
+
+
+def with_tables(scenario: Scenario) -> Scenario:
+    """`scenario` with the tables of [controllers.own] among its options of controllers."""
+    tables = scenario.controller_options
+    return replace(scenario, controller_options={**tables, **tables.get("own", {})})
 
 
 def make(name: str, scenario: Scenario) -> "OwnController":
     """The controller `name`, tried once on an empty city. Raises InputError, on one line, for whatever is wrong."""
-    cls, scenario = _class(name), as_modelled(scenario, table_name(name))
+    cls, scenario = _class(name), as_modelled(with_tables(scenario), table_name(name))
     try:
         inspect.signature(cls).bind(scenario)
     except TypeError as error:

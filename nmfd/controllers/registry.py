@@ -5,7 +5,6 @@ Besides those here there are controllers of the user's own (nmfd.controllers.own
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -73,19 +72,22 @@ _WITHOUT_POLICY: dict[str, Callable[[Scenario], Controller]] = {
 _WITH_POLICY = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
 # The policy that is watched.
 _GUARDED = {"dpc-pc-guarded": "dpc-pc", "dpc-pcrg-guarded": "dpc-pcrg"}
+# The policy that goes on learning.
+_ONLINE = {"dpc-pc-online": "dpc-pc", "dpc-pcrg-online": "dpc-pcrg"}
 # Whether the plan guides routes too. The same as bound.NAMES.
 _WITH_PLAN = {"bound-pc": False, "bound-pcrg": True}
+OWN = "own"  # the table in [controllers] that holds those of controllers of the user's own
 _OWN = re.compile(r".+\.py:\w+(?=\+|$)")
 
 
 def names() -> tuple[str, ...]:
     """Every controller that is built in."""
-    return (*_WITHOUT_POLICY, *_WITH_POLICY, *_GUARDED, *_WITH_PLAN)
+    return (*_WITHOUT_POLICY, *_WITH_POLICY, *_GUARDED, *_ONLINE, *_WITH_PLAN)
 
 
 def policy_names() -> tuple[str, ...]:
     """The controllers that need a trained policy."""
-    return (*_WITH_POLICY, *_GUARDED)
+    return (*_WITH_POLICY, *_GUARDED, *_ONLINE)
 
 
 def check(name: str) -> None:
@@ -125,13 +127,11 @@ def is_own(name: str) -> bool:
     return name not in names()
 
 
-def table_name(name: str) -> str:
-    """Whose table in [controllers] the controller reads."""
-    if not is_own(name):
-        return name
+def configured_own(name: str, scenario: Scenario) -> tuple[str, Scenario]:
+    """Of a controller of the user's own: the name of its table, and `scenario` with the tables of all such."""
     from nmfd.controllers import own
 
-    return own.table_name(name)
+    return own.table_name(name), own.with_tables(scenario)
 
 
 def fingerprint(name: str, policy: Path | None) -> dict[str, object]:
@@ -174,7 +174,7 @@ def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Pa
 def _owner(name: str) -> str:
     """Whose policy and options `name` uses."""
     name, rest = split(name)
-    return "+".join([_GUARDED.get(name, name), *rest])
+    return "+".join([{**_GUARDED, **_ONLINE}.get(name, name), *rest])
 
 
 def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Controller:
@@ -202,6 +202,10 @@ def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Contro
         from nmfd.controllers import guarded
 
         return guarded.load(path, scenario, guidance=_WITH_POLICY[_GUARDED[name]])
+    if name in _ONLINE:
+        from nmfd.controllers import online
+
+        return online.load(path, scenario, guidance=_WITH_POLICY[_ONLINE[name]])
     from nmfd.controllers import dpc
 
     return dpc.load(path, scenario, guidance=_WITH_POLICY[name])
@@ -220,13 +224,14 @@ def check_options(scenario: Scenario) -> None:
     where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
     tables = toml.Table(scenario.controller_options, where, "controllers.")
     for variant in scenario.controller_options:
+        if variant == OWN:  # checked by those controllers, if at all
+            tables.table(OWN)
+            continue
         table, name = tables.table(variant), split(variant)[0]
         if name not in names():
-            if near := difflib.get_close_matches(name, names(), n=1, cutoff=0.82):
-                raise tables.error(
-                    variant, f"unknown controller, very like {near[0]}; choose from {', '.join(names())}, or one of "
-                    "them with + and the options of a strategy")
-            continue  # of a controller of the user's own, who reads it
+            raise tables.error(variant, f"unknown controller; choose from {', '.join(names())}, or one of them with + "
+                               "and the options of a strategy; that of a controller of your own is "
+                               f"controllers.{OWN}.{variant}")
         table.text("model", None)
         options = {**scenario.controller_options.get(name, {}), **table.raw()}
         options.pop("model", None)
@@ -239,6 +244,10 @@ def check_options(scenario: Scenario) -> None:
             from nmfd import training
 
             training.settings(own, variant)
+        elif name in _ONLINE:
+            from nmfd.controllers import online
+
+            online.options(own, name)
         elif name in ("pi-gating", "probing-pc", "probing-pcrg"):
             if scenario.protected:  # without a protected region gating cannot be made, and is not made
                 _WITHOUT_POLICY[name](own)

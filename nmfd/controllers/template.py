@@ -14,7 +14,7 @@ from nmfd import Controls, Measurement, Scenario
 
 
 class MyController:
-    # The name of its table in scenario.toml, [controllers.my-controller].
+    # The name of its table of options in scenario.toml, if it has one: [controllers.own.my-controller].
     name = "my-controller"
     # Files beside this one that the results depend on, such as weights: when they change, runs are done again.
     files = ()

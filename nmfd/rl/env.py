@@ -24,8 +24,10 @@ class RegionalEnv(gymnasium.Env):
 
     metadata = {"render_modes": []}
 
-    def __init__(self, scenario: Scenario, plant: Plant | None = None, *, guidance: bool = False):
-        self.interface = Interface(scenario.network, guidance=guidance)
+    def __init__(
+        self, scenario: Scenario, plant: Plant | None = None, *, guidance: bool = False, metering: bool = False,
+    ):
+        self.interface = Interface(scenario.network, guidance=guidance, metering=metering)
         self._episode = Episode(scenario, NmfdPlant(scenario) if plant is None else plant)
         self.unit = self._episode.unit
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.interface.observation_size,), np.float32)

@@ -16,13 +16,17 @@ class Interface:
     Observation, float32: for all regions x_ij of every pair and the backlog of every region; for some, x_ij and the
     backlog of these, and the accumulation of every region. All divided by the region's critical accumulation.
 
-    Action, in [-1, 1]: u_ih of every boundary out of these regions, from u_min to u_max; with guidance also a logit for
-    every next region h of theta_ihj where there is a choice, of which the softmax is taken. Admissible whatever it is.
+    Action, in [-1, 1]: u_ih of every boundary out of these regions, from u_min to u_max, or with `metering` one for all
+    entries of a region h alike, as gating does, which is easier to explore; with guidance also a logit for every next
+    region h of theta_ihj where there is a choice, of which the softmax is taken. Admissible whatever it is.
 
     observation_size, action_size
     """
 
-    def __init__(self, network: Network, *, guidance: bool = False, regions: Sequence[int] | None = None):
+    def __init__(
+        self, network: Network, *, guidance: bool = False, metering: bool = False,
+        regions: Sequence[int] | None = None,
+    ):
         self._network, self._guidance = network, guidance
         chosen = np.arange(network.regions) if regions is None else np.array(regions)
         self._chosen, self._all = chosen, regions is None
@@ -31,7 +35,9 @@ class Interface:
         self._boundaries = np.nonzero(network.adjacency & mine[:, None])
         choice = network.split_mask & (network.split_mask.sum(axis=1, keepdims=True) > 1) & mine[:, None, None]
         self._ways = np.nonzero(choice) if guidance else None
-        self._count = len(self._boundaries[0])
+        entered, gate = np.unique(self._boundaries[1], return_inverse=True)
+        self._gate = gate if metering else np.arange(len(gate))  # which number of an action is u of each boundary
+        self._count = len(entered) if metering else len(gate)
         self.action_size = self._count + (len(self._ways[0]) if guidance else 0)
         self.observation_size = len(chosen) * (network.regions + 1) + (0 if self._all else network.regions)
         self._open = np.where(network.adjacency, network.u_max, 0.0)
@@ -57,7 +63,8 @@ class Interface:
         network = self._network
         share = 0.5 * (np.clip(np.asarray(action, dtype=float)[..., :self._count], -1.0, 1.0) + 1.0)
         perimeter = np.broadcast_to(self._open, (*share.shape[:-1], *self._open.shape)).copy()
-        perimeter[..., *self._boundaries] = network.u_min + (network.u_max - network.u_min) * share
+        perimeter[..., *self._boundaries] = (
+            network.u_min + (network.u_max - network.u_min) * share[..., self._gate])
         return perimeter
 
     def splits(self, action: np.ndarray) -> np.ndarray | None:

@@ -22,12 +22,12 @@ class NmfdVectorEnv(VectorEnv):
     """
 
     def __init__(
-        self, scenario: Scenario, num_envs: int, *, guidance: bool = False, demand_spread: float = 0.0,
-        initial_share: float = 0.0,
+        self, scenario: Scenario, num_envs: int, *, guidance: bool = False, metering: bool = False,
+        demand_spread: float = 0.0, initial_share: float = 0.0,
     ):
         self.num_envs, self.scenario = num_envs, scenario
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
-        self.interface = Interface(scenario.network, guidance=guidance)
+        self.interface = Interface(scenario.network, guidance=guidance, metering=metering)
         self.unit = sum(mfd.critical for mfd in scenario.network.mfds)
         self.single_observation_space = gymnasium.spaces.Box(
             -np.inf, np.inf, (self.interface.observation_size,), np.float32)

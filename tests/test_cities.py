@@ -1,0 +1,83 @@
+"""Cities that are not ours: the demos that come with SUMO, and real ones if they lie beside the project or in $CITIES.
+
+Each must give a network and a scenario that run, or one clear line.
+"""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import sumo
+from click.testing import CliRunner
+
+from cosim.cli import main
+from cosim.importing.quality import pieces
+from cosim.importing.streets import read_streets
+from cosim.plant import SumoPlant
+from nmfd.scenario import load_scenario
+from nmfd.types import Controls
+
+GAMES = Path(sumo.SUMO_HOME) / "tools" / "game"
+CITIES = Path(os.environ.get("CITIES", Path(__file__).parents[2] / "shared" / "cities"))
+REAL = {"bologna": ("bologna/run.sumocfg", 4), "ingolstadt": ("ingolstadt21/ingolstadt21.sumocfg", 3),
+        "luxembourg": ("luxembourg/luxembourg.net.xml.gz", 6)}
+
+
+def cosim(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def check(folder: Path, name: str, intervals: int) -> None:
+    """Every edge in one region, all connected; vehicles enter, and the ledger, checked in every interval, is exact."""
+    network = folder / "networks" / name
+    streets = read_streets(network / "city.net.xml.gz")
+    table = pd.read_csv(network / "regions.csv", dtype={"edge": str})
+    assert list(table["edge"]) == list(streets.edges)
+    regions = table["region"].to_numpy()
+    for region in range(regions.max() + 1):
+        assert pieces(streets, streets.main_part & (regions == region)) == 1
+    scenario = replace(load_scenario(folder / "scenarios" / name), steps=intervals)
+    plant = SumoPlant(scenario)
+    try:
+        plant.reset(0)
+        for _ in range(intervals):
+            measurement = plant.step(Controls(
+                perimeter=np.where(scenario.network.adjacency, 0.3, 0.0), splits=scenario.network.nominal_splits))
+        record = plant.record()
+        assert record.departures.sum() > 0
+        assert record.departures.sum() - record.arrivals.sum() == measurement.accumulation.sum()
+    finally:
+        plant.close()
+
+
+@pytest.mark.skipif(not GAMES.is_dir(), reason="this SUMO comes without its demos")
+@pytest.mark.parametrize("name, expected", [
+    ("cross", None), ("grid6", None), ("corridor", None), ("A10KW", None),
+    ("DRT", "names no vehicles for the streets of cars"), ("ramp", "no two regions can be made"),
+    ("rail", "has no edge that cars may use"),
+])
+def test_demos_of_sumo(tmp_path, name, expected):
+    result = cosim("import", GAMES / f"{name}.sumocfg", "--regions", 3, "--method", "geometric", "--no-run", "--out",
+                   tmp_path / "networks" / name)
+    if expected is None:
+        assert result.exit_code == 0, result.output + str(result.exception)
+        check(tmp_path, name, 2)
+    else:
+        assert result.exit_code == 2 and expected in result.stderr and result.stderr.count("\n") == 1
+        assert not list((tmp_path / "networks").glob("*")) and not list((tmp_path / "scenarios").glob("*"))
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_cities(tmp_path, name):
+    source, count = REAL[name]
+    if not (CITIES / source).is_file():
+        pytest.skip(f"{CITIES / source} is not there")
+    peak = ("--demand", "peak", "--level", "0.05") if name == "luxembourg" else ()
+    result = cosim("import", CITIES / source, "--regions", count, "--method", "geometric", "--no-run", *peak, "--out",
+                   tmp_path / "networks" / name)
+    assert result.exit_code == 0, result.output + str(result.exception)
+    assert f"{count} regions by method geometric" in result.stdout
+    check(tmp_path, name, 2)
