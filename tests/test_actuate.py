@@ -56,6 +56,7 @@ def check(states, phases, min_green=MIN_GREEN):
         sequence = runs(states, link)
         for (before, _), (after, _) in itertools.pairwise(sequence):
             assert (before, after) != ("G", "r"), f"link {link} goes from green to red without yellow"
+            assert (before, after) != ("r", "y"), f"link {link} goes from red to yellow"
         for n, (shown, length) in enumerate(sequence[1:-1], start=1):
             if shown == "G":
                 assert length >= min(min_green, least), f"link {link} is green for {length} s"

@@ -50,6 +50,8 @@ def test_counting_changes_nothing(scenario, integrator, substeps):
     plain = dynamics.advance(p, x, demand, perimeter, splits, 30.0, **options)
     counted, ended = dynamics.advance_counted(p, x, demand, perimeter, splits, 30.0, **options)
     torch.testing.assert_close(counted, plain, rtol=1e-13, atol=1e-10)
+    single, _ = dynamics.advance_counted(p, x[0], demand[0], perimeter[0], splits, 30.0, **options)
+    torch.testing.assert_close(single, plain[0], rtol=1e-13, atol=1e-10)
     lost = (x + 30.0 * demand - counted).sum((-2, -1))
     torch.testing.assert_close(ended, lost, rtol=1e-12, atol=1e-9)
     model = acyclic.build(scenario.network)
