@@ -21,6 +21,7 @@ from nmfd.scenario import Scenario
 
 MAPS = 4       # times of the maps
 PANELS = 11    # boundaries, or pairs of region and destination, that are shown one by one
+NAMED = 2      # controllers with the most teleports in a title
 WINDOW = 3     # control intervals over which realised shares are taken
 DRAWN = (      # what pictures of streets and gateways need of a record
     "edge_vehicles", "gateway_queue", "gateway_flow", "gateway_green", "gateway_original_green", "crossings", "guided")
@@ -85,11 +86,14 @@ def shown_seed(rows: pd.DataFrame) -> int:
 
 
 def teleports(rows: pd.DataFrame) -> str:
-    """How many vehicles were teleported in the runs behind a picture."""
+    """How many vehicles were teleported in the runs behind a picture; the controllers with the most by name, so that
+    it fits into a title."""
     counts = rows.groupby("controller", sort=False)["teleports"].sum()
-    if not counts.any():
+    counts = counts[counts > 0].sort_values(ascending=False, kind="stable")
+    if counts.empty:
         return "no teleport in any run"
-    return "teleports: " + ", ".join(f"{name} {count:.0f}" for name, count in counts.items())
+    named = [f"{name} {count:.0f}" for name, count in counts.iloc[:NAMED].items()]
+    return "teleports: " + ", ".join(named + ["others fewer"] * (len(counts) > NAMED))
 
 
 def link_maps(path: Path, city: City, results: dict[str, Result], note: str) -> None:

@@ -165,3 +165,12 @@ def test_a_small_evaluation_in_sumo(city, tmp_path):
     before = {path: path.read_bytes() for path in level.glob("*.npz")}
     assert cosim(*arguments).exit_code == 0
     assert before == {path: path.read_bytes() for path in level.glob("*.npz")}
+
+
+def test_titles_name_the_most_teleports():
+    rows = pd.DataFrame([{"controller": f"c{n}", "teleports": 0} for n in (1, 2)])
+    assert evaluate.report.teleports(rows) == "no teleport in any run"
+    rows = pd.DataFrame([{"controller": name, "teleports": count} for name, count in (
+        ("a", 1), ("b", 9), ("c", 4), ("d", 0), ("b", 2))])
+    assert evaluate.report.teleports(rows) == "teleports: b 11, c 4, others fewer"
+    assert evaluate.report.teleports(rows[rows["controller"] != "a"]) == "teleports: b 11, c 4"

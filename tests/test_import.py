@@ -157,7 +157,7 @@ def test_own_regions_come_back(config, tmp_path, own):
     good(cosim("import", config, f"--{own}", file, "--no-run", "--out", tmp_path / "networks" / "again"))
     before, after = (pd.read_csv(folder / "regions.csv") for folder in (network, tmp_path / "networks" / "again"))
     same = (before.region == after.region).mean()
-    assert same == 1.0 if own != "polygons" else same > 0.85
+    assert same == 1.0 if own != "polygons" else same > 0.95
 
 
 def test_networks_as_they_are(tmp_path):

@@ -50,9 +50,10 @@ def outlines(streets: Streets, regions: np.ndarray) -> list[list[np.ndarray]]:
     points, of = sampled(streets, streets.drivable)
     low, high = points.min(axis=0), points.max(axis=0)
     cell = max(float((high - low).max()) / CELLS, 1.0)
-    x, y = (np.arange(low[a] - 3 * cell, high[a] + 4 * cell, cell) for a in (0, 1))
+    reach = 2.5 * max(cell, SPACING)  # beyond, a place belongs to no street; the map must end there, or rings stay open
+    x, y = (np.arange(low[a] - reach - 2 * cell, high[a] + reach + 3 * cell, cell) for a in (0, 1))
     distance, nearest = cKDTree(points).query(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    label = np.where(distance < 2.5 * max(cell, SPACING), regions[of[nearest]], -1).reshape(len(y), len(x))
+    label = np.where(distance < reach, regions[of[nearest]], -1).reshape(len(y), len(x))
     ax = Figure().subplots()
     found = []
     for region in range(int(regions.max()) + 1):

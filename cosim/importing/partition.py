@@ -10,7 +10,7 @@ from cosim.importing.blocks import make_blocks
 from cosim.importing.clustering import agglomerate, features
 from cosim.importing.geometric import k_means
 from cosim.importing.given import read_given
-from cosim.importing.refine import prices, refine
+from cosim.importing.refine import best, prices
 from cosim.importing.regions import finish
 from cosim.importing.streets import Streets
 from nmfd.errors import InputError
@@ -22,6 +22,7 @@ METHODS = {
     "taz": "a SUMO file with a TAZ per region",
     "polygons": "a SUMO file with one or more polygons per region",
 }
+STARTS = 4  # of k-means, from which the partition is refined
 GIVEN = ("edges", "taz", "polygons")
 
 
@@ -48,12 +49,13 @@ def partition(
         feature = features(blocks, blocks.mean(density, streets.lane_metres))
         if method == "geometric":
             feature = feature[:, 1:]
-            labels = k_means(blocks, regions, seed)
+            starts = []
         else:
-            labels = agglomerate(blocks, feature, regions)
+            starts = [agglomerate(blocks, feature, regions)]
+        starts += [k_means(blocks, regions, seed + n) for n in range(STARTS)]
         controlled = np.array([
             signal is not None and signal not in left_alone for signal in streets.link_signals], dtype=bool)
-        labels = refine(blocks, labels, feature, prices(streets, blocks, controlled, baseline))
+        labels = best(blocks, starts, feature, prices(streets, blocks, controlled, baseline))
         found = finish(streets, np.where(blocks.of >= 0, labels[blocks.of], -1))
     if found.max() < 1:
         raise InputError(

@@ -6,7 +6,10 @@
 
 The price of a boundary is that of the connections over it: one that a fixed-time signal controls is cheap, one that
 much traffic takes without any is dear. That makes boundaries short, and puts them where perimeter control has a say.
+Blocks move one by one, and end in the nearest optimum: the best of several starts is taken.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -47,6 +50,28 @@ def refine(blocks: Blocks, labels: np.ndarray, feature: np.ndarray, price: csr_a
     return state.labels
 
 
+def cut(labels: np.ndarray, price: csr_array) -> float:
+    """The price of the boundaries between the regions."""
+    pairs = price.tocoo()
+    return float(pairs.data[labels[pairs.row] != labels[pairs.col]].sum()) / 2
+
+
+def best(blocks: Blocks, starts: Sequence[np.ndarray], feature: np.ndarray, price: csr_array) -> np.ndarray:
+    """(B,) the labels of least cost among the refined `starts`, of those that have the most regions. The price of
+    boundaries is over that of the first start for all of them."""
+    scale, weight = max(cut(starts[0], price), 1e-9), blocks.weight / blocks.weight.sum()
+
+    def cost(labels: np.ndarray) -> tuple[int, float]:
+        regions = int(labels.max()) + 1
+        size = np.bincount(labels, weight, regions)
+        total = np.stack([np.bincount(labels, weight * axis, regions) for axis in feature.T], axis=1)
+        between = ((total**2).sum(axis=1) / np.maximum(size, 1e-12)).sum()
+        balance = ((size * regions - 1.0) ** 2).mean()
+        return -regions, CUT * cut(labels, price) / scale + BALANCE * balance - between
+
+    return min((refine(blocks, labels, feature, price) for labels in starts), key=cost)
+
+
 class _State:
     """Labels with the sums that make the gain of a move cheap."""
 
@@ -57,9 +82,7 @@ class _State:
         self._size = np.bincount(labels, self._weight, regions)
         self._sum = np.stack([np.bincount(labels, self._weight * axis, regions) for axis in feature.T], axis=1)
         self._count = np.bincount(labels, minlength=regions)
-        pairs = price.tocoo()
-        cut = pairs.data[labels[pairs.row] != labels[pairs.col]].sum() / 2
-        self._scale = CUT / max(cut, 1e-9)
+        self._scale = CUT / max(cut(labels, price), 1e-9)
 
     def improve(self, block: int) -> bool:
         """Move the block to the neighbouring region that gains most, if any does."""
