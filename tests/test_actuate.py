@@ -110,6 +110,12 @@ def test_an_opened_link_keeps_its_original_green(mode):
     assert green[1] == MIN_GREEN if mode == "hold-back" else green[1] < 42
 
 
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
+def test_a_green_that_is_cut_has_the_yellow_of_the_programme_and_no_more(share):
+    states = play(SINGLE, {0: (0, 1)}, "hold-back", [np.full((2, 2), share)] * 4)
+    assert [length for shown, length in runs(states, 0)[2:-1] if shown == "y"] == [3, 3, 3]
+
+
 def test_hold_back_touches_the_gateway_only():
     held = play(PHASES, {0: (0, 1)}, "hold-back", [np.zeros((2, 2))] * 3)
     free = play(PHASES, {0: (0, 1)}, "hold-back", [np.ones((2, 2))] * 3)
