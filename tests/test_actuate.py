@@ -93,6 +93,7 @@ def test_green_falls_from_the_original_to_the_minimum():
         states = play(PHASES, {0: (0, 1)}, "hold-back", [np.full((2, 2), share)] * 3)
         green.append(sum(s[0] in "Gg" for s in states[90:180]))
     assert green[0] == MIN_GREEN and green[-1] == 30
+    assert green[2] == 10 and green[4] == 15 and green[6] == 20  # 5 s and so much of the other 25 s
     assert (np.diff(green) >= 2).all()
 
 
