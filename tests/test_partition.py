@@ -8,7 +8,7 @@ from cosim.importing.blocks import make_blocks
 from cosim.importing.clustering import agglomerate, features
 from cosim.importing.geometric import k_means
 from cosim.importing.quality import pieces
-from cosim.importing.refine import prices, refine
+from cosim.importing.refine import best, cut, prices, refine
 from cosim.importing.regions import finish
 from cosim.importing.streets import read_streets
 
@@ -80,6 +80,20 @@ def test_refinement_moves_the_boundary_to_the_signals(streets):
     assert (columns[where][crossing] == "E").mean() > max(before, 0.95)
     found = finish(streets, better[blocks.of])
     assert all(pieces(streets, found == region) == 1 for region in range(2))
+
+
+def test_the_best_of_several_starts(streets):
+    """Signals on a line far from the first start: moving block by block does not get there, another start does."""
+    blocks = make_blocks(streets)
+    feature = features(blocks, np.zeros(len(blocks.weight)))[:, 1:]
+    where = streets.junctions[streets.links[:, 0], 1]
+    rows = np.array([name[1] for name in sorted(streets.places, key=streets.places.get)])
+    price = prices(streets, blocks, rows[where] == "4", None)   # row 4 runs west to east, in the middle
+    starts = [(blocks.position[:, axis] > 650.0).astype(int) for axis in (0, 1)]
+    alone, found = refine(blocks, starts[0], feature, price), best(blocks, starts, feature, price)
+    assert cut(found, price) < 0.5 * cut(alone, price)
+    assert (best(blocks, starts[::-1], feature, price) == found).all()
+    assert (best(blocks, starts[:1], feature, price) == alone).all()
 
 
 def test_finish_repairs_what_is_torn(streets):
