@@ -93,6 +93,7 @@ def test_green_falls_from_the_original_to_the_minimum():
         states = play(PHASES, {0: (0, 1)}, "hold-back", [np.full((2, 2), share)] * 3)
         green.append(sum(s[0] in "Gg" for s in states[90:180]))
     assert green[0] == MIN_GREEN and green[-1] == 30
+    assert green[2] == 10 and green[4] == 15 and green[6] == 20  # 5 s and so much of the other 25 s
     assert (np.diff(green) >= 2).all()
 
 
@@ -108,6 +109,12 @@ def test_an_opened_link_keeps_its_original_green(mode):
     green = [sum(state[link] == "G" for state in states[90:]) for link in (0, 1)]
     assert green[0] == 42
     assert green[1] == MIN_GREEN if mode == "hold-back" else green[1] < 42
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
+def test_a_green_that_is_cut_has_the_yellow_of_the_programme_and_no_more(share):
+    states = play(SINGLE, {0: (0, 1)}, "hold-back", [np.full((2, 2), share)] * 4)
+    assert [length for shown, length in runs(states, 0)[2:-1] if shown == "y"] == [3, 3, 3]
 
 
 def test_hold_back_touches_the_gateway_only():
