@@ -141,7 +141,8 @@ def gateway_queues(path: Path, city: City, results: dict[str, Result], note: str
 
 
 def perimeter(path: Path, city: City, network: Network, result: Result, note: str) -> None:
-    """Commanded u against green and flow: the boundaries that were closed most over time, and all in one cloud."""
+    """Commanded u against green and flow: the boundaries that were closed most over time, and all in one cloud; no
+    picture of a city without a signal under control."""
     trajectory, record = result.trajectory, result.record
     pairs = {}
     for pair in map(tuple, np.argwhere(network.adjacency)):
@@ -152,6 +153,8 @@ def perimeter(path: Path, city: City, network: Network, result: Result, note: st
         if members and original.sum() > 0:
             flow = record["gateway_flow"][:, members].sum(axis=1) / (figures.SATURATION * original.sum(axis=1))
             pairs[pair] = trajectory.perimeter[:, *pair], shown.sum(axis=1) / original.sum(axis=1), flow
+    if not pairs:
+        return
     closed = [pair for pair in pairs if pairs[pair][0].min() < network.u_max - 1e-9]
     chosen = sorted(sorted(closed, key=lambda pair: pairs[pair][0].mean())[:PANELS])
     drawing, axes = plots.panels(len(chosen) + 1)
@@ -168,12 +171,15 @@ def perimeter(path: Path, city: City, network: Network, result: Result, note: st
 
 
 def splits(path: Path, network: Network, result: Result, note: str) -> None:
-    """Commanded theta against the shares that went there: the busiest choices over time, and all in one cloud."""
+    """Commanded theta against the shares that went there: the busiest choices over time, and all in one cloud; no
+    picture where there is nothing to choose, as with two regions."""
     trajectory, crossings = result.trajectory, result.record["crossings"].astype(float)
     leaving = crossings.sum(axis=2)  # (T, R, R), from i bound for j
     choices = [
         (i, j) for i, j in np.ndindex(network.adjacency.shape)
         if i != j and network.split_mask[i, :, j].sum() > 1 and leaving[:, i, j].sum() > 0]
+    if not choices:
+        return
     totals = []
     for i, j in choices:
         neighbours = np.flatnonzero(network.split_mask[i, :, j])

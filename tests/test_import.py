@@ -308,3 +308,17 @@ def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
         assert plant.record().guided.sum() > 10
     finally:
         plant.close()
+
+
+def test_the_chain_in_a_city_without_signals(tmp_path):
+    """Nothing for perimeter control to do, and the evaluation says so."""
+    net = tiny_city.network(tmp_path, "--default-junction-type", "priority", name="none.net.xml")
+    good(cosim("import", net, "--regions", 2, "--demand", "peak", "--level", 0.5, "--method", "geometric", "--no-run",
+               "--out", tmp_path / "networks" / "none"))
+    good(cosim("evaluate", tmp_path / "scenarios" / "none", "--controllers", "no-control,pi-gating,route-guidance",
+               "--seeds", 1, "--steps", 4, "--workers", 1, "--out", tmp_path / "out"))
+    report = (tmp_path / "out" / "evaluate.md").read_text()
+    assert "Signals under control see 0 % of the flow" in report and "route-guidance" in report
+    line = next(line for line in report.splitlines() if line.startswith("- pi-gating"))
+    assert "no control authority at the boundaries, 100 % of the flow" in line and "no region is ever critical" in line
+    assert not (tmp_path / "out" / "demand-1" / "perimeter.png").exists()
