@@ -16,16 +16,18 @@ if TYPE_CHECKING:
     from cosim.api import run
     from cosim.experiment import experiment as run_tasks
     from cosim.experiment import overview, read_run
-    from cosim.plant import Settings, SumoPlant, settings
+    from cosim.plant import SumoPlant
     from cosim.simulate import Result, Task
+    from cosim.sumo_settings import Settings, settings
     from cosim.sweeps import Sweep, sweep
 
 __all__ = [
     "Result", "Settings", "SumoPlant", "Sweep", "Task", "overview", "read_run", "run", "run_tasks", "settings", "sweep"]
 _PLACES = {
-    "Result": "simulate.Result", "Settings": "plant.Settings", "SumoPlant": "plant.SumoPlant", "Task": "simulate.Task",
+    "Result": "simulate.Result", "Settings": "sumo_settings.Settings", "SumoPlant": "plant.SumoPlant",
+    "Task": "simulate.Task",
     "overview": "experiment.overview", "read_run": "experiment.read_run", "run": "api.run",
-    "run_tasks": "experiment.experiment", "settings": "plant.settings", "Sweep": "sweeps.Sweep",
+    "run_tasks": "experiment.experiment", "settings": "sumo_settings.settings", "Sweep": "sweeps.Sweep",
     "sweep": "sweeps.sweep"}
 
 

@@ -33,7 +33,7 @@ def run(
     sumo_output: files of SUMO's own outputs: {"tripinfo": "trips.xml"}, also summary, edgedata, emission
     progress: called as progress(done, steps) after every control interval
 
-    The result holds `trajectory` (nmfd.Trajectory), `record` (arrays, see cosim.plant.Record) and `facts` (the row of
+    The result holds `trajectory` (nmfd.Trajectory), `record` (arrays, see cosim.record.Record) and `facts` (the row of
     sumo.csv). The same seed gives the same result, but for wall times. Raises InputError, and RuntimeError while
     another simulation is open in this process.
     """

@@ -12,11 +12,12 @@ import pandas as pd
 
 from cosim import estimates, incidents
 from cosim.city import ensure_built
-from cosim.plant import Settings, own_vehicles, settings
+from cosim.plant import own_vehicles
 from cosim.regions import check_adjacency, load_city
 from cosim.signals import read_signals
 from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.strategy import configured, parse
+from cosim.sumo_settings import Settings, settings
 from cosim.xml_files import read_xml
 from nmfd import faults, runs
 from nmfd.benchmarks import REFERENCE, draw_accumulations, interval
@@ -212,7 +213,7 @@ def record_path(folder: Path, controller: str, seed: int) -> Path:
 
 
 def write_record(path: Path, result: Result) -> None:
-    """The fields of cosim.plant.Record, atomically."""
+    """The fields of cosim.record.Record, atomically."""
     with runs.atomic(path) as temporary:
         np.savez_compressed(temporary, **result.record)
 

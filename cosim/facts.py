@@ -5,7 +5,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from cosim.plant import Record
+from cosim.record import Record
 from cosim.regions import City, Gateway, gateway_room_taken
 from cosim.trip_facts import TripFacts
 from nmfd.types import Trajectory

@@ -11,9 +11,9 @@ from cosim.city import ensure_built
 from cosim.importing import atlas
 from cosim.importing.quality import Tables
 from cosim.importing.streets import read_streets
-from cosim.plant import settings
 from cosim.regions import City, edge_shapes, load_city
 from cosim.simulate import Result
+from cosim.sumo_settings import settings
 from nmfd import plots
 from nmfd.benchmarks import REFERENCE, draw_accumulations
 from nmfd.network import Network

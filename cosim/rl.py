@@ -41,7 +41,8 @@ def pettingzoo_env(
 
 
 def _city(scenario: Scenario | Path | str, steps: int | None, city: str) -> tuple[Scenario, "SumoPlant"]:
-    from cosim.plant import SumoPlant, settings
+    from cosim.plant import SumoPlant
+    from cosim.sumo_settings import settings
 
     loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     if steps is not None:

@@ -43,7 +43,7 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """trajectory; record: the fields of cosim.plant.Record; facts: a row of sumo.csv."""
+    """trajectory; record: the fields of cosim.record.Record; facts: a row of sumo.csv."""
 
     trajectory: Trajectory
     record: dict[str, np.ndarray]
@@ -90,7 +90,8 @@ def drive(
     only if all goes well. Raises InputError.
     """
     from cosim import facts
-    from cosim.plant import SumoPlant, settings
+    from cosim.plant import SumoPlant
+    from cosim.sumo_settings import settings
     from nmfd import closed_loop, runs
 
     begin = time.perf_counter() if begin is None else begin

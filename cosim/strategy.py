@@ -18,11 +18,11 @@ SIGNALS = (FIXED, WEBSTER, ACTUATED, MAX_PRESSURE)
 HOLD_BACK, REDISTRIBUTE = "hold-back", "redistribute"
 MODES = (HOLD_BACK, REDISTRIBUTE)
 
-# Option -> (field of cosim.plant.Settings, its value).
+# Option -> (field of cosim.sumo_settings.Settings, its value).
 _WORDS = {
     **{name: ("signals", name) for name in SIGNALS[1:]}, **{name: ("actuation", name) for name in MODES},
     "estimate": ("measurement", "estimate")}
-# Option with a number -> (field of cosim.plant.Settings, least percentage); at most 100.
+# Option with a number -> (field of cosim.sumo_settings.Settings, least percentage); at most 100.
 _PERCENTAGES = {
     "rerouting": ("rerouting", 1), "compliance": ("compliance", 0), "queue-override": ("queue_override", 1)}
 OPTIONS = (*_WORDS, *(f"{name}-N" for name in _PERCENTAGES))
@@ -31,7 +31,7 @@ OPTIONS = (*_WORDS, *(f"{name}-N" for name in _PERCENTAGES))
 @dataclass(frozen=True, kw_only=True)
 class Strategy:
     """name: as the user wrote it; controller: of nmfd.controllers.registry; overrides: field of
-    cosim.plant.Settings -> value, instead of that of the scenario."""
+    cosim.sumo_settings.Settings -> value, instead of that of the scenario."""
 
     name: str
     controller: str

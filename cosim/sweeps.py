@@ -13,9 +13,9 @@ import pandas as pd
 
 from cosim import cluster, experiment
 from cosim.evaluate import level_folders
-from cosim.plant import settings
 from cosim.simulate import Result, Task
 from cosim.strategy import parse
+from cosim.sumo_settings import settings
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.frames import write_parquet

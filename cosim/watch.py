@@ -12,11 +12,12 @@ import numpy as np
 from matplotlib.colors import to_rgb
 
 from cosim.importing.layers import colour as region_colour
-from cosim.plant import SumoPlant, settings
+from cosim.plant import SumoPlant
 from cosim.regions import City, Gateway, edge_shapes
 from cosim.simulate import Task, scenario_of
 from cosim.strategy import configured, parse
 from cosim.sumo import LOST, Window
+from cosim.sumo_settings import settings
 from nmfd import closed_loop, runs
 from nmfd.controllers import registry
 from nmfd.errors import InputError

@@ -10,8 +10,9 @@ import pytest
 from cosim import estimates
 from cosim.city import ensure_built
 from cosim.detectors import instruments, lay_out, probes
-from cosim.plant import Settings, SumoPlant, settings
+from cosim.plant import SumoPlant
 from cosim.regions import load_city
+from cosim.sumo_settings import Settings, settings
 from nmfd import closed_loop, plots, runs
 from nmfd.controllers.gating import PiGating
 from nmfd.errors import InputError

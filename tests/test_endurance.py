@@ -11,7 +11,8 @@ import tiny_city
 from click.testing import CliRunner
 
 from cosim.cli import main
-from cosim.plant import SumoPlant, settings
+from cosim.plant import SumoPlant
+from cosim.sumo_settings import settings
 from nmfd.closed_loop import run
 from nmfd.controllers import registry
 from nmfd.plant import AcyclicPlant, NmfdPlant

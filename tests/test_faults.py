@@ -19,8 +19,9 @@ from click.testing import CliRunner
 import cosim.cli
 import nmfd.cli
 from cosim.city import ensure_built
-from cosim.plant import SumoPlant, settings
+from cosim.plant import SumoPlant
 from cosim.regions import load_city
+from cosim.sumo_settings import settings
 from nmfd import faults, runs
 from nmfd.closed_loop import run
 from nmfd.controllers import registry

@@ -18,8 +18,9 @@ from cosim.importing.case import read_case
 from cosim.importing.demand import read_traffic
 from cosim.importing.streets import graph, read_streets
 from cosim.originals import read_originals, read_routes
-from cosim.plant import SumoPlant, settings
+from cosim.plant import SumoPlant
 from cosim.regions import load_city
+from cosim.sumo_settings import settings
 from nmfd.scenario import load_scenario
 from nmfd.types import Controls
 

@@ -8,8 +8,9 @@ import pytest
 from test_actuate import MIN_GREEN, check
 
 from cosim.guidance import shifted
-from cosim.plant import Settings, SumoPlant
+from cosim.plant import SumoPlant
 from cosim.sumo import Session
+from cosim.sumo_settings import Settings
 from nmfd.ledger import LedgerError
 from nmfd.scenario import load_scenario
 from nmfd.types import Controls

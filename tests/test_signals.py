@@ -13,10 +13,11 @@ from cosim.city import ensure_built
 from cosim.flows import turning_flows
 from cosim.green_wave import offsets
 from cosim.max_pressure import MIN_GREEN, Junction, Roads, transition
-from cosim.plant import Settings, SumoPlant
+from cosim.plant import SumoPlant
 from cosim.regions import gateway_room_taken, load_city
 from cosim.signals import Link, Signal, read_signals
 from cosim.sumo import Phase
+from cosim.sumo_settings import Settings
 from cosim.trips import make_trips
 from cosim.webster import LOST, SATURATION, optimised, plan
 from nmfd.errors import InputError

@@ -4,8 +4,8 @@ from dataclasses import fields
 
 import pytest
 
-from cosim.plant import Settings
 from cosim.strategy import ALONE, OPTIONS, configured, parse
+from cosim.sumo_settings import Settings
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 
