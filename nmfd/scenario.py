@@ -110,6 +110,10 @@ def _name_from(own: dict, folder: Path, here: Path) -> None:
     for key in ("routes", "background", "additional") if isinstance(sumo, dict) else ():
         if isinstance(sumo.get(key), list) and all(isinstance(name, str) for name in sumo[key]):
             sumo[key] = [seen(name) for name in sumo[key]]
+    controllers = own.get("controllers")
+    for options in controllers.values() if isinstance(controllers, dict) else ():
+        if isinstance(options, dict) and isinstance(options.get("model"), str):
+            options["model"] = seen(options["model"])
 
 
 def _completed(content: dict, base: dict) -> dict:

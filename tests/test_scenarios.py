@@ -68,6 +68,17 @@ def test_a_controller_plans_with_the_model_that_it_names(base, tmp_path):
     assert registry.make("mpc-pc", scenario).options.horizon == 4
 
 
+def test_an_inherited_model_lies_where_the_base_says(base, tmp_path):
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 800.0"))
+    beside(base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\n')
+    far = tmp_path / "far" / "away"
+    far.mkdir(parents=True)
+    [first] = [folder.parent for folder in tmp_path.glob("*/scenario.toml") if 'name = "x"' in folder.read_text()]
+    (far / "scenario.toml").write_text(f'name = "y"\nbase = "../../{first.name}"\n')
+    assert as_modelled(load_scenario(far), "mpc-pc").network.mfds[0].jam == 800.0
+
+
 def test_a_variant_has_options_model_and_policy_of_its_own(base, tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 800.0"))
