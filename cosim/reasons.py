@@ -20,6 +20,7 @@ from nmfd.types import Trajectory
 
 NO_AUTHORITY = 0.5   # of the flow over the boundaries passes without a signal under control
 HARDLY = 0.01        # of the commands, or of the time
+NEARLY_OPEN = 0.1    # of the range of u, below its upper bound: a learned policy never quite reaches that
 MOSTLY_INSIDE = 0.5  # of what came into a region started there
 MORE_FULL = 0.02     # of the edges before gateways and intervals
 
@@ -58,7 +59,8 @@ def load(network: Network, trajectories: Sequence[Trajectory], records: Iterable
 @dataclass(frozen=True, kw_only=True)
 class Deeds:
     """What a controller did. held: share of its perimeter commands, one per boundary, direction and interval, that were
-    below the upper bound by more than HARDLY of the range; guided: vehicles per trip that it gave a next region."""
+    below the upper bound by more than NEARLY_OPEN of the range; guided: vehicles per trip that it gave a next region.
+    """
 
     held: float
     guided: float
@@ -72,7 +74,7 @@ class Deeds:
 
 def deeds(network: Network, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> Deeds:
     """What a controller did in some runs."""
-    limit = network.u_max - HARDLY * (network.u_max - network.u_min)
+    limit = network.u_max - NEARLY_OPEN * (network.u_max - network.u_min)
     held = [(t.perimeter[:, network.adjacency] < limit).mean() for t in trajectories]
     guided, trips = 0.0, 0.0
     for record in records:
