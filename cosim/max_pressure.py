@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 
 from cosim.actuate import yellow_time
 from cosim.rationing import NEVER, Ration
-from cosim.regions import City
+from cosim.regions import City, gateway_movements
 from cosim.signals import GREEN, Link, Signal, is_stage
 from cosim.sumo import Phase, Session
 
@@ -39,10 +39,7 @@ class MaxPressure:
         roads = Roads(city, [*signals, *others], flows)
         self._lanes, self._weights, self._movements = roads.lanes, roads.weights, roads.movements
         self._gain, self._begins = roads.stages(signals)
-        pairs: dict[str, dict[int, tuple[int, int]]] = {}
-        for gateway in city.gateways:
-            for link in gateway.links if gateway.signal is not None else ():
-                pairs.setdefault(gateway.signal, {})[link] = (gateway.source, gateway.target)
+        pairs = gateway_movements(city)
         self._junctions = [Junction(signal, session.time, pairs.get(signal.id)) for signal in signals]
         self._next = session.time
         for junction in self._junctions:

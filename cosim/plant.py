@@ -20,7 +20,7 @@ from cosim.max_pressure import MaxPressure
 from cosim.measure import Meter
 from cosim.originals import MESOSCOPIC, Originals, check_edges, read_originals, read_routes, write_originals
 from cosim.record import Record
-from cosim.regions import City, Gateway, check_adjacency, gateway_room_taken, load_city
+from cosim.regions import City, Gateway, check_adjacency, gateway_movements, gateway_room_taken, load_city
 from cosim.signals import Signal, read_signals, write_programmes
 from cosim.strategy import ACTUATED, FIXED, MAX_PRESSURE, WEBSTER
 from cosim.sumo import Session, Window
@@ -282,13 +282,8 @@ class SumoPlant:
         return [path]
 
     def _gateway_signals(self) -> dict[str, GatewaySignal]:
-        movements: dict[str, dict[int, tuple[int, int]]] = {}
-        for gateway in self.city.gateways:
-            if gateway.signal is not None and gateway.signal not in self._rationed:
-                for link in gateway.links:
-                    movements.setdefault(gateway.signal, {})[link] = (gateway.source, gateway.target)
-        signals = {}
-        for signal in sorted(movements):
+        movements, signals = gateway_movements(self.city), {}
+        for signal in sorted(movements.keys() - self._rationed.keys()):
             if signal in self._settings.leave_signals:
                 continue
             programme = self._session.programme(signal)

@@ -264,6 +264,16 @@ def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gate
         for key, members in sorted(movements.items()))
 
 
+def gateway_movements(city: City) -> dict[str, dict[int, tuple[int, int]]]:
+    """Signal -> link index -> (i, h), of the links that lead over a boundary."""
+    movements: dict[str, dict[int, tuple[int, int]]] = {}
+    for gateway in city.gateways:
+        if gateway.signal is not None:
+            movements.setdefault(gateway.signal, {}).update(
+                dict.fromkeys(gateway.links, (gateway.source, gateway.target)))
+    return movements
+
+
 def edge_room(city: City) -> np.ndarray:
     """(E,) [veh]: how many stand on each edge at JAM_SPACING."""
     return np.array([max(city.lanes[edge] * city.length[edge] / JAM_SPACING, 1.0) for edge in city.edges])

@@ -1,9 +1,9 @@
 """cosim evaluate: order, what is kept and what is run again, failures, and one small evaluation in SUMO."""
 
 import re
-import shutil
 from pathlib import Path
 
+import copies
 import numpy as np
 import pandas as pd
 import pytest
@@ -33,10 +33,7 @@ def cosim(*arguments):
 @pytest.fixture
 def city(tmp_path):
     """A copy of grid7 and its scenario, which a test may change; the folder of the scenario."""
-    shutil.copytree(ROOT / "networks" / "grid7", tmp_path / "networks" / "grid7")
-    shutil.copytree(ROOT / "scenarios" / "grid7_peak", tmp_path / "scenarios" / "peak",
-                    ignore=shutil.ignore_patterns("reference"))
-    return tmp_path / "scenarios" / "peak"
+    return copies.peak(tmp_path)
 
 
 @pytest.fixture

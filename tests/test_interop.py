@@ -1,10 +1,10 @@
 """SUMO's own outputs and Parquet files beside ours: there, complete, and in agreement."""
 
 import gzip
-import shutil
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import copies
 import pandas as pd
 import pytest
 import tiny
@@ -19,11 +19,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def peak(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("city")
-    shutil.copytree(ROOT / "networks" / "grid7", folder / "networks" / "grid7")
-    shutil.copytree(ROOT / "scenarios" / "grid7_peak", folder / "scenarios" / "peak",
-                    ignore=shutil.ignore_patterns("reference"))
-    return folder / "scenarios" / "peak"
+    return copies.peak(tmp_path_factory.mktemp("city"))
 
 
 def cosim_run(*arguments):

@@ -1,9 +1,9 @@
 """Environments for reinforcement learning: the libraries' own checks, and agreement with the closed loop."""
 
-import shutil
 import warnings
 from pathlib import Path
 
+import copies
 import numpy as np
 import pytest
 import tiny
@@ -32,11 +32,7 @@ def hexagon():
 
 @pytest.fixture(scope="module")
 def peak(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("city")
-    shutil.copytree(ROOT / "networks" / "grid7", folder / "networks" / "grid7")
-    shutil.copytree(ROOT / "scenarios" / "grid7_peak", folder / "scenarios" / "peak",
-                    ignore=shutil.ignore_patterns("reference"))
-    return folder / "scenarios" / "peak"
+    return copies.peak(tmp_path_factory.mktemp("city"))
 
 
 def gymnasium_check(env):

@@ -8,6 +8,7 @@ import threading
 import time
 from pathlib import Path
 
+import copies
 import numpy as np
 import pandas as pd
 import pytest
@@ -25,13 +26,10 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def peak(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("city")
-    shutil.copytree(ROOT / "networks" / "grid7", folder / "networks" / "grid7")
-    shutil.copytree(ROOT / "scenarios" / "grid7_peak", folder / "scenarios" / "peak",
-                    ignore=shutil.ignore_patterns("reference"))
-    file = folder / "scenarios" / "peak" / "scenario.toml"
+    folder = copies.peak(tmp_path_factory.mktemp("city"))
+    file = folder / "scenario.toml"
     file.write_text(re.sub(r"ramp_up = [\d.]+", "ramp_up = 90.0", file.read_text()))
-    return folder / "scenarios" / "peak"
+    return folder
 
 
 def sweep(*arguments):

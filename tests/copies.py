@@ -1,0 +1,14 @@
+"""Copies of the committed cities, which a test may change."""
+
+import shutil
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def peak(folder: Path) -> Path:
+    """The scenario grid7_peak in `folder`, with its network and without the reference results."""
+    shutil.copytree(ROOT / "networks" / "grid7", folder / "networks" / "grid7")
+    shutil.copytree(ROOT / "scenarios" / "grid7_peak", folder / "scenarios" / "peak",
+                    ignore=shutil.ignore_patterns("reference"))
+    return folder / "scenarios" / "peak"
