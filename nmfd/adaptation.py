@@ -20,6 +20,7 @@ from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.scenario import Scenario
+from nmfd.text_table import aligned
 from nmfd.workers import Failure, ended
 
 RAIN = 0.8      # of the outflow at every accumulation
@@ -139,8 +140,4 @@ def table(rows: Sequence[Mapping]) -> str:
                 f"{statistics.fmean(r['final_accumulation_veh'] for r in group):,.0f}",
                 f"{statistics.fmean(r['control_step_ms_median'] for r in group):.3g} / "
                 f"{max(r['control_step_ms_max'] for r in group):.3g}"])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join([
-        *("  ".join([*(cell.ljust(w) for cell, w in zip(line[:2], widths, strict=False)),
-                     *(cell.rjust(w) for cell, w in zip(line[2:], widths[2:], strict=True))]) for line in lines),
-        CAPTION])
+    return "\n".join([*aligned(lines, left=(0, 1)), CAPTION])

@@ -13,6 +13,7 @@ from nmfd import closed_loop, faults, runs
 from nmfd.controllers import registry
 from nmfd.plant import AcyclicPlant, NmfdPlant
 from nmfd.scenario import Scenario
+from nmfd.text_table import aligned
 from nmfd.types import Plant, Trajectory
 from nmfd.workers import Failure, attempt, ended, outcomes
 
@@ -202,11 +203,7 @@ def table(rows: Sequence[Mapping]) -> str:
             f"{mean('completed_veh'):,.0f}", f"{mean('evaluation_time_s'):.3g}",
             f"{mean('control_step_ms_median'):.3g} / {max(row['control_step_ms_max'] for row in group):.3g}",
             str(sum(row["solver_failures"] for row in group))])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    text = [
-        "  ".join([line[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(line[1:], widths[1:], strict=True))])
-        for line in lines]
-    return "\n".join([*text, CAPTION, *[BOUND_CAPTION] * with_bound])
+    return "\n".join([*aligned(lines), CAPTION, *[BOUND_CAPTION] * with_bound])
 
 
 def _percent(values: Sequence[float], reference: Sequence[float]) -> str:

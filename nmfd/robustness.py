@@ -18,6 +18,7 @@ from nmfd.controllers import registry
 from nmfd.demand_noise import perturbed
 from nmfd.metrics import summary
 from nmfd.scenario import Scenario
+from nmfd.text_table import aligned
 from nmfd.workers import Failure, ended
 
 COLUMNS = {
@@ -148,8 +149,4 @@ def table(rows: Sequence[Mapping]) -> str:
     for name in compared(rows):
         gains = improvements(rows, name)
         lines.append([name, *("{:.1f} ± {:.1f}".format(*gains[s]) if s in gains else "-" for s in count)])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    text = [
-        "  ".join([line[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(line[1:], widths[1:], strict=True))])
-        for line in lines]
-    return "\n".join([*text, CAPTION])
+    return "\n".join([*aligned(lines), CAPTION])

@@ -22,6 +22,7 @@ from nmfd.errors import InputError
 from nmfd.mfd import Mfd
 from nmfd.network import Network
 from nmfd.scenario import Scenario
+from nmfd.text_table import aligned
 from nmfd.types import Controller, Measurement
 from nmfd.workers import Failure, outcomes
 
@@ -236,7 +237,4 @@ def table(rows: Sequence[Mapping]) -> str:
             f"{row['first_decision_s']:.3g}",
             f"{1e3 * row['median_decision_s']:.3g} / {1e3 * row['longest_decision_s']:.3g}",
             f"{row['peak_memory_mib']:.0f}", str(row["unsolved_decisions"]), row["status"]])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    text = ["  ".join(cell.ljust(w) if n < 3 or n == 9 else cell.rjust(w)
-                      for n, (cell, w) in enumerate(zip(line, widths, strict=True))).rstrip() for line in lines]
-    return "\n".join([*text, CAPTION])
+    return "\n".join([*aligned(lines, left=(0, 1, 2, 9)), CAPTION])
