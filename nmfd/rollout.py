@@ -60,19 +60,20 @@ class Rollout:
             demand = demand * (levels[0] + (levels[1] - levels[0]) * uniform(batch, 1, 1))
         return x * (rollout < share * batch)[:, None, None], demand
 
-    def draw_model(self, batch: int, spread: float, generator) -> None:
+    def draw_model(self, batch: int, spread: float, generator, scale: float = 1.0) -> None:
         """From now on every one of `batch` rollouts has a regional model of its own, around the nominal one.
 
         spread: standard deviation of the logarithm of every region's accumulation axis (jam and critical accumulation,
-        storage), and half of it of its outflow and of the capacities [-]; 0 for the nominal model
+        storage), and half of it of its outflow and of the capacities [-]
+        scale: of all accumulation axes besides [-]; spread 0 and scale 1 give the nominal model
         """
         p, regions = self._nominal, len(self.jam)
-        if spread:
+        if spread or scale != 1.0:
             def factor(*shape, share=1.0):
                 normal = torch.randn(batch, *shape, generator=generator, dtype=self.dtype).to(self.device)
                 return torch.exp(share * spread * normal.clamp(-2.0, 2.0))
 
-            wide, high = factor(regions), factor(regions, share=0.5)
+            wide, high = scale * factor(regions), factor(regions, share=0.5)
             # The integration step stays short enough: no rate rises above the largest that the network was checked for.
             high = high.clamp(max=1.0 / (self._fastest() * self.scenario.step / self.scenario.substeps))
             p = replace(

@@ -16,6 +16,7 @@ import torch
 from nmfd import toml
 from nmfd.controllers import guarded
 from nmfd.controllers.dpc import ACTIVATIONS, DEEPEST, WIDEST, Architecture, Policy, checkpoint
+from nmfd.controllers.gating import PiGating
 from nmfd.errors import InputError
 from nmfd.network import Network
 from nmfd.rollout import Rollout, compiled_step
@@ -27,6 +28,9 @@ VALIDATE_EVERY = 20  # Adam steps
 MOST_STEPS = 10**7
 ROBUST_NOISE = 3.0     # veh/s, of the policies whose name ends in -robust
 WORTH_COMPILING = 200  # Adam steps
+# Of the first policy from a gate: Adam steps, states in each, learning rate; width of the gate and the fullest region,
+# as a share of the set point; share of u where there is no gate.
+GATE_STEPS, GATE_BATCH, GATE_RATE, GATE_WIDTH, GATE_FULLEST, OPENED = 1000, 256, 2e-3, 0.05, 2.5, 0.95
 WEAK, OPEN, RARE = 0.1, 3.0, 1e-3  # of the first policy from no control: factor of weights, logit of u, least theta
 VALIDATIONS = 16       # perturbed scenarios in a validation, if training perturbs the demand
 NAMES = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
@@ -48,7 +52,11 @@ class Training:
         rollout has its own sigma, evenly between 0 and `noise` (demand_noise.WHERE, "pairs")
     detour_cost: what a vehicle loses that is guided off the drivers' own split ratios, in the objective [s]
     mfd_spread: of the regional model that every rollout has for itself (Rollout.draw_model) [-]
+    mfd_scale: of the accumulation axes of these models besides [-]; below 1 for a city that may lock, by chance, before
+        its mean outflow falls
     from_no_control: the first policy is nearly no control, so that what training finds no reason to change stays open
+    from_gating: the first policy is nearly a gate on the protected regions, which holds them at the set point of
+        pi-gating: where the regional model locks whatever small changes do, descent finds no way to a gate by itself
     noise_all: the same of the noise on every pair of regions ("all"), in every other rollout, instead of `noise`
     """
 
@@ -66,8 +74,10 @@ class Training:
     noise: float = 0.0
     noise_all: float = 0.0
     mfd_spread: float = 0.0
+    mfd_scale: float = 1.0
     detour_cost: float = 0.0
     from_no_control: bool = False
+    from_gating: bool = False
 
     @property
     def levels(self) -> tuple[float, float]:
@@ -106,9 +116,13 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         noise=table.number("noise", default.noise, low=0.0, high=1e6),
         noise_all=table.number("noise_all", default.noise_all, low=0.0, high=1e6),
         mfd_spread=table.number("mfd_spread", default.mfd_spread, low=0.0, high=1.0),
+        mfd_scale=table.number("mfd_scale", default.mfd_scale, low=0.1, high=1.0),
         detour_cost=table.number("detour_cost", default.detour_cost, low=0.0, high=1e6),
-        from_no_control=table.flag("from_no_control", default.from_no_control))
+        from_no_control=table.flag("from_no_control", default.from_no_control),
+        from_gating=table.flag("from_gating", default.from_gating))
     table.close()
+    if chosen.from_gating and not scenario.protected:
+        raise table.error("from_gating", "expected a scenario with protected regions; name them, or leave it out")
     return chosen if steps is None else Training(**{**asdict(chosen), "steps": steps})
 
 
@@ -146,6 +160,8 @@ def train(
         begin_as_no_control(policy, scenario.network)
     policy = policy.to(device)
     rollout = Rollout(scenario, device=device, detour_cost=chosen.detour_cost)
+    if chosen.from_gating and not resume:
+        begin_as_gate(policy, rollout, generator)
     advance = compiled_step(rollout.step) if compiled else rollout.step
     optimizer = torch.optim.Adam(policy.parameters(), lr=chosen.learning_rate)
     first, best, history = 0, float("inf"), []
@@ -158,7 +174,7 @@ def train(
             for group in optimizer.param_groups:
                 cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
                 group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
-            rollout.draw_model(chosen.batch, chosen.mfd_spread, generator)
+            rollout.draw_model(chosen.batch, chosen.mfd_spread, generator, chosen.mfd_scale)
             x, demand = rollout.random_start(
                 chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
             demand = rollout.perturb(
@@ -206,6 +222,25 @@ def begin_as_no_control(policy: Policy, network: Network) -> None:
             policy.splits_decoder.bias.copy_(own.clamp(min=RARE).log().flatten())
 
 
+def begin_as_gate(policy: Policy, rollout: Rollout, generator: torch.Generator) -> None:
+    """Let `policy` close the entries of every protected region as this fills, half at the set point of pi-gating."""
+    network, protected = rollout.scenario.network, list(rollout.scenario.protected)
+    set_point = torch.tensor(PiGating(rollout.scenario).set_point, dtype=rollout.dtype, device=rollout.device)
+    counts = rollout.parameters.adjacency.expand(GATE_BATCH, -1, -1)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=GATE_RATE)
+    for _ in range(GATE_STEPS):
+        x, _ = rollout.random_start(GATE_BATCH, 0.0, 1.0, generator)
+        full = torch.rand(GATE_BATCH, len(protected), generator=generator).to(x) * GATE_FULLEST * set_point
+        x[:, protected] *= (full / x[:, protected].sum(-1).clamp(min=1.0)).unsqueeze(-1)
+        wanted = torch.full_like(x, OPENED)
+        wanted[:, :, protected] = torch.sigmoid((set_point - full) / (GATE_WIDTH * set_point)).unsqueeze(1)
+        share = (policy(x)[0] - network.u_min) / (network.u_max - network.u_min)
+        loss = torch.nn.functional.binary_cross_entropy(share.clamp(0.0, 1.0), wanted, weight=counts)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+
 def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> float:
     """TTS of the scenario itself from its own start, the geometric mean of two noise draws [veh s].
 
@@ -214,7 +249,7 @@ def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> f
     generator = torch.Generator().manual_seed(seed)
     perturbed = chosen.noise or chosen.noise_all or chosen.mfd_spread or chosen.demand_low < chosen.demand_high
     count = 2 + (VALIDATIONS if perturbed else 0)
-    rollout.draw_model(count, chosen.mfd_spread, generator)
+    rollout.draw_model(count, chosen.mfd_spread, generator, chosen.mfd_scale)
     level = torch.linspace(0.0, 1.0, count // 2).repeat_interleave(2)  # in twos: one of each kind of noise
     nominal = rollout.demand.unsqueeze(1).expand(-1, count, -1, -1)
     demand = rollout.perturb(nominal, level, chosen.noise, chosen.noise_all, generator)
@@ -230,7 +265,7 @@ def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> f
 def visited(policy: Policy, rollout: Rollout, chosen: Training, seed: int) -> np.ndarray:
     """States (N, R*R) [-], as a share of the policy's scale, that `policy` sees in rollouts like those in training."""
     generator = torch.Generator().manual_seed(seed)
-    rollout.draw_model(4 * chosen.batch, chosen.mfd_spread, generator)
+    rollout.draw_model(4 * chosen.batch, chosen.mfd_spread, generator, chosen.mfd_scale)
     x, demand = rollout.random_start(
         4 * chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
     demand = rollout.perturb(

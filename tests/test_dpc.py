@@ -11,6 +11,7 @@ import torch
 from nmfd import dynamics, training
 from nmfd.controllers import dpc
 from nmfd.controllers.dpc import Architecture, DpcController, Policy, SoftExponential
+from nmfd.controllers.gating import PiGating
 from nmfd.errors import InputError
 from nmfd.network import load_network
 from nmfd.scenario import load_scenario
@@ -294,6 +295,35 @@ def test_every_rollout_has_a_model_of_its_own(scenario):
     torch.testing.assert_close(dynamics.rate(p, x) / p.c, scale.expand(4000, -1), rtol=1e-4, atol=0.0)
     rollout.draw_model(4000, 0.0, torch.Generator().manual_seed(0))
     assert rollout.parameters is nominal
+    rollout.draw_model(3, 0.0, torch.Generator().manual_seed(0), scale=0.75)
+    torch.testing.assert_close(rollout.parameters.jam, 0.75 * nominal.jam.expand(3, -1))
+    shorter = dynamics.rate(rollout.parameters, 0.75 * x[:3])
+    torch.testing.assert_close(shorter, dynamics.rate(nominal, x[:3]))
+
+
+def test_a_policy_begins_as_a_gate(scenario):
+    """Entries of the protected region close as it fills, about the set point of pi-gating; the others stay open."""
+    rollout, generator, network = training.Rollout(scenario), torch.Generator().manual_seed(0), scenario.network
+    torch.manual_seed(0)
+    made = Policy(network, Architecture(width=32, guidance=False))
+    training.begin_as_gate(made, rollout, generator)
+    x, _ = rollout.random_start(50, 0.0, 1.0, generator)
+    x = torch.where(x[:, 1:].sum((1, 2), keepdim=True) > 1.0, x, torch.full_like(x, 50.0))
+    shares = []
+    for full in (0.7, 1.0, 1.4):
+        filled = x.clone()
+        filled[:, 1] *= (full * PiGating(scenario).set_point[0] / x[:, 1].sum(-1)).unsqueeze(-1)
+        with torch.no_grad():
+            shares.append((made(filled)[0] - network.u_min) / (network.u_max - network.u_min))
+    assert shares[0][:, 0, 1].min() > 0.8 and shares[2][:, 0, 1].max() < 0.2
+    assert 0.3 < shares[1][:, 0, 1].mean() < 0.7
+    assert min(share[:, 1, 0].min() for share in shares) > 0.8
+
+
+def test_a_gate_needs_a_protected_region(scenario):
+    open_city = replace(scenario, protected=(), controller_options={"dpc-pc": {"from_gating": True}})
+    with pytest.raises(InputError, match="controllers.dpc-pc.from_gating: expected a scenario with protected regions"):
+        training.settings(open_city, "dpc-pc")
 
 
 def test_detours_cost_what_they_divert(scenario):
