@@ -95,6 +95,7 @@ def fit(
     region. The curve of every region falls in q and stays positive up to its jam accumulation, beyond which the outflow
     is constant, and step * q * exit rate <= 1 for the integration step: the result is always a valid network.
     """
+    torch.set_num_threads(1)  # the matrices are small: more threads only wait for one another, and sum in another order
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     model = _Model(network, runs, step, substeps / step)
