@@ -16,7 +16,7 @@ from cosim.plant import own_vehicles
 from cosim.regions import check_adjacency, load_city
 from cosim.signals import read_signals
 from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
-from cosim.strategy import configured, parse
+from cosim.strategy import MAX_PRESSURE, configured, parse
 from cosim.sumo_settings import Settings, settings
 from cosim.xml_files import read_xml
 from nmfd import faults, runs
@@ -151,9 +151,10 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
     files = ensure_built(scenario.network)
     city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
     check_adjacency(city, scenario.network)
-    read_signals(city)
+    simple, _ = read_signals(city)
     own_vehicles(scenario, chosen, city)
-    incidents.check(faults.of(scenario), city, "faults")
+    everywhere = MAX_PRESSURE in {parse(name).overrides.get("signals", chosen.signals) for name in controllers}
+    incidents.check(faults.of(scenario), city, "faults", [signal.id for signal in simple] if everywhere else ())
     for name in (*chosen.background, *chosen.additional):
         read_xml(scenario.folder / name)
     configuration = {

@@ -134,17 +134,19 @@ class SumoPlant:
         self._guide = Guide(
             self._session, self.city, scenario.network.nominal_splits, compliance=chosen.compliance,
             most_detour=chosen.most_detour, random=np.random.default_rng([seed, 0x67756964]))
+        self._incidents = Incidents(faults.of(scenario), self._session, self.city)
         self._max_pressure, self._rationed = None, {}
         if chosen.signals == MAX_PRESSURE:
             flows = self._own_flows()
             if flows is None:
                 flows = turning_flows(self.city, scenario.demand, scenario.step)
             others = [signal for signal in self.simple_signals if signal not in steered]
-            self._max_pressure = MaxPressure(self._session, self.city, steered, flows, others=others)
+            self._max_pressure = MaxPressure(
+                self._session, self.city, steered, flows, others=others, min_green=chosen.min_green,
+                show=self._incidents.show)
             self._rationed = {signal.id: signal for signal in steered if signal.id in self._gateway_ids}
         self._signals = self._gateway_signals()
         self._original_green = self._programmed_green()
-        self._incidents = Incidents(faults.of(scenario), self._session, self.city)
         self._actuator = Actuator(list(self._signals.values()), self._incidents.show)
         self._speed: np.ndarray | None = None
         self._k, self._rows, self._opened = 0, [], {}
@@ -170,6 +172,7 @@ class SumoPlant:
             self._actuator.play(session.time)
             if self._max_pressure is not None:
                 self._max_pressure.play(session.time)
+            self._incidents.play(session.time)
             session.step()
             self._guide.apply(meter.observe())
             if self._detectors and n % often == often - 1:
@@ -201,7 +204,7 @@ class SumoPlant:
             queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))
         row["gateway_original_green"] = self._original_green
         for n, gateway in enumerate(self.city.gateways):
-            if self._incidents.refused(gateway.signal):
+            if gateway.signal in self._incidents.refused:
                 row["gateway_green"][n] = self._original_green[n]
         self._rows.append(row)
         return measurement

@@ -215,11 +215,14 @@ class Session:
         return True
 
     # Incidents.
-    def restart_programme(self, signal: str) -> None:
-        """Let a signal run the programme again that it had in the beginning."""
-        lights = self._sumo.trafficlight
-        own = next(logic.programID for logic in lights.getAllProgramLogics(signal) if logic.programID != "online")
-        lights.setProgram(signal, own)
+
+    def programme_id(self, signal: str) -> str:
+        """Of the programme that runs on `signal` now."""
+        return self._sumo.trafficlight.getProgram(signal)
+
+    def restart_programme(self, signal: str, programme: str) -> None:
+        """Let a signal run one of its own programmes again."""
+        self._sumo.trafficlight.setProgram(signal, programme)
 
     def limit_speed(self, edge: str, limits: list[float]) -> list[float]:
         """Set the speed limits [m/s] of the lanes of an edge, one for each or one for all; those before."""

@@ -2,6 +2,7 @@
 
 import errno
 import gzip
+import itertools
 import os
 import re
 import resource
@@ -18,6 +19,7 @@ from click.testing import CliRunner
 
 import cosim.cli
 import nmfd.cli
+from cosim.actuate import YELLOW
 from cosim.city import ensure_built
 from cosim.plant import SumoPlant
 from cosim.regions import load_city
@@ -247,13 +249,15 @@ def city(tmp_path_factory):
     return load_scenario(folder / "scenarios" / "tiny")
 
 
-def in_sumo(city, *ordered, perimeter=None, **changed):
-    """The measurements and the record of a run with these faults."""
+def in_sumo(city, *ordered, perimeter=None, watch=None, **changed):
+    """The measurements and the record of a run with these faults; watch(plant) is called when it begins."""
     scenario = replace(city, faults=ordered)
     plant = SumoPlant(scenario, overrides=replace(settings(scenario), **changed))
     opened = np.where(city.network.adjacency, city.network.u_max if perimeter is None else perimeter, 0.0)
     try:
         measurements = [plant.reset(0)]
+        if watch:
+            watch(plant)
         for _ in range(STEPS):
             measurements.append(plant.step(Controls(perimeter=opened, splits=None)))
         return measurements, plant.record()
@@ -290,6 +294,36 @@ def test_a_signal_that_takes_no_programme(city):
     own = [n for n, gateway in enumerate(gateways) if gateway.signal == signal]
     assert own and (record.gateway_green[3:6, own] == record.gateway_original_green[3:6, own]).all()
     assert (free.gateway_green[3:6, own] < free.gateway_original_green[3:6, own]).any()
+
+
+@pytest.mark.parametrize("signals, gateway", [("fixed", True), ("max-pressure", True), ("max-pressure", False)])
+def test_a_deaf_signal_runs_its_own_programme(city, signals, gateway):
+    """Under max-pressure too, rationed or not: second by second its own, with yellow before and after."""
+    plant = SumoPlant(replace(city, faults=()))
+    gateways = {gateway.signal for gateway in loaded(city).gateways}
+    name = next(found.id for found in plant.simple_signals if (found.id in gateways) == gateway)
+    plant.reset(0)
+    own = [phase.state for phase in plant.session.programme(name).phases
+           for _ in range(round(phase.duration))]
+    plant.close()
+    shown = []
+
+    def watch(plant):
+        step = plant.session.step
+        plant.session.step = lambda: (step(), shown.append(plant.session.signal_state(name)))
+
+    measurements, _ = in_sumo(
+        city, f"signal:{name}@3-6", perimeter=city.network.u_min, watch=watch, signals=signals)
+    problems = [m.problem for m in measurements[1:]]
+    assert problems == [f"signal {name} took no programme" if 3 <= k < 6 else "" for k in range(STEPS)]
+    interval = round(city.step)
+    begin, end = 3 * interval + round(YELLOW), 6 * interval
+    cycles = [[own[(n + k) % len(own)] for k in range(end - begin)] for n in range(len(own))]
+    assert shown[begin:end] in cycles
+    assert shown[begin - interval : end - interval] not in cycles and shown[-len(own) :] not in [
+        cycle[: len(own)] for cycle in cycles]
+    for before, after in itertools.pairwise(shown):
+        assert not any(a in "Gg" and b == "r" for a, b in zip(before, after, strict=True)), (before, after)
 
 
 def test_silent_loop_detectors(city):
