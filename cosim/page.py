@@ -1,7 +1,6 @@
 """The report: one HTML file with everything in it, from the finished runs of one or several folders."""
 
 import json
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from cosim.finished import Finished, Level
 from cosim.markup import cell, fold, items, page, picture, table, tag, text, typeset
 from nmfd import runs
 from nmfd.benchmarks import REFERENCE
+from nmfd.scratch import Scratch
 
 WORDS = (
     "Total time spent (TTS) adds up the time of all vehicles on the road and of those that wait to enter: less is "
@@ -76,8 +76,7 @@ def _run(run: Finished, anchor: str, levels: Sequence[str]) -> str:
         run.scenario.name, configuration["steps"], configuration["step_s"], len(run.levels), rows)
     lead = [text("p", typeset(sentence)) for sentence in (
         first, *(_at(run, level) + story.head(level.rows) for level in run.levels))]
-    with tempfile.TemporaryDirectory(prefix="cosim-report-") as scratch:
-        folder = Path(scratch)
+    with Scratch("cosim-") as folder:
         if run.city is not None:
             report.region_map(folder / "regions.png", run.scenario, run.city)
         if len(run.levels) > 1:
@@ -106,8 +105,7 @@ def _level(run: Finished, level: Level, reference: str | None) -> str:
         fold("Every strategy against every other, paired by seed", _numbers(
             "pairs", tables.pairs(rows).drop(columns="demand"))),
         fold("Every run", _numbers("runs", rows))]
-    with tempfile.TemporaryDirectory(prefix="cosim-report-") as scratch:
-        folder = Path(scratch)
+    with Scratch("cosim-") as folder:
         report.draw(level.folder, run.scenario, run.city, rows, folder)
         report.draw_more(folder, run.scenario, level.folder, rows)
         missing = []

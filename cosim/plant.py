@@ -1,6 +1,5 @@
 """The SUMO city as a plant: the same protocol as the regional plants, the same controllers."""
 
-import tempfile
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -31,6 +30,7 @@ from nmfd import faults
 from nmfd.errors import InputError
 from nmfd.estimation import Estimator
 from nmfd.scenario import Scenario
+from nmfd.scratch import Scratch
 from nmfd.types import Controls, Measurement
 
 SAMPLE_EVERY = 10.0  # s, between two samples of the production and of the queues
@@ -87,14 +87,14 @@ class SumoPlant:
                 f"{files.net_file}: sumo.signals: {self._settings.signals} needs fixed-time signals with several green "
                 f"phases, but none of the {len(self.other_signals)} signals here is one; choose fixed")
         self._gateway_ids = {gateway.signal for gateway in self.city.gateways if gateway.signal is not None}
-        self._folder = tempfile.TemporaryDirectory(prefix="cosim-")
+        self._folder = Scratch("cosim-")
         self._session: Session | None = None
 
     def reset(self, seed: int) -> Measurement:
         """Trips, drivers and reroutes all follow from `seed`."""
         self._end_session()
         scenario, chosen = self._scenario, self._settings
-        routes = Path(self._folder.name) / "trips.rou.xml"
+        routes = self._folder.path / "trips.rou.xml"
         self._vehicles, files = self._write_vehicles(routes, seed), [routes]
         self._trip_file = self._outputs.get("tripinfo", routes.with_name("tripinfo.xml"))
         steered = [s for s in self.simple_signals if not (
@@ -112,7 +112,7 @@ class SumoPlant:
             additional = self._additional() + additional
         estimating = chosen.measurement == ESTIMATE
         if estimating:
-            loops = Path(self._folder.name) / "loops.add.xml"
+            loops = self._folder.path / "loops.add.xml"
             write_loops(self.city, self._layout, scenario.step, loops)
             additional.append(loops)
         additional += self._window.additional if self._window else ()
@@ -214,7 +214,7 @@ class SumoPlant:
 
     def close(self) -> None:
         self._end_session()
-        self._folder.cleanup()
+        self._folder.close()
 
     def record(self) -> Record:
         """Of all control intervals since the reset."""
@@ -278,7 +278,7 @@ class SumoPlant:
                 self.city, self.simple_signals, self._scenario.demand, self._scenario.step,
                 folder=self._scenario.network.folder / "build", flows=self._own_flows())
         elif self._settings.signals == ACTUATED:
-            path = Path(self._folder.name) / "actuated.add.xml"
+            path = self._folder.path / "actuated.add.xml"
             write_programmes(path, [actuated_row(signal) for signal in signals])
         else:
             return []

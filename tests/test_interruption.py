@@ -1,12 +1,14 @@
 """kill -9 at any moment: what was finished stays, nothing half-written counts, and the same command goes on to the same
 bytes. Commands run in forked processes, which kill themselves beside a write, or are killed after a while."""
 
+import fcntl
 import json
 import os
 import random
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -20,9 +22,12 @@ from click.testing import CliRunner
 
 import cosim.cli
 import nmfd.cli
+from cosim.plant import SumoPlant
 from nmfd import runs, training, workers
 from nmfd.errors import InputError
 from nmfd.runs import LOCK, TEMPORARY
+from nmfd.scenario import load_scenario
+from nmfd.scratch import Scratch, sweep
 
 MAINS = {"nmfd": nmfd.cli.main, "cosim": cosim.cli.main}
 
@@ -308,3 +313,38 @@ def test_arrays_of_a_run_hold_no_times(tmp_path):
         good(call("nmfd", "benchmark", scenario, "--controllers", "mpc-pc", "--out", tmp_path / name))
     assert arrays(tmp_path / "a") == arrays(tmp_path / "b")
     assert np.isnan(runs.read_trajectory(tmp_path / "a" / "mpc-pc-0.npz").decision_time).all()
+
+
+def test_scratch_folders_of_killed_processes_go_at_the_next_start(tmp_path, monkeypatch, city):
+    """Those of living ones stay, and so does what is none."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (tmp_path / "cosim-mine").mkdir()
+    child = os.fork()
+    if child == 0:
+        plant = SumoPlant(load_scenario(city))
+        plant.reset(0)
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    [left] = [path for path in tmp_path.glob("cosim-*") if path.name != "cosim-mine"]
+    assert (left / "trips.rou.xml").is_file()
+    with Scratch("cosim-") as own:
+        assert not left.exists() and own.is_dir()
+        good(call("cosim", "run", city, "--controller", "no-control", "--steps", 2, "--out", tmp_path / "out"))
+        assert own.is_dir()
+    assert [path.name for path in tmp_path.glob("cosim-*")] == ["cosim-mine"]
+
+
+def test_what_is_made_while_others_look_for_old_folders_stays(tmp_path, monkeypatch):
+    """A folder that was taken for an old one before it was locked is made anew."""
+    flock = fcntl.flock
+
+    def swept_before(file, operation):
+        monkeypatch.setattr(fcntl, "flock", flock)
+        sweep(tmp_path, "x-")
+        flock(file, operation)
+
+    monkeypatch.setattr(fcntl, "flock", swept_before)
+    with Scratch("x-", where=tmp_path) as folder:
+        sweep(tmp_path, "x-")
+        assert list(tmp_path.iterdir()) == [folder]
+    assert not list(tmp_path.iterdir())
