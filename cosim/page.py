@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from cosim import report, story, tables
+from cosim import reasons, report, story, tables
 from cosim.finished import Finished, Level
 from cosim.markup import cell, fold, items, page, picture, table, tag, text, typeset
 from nmfd import runs
@@ -99,7 +99,7 @@ def _level(run: Finished, level: Level, reference: str | None) -> str:
     first, second = tables.shown(tables.statistics(rows, reference), reference)
     title = f"Demand times {level.demand:g}"
     parts = [
-        text("h3", title), items(story.details(rows)),
+        text("h3", title), items(story.details(rows)), *_why(run, level),
         _frame(f"What came of it, {title.lower()}", first),
         _frame(f"How, {title.lower()}", second), text("p", " ".join(tables.CAPTION.split()), class_="caption"),
         fold("Every strategy against every other, paired by seed", _numbers(
@@ -122,6 +122,12 @@ def _level(run: Finished, level: Level, reference: str | None) -> str:
     both = f" and, where two are compared, {REFERENCE} and {pair[0]}" if len(pair) and REFERENCE in names else ""
     parts.insert(2, text("p", f"Pictures of single runs show seed {report.shown_seed(rows)}{both}.", class_="note"))
     return tag("div", *parts)
+
+
+def _why(run: Finished, level: Level) -> list[str]:
+    """Why strategies gain or not, where there is one to tell of."""
+    city, lines = reasons.at(level.demand, level.folder, run.scenario.network, level.rows)
+    return [text("h4", "Why"), text("p", typeset(city)), items(lines)] if lines else []
 
 
 def _frame(label: str, frame: pd.DataFrame) -> str:

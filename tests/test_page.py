@@ -101,6 +101,16 @@ def test_names_and_reasons_are_escaped(content):
     assert "1 x <script>alert(1)</script>" in Page(content).words
 
 
+def test_why_a_strategy_gains_is_told(content, evaluation):
+    """The lines of evaluate.md, at every demand level."""
+    why = (evaluation / "evaluate.md").read_text().partition("## Why")[2]
+    lines = [line.removeprefix("- ") for line in why.splitlines() if line.startswith("- ")]
+    assert len(lines) == 2 * 2 and "Signals under control see" in why
+    words = Page(content).words
+    for line in [*lines, *(line for line in why.splitlines() if line.startswith("Signals under"))]:
+        assert markup.typeset(line) in words, line
+
+
 def test_every_number_of_the_tables_is_there(content, evaluation):
     read = Page(content)
     runs = pd.read_csv(evaluation / "runs.csv", keep_default_na=False, dtype=str)

@@ -61,10 +61,10 @@ def made_up(task) -> Result:
 
 def test_a_failed_run_is_a_row_and_is_tried_again(peak, tmp_path, ran):
     tasks, failing = ran
-    failing.add(("dpc-pc+compliance-50", 1))
+    failing.add(("probing-pcrg+compliance-50", 1))
     arguments = (
-        peak, "--controllers", "no-control,dpc-pc", "--seeds", 2, "--demand", "0.8,1.0", "--compliance", "50,100",
-        "--out", tmp_path / "out")
+        peak, "--controllers", "route-guidance,probing-pcrg", "--seeds", 2, "--demand", "0.8,1.0",
+        "--compliance", "50,100", "--out", tmp_path / "out")
     done = sweep(*arguments)
     assert done.exit_code == 0 and "2 of 16 runs failed" in done.stderr, done.output + str(done.exception)
     rows = pd.read_parquet(tmp_path / "out" / "sweep.parquet")
@@ -72,13 +72,13 @@ def test_a_failed_run_is_a_row_and_is_tried_again(peak, tmp_path, ran):
     assert len(rows) == 16 and not rows.duplicated(["controller", "seed", "demand", "compliance"]).any()
     bad = rows[rows["status"] == "failed"]
     assert set(bad["reason"]) == {"SUMO fell over"} and set(bad["demand"]) == {0.8, 1.0}
-    assert (bad[["controller", "seed", "compliance"]] == ["dpc-pc", 1, 0.5]).all(axis=None)
+    assert (bad[["controller", "seed", "compliance"]] == ["probing-pcrg", 1, 0.5]).all(axis=None)
     assert bad["total_time_spent_veh_s"].isna().all()
     good = rows[rows["status"] == "ok"]
     assert (good["total_time_spent_veh_s"] == 2 * 90.0 * 49).all() and (good["co2_kg"] == 1.0).all()
     tasks.clear(), failing.clear()
     assert sweep(*arguments).exit_code == 0
-    assert sorted(tasks) == [("dpc-pc+compliance-50", 1, 0.8), ("dpc-pc+compliance-50", 1, 1.0)]
+    assert sorted(tasks) == [("probing-pcrg+compliance-50", 1, 0.8), ("probing-pcrg+compliance-50", 1, 1.0)]
     assert (pd.read_parquet(tmp_path / "out" / "sweep.parquet")["status"] == "ok").all()
 
 
@@ -102,6 +102,22 @@ def test_more_is_added_and_an_interruption_keeps_what_is_there(peak, tmp_path, r
     assert rows["compliance"].tolist() == [1.0, 1.0]  # the scenario's
 
 
+def test_who_guides_nobody_is_run_once(peak, tmp_path, ran):
+    """Whatever share of the drivers would follow; of a controller of the user's own nobody knows."""
+    own = tmp_path / "mine.py"
+    own.write_text("class Mine:\n    def __init__(self, scenario):\n        pass\n")
+    names = ["no-control", "rerouting-30+webster", "pi-gating+max-pressure", "dpc-pc", "route-guidance", f"{own}:Mine"]
+    order = sweeps.Sweep(scenario=peak, controllers=tuple(names), seeds=[0], out=tmp_path, compliance=(0.0, 0.5))
+    assert list(order.strategies()) == [
+        *names[:4], "route-guidance+compliance-0", "route-guidance+compliance-50",
+        f"{own}:Mine+compliance-0", f"{own}:Mine+compliance-50"]
+    assert len(order.plan()) == 8
+    tasks, _ = ran
+    done = sweep(peak, "--controllers", "no-control", "--compliance", "0,50", "--out", tmp_path / "out")
+    assert done.exit_code == 0 and tasks == [("no-control", 0, 1.0)]
+    assert pd.read_parquet(tmp_path / "out" / "sweep.parquet")["compliance"].tolist() == [1.0]  # the scenario's
+
+
 def test_one_run_for_real(peak, tmp_path):
     done = sweep(peak, "--controllers", "actuated", "--steps", 2, "--workers", 1, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output + str(done.exception)
@@ -113,7 +129,7 @@ def test_one_run_for_real(peak, tmp_path):
     (("--controllers", "nobody"), "'nobody' is unknown"),
     (("--controllers", "no-control", "--compliance", "0.5"), "--compliance: expected whole percentages"),
     (("--controllers", "no-control", "--compliance", "5,05"), "names a percentage twice"),
-    (("--controllers", "dpc-pc+compliance-50", "--compliance", "0"), "exclude each other"),
+    (("--controllers", "dpc-pcrg+compliance-50", "--compliance", "0"), "exclude each other"),
     (("--controllers", "no-control", "--workers", "2", "--scheduler", "tcp://x:1"), "leave one away"),
 ])
 def test_mistakes(peak, tmp_path, arguments, expected):
