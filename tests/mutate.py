@@ -10,6 +10,7 @@ interrupted: what is in the log is not run again.
 import argparse
 import ast
 import copy
+import importlib
 import importlib.util
 import os
 import resource
@@ -30,6 +31,7 @@ OPERATORS = {
     ast.IsNot: ast.Is, ast.And: ast.Or, ast.Or: ast.And, ast.USub: ast.UAdd}
 NAMES = {"min": "max", "minimum": "maximum", "all": "any", "floor": "ceil"}
 NAMES |= {other: name for name, other in NAMES.items()}
+OPTIONS = ("-x", "-q", "-p", "no:cacheprovider", "-o", "addopts=", "-m", "not slow")
 SECONDS = 120  # of CPU, after which a mutant counts as noticed: it does not end
 
 
@@ -86,7 +88,7 @@ def noticed(name: str, tree: ast.Module, tests: list[str]) -> bool:
             module = sys.modules[name] = importlib.util.module_from_spec(spec)
             exec(compile(tree, spec.origin, "exec"), module.__dict__)
             setattr(sys.modules[name.rpartition(".")[0]], name.rpartition(".")[2], module)
-            code = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests]))
+            code = int(pytest.main([*OPTIONS, *tests]))
         os._exit(code)
     return os.waitpid(child, 0)[1] != 0
 
@@ -99,6 +101,8 @@ def main() -> None:
     order = parser.parse_args()
     sys.path[:0] = [str(HERE), str(HERE.parent)]
     torch.set_num_threads(1)
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+    importlib.import_module(order.module)  # with all that it needs; who needs it is imported in every child
     source = (HERE.parent / order.module.replace(".", "/")).with_suffix(".py").read_text()
     if noticed(order.module, ast.parse(source), order.tests):
         sys.exit("the tests fail without a mutant")

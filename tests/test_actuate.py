@@ -117,6 +117,28 @@ def test_a_green_that_is_cut_has_the_yellow_of_the_programme_and_no_more(share):
     assert [length for shown, length in runs(states, 0)[2:-1] if shown == "y"] == [3, 3, 3]
 
 
+@pytest.mark.parametrize("position", [0.0, 17.0])
+def test_a_link_that_is_never_red_is_held_once_per_cycle(position):
+    """Its window is the cycle; the one that had begun before the simulation is left whole."""
+    states = play(PHASES, {3: (0, 1)}, "hold-back", [np.full((2, 2), 0.4)] * 4, position=position)
+    first = round(90 - position) if position else 90
+    assert "".join(state[3] for state in states[first : first + 180]) == 2 * (39 * "g" + 3 * "y" + 48 * "r")
+    assert {state[3] for state in states[: round(90 - position)]} == {"g"}
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_before_any_command_the_original_programme_runs(mode):
+    signal = GatewaySignal(programme(SINGLE), {0: (0, 1)}, min_green=MIN_GREEN, mode=mode, start=0.0)
+    original = [state for state, duration in SINGLE for _ in range(duration)]
+    assert [signal.update(float(second)) for second in range(270)] == 3 * original
+
+
+def test_a_time_just_before_the_end_of_the_cycle_is_in_its_last_phase():
+    """Sums of simulation steps are off by some rounding."""
+    signal = GatewaySignal(programme(SINGLE), {0: (0, 1)}, min_green=MIN_GREEN, mode="hold-back", start=0.0)
+    assert signal.update(90.0 - 1e-7) == "ry" and signal.update(90.0) == "Gr"
+
+
 def test_hold_back_touches_the_gateway_only():
     held = play(PHASES, {0: (0, 1)}, "hold-back", [np.zeros((2, 2))] * 3)
     free = play(PHASES, {0: (0, 1)}, "hold-back", [np.ones((2, 2))] * 3)
