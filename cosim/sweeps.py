@@ -117,12 +117,17 @@ def _finished(out: Path) -> pd.DataFrame:
 
 
 def _failures(file: Path) -> dict[tuple[str, int, float], str]:
-    """Strategy, seed and demand level -> reason, of the runs that failed so far."""
+    """Strategy, seed and demand level -> reason, of the runs that failed so far. Raises InputError."""
     if not file.is_file():
         return {}
-    rows = pd.read_parquet(file)
-    rows = rows[rows["status"] == FAILED]
-    return {tuple(key): reason for *key, reason in rows[[*KEYS, "reason"]].itertuples(index=False, name=None)}
+    try:
+        rows = pd.read_parquet(file)
+        rows = rows[rows["status"] == FAILED]
+        return {tuple(key): reason for *key, reason in rows[[*KEYS, "reason"]].itertuples(index=False, name=None)}
+    except (OSError, ValueError, KeyError) as error:  # pyarrow's own errors are among them
+        raise InputError(
+            f"{file}: is no table of a sweep ({' '.join(str(error).split())[:200]}); delete it, the runs are kept in "
+            "the folders beside it") from None
 
 
 def _named(rows: pd.DataFrame, own: float) -> pd.DataFrame:

@@ -58,7 +58,7 @@ def atomic(path: Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except BaseException as error:
-        if isinstance(error, OSError) and error.filename is None:  # a full disk is met without a name
+        if isinstance(error, OSError) and error.filename in (None, str(temporary)):  # a full disk is met without a name
             error.filename = str(path)
         with suppress(OSError):
             temporary.unlink()

@@ -32,7 +32,7 @@ OPERATORS = {
 NAMES = {"min": "max", "minimum": "maximum", "all": "any", "floor": "ceil"}
 NAMES |= {other: name for name, other in NAMES.items()}
 OPTIONS = ("-x", "-q", "-p", "no:cacheprovider", "-o", "addopts=", "-m", "not slow")
-SECONDS = 120  # of CPU, after which a mutant counts as noticed: it does not end
+SECONDS = 20  # of CPU, after which a mutant counts as noticed: it does not end
 
 
 def changed(node: ast.AST) -> bool:

@@ -138,6 +138,15 @@ def test_mistakes(peak, tmp_path, arguments, expected):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("content", [b"", b"\0\xff" * 50, None])
+def test_a_damaged_table_is_one_line(peak, tmp_path, content):
+    file = tmp_path / "sweep.parquet"
+    pd.DataFrame({"a": [1]}).to_parquet(file) if content is None else file.write_bytes(content)
+    done = sweep(peak, "--controllers", "no-control", "--out", tmp_path)
+    assert done.exit_code == 2 and done.stderr.count("\n") == 1, done.stderr + repr(done.exception)
+    assert f"{file}: is no table of a sweep" in done.stderr and [p.name for p in tmp_path.iterdir()] == [file.name]
+
+
 def test_a_process_that_dies_is_a_failure(monkeypatch, tmp_path):
     monkeypatch.setattr(remote.sys, "executable", shutil.which("false"))
     task = Task(scenario=tmp_path, controller="no-control", seed=0)
