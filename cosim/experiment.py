@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cosim import estimates, incidents
+from cosim import estimates, incidents, sumo_output
 from cosim.city import ensure_built
 from cosim.plant import own_vehicles
 from cosim.regions import check_adjacency, load_city
@@ -42,7 +42,8 @@ def experiment(
 
     As `perform` does it; RunFailed at the end if runs failed.
     """
-    failures = perform([(out, task) for task in tasks], workers=workers, progress=progress, tell=tell)
+    zipped = any(kind == sumo_output.ZIPPED for task in tasks for kind, _ in task.sumo_output)
+    failures = perform([(out, task) for task in tasks], workers=workers, fresh=zipped, progress=progress, tell=tell)
     if (out / "summary.csv").is_file() and (kept := trajectories(out)):
         scenario = scenario_of(tasks[0])
         draw_accumulations(out, scenario, kept)

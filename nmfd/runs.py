@@ -359,6 +359,7 @@ def manifest(
                 yield
             finally:
                 if not results.exists() and first:
+                    sweep(path)  # what a process that died at work for this one has left
                     with suppress(OSError):
                         file.unlink()
     finally:

@@ -413,6 +413,20 @@ def test_a_full_disk(tmp_path):
     assert len(runs.read_summary(out / "summary.csv")) == 2
 
 
+@pytest.mark.parametrize("kind, less", [("tripinfo", 20), ("edgedata", 20), ("emission", 20), ("tripinfo", 10**9)])
+def test_a_disk_that_is_full_before_sumo_has_written_all(city, tmp_path, kind, less):
+    """SUMO says nothing of it, and its files are looked at; or it ends its process (emission). Once even what it reads
+    cannot be written."""
+    out = tmp_path / "out"
+    command = ("cosim", "run", city.folder, "--controller", "no-control", "--steps", 4, "--sumo-output", kind, "--out")
+    assert call(*command, tmp_path / "whole").exit_code == 0
+    [file] = (tmp_path / "whole").glob(f"*{kind}.xml*")
+    status, stderr = with_limit(max(file.stat().st_size - less, 100), *command, out)
+    assert status in (1, 2) and stderr.count("\n") == 1, stderr
+    assert any(words in stderr for words in ("is the disk full?", "its process died", os.strerror(errno.EFBIG))), stderr
+    assert not out.exists()
+
+
 def test_a_full_disk_before_the_first_run_leaves_nothing(tmp_path):
     folder, out = tiny.write(tmp_path), tmp_path / "out"
     status, stderr = with_limit(10, "nmfd", "benchmark", folder, "--controllers", "no-control", "--out", out)
