@@ -111,6 +111,14 @@ def test_an_opened_link_keeps_its_original_green(mode):
     assert green[1] == MIN_GREEN if mode == "hold-back" else green[1] < 42
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_where_all_links_are_opened_the_original_programme_runs(mode):
+    signal = GatewaySignal(programme(PHASES), {0: (0, 1)}, min_green=MIN_GREEN, mode=mode, start=0.0)
+    signal.command(np.zeros((2, 2)), opened={0})
+    original = [state for state, duration in PHASES for _ in range(duration)]
+    assert [signal.update(float(second)) for second in range(270)] == 3 * original
+
+
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
 def test_a_green_that_is_cut_has_the_yellow_of_the_programme_and_no_more(share):
     states = play(SINGLE, {0: (0, 1)}, "hold-back", [np.full((2, 2), share)] * 4)
