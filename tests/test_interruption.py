@@ -91,6 +91,51 @@ def arrays(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.glob("*.npz")}
 
 
+def interrupted(file: Path, *command, after: float) -> tuple[int, str]:
+    """Exit status and stderr (through `file`) of a command in a forked process that gets Ctrl-C after so many
+    seconds."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with suppress(BaseException):
+            with file.open("w") as stream:
+                os.dup2(stream.fileno(), 1), os.dup2(stream.fileno(), 2)
+            sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            program, *arguments = map(str, command)
+            os.write(writer, b"x")
+            try:
+                MAINS[program](arguments)
+            except SystemExit as end:
+                sys.stderr.flush()
+                os._exit(end.code)
+        os._exit(99)
+    os.read(reader, 1)
+    time.sleep(after)
+    os.kill(child, signal.SIGINT)
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status), file.read_text()
+
+
+def test_ctrl_c_at_random_moments(tmp_path):
+    """Status 130 and a line, unless it was too late; the same command then goes on to the same bytes."""
+    scenario, out, draw = tiny.write(tmp_path), tmp_path / "out", random.Random(4)
+    command = ("nmfd", "benchmark", scenario, "--controllers", "no-control,mpc-pc", "--seeds", 2, "--out")
+    begin = time.monotonic()
+    good(call(*command, tmp_path / "whole"))
+    lasted, seen = time.monotonic() - begin, set()
+    for share in (0.0, 0.05, 0.2, 0.4, 0.6, 0.8):
+        status, said = interrupted(tmp_path / "said", *command, out, after=lasted * (share + 0.1 * draw.random()))
+        seen.add(status)
+        assert status in (0, 130) and "Traceback" not in said and said.count("interrupted") == (status == 130), said
+        everything_readable(out)
+        if status == 0:
+            break
+    assert 130 in seen
+    good(call(*command, out))
+    assert arrays(out) == arrays(tmp_path / "whole")
+
+
 BOUNDARIES = [(1, False), (1, True), (2, False), (2, True), (3, False), (3, True), (5, True), (6, False), (8, True)]
 
 
