@@ -160,6 +160,19 @@ def test_redistribute_gives_the_seconds_to_the_crossing_street():
     assert sum(s[1] == "G" for s in held) == sum(s[1] == "G" for s in free) + 42 - MIN_GREEN
 
 
+def test_redistribute_leaves_the_time_between_greens_alone():
+    """Phases that are red for all are as long as before; the crossing street gets it all."""
+    phases = [("Gr", 30), ("yr", 3), ("rr", 2), ("rG", 30), ("ry", 3), ("rr", 2)]
+    held = play(phases, {0: (0, 1)}, "redistribute", [np.zeros((2, 2))] * 3, interval=70)[70:140]
+    assert [held.count(state) for state in ("Gr", "yr", "rr", "rG", "ry")] == [5, 3, 4, 55, 3]
+
+
+def test_every_window_of_a_link_keeps_its_minimum_green():
+    phases = [("G", 20), ("y", 3), ("G", 10), ("y", 3), ("r", 54)]
+    held = "".join(play(phases, {0: (0, 1)}, "hold-back", [np.zeros((2, 2))] * 2)[90:])
+    assert held == 5 * "G" + 3 * "y" + 15 * "r" + 5 * "G" + 3 * "y" + 59 * "r"
+
+
 def test_green_time_is_what_was_shown():
     signal = GatewaySignal(programme(PHASES), {0: (0, 1)}, min_green=MIN_GREEN, mode="hold-back", start=0.0)
     signal.command(np.full((2, 2), 0.5))
