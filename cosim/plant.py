@@ -22,7 +22,7 @@ from cosim.record import Record
 from cosim.regions import City, Gateway, check_adjacency, gateway_movements, gateway_room_taken, load_city
 from cosim.signals import Signal, read_signals, write_programmes
 from cosim.strategy import ACTUATED, FIXED, MAX_PRESSURE, WEBSTER
-from cosim.sumo import Session, Window
+from cosim.sumo import Session, Window, file_list
 from cosim.sumo_settings import ESTIMATE, Settings, settings
 from cosim.trip_facts import TripFacts, read_trip_facts, trip_options
 from cosim.trips import write_trips
@@ -120,7 +120,7 @@ class SumoPlant:
             additional.append(sumo_output.write_edge_data(
                 routes.with_name("edgedata.add.xml"), self._outputs["edgedata"], scenario.step))
         if additional:
-            options += ["--additional-files", ",".join(map(str, additional))]
+            options += ["--additional-files", file_list(additional)]
         self._session = Session(
             self._net_file, files, seed=seed, step_length=chosen.step_length,
             time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action,

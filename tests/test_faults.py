@@ -367,6 +367,17 @@ def test_orders_for_what_the_city_does_not_have(city, tmp_path, ordered, problem
     assert not out.exists()
 
 
+def test_a_path_with_a_comma_is_named_and_one_with_a_space_is_none(city, tmp_path):
+    """SUMO separates files by commas."""
+    for name, status in (("a, b", 2), ("é b", 0)):
+        shutil.copytree(city.folder.parent.parent, tmp_path / name)
+        out = tmp_path / name / "out"
+        result = call("cosim", "run", tmp_path / name / "scenarios" / "tiny", "--controller", "no-control", "--steps",
+                      1, "--out", out)
+        assert result.exit_code == status and out.exists() == (status == 0), result.output
+        assert status == 0 or re.search("error: .*a, b/.*: SUMO cannot read a file with a comma", result.stderr)
+
+
 def test_statuses_of_a_city_are_in_its_tables(city, tmp_path):
     out = tmp_path / "out"
     result = call("cosim", "run", city.folder, "--controller", "mpc-pc", "--steps", 4, "--out", out, "--fault",
