@@ -111,9 +111,9 @@ def _manifest(folder: Path) -> dict:
     path = folder / "manifest.json"
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
-        configuration, folder = manifest["configuration"], manifest["sessions"][-1]["scenario_folder"]
+        configuration, scenario = manifest["configuration"], manifest["sessions"][-1]["scenario_folder"]
         numbers = [configuration[key] for key in ("demand_factor", "steps", "step_s")]
-        if not isinstance(folder, str) or not all(isinstance(number, (int, float)) for number in numbers):
+        if not isinstance(scenario, str) or not all(isinstance(number, (int, float)) for number in numbers):
             raise TypeError
         return manifest
     except FileNotFoundError:
