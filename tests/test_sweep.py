@@ -13,11 +13,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
+from test_interruption import killed
 
 from cosim import remote, sweeps
 from cosim.cli import main
 from cosim.simulate import FACTS, Result, Task
 from nmfd.errors import InputError
+from nmfd.runs import read_summary
 from nmfd.types import Trajectory
 from nmfd.workers import Failure
 
@@ -116,6 +118,23 @@ def test_who_guides_nobody_is_run_once(peak, tmp_path, ran):
     done = sweep(peak, "--controllers", "no-control", "--compliance", "0,50", "--out", tmp_path / "out")
     assert done.exit_code == 0 and tasks == [("no-control", 0, 1.0)]
     assert pd.read_parquet(tmp_path / "out" / "sweep.parquet")["compliance"].tolist() == [1.0]  # the scenario's
+
+
+@pytest.mark.parametrize("write, behind", [(4, False), (6, True)])
+def test_killed_it_goes_on(peak, tmp_path, ran, write, behind):
+    """kill -9 beside a write: table and run folder stay readable, and only what was not finished is run again."""
+    tasks, _ = ran
+    out = tmp_path / "out"
+    arguments = ("sweep", peak, "--controllers", "no-control", "--seeds", 3, "--out", out)
+    assert killed("cosim", *arguments, write=write, behind=behind)
+    if (out / "sweep.parquet").exists():
+        assert (pd.read_parquet(out / "sweep.parquet")["status"] == "ok").all()
+    summary = out / "demand-1" / "summary.csv"
+    finished = [row["seed"] for row in read_summary(summary)] if summary.exists() else []
+    assert sweep(*arguments[1:]).exit_code == 0
+    assert [seed for _, seed, _ in tasks] == [seed for seed in range(3) if seed not in finished]
+    assert pd.read_parquet(out / "sweep.parquet")["seed"].tolist() == [0, 1, 2]
+    assert not [path for path in out.rglob(".*")]
 
 
 def test_one_run_for_real(peak, tmp_path):
