@@ -157,11 +157,11 @@ def _windows(programme: Programme, link: int) -> dict[int, float]:
 
 def yellow_time(phases: Sequence[Phase], link: int) -> float:
     """The longest yellow after a green of `link` [s]."""
-    cycle, found = sum(phase.duration for phase in phases), []
+    found = []
     for n, phase in enumerate(phases):
         if phase.state[link] == "y" and phases[n - 1].state[link] in GREEN:
             length = 0.0
-            while phases[n % len(phases)].state[link] == "y" and length < cycle:
+            while phases[n % len(phases)].state[link] == "y":  # it ends at that green at the latest
                 length, n = length + phases[n % len(phases)].duration, n + 1
             found.append(length)
     return max(found, default=YELLOW)

@@ -15,6 +15,7 @@ from xml.sax.saxutils import quoteattr
 from nmfd import toml
 from nmfd.errors import InputError
 from nmfd.network import Network
+from nmfd.scratch import Scratch
 
 # (lanes, movements, every movement has lanes of its own) -> lanes of each movement, numbered from the right
 LANES = {
@@ -273,8 +274,7 @@ def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
     import sumo
 
     *plain, region_of = _plain_xml(recipe)
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
+    with Scratch("cosim-") as folder:
         options = []
         for kind, content in zip(("node", "edge", "connection"), plain, strict=True):
             (folder / f"{kind}.xml").write_text(content)

@@ -160,7 +160,8 @@ def evaluate(
 @click.option("--demand", default="1.0", show_default=True, metavar="A,B,...",
               help="Demand levels: multiples of the scenario's demand.")
 @click.option("--compliance", metavar="A,B,...",
-              help="Drivers who follow route guidance [%], such as 0,50,100. [default: the scenario's]")
+              help="Drivers who follow route guidance [%], such as 0,50,100; of controllers that guide nobody there is "
+                   "one run all the same. [default: the scenario's]")
 @click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
               help="Policy of a DPC controller, if not SCENARIO/NAME.pt. May be repeated.")
 @click.option("--workers", type=COUNT, metavar="N",

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cosim import estimates, incidents
+from cosim import estimates, incidents, sumo_output
 from cosim.city import ensure_built
 from cosim.plant import own_vehicles
 from cosim.regions import check_adjacency, load_city
 from cosim.signals import read_signals
 from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
-from cosim.strategy import configured, parse
+from cosim.strategy import MAX_PRESSURE, configured, parse
 from cosim.sumo_settings import Settings, settings
 from cosim.xml_files import read_xml
 from nmfd import faults, runs
@@ -42,7 +42,8 @@ def experiment(
 
     As `perform` does it; RunFailed at the end if runs failed.
     """
-    failures = perform([(out, task) for task in tasks], workers=workers, progress=progress, tell=tell)
+    zipped = any(kind == sumo_output.ZIPPED for task in tasks for kind, _ in task.sumo_output)
+    failures = perform([(out, task) for task in tasks], workers=workers, fresh=zipped, progress=progress, tell=tell)
     if (out / "summary.csv").is_file() and (kept := trajectories(out)):
         scenario = scenario_of(tasks[0])
         draw_accumulations(out, scenario, kept)
@@ -151,9 +152,10 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
     files = ensure_built(scenario.network)
     city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
     check_adjacency(city, scenario.network)
-    read_signals(city)
+    simple, _ = read_signals(city)
     own_vehicles(scenario, chosen, city)
-    incidents.check(faults.of(scenario), city, "faults")
+    everywhere = MAX_PRESSURE in {parse(name).overrides.get("signals", chosen.signals) for name in controllers}
+    incidents.check(faults.of(scenario), city, "faults", [signal.id for signal in simple] if everywhere else ())
     for name in (*chosen.background, *chosen.additional):
         read_xml(scenario.folder / name)
     configuration = {

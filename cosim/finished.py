@@ -86,7 +86,12 @@ def read(path: Path, scenario: Path | None = None) -> Finished:
 def _order(path: Path) -> list[str]:
     """The controllers as `cosim evaluate` shows them; others follow as they come."""
     table = path / "runs.csv"
-    return list(dict.fromkeys(pd.read_csv(table, usecols=["controller"])["controller"])) if table.is_file() else []
+    if not table.is_file():
+        return []
+    try:
+        return list(dict.fromkeys(pd.read_csv(table, usecols=["controller"], dtype=str)["controller"]))
+    except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
+        raise InputError(f"{table}: is no table of runs ({error}); delete it") from None
 
 
 def _level(demand: float, folder: Path, order: Sequence[str]) -> Level:
@@ -106,7 +111,10 @@ def _manifest(folder: Path) -> dict:
     path = folder / "manifest.json"
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
-        _ = manifest["configuration"]["demand_factor"], manifest["sessions"][-1]["scenario_folder"]
+        configuration, scenario = manifest["configuration"], manifest["sessions"][-1]["scenario_folder"]
+        numbers = [configuration[key] for key in ("demand_factor", "steps", "step_s")]
+        if not isinstance(scenario, str) or not all(isinstance(number, (int, float)) for number in numbers):
+            raise TypeError
         return manifest
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; give a folder of `cosim run` or `cosim evaluate`") from None

@@ -69,6 +69,9 @@ def identify(
         raise InputError(
             f"{'--guided' if loading.guided else '--with'}: {loaded.name} runs on {target}, whose model must stay that "
             "of its own drivers and signals; name another folder with --network")
+    there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):  # rather than after hours of loading
+        raise InputError(f"--network: {there} is no folder that can be written to; choose another")
     first, second = loading.stages
     found = _load(scenario, loading, first, {}, out, workers, progress)
     network = static_model(loaded, found, guided=loading.guided)

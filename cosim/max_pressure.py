@@ -10,7 +10,7 @@ x counts vehicles per lane, as loops and cameras see them; on lanes that several
 turn lanes, they are shared out by r, from the demand's static routes.
 """
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -22,7 +22,6 @@ from cosim.signals import GREEN, Link, Signal, is_stage
 from cosim.sumo import Phase, Session
 
 EVERY = 5.0       # s between two decisions: about two vehicles per lane
-MIN_GREEN = 5.0   # s, as the perimeter control has it
 PERMISSIVE = 0.3  # saturation flow of a movement that must give way (g), as a share of a protected one
 
 
@@ -31,19 +30,20 @@ class MaxPressure:
 
     def __init__(
         self, session: Session, city: City, signals: list[Signal], flows: Mapping[tuple[str, str], float], *,
-        others: list[Signal],
+        others: list[Signal], min_green: float, show: Callable[[str, str], None],
     ):
         """flows: (edge, next edge) -> any measure of flow, for the turning shares; others: signals that somebody else
-        controls, but whose queues count as well."""
-        self._session = session
+        controls, but whose queues count as well; min_green: [s]; show(signal, state) puts a state on a signal."""
+        self._session, self._show = session, show
         roads = Roads(city, [*signals, *others], flows)
         self._lanes, self._weights, self._movements = roads.lanes, roads.weights, roads.movements
         self._gain, self._begins = roads.stages(signals)
         pairs = gateway_movements(city)
-        self._junctions = [Junction(signal, session.time, pairs.get(signal.id)) for signal in signals]
+        self._junctions = [
+            Junction(signal, session.time, pairs.get(signal.id), min_green=min_green) for signal in signals]
         self._next = session.time
         for junction in self._junctions:
-            session.set_signal_state(junction.signal, junction.state)
+            show(junction.signal, junction.state)
 
     def command(self, share: np.ndarray, opened: Mapping[str, Collection[int]]) -> None:
         """share: (R, R) [-], (u - u_min) / (u_max - u_min); opened: signal -> gateway links without a ration."""
@@ -59,7 +59,7 @@ class MaxPressure:
         """Show what holds from `now` [s] on."""
         for junction in self._junctions:
             if now >= junction.next_change - 1e-6:
-                self._session.set_signal_state(junction.signal, junction.advance(now))
+                self._show(junction.signal, junction.advance(now))
         if now < self._next - 1e-6:
             return
         self._next = now + EVERY
@@ -69,7 +69,7 @@ class MaxPressure:
                 best = pressure[begin : begin + junction.stages]
                 stage = int(np.argmax(best))
                 if best[stage] > best[junction.stage]:
-                    self._session.set_signal_state(junction.signal, junction.switch(stage, now))
+                    self._show(junction.signal, junction.switch(stage, now))
 
     def _pressure(self) -> np.ndarray:
         count = self._session.lane_vehicles
@@ -84,15 +84,17 @@ class MaxPressure:
 class Junction:
     """What one signal shows, second by second: a stage, or the way from one stage to the next."""
 
-    def __init__(self, signal: Signal, now: float, gateways: Mapping[int, tuple[int, int]] | None = None):
-        """gateways: link index -> (i, h), of the links whose green is rationed."""
+    def __init__(
+        self, signal: Signal, now: float, gateways: Mapping[int, tuple[int, int]] | None = None, *, min_green: float,
+    ):
+        """gateways: link index -> (i, h), of the links whose green is rationed; min_green: [s]"""
         self.signal, self._phases, self._numbers = signal.id, signal.phases, signal.stages
         self.stages, self.stage = len(signal.stages), 0
         self._base = signal.phases[signal.stages[0]].state
-        self._green_since = now
+        self._green_since, self._min_green = now, min_green
         cycle = sum(phase.duration for phase in signal.phases)
         self._rations = {
-            link: Ration(pair, cycle=cycle, min_green=MIN_GREEN, yellow=yellow_time(signal.phases, link), start=now)
+            link: Ration(pair, cycle=cycle, min_green=min_green, yellow=yellow_time(signal.phases, link), start=now)
             for link, pair in (gateways or {}).items()}
         self._movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
         self._coming: list[tuple[float, str]] = []
@@ -115,7 +117,7 @@ class Junction:
         return {link: ration.green_time(now) for link, ration in self._rations.items()}
 
     def may_switch(self, now: float) -> bool:
-        return not self._coming and now >= self._green_since + MIN_GREEN - 1e-6
+        return not self._coming and now >= self._green_since + self._min_green - 1e-6
 
     def switch(self, stage: int, now: float) -> str:
         """Leave the stage that is shown for another; the state from `now` on."""

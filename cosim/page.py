@@ -1,17 +1,17 @@
 """The report: one HTML file with everything in it, from the finished runs of one or several folders."""
 
 import json
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
 
-from cosim import report, story, tables
+from cosim import reasons, report, story, tables
 from cosim.finished import Finished, Level
 from cosim.markup import cell, fold, items, page, picture, table, tag, text, typeset
 from nmfd import runs
 from nmfd.benchmarks import REFERENCE
+from nmfd.scratch import Scratch
 
 WORDS = (
     "Total time spent (TTS) adds up the time of all vehicles on the road and of those that wait to enter: less is "
@@ -76,8 +76,7 @@ def _run(run: Finished, anchor: str, levels: Sequence[str]) -> str:
         run.scenario.name, configuration["steps"], configuration["step_s"], len(run.levels), rows)
     lead = [text("p", typeset(sentence)) for sentence in (
         first, *(_at(run, level) + story.head(level.rows) for level in run.levels))]
-    with tempfile.TemporaryDirectory(prefix="cosim-report-") as scratch:
-        folder = Path(scratch)
+    with Scratch("cosim-") as folder:
         if run.city is not None:
             report.region_map(folder / "regions.png", run.scenario, run.city)
         if len(run.levels) > 1:
@@ -100,14 +99,13 @@ def _level(run: Finished, level: Level, reference: str | None) -> str:
     first, second = tables.shown(tables.statistics(rows, reference), reference)
     title = f"Demand times {level.demand:g}"
     parts = [
-        text("h3", title), items(story.details(rows)),
+        text("h3", title), items(story.details(rows)), *_why(run, level),
         _frame(f"What came of it, {title.lower()}", first),
         _frame(f"How, {title.lower()}", second), text("p", " ".join(tables.CAPTION.split()), class_="caption"),
         fold("Every strategy against every other, paired by seed", _numbers(
             "pairs", tables.pairs(rows).drop(columns="demand"))),
         fold("Every run", _numbers("runs", rows))]
-    with tempfile.TemporaryDirectory(prefix="cosim-report-") as scratch:
-        folder = Path(scratch)
+    with Scratch("cosim-") as folder:
         report.draw(level.folder, run.scenario, run.city, rows, folder)
         report.draw_more(folder, run.scenario, level.folder, rows)
         missing = []
@@ -124,6 +122,12 @@ def _level(run: Finished, level: Level, reference: str | None) -> str:
     both = f" and, where two are compared, {REFERENCE} and {pair[0]}" if len(pair) and REFERENCE in names else ""
     parts.insert(2, text("p", f"Pictures of single runs show seed {report.shown_seed(rows)}{both}.", class_="note"))
     return tag("div", *parts)
+
+
+def _why(run: Finished, level: Level) -> list[str]:
+    """Why strategies gain or not, where there is one to tell of."""
+    city, lines = reasons.at(level.demand, level.folder, run.scenario.network, level.rows)
+    return [text("h4", "Why"), text("p", typeset(city)), items(lines)] if lines else []
 
 
 def _frame(label: str, frame: pd.DataFrame) -> str:

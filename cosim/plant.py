@@ -1,6 +1,5 @@
 """The SUMO city as a plant: the same protocol as the regional plants, the same controllers."""
 
-import tempfile
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,7 +22,7 @@ from cosim.record import Record
 from cosim.regions import City, Gateway, check_adjacency, gateway_movements, gateway_room_taken, load_city
 from cosim.signals import Signal, read_signals, write_programmes
 from cosim.strategy import ACTUATED, FIXED, MAX_PRESSURE, WEBSTER
-from cosim.sumo import Session, Window
+from cosim.sumo import Session, Window, file_list
 from cosim.sumo_settings import ESTIMATE, Settings, settings
 from cosim.trip_facts import TripFacts, read_trip_facts, trip_options
 from cosim.trips import write_trips
@@ -31,6 +30,7 @@ from nmfd import faults
 from nmfd.errors import InputError
 from nmfd.estimation import Estimator
 from nmfd.scenario import Scenario
+from nmfd.scratch import Scratch
 from nmfd.types import Controls, Measurement
 
 SAMPLE_EVERY = 10.0  # s, between two samples of the production and of the queues
@@ -87,14 +87,14 @@ class SumoPlant:
                 f"{files.net_file}: sumo.signals: {self._settings.signals} needs fixed-time signals with several green "
                 f"phases, but none of the {len(self.other_signals)} signals here is one; choose fixed")
         self._gateway_ids = {gateway.signal for gateway in self.city.gateways if gateway.signal is not None}
-        self._folder = tempfile.TemporaryDirectory(prefix="cosim-")
+        self._folder = Scratch("cosim-")
         self._session: Session | None = None
 
     def reset(self, seed: int) -> Measurement:
         """Trips, drivers and reroutes all follow from `seed`."""
         self._end_session()
         scenario, chosen = self._scenario, self._settings
-        routes = Path(self._folder.name) / "trips.rou.xml"
+        routes = self._folder.path / "trips.rou.xml"
         self._vehicles, files = self._write_vehicles(routes, seed), [routes]
         self._trip_file = self._outputs.get("tripinfo", routes.with_name("tripinfo.xml"))
         steered = [s for s in self.simple_signals if not (
@@ -112,7 +112,7 @@ class SumoPlant:
             additional = self._additional() + additional
         estimating = chosen.measurement == ESTIMATE
         if estimating:
-            loops = Path(self._folder.name) / "loops.add.xml"
+            loops = self._folder.path / "loops.add.xml"
             write_loops(self.city, self._layout, scenario.step, loops)
             additional.append(loops)
         additional += self._window.additional if self._window else ()
@@ -120,7 +120,7 @@ class SumoPlant:
             additional.append(sumo_output.write_edge_data(
                 routes.with_name("edgedata.add.xml"), self._outputs["edgedata"], scenario.step))
         if additional:
-            options += ["--additional-files", ",".join(map(str, additional))]
+            options += ["--additional-files", file_list(additional)]
         self._session = Session(
             self._net_file, files, seed=seed, step_length=chosen.step_length,
             time_to_teleport=chosen.time_to_teleport, collision_action=chosen.collision_action,
@@ -134,17 +134,19 @@ class SumoPlant:
         self._guide = Guide(
             self._session, self.city, scenario.network.nominal_splits, compliance=chosen.compliance,
             most_detour=chosen.most_detour, random=np.random.default_rng([seed, 0x67756964]))
+        self._incidents = Incidents(faults.of(scenario), self._session, self.city)
         self._max_pressure, self._rationed = None, {}
         if chosen.signals == MAX_PRESSURE:
             flows = self._own_flows()
             if flows is None:
                 flows = turning_flows(self.city, scenario.demand, scenario.step)
             others = [signal for signal in self.simple_signals if signal not in steered]
-            self._max_pressure = MaxPressure(self._session, self.city, steered, flows, others=others)
+            self._max_pressure = MaxPressure(
+                self._session, self.city, steered, flows, others=others, min_green=chosen.min_green,
+                show=self._incidents.show)
             self._rationed = {signal.id: signal for signal in steered if signal.id in self._gateway_ids}
         self._signals = self._gateway_signals()
         self._original_green = self._programmed_green()
-        self._incidents = Incidents(faults.of(scenario), self._session, self.city)
         self._actuator = Actuator(list(self._signals.values()), self._incidents.show)
         self._speed: np.ndarray | None = None
         self._k, self._rows, self._opened = 0, [], {}
@@ -170,6 +172,7 @@ class SumoPlant:
             self._actuator.play(session.time)
             if self._max_pressure is not None:
                 self._max_pressure.play(session.time)
+            self._incidents.play(session.time)
             session.step()
             self._guide.apply(meter.observe())
             if self._detectors and n % often == often - 1:
@@ -201,7 +204,7 @@ class SumoPlant:
             queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))
         row["gateway_original_green"] = self._original_green
         for n, gateway in enumerate(self.city.gateways):
-            if self._incidents.refused(gateway.signal):
+            if gateway.signal in self._incidents.refused:
                 row["gateway_green"][n] = self._original_green[n]
         self._rows.append(row)
         return measurement
@@ -211,7 +214,7 @@ class SumoPlant:
 
     def close(self) -> None:
         self._end_session()
-        self._folder.cleanup()
+        self._folder.close()
 
     def record(self) -> Record:
         """Of all control intervals since the reset."""
@@ -275,7 +278,7 @@ class SumoPlant:
                 self.city, self.simple_signals, self._scenario.demand, self._scenario.step,
                 folder=self._scenario.network.folder / "build", flows=self._own_flows())
         elif self._settings.signals == ACTUATED:
-            path = Path(self._folder.name) / "actuated.add.xml"
+            path = self._folder.path / "actuated.add.xml"
             write_programmes(path, [actuated_row(signal) for signal in signals])
         else:
             return []

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from cosim import experiment, tables
-from cosim.strategy import parse
+from cosim.strategy import model_free
 from nmfd import runs
 from nmfd.benchmarks import REFERENCE
 from nmfd.network import Network
@@ -90,18 +90,23 @@ def text(folders: Mapping[float, Path], network: Network, rows: pd.DataFrame) ->
     """
     parts = []
     for level, folder in folders.items():
-        part = rows[rows["demand"] == level]
-        kept = {name: [int(seed) for seed in group["seed"]] for name, group in part.groupby("controller", sort=False)}
-        shown = REFERENCE if REFERENCE in kept else next(iter(kept))
-        found = load(network, *_runs(folder, shown, kept[shown]))
-        leaking = float(part.loc[part["controller"] == shown, "leaking_share"].mean())
-        lines = [f"## Why, at demand times {level:g}", "", _city(network, found, leaking, shown), ""]
-        for name, seeds in kept.items():
-            if name != REFERENCE:
-                done = deeds(network, *_runs(folder, name, seeds))
-                lines.append(f"- {name} {verdict(part, level, name, found, leaking, done, network)}")
-        parts.append("\n".join(lines))
+        city, lines = at(level, folder, network, rows[rows["demand"] == level])
+        parts.append("\n".join([f"## Why, at demand times {level:g}", "", city, "", *(f"- {line}" for line in lines)]))
     return "\n\n".join(parts) + "\n"
+
+
+def at(level: float, folder: Path, network: Network, rows: pd.DataFrame) -> tuple[str, list[str]]:
+    """What the city was like without control at one demand level, and a line per controller; rows: of this level."""
+    kept = {name: [int(seed) for seed in group["seed"]] for name, group in rows.groupby("controller", sort=False)}
+    shown = REFERENCE if REFERENCE in kept else next(iter(kept))
+    found = load(network, *_runs(folder, shown, kept[shown]))
+    leaking = float(rows.loc[rows["controller"] == shown, "leaking_share"].mean())
+    lines = []
+    for name, seeds in kept.items():
+        if name != REFERENCE:
+            done = deeds(network, *_runs(folder, name, seeds))
+            lines.append(f"{name} {verdict(rows, level, name, found, leaking, done, network)}")
+    return _city(network, found, leaking, shown), lines
 
 
 def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Trajectory], Iterable[Mapping]]:
@@ -120,11 +125,11 @@ def verdict(
         return f"has no common seed with {REFERENCE}, so that nothing can be said: add it to --controllers"
     spread = f"± {pair.percent_half:.1f} over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed, no proof"
     size = f"{pair.percent:+.1f} % in total time spent {spread}"
-    model_free = parse(name).model_free
+    unmodelled = model_free(name)
     if pair.percent < 0 and (pair.excludes_zero or pair.seeds == 1):
-        return f"gains ({size})" + ("" if model_free else f"; {done}")
+        return f"gains ({size})" + ("" if unmodelled else f"; {done}")
     kind = "loses" if pair.excludes_zero or pair.seeds == 1 else "gains nothing that stands out from the seeds"
-    reasons = [] if model_free else _reasons(rows, name, found, leaking, done, network)
+    reasons = [] if unmodelled else _reasons(rows, name, found, leaking, done, network)
     return f"{kind} ({size})" + (f": {'; '.join(reasons)}" if reasons else "")
 
 

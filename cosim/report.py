@@ -38,7 +38,8 @@ def draw(
     names = ranked(rows)
     seed = shown_seed(rows)
     order = list(dict.fromkeys(rows["controller"]))
-    runs = sorted(experiment.trajectories(folder), key=lambda t: (order.index(t.controller), t.seed))
+    runs = sorted((t for t in experiment.trajectories(folder) if t.controller in order),
+                  key=lambda t: (order.index(t.controller), t.seed))
     note = teleports(rows)
     draw_accumulations(out, scenario, runs, seed=seed, title=f"seed {seed}, shaded: all seeds; {note}")
     results = {} if city is None else {

@@ -89,7 +89,7 @@ def drive(
     begin: when the setting up began (time.perf_counter); outputs: SUMO's own, kind (cosim.sumo_output) -> file, there
     only if all goes well. Raises InputError.
     """
-    from cosim import facts
+    from cosim import facts, sumo_output
     from cosim.plant import SumoPlant
     from cosim.sumo_settings import settings
     from nmfd import closed_loop, runs
@@ -116,6 +116,7 @@ def drive(
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
             "signals_left_alone": len(plant.other_signals)}
+        sumo_output.check_whole(files)
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
 
 

@@ -37,11 +37,6 @@ class Strategy:
     controller: str
     overrides: dict[str, Any] = field(default_factory=dict)
 
-    @property
-    def model_free(self) -> bool:
-        """Whether a run does not depend on the regional model."""
-        return self.controller == ALONE
-
 
 def parse(name: str) -> Strategy:
     """The strategy `name`. InputError for a controller or option that there is not, and for contradictory ones."""
@@ -62,6 +57,12 @@ def parse(name: str) -> Strategy:
             raise InputError(f"strategy {name!r}: {chosen[key]} and {word} exclude each other; leave one of them out")
         chosen[key], overrides[key] = word, value
     return Strategy(name=name, controller=controller, overrides=overrides)
+
+
+def model_free(name: str) -> bool:
+    """Whether runs of a strategy do not depend on the regional model; its controller need not be there any more."""
+    first, _ = registry.split(name)
+    return first == ALONE or _option(first) is not None
 
 
 def configured(name: str, tables: Iterable[str]) -> str:

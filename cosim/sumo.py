@@ -75,7 +75,7 @@ class Session:
         if Session._open:
             raise RuntimeError("a SUMO session is already open in this process; close it first")
         self.sumo_time, self.step_length, self._exits = 0.0, step_length, False
-        routes = ",".join(map(str, [route_file] if isinstance(route_file, Path) else route_file))
+        routes = file_list([route_file] if isinstance(route_file, Path) else route_file)
         self.command = [
             "sumo", "--net-file", str(net_file), "--route-files", routes, "--seed", str(seed),
             "--step-length", str(step_length), "--time-to-teleport", str(time_to_teleport), "--collision.action",
@@ -215,11 +215,14 @@ class Session:
         return True
 
     # Incidents.
-    def restart_programme(self, signal: str) -> None:
-        """Let a signal run the programme again that it had in the beginning."""
-        lights = self._sumo.trafficlight
-        own = next(logic.programID for logic in lights.getAllProgramLogics(signal) if logic.programID != "online")
-        lights.setProgram(signal, own)
+
+    def programme_id(self, signal: str) -> str:
+        """Of the programme that runs on `signal` now."""
+        return self._sumo.trafficlight.getProgram(signal)
+
+    def restart_programme(self, signal: str, programme: str) -> None:
+        """Let a signal run one of its own programmes again."""
+        self._sumo.trafficlight.setProgram(signal, programme)
 
     def limit_speed(self, edge: str, limits: list[float]) -> list[float]:
         """Set the speed limits [m/s] of the lanes of an edge, one for each or one for all; those before."""
@@ -239,6 +242,14 @@ class Session:
         """Give points of interest, by id, a colour (red, green, blue)."""
         for mark, colour in colours.items():
             self._sumo.poi.setColor(mark, (*colour, 255))
+
+
+def file_list(files: Sequence[Path]) -> str:
+    """Files as an option of SUMO. InputError for a name with a comma, where SUMO would take the next one to begin."""
+    for file in files:
+        if "," in str(file):
+            raise InputError(f"{file}: SUMO cannot read a file with a comma in its path; rename it, or its folder")
+    return ",".join(map(str, files))
 
 
 def _start(window: Window, command: list[str]) -> None:

@@ -1,15 +1,20 @@
 """SUMO's own output files of a run, on request: for tools that read them, beside what is recorded here."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
+from cosim.xml_files import BROKEN, opened
 from nmfd.errors import InputError
 from nmfd.runs import run_name
+from nmfd.workers import RunFailed
 
 # Kind -> ending of its file. The emissions of every vehicle in every step are gigabytes, unless compressed.
 KINDS = {
     "tripinfo": "tripinfo.xml", "summary": "summary.xml", "edgedata": "edgedata.xml", "emission": "emission.xml.gz"}
+ZIPPED = "emission"  # where the disk is full, SUMO ends the process that it runs in
+TAIL = 200  # bytes that are sure to hold the end tag of the root
 
 
 def parse(text: str) -> tuple[str, ...]:
@@ -34,6 +39,22 @@ def options(outputs: Mapping[str, Path]) -> tuple[str, ...]:
     """Options of SUMO for `summary` and `emission`; tripinfo is written anyway (trip_facts)."""
     return tuple(part for kind in ("summary", "emission") if kind in outputs
                  for part in (f"--{kind}-output", str(outputs[kind])))
+
+
+def check_whole(outputs: Mapping[str, Path]) -> None:
+    """RunFailed for a file that SUMO, which says nothing of a full disk, could not write to its end."""
+    for path in outputs.values():
+        end = b""
+        try:
+            with opened(path) as stream:
+                if path.suffix != ".gz":
+                    stream.seek(max(path.stat().st_size - TAIL, 0))
+                while part := stream.read(1 << 20):
+                    end = (end + part)[-TAIL:]
+        except BROKEN as error:
+            raise RunFailed(f"{path}: SUMO did not finish this file ({error}): is the disk full?") from None
+        if not re.search(rb"</[\w-]+>\s*$", end):
+            raise RunFailed(f"{path}: SUMO did not finish this file: is the disk full?")
 
 
 def write_edge_data(path: Path, target: Path, every: float) -> Path:

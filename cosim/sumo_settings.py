@@ -15,7 +15,8 @@ class Settings:
     """[sumo] of scenario.toml.
 
     step_length: of SUMO [s]; time_to_teleport: [s], -1 for never; collision_action: SUMO's
-    actuation: "hold-back" or "redistribute"; min_green: of a gateway movement [s]
+    actuation: "hold-back" or "redistribute"; min_green: of a gateway movement, and of every
+        stage under max-pressure [s]
     queue_override: a gateway whose edge held this share of its room in the last control interval is left open, 0 for
         never [-]
     compliance: share of the decisions in which a driver follows the route guidance [-]

@@ -30,8 +30,9 @@ FIRST = ["strategy", "controller", "seed", "demand", "compliance", "status", "re
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
     """scenario: its folder; controllers: strategies; levels: multiples of the scenario's demand; compliance: shares of
-    the drivers' decisions that follow route guidance, the scenario's own where there is none; steps: control
-    intervals, all if None; policies: controller -> file instead of the scenario's own; out: the folder."""
+    the drivers' decisions that follow route guidance, the scenario's own where there is none or nobody guides;
+    steps: control intervals, all if None; policies: controller -> file instead of the scenario's own; out: the folder.
+    """
 
     scenario: Path
     controllers: tuple[str, ...]
@@ -43,12 +44,11 @@ class Sweep:
     policies: Mapping[str, Path] = field(default_factory=dict)
 
     def strategies(self) -> dict[str, str]:
-        """Strategy with its compliance -> strategy as asked for. Raises InputError."""
+        """Strategy with its compliance -> strategy as asked for; those that guide nobody once only. InputError."""
         ways = [f"+compliance-{100 * share:g}" for share in self.compliance] or [""]
         found = {name + way: name for name in self.controllers for way in ways}
-        for name in found:
-            parse(name)
-        return found
+        guiding = {name: registry.guides(parse(name).controller) for name in found}
+        return {strategy if guiding[strategy] else name: name for strategy, name in found.items()}
 
     def plan(self) -> list[tuple[Path, Task]]:
         """Every run with its run folder, seed by seed, so that whatever is finished compares like with like."""
@@ -117,12 +117,17 @@ def _finished(out: Path) -> pd.DataFrame:
 
 
 def _failures(file: Path) -> dict[tuple[str, int, float], str]:
-    """Strategy, seed and demand level -> reason, of the runs that failed so far."""
+    """Strategy, seed and demand level -> reason, of the runs that failed so far. Raises InputError."""
     if not file.is_file():
         return {}
-    rows = pd.read_parquet(file)
-    rows = rows[rows["status"] == FAILED]
-    return {tuple(key): reason for *key, reason in rows[[*KEYS, "reason"]].itertuples(index=False, name=None)}
+    try:
+        rows = pd.read_parquet(file)
+        rows = rows[rows["status"] == FAILED]
+        return {tuple(key): reason for *key, reason in rows[[*KEYS, "reason"]].itertuples(index=False, name=None)}
+    except (OSError, ValueError, KeyError) as error:  # pyarrow's own errors are among them
+        raise InputError(
+            f"{file}: is no table of a sweep ({' '.join(str(error).split())[:200]}); delete it, the runs are kept in "
+            "the folders beside it") from None
 
 
 def _named(rows: pd.DataFrame, own: float) -> pd.DataFrame:

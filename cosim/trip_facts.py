@@ -9,6 +9,9 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
 
+from cosim.xml_files import BROKEN
+from nmfd.workers import RunFailed
+
 CLASS = "HBEFA4/PC_petrol_Euro-4"
 MILLIGRAMS = 1e-6  # kg
 
@@ -37,7 +40,14 @@ def trip_options(path: Path) -> tuple[str, ...]:
 
 
 def read_trip_facts(path: Path) -> TripFacts:
-    """Read SUMO's tripinfo output of a simulation that has ended."""
+    """Read SUMO's tripinfo output of a simulation that has ended. Raises RunFailed if it is not whole."""
+    try:
+        return _read(path)
+    except BROKEN as error:
+        raise RunFailed(f"{path}: SUMO did not finish this file ({error}): is the disk full?") from None
+
+
+def _read(path: Path) -> TripFacts:
     trips = completed = 0
     travel_time = departure_delay = co2 = fuel = 0.0
     for _, element in ElementTree.iterparse(path):

@@ -2,10 +2,8 @@
 
 import os
 import sys
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -22,6 +20,7 @@ from nmfd import closed_loop, runs
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.network import Network
+from nmfd.scratch import Scratch
 from nmfd.types import Controls, Measurement, Trajectory
 
 CLOSED, HALF, OPEN, LEFT_ALONE = np.array([(214, 39, 40), (240, 190, 40), (44, 160, 44), (150, 150, 150)])
@@ -68,8 +67,8 @@ def watch(
             "film of it with `cosim video RUN`")
     scenario, strategy = scenario_of(task), parse(task.controller)
     controller = registry.make(configured(task.controller, scenario.controller_options), scenario, policy=task.policy)
-    with tempfile.TemporaryDirectory(prefix="cosim-watch-") as scratch:
-        drawn, view = Path(scratch) / "regions.add.xml", Path(scratch) / "view.xml"
+    with Scratch("cosim-") as scratch:
+        drawn, view = scratch / "regions.add.xml", scratch / "view.xml"
         window = Window(
             options=("--gui-settings-file", str(view), "--start", "true", "--quit-on-end", "true",
                      "--window-size", "1200,900", *options),

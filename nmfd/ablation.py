@@ -4,7 +4,6 @@ Each is a list of independent runs whose rows are kept in csv files, with a figu
 """
 
 import statistics
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,6 +17,7 @@ from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.scenario import Scenario
+from nmfd.scratch import Scratch
 from nmfd.workers import Failure, ended
 
 METHODS = {"alternating": True, "joint": False}
@@ -43,9 +43,9 @@ def train_one(
     def log(step: int, total: float) -> None:
         curve.append(dict(zip(VALIDATION_COLUMNS, (method, seed, step, total), strict=True)))
 
-    with tempfile.TemporaryDirectory() as folder:
+    with Scratch("nmfd-") as folder:
         policy = training.train(
-            changed, controller, seed=seed, out=Path(folder) / "policy.pt", steps=steps, log=log, compiled=compiled,
+            changed, controller, seed=seed, out=folder / "policy.pt", steps=steps, log=log, compiled=compiled,
             progress=progress and (lambda done, total, note: progress(done, total)))
         driver = registry.make(controller, scenario, policy=policy)
         row = summary(closed_loop.run(PLANTS[plant](scenario), driver, scenario, seed=0))

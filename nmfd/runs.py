@@ -58,7 +58,7 @@ def atomic(path: Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except BaseException as error:
-        if isinstance(error, OSError) and error.filename is None:  # a full disk is met without a name
+        if isinstance(error, OSError) and error.filename in (None, str(temporary)):  # a full disk is met without a name
             error.filename = str(path)
         with suppress(OSError):
             temporary.unlink()
@@ -359,6 +359,7 @@ def manifest(
                 yield
             finally:
                 if not results.exists() and first:
+                    sweep(path)  # what a process that died at work for this one has left
                     with suppress(OSError):
                         file.unlink()
     finally:

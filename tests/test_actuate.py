@@ -111,10 +111,40 @@ def test_an_opened_link_keeps_its_original_green(mode):
     assert green[1] == MIN_GREEN if mode == "hold-back" else green[1] < 42
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_where_all_links_are_opened_the_original_programme_runs(mode):
+    signal = GatewaySignal(programme(PHASES), {0: (0, 1)}, min_green=MIN_GREEN, mode=mode, start=0.0)
+    signal.command(np.zeros((2, 2)), opened={0})
+    original = [state for state, duration in PHASES for _ in range(duration)]
+    assert [signal.update(float(second)) for second in range(270)] == 3 * original
+
+
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
 def test_a_green_that_is_cut_has_the_yellow_of_the_programme_and_no_more(share):
     states = play(SINGLE, {0: (0, 1)}, "hold-back", [np.full((2, 2), share)] * 4)
     assert [length for shown, length in runs(states, 0)[2:-1] if shown == "y"] == [3, 3, 3]
+
+
+@pytest.mark.parametrize("position", [0.0, 17.0])
+def test_a_link_that_is_never_red_is_held_once_per_cycle(position):
+    """Its window is the cycle; the one that had begun before the simulation is left whole."""
+    states = play(PHASES, {3: (0, 1)}, "hold-back", [np.full((2, 2), 0.4)] * 4, position=position)
+    first = round(90 - position) if position else 90
+    assert "".join(state[3] for state in states[first : first + 180]) == 2 * (39 * "g" + 3 * "y" + 48 * "r")
+    assert {state[3] for state in states[: round(90 - position)]} == {"g"}
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_before_any_command_the_original_programme_runs(mode):
+    signal = GatewaySignal(programme(SINGLE), {0: (0, 1)}, min_green=MIN_GREEN, mode=mode, start=0.0)
+    original = [state for state, duration in SINGLE for _ in range(duration)]
+    assert [signal.update(float(second)) for second in range(270)] == 3 * original
+
+
+def test_a_time_just_before_the_end_of_the_cycle_is_in_its_last_phase():
+    """Sums of simulation steps are off by some rounding."""
+    signal = GatewaySignal(programme(SINGLE), {0: (0, 1)}, min_green=MIN_GREEN, mode="hold-back", start=0.0)
+    assert signal.update(90.0 - 1e-7) == "ry" and signal.update(90.0) == "Gr"
 
 
 def test_hold_back_touches_the_gateway_only():
@@ -128,6 +158,19 @@ def test_redistribute_gives_the_seconds_to_the_crossing_street():
     held = play(SINGLE, {0: (0, 1)}, "redistribute", [np.zeros((2, 2))] * 3)[90:180]
     assert sum(s[0] == "G" for s in held) == MIN_GREEN
     assert sum(s[1] == "G" for s in held) == sum(s[1] == "G" for s in free) + 42 - MIN_GREEN
+
+
+def test_redistribute_leaves_the_time_between_greens_alone():
+    """Phases that are red for all are as long as before; the crossing street gets it all."""
+    phases = [("Gr", 30), ("yr", 3), ("rr", 2), ("rG", 30), ("ry", 3), ("rr", 2)]
+    held = play(phases, {0: (0, 1)}, "redistribute", [np.zeros((2, 2))] * 3, interval=70)[70:140]
+    assert [held.count(state) for state in ("Gr", "yr", "rr", "rG", "ry")] == [5, 3, 4, 55, 3]
+
+
+def test_every_window_of_a_link_keeps_its_minimum_green():
+    phases = [("G", 20), ("y", 3), ("G", 10), ("y", 3), ("r", 54)]
+    held = "".join(play(phases, {0: (0, 1)}, "hold-back", [np.zeros((2, 2))] * 2)[90:])
+    assert held == 5 * "G" + 3 * "y" + 15 * "r" + 5 * "G" + 3 * "y" + 59 * "r"
 
 
 def test_green_time_is_what_was_shown():

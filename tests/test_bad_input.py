@@ -543,6 +543,7 @@ LINES = {
         identify {g} --seeds 0|x
         identify {g} --iterations 0
         identify {g} --guided
+        identify {g} --network /dev/null|{g}/scenario.toml|/dev/null/x
         import {none} --regions 3 --out {out}
         import {net} --regions 1|x --out {out}
         import {net} --out {out}

@@ -69,6 +69,23 @@ def test_vehicles_leave_as_their_trips_end():
     torch.testing.assert_close(after.sum((-2, -1)), expected, rtol=0.0, atol=1e-9)
 
 
+def test_one_euler_step_is_the_default():
+    x, demand, perimeter, splits = random_tensors(9, filling=6000.0)
+    expected = dynamics.euler(PARAMETERS, x, demand, perimeter, splits, STEP)
+    for after in (dynamics.advance(PARAMETERS, x, demand, perimeter, splits, STEP),
+                  dynamics.advance_counted(PARAMETERS, x, demand, perimeter, splits, STEP)[0]):
+        torch.testing.assert_close(after, expected, rtol=1e-13, atol=1e-10)
+
+
+@KINDS
+def test_who_is_where_he_wants_to_be_is_not_sent_on(network):
+    """Whatever the splits say of those who have arrived."""
+    x, _, perimeter, splits = random_tensors(10, filling=6000.0)
+    p, here = dynamics.parameters(network), torch.arange(7)
+    _, transfers = dynamics.flows(p, x, perimeter, torch.ones_like(splits))
+    assert (transfers[here, :, here] == 0.0).all() and (transfers > 0.0).any()
+
+
 def test_one_region_with_a_linear_mfd_decays_exponentially():
     p = one_region(Mfd(a=0.0, b=0.0, c=0.0042, jam=10_000.0))
     none = torch.zeros(1, 1, dtype=torch.float64)

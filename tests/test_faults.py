@@ -2,6 +2,7 @@
 
 import errno
 import gzip
+import itertools
 import os
 import re
 import resource
@@ -18,6 +19,7 @@ from click.testing import CliRunner
 
 import cosim.cli
 import nmfd.cli
+from cosim.actuate import YELLOW
 from cosim.city import ensure_built
 from cosim.plant import SumoPlant
 from cosim.regions import load_city
@@ -247,13 +249,15 @@ def city(tmp_path_factory):
     return load_scenario(folder / "scenarios" / "tiny")
 
 
-def in_sumo(city, *ordered, perimeter=None, **changed):
-    """The measurements and the record of a run with these faults."""
+def in_sumo(city, *ordered, perimeter=None, watch=None, **changed):
+    """The measurements and the record of a run with these faults; watch(plant) is called when it begins."""
     scenario = replace(city, faults=ordered)
     plant = SumoPlant(scenario, overrides=replace(settings(scenario), **changed))
     opened = np.where(city.network.adjacency, city.network.u_max if perimeter is None else perimeter, 0.0)
     try:
         measurements = [plant.reset(0)]
+        if watch:
+            watch(plant)
         for _ in range(STEPS):
             measurements.append(plant.step(Controls(perimeter=opened, splits=None)))
         return measurements, plant.record()
@@ -290,6 +294,36 @@ def test_a_signal_that_takes_no_programme(city):
     own = [n for n, gateway in enumerate(gateways) if gateway.signal == signal]
     assert own and (record.gateway_green[3:6, own] == record.gateway_original_green[3:6, own]).all()
     assert (free.gateway_green[3:6, own] < free.gateway_original_green[3:6, own]).any()
+
+
+@pytest.mark.parametrize("signals, gateway", [("fixed", True), ("max-pressure", True), ("max-pressure", False)])
+def test_a_deaf_signal_runs_its_own_programme(city, signals, gateway):
+    """Under max-pressure too, rationed or not: second by second its own, with yellow before and after."""
+    plant = SumoPlant(replace(city, faults=()))
+    gateways = {gateway.signal for gateway in loaded(city).gateways}
+    name = next(found.id for found in plant.simple_signals if (found.id in gateways) == gateway)
+    plant.reset(0)
+    own = [phase.state for phase in plant.session.programme(name).phases
+           for _ in range(round(phase.duration))]
+    plant.close()
+    shown = []
+
+    def watch(plant):
+        step = plant.session.step
+        plant.session.step = lambda: (step(), shown.append(plant.session.signal_state(name)))
+
+    measurements, _ = in_sumo(
+        city, f"signal:{name}@3-6", perimeter=city.network.u_min, watch=watch, signals=signals)
+    problems = [m.problem for m in measurements[1:]]
+    assert problems == [f"signal {name} took no programme" if 3 <= k < 6 else "" for k in range(STEPS)]
+    interval = round(city.step)
+    begin, end = 3 * interval + round(YELLOW), 6 * interval
+    cycles = [[own[(n + k) % len(own)] for k in range(end - begin)] for n in range(len(own))]
+    assert shown[begin:end] in cycles
+    assert shown[begin - interval : end - interval] not in cycles and shown[-len(own) :] not in [
+        cycle[: len(own)] for cycle in cycles]
+    for before, after in itertools.pairwise(shown):
+        assert not any(a in "Gg" and b == "r" for a, b in zip(before, after, strict=True)), (before, after)
 
 
 def test_silent_loop_detectors(city):
@@ -331,6 +365,17 @@ def test_orders_for_what_the_city_does_not_have(city, tmp_path, ordered, problem
     result = call("cosim", "run", city.folder, "--controller", "no-control", "--out", out, "--fault", ordered)
     assert result.exit_code == 2 and problem in result.stderr and result.stderr.count("\n") == 1
     assert not out.exists()
+
+
+def test_a_path_with_a_comma_is_named_and_one_with_a_space_is_none(city, tmp_path):
+    """SUMO separates files by commas."""
+    for name, status in (("a, b", 2), ("é b", 0)):
+        shutil.copytree(city.folder.parent.parent, tmp_path / name)
+        out = tmp_path / name / "out"
+        result = call("cosim", "run", tmp_path / name / "scenarios" / "tiny", "--controller", "no-control", "--steps",
+                      1, "--out", out)
+        assert result.exit_code == status and out.exists() == (status == 0), result.output
+        assert status == 0 or re.search("error: .*a, b/.*: SUMO cannot read a file with a comma", result.stderr)
 
 
 def test_statuses_of_a_city_are_in_its_tables(city, tmp_path):
@@ -377,6 +422,28 @@ def test_a_full_disk(tmp_path):
         name: content for name, content in before.items() if name != "manifest.json"}
     assert call(*command, 2).exit_code == 0
     assert len(runs.read_summary(out / "summary.csv")) == 2
+
+
+IN_SUMO = ("cosim", "run", "--controller", "no-control", "--steps", 4, "--sumo-output")
+
+
+@pytest.fixture(scope="module")
+def sizes(city, tmp_path_factory):
+    """SUMO's own outputs of a run: kind -> bytes."""
+    out = tmp_path_factory.mktemp("whole") / "out"
+    assert call(*IN_SUMO, "tripinfo,edgedata,emission", "--out", out, city.folder).exit_code == 0
+    return {file.name.split(".")[1]: file.stat().st_size for file in out.glob("*.xml*")}
+
+
+@pytest.mark.parametrize("kind, share", [("tripinfo", 0.9), ("edgedata", 0.9), ("emission", 0.9), ("tripinfo", 0.001)])
+def test_a_disk_that_is_full_before_sumo_has_written_all(city, sizes, tmp_path, kind, share):
+    """SUMO says nothing of it, and its files are looked at; or it ends its process (emission). Once even what it reads
+    cannot be written."""
+    out = tmp_path / "out"
+    status, stderr = with_limit(int(share * sizes[kind]), *IN_SUMO, kind, "--out", out, city.folder)
+    assert status in (1, 2) and stderr.count("\n") == 1, stderr
+    assert any(words in stderr for words in ("is the disk full?", "its process died", os.strerror(errno.EFBIG))), stderr
+    assert not out.exists()
 
 
 def test_a_full_disk_before_the_first_run_leaves_nothing(tmp_path):

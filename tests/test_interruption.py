@@ -1,12 +1,14 @@
 """kill -9 at any moment: what was finished stays, nothing half-written counts, and the same command goes on to the same
 bytes. Commands run in forked processes, which kill themselves beside a write, or are killed after a while."""
 
+import fcntl
 import json
 import os
 import random
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -20,9 +22,12 @@ from click.testing import CliRunner
 
 import cosim.cli
 import nmfd.cli
+from cosim.plant import SumoPlant
 from nmfd import runs, training, workers
 from nmfd.errors import InputError
 from nmfd.runs import LOCK, TEMPORARY
+from nmfd.scenario import load_scenario
+from nmfd.scratch import Scratch, sweep
 
 MAINS = {"nmfd": nmfd.cli.main, "cosim": cosim.cli.main}
 
@@ -84,6 +89,51 @@ def everything_readable(folder: Path) -> None:
 
 def arrays(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.glob("*.npz")}
+
+
+def interrupted(file: Path, *command, after: float) -> tuple[int, str]:
+    """Exit status and stderr (through `file`) of a command in a forked process that gets Ctrl-C after so many
+    seconds."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with suppress(BaseException):
+            with file.open("w") as stream:
+                os.dup2(stream.fileno(), 1), os.dup2(stream.fileno(), 2)
+            sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            program, *arguments = map(str, command)
+            os.write(writer, b"x")
+            try:
+                MAINS[program](arguments)
+            except SystemExit as end:
+                sys.stderr.flush()
+                os._exit(end.code)
+        os._exit(99)
+    os.read(reader, 1)
+    time.sleep(after)
+    os.kill(child, signal.SIGINT)
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status), file.read_text()
+
+
+def test_ctrl_c_at_random_moments(tmp_path):
+    """Status 130 and a line, unless it was too late; the same command then goes on to the same bytes."""
+    scenario, out, draw = tiny.write(tmp_path), tmp_path / "out", random.Random(4)
+    command = ("nmfd", "benchmark", scenario, "--controllers", "no-control,mpc-pc", "--seeds", 2, "--out")
+    begin = time.monotonic()
+    good(call(*command, tmp_path / "whole"))
+    lasted, seen = time.monotonic() - begin, set()
+    for share in (0.0, 0.1, 0.3, 0.6):
+        status, said = interrupted(tmp_path / "said", *command, out, after=lasted * (share + 0.1 * draw.random()))
+        seen.add(status)
+        assert status in (0, 130) and "Traceback" not in said and said.count("interrupted") == (status == 130), said
+        everything_readable(out)
+        if status == 0:
+            break
+    assert 130 in seen
+    good(call(*command, out))
+    assert arrays(out) == arrays(tmp_path / "whole")
 
 
 BOUNDARIES = [(1, False), (1, True), (2, False), (2, True), (3, False), (3, True), (5, True), (6, False), (8, True)]
@@ -308,3 +358,38 @@ def test_arrays_of_a_run_hold_no_times(tmp_path):
         good(call("nmfd", "benchmark", scenario, "--controllers", "mpc-pc", "--out", tmp_path / name))
     assert arrays(tmp_path / "a") == arrays(tmp_path / "b")
     assert np.isnan(runs.read_trajectory(tmp_path / "a" / "mpc-pc-0.npz").decision_time).all()
+
+
+def test_scratch_folders_of_killed_processes_go_at_the_next_start(tmp_path, monkeypatch, city):
+    """Those of living ones stay, and so does what is none."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (tmp_path / "cosim-mine").mkdir()
+    child = os.fork()
+    if child == 0:
+        plant = SumoPlant(load_scenario(city))
+        plant.reset(0)
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    [left] = [path for path in tmp_path.glob("cosim-*") if path.name != "cosim-mine"]
+    assert (left / "trips.rou.xml").is_file()
+    with Scratch("cosim-") as own:
+        assert not left.exists() and own.is_dir()
+        good(call("cosim", "run", city, "--controller", "no-control", "--steps", 2, "--out", tmp_path / "out"))
+        assert own.is_dir()
+    assert [path.name for path in tmp_path.glob("cosim-*")] == ["cosim-mine"]
+
+
+def test_what_is_made_while_others_look_for_old_folders_stays(tmp_path, monkeypatch):
+    """A folder that was taken for an old one before it was locked is made anew."""
+    flock = fcntl.flock
+
+    def swept_before(file, operation):
+        monkeypatch.setattr(fcntl, "flock", flock)
+        sweep(tmp_path, "x-")
+        flock(file, operation)
+
+    monkeypatch.setattr(fcntl, "flock", swept_before)
+    with Scratch("x-", where=tmp_path) as folder:
+        sweep(tmp_path, "x-")
+        assert list(tmp_path.iterdir()) == [folder]
+    assert not list(tmp_path.iterdir())

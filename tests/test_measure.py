@@ -128,6 +128,15 @@ def test_a_trip_through_three_regions(play):
     assert play.meter._vehicles == {}  # nothing is kept of who has gone
 
 
+def test_two_boundaries_between_two_counts(play):
+    """Where a vehicle comes from is known without a count in between."""
+    play.session.routes = {"v": ("a0", "b0", "b1", "c0")}
+    play.step(new=["v"])
+    events = [event for edge in ("b0", "b0", "b1", "c0", "c0", "c0") for event in play.step(move={"v": edge})]
+    assert [(event.source, event.region) for event in events] == [(0, 1), (1, 2)]
+    assert (play.meter.accumulation() == x((2, 2))).all() and play.meter.crossings.sum() == 2
+
+
 def test_a_region_that_is_first_seen_at_the_count(play):
     """On a junction, where no edge is polled; the entry is an event all the same, and its source is where it was."""
     play.session.routes = {"v": ("a0", "b0", "b1")}
@@ -284,6 +293,15 @@ def test_short_entries_are_polled_more_often(length, speed, every):
     session.places["v"] = "b0"
     steps = next(n for n in range(2, 9) if meter.observe())
     assert meter._poll_every == every and steps == max(every, 2)
+
+
+@pytest.mark.parametrize("length, every", [(100.0, 3), (40.0, 2), (20.0, 1)])
+def test_entries_are_asked_no_more_often_than_that(length, every):
+    session, asked = Streets(), []
+    meter, session.vehicles_on = Meter(session, city(length)), lambda edge: asked.append(edge) or ()
+    for _ in range(12):
+        meter.observe()
+    assert len(asked) == 12 // every * 3  # three entries
 
 
 def test_the_shortest_entry_decides():

@@ -1,6 +1,7 @@
 """The report: a valid page that needs nothing else, holds every number, and says in words what the numbers say."""
 
 import base64
+import json
 import re
 import shutil
 import subprocess
@@ -101,6 +102,16 @@ def test_names_and_reasons_are_escaped(content):
     assert "1 x <script>alert(1)</script>" in Page(content).words
 
 
+def test_why_a_strategy_gains_is_told(content, evaluation):
+    """The lines of evaluate.md, at every demand level."""
+    why = (evaluation / "evaluate.md").read_text().partition("## Why")[2]
+    lines = [line.removeprefix("- ") for line in why.splitlines() if line.startswith("- ")]
+    assert len(lines) == 2 * 2 and "Signals under control see" in why
+    words = Page(content).words
+    for line in [*lines, *(line for line in why.splitlines() if line.startswith("Signals under"))]:
+        assert markup.typeset(line) in words, line
+
+
 def test_every_number_of_the_tables_is_there(content, evaluation):
     read = Page(content)
     runs = pd.read_csv(evaluation / "runs.csv", keep_default_na=False, dtype=str)
@@ -190,6 +201,47 @@ def test_error_lines(evaluation, tmp_path, name, arguments, expected):
         manifest.write_text("{}")
     assert expected in error_line(cosim("report", folder, *arguments))
     assert not (folder / "report.html").exists()
+
+
+DAMAGED = {
+    "runs.csv": "is no table of runs", "demand-1/sumo.csv": "is no table of runs", "demand-1/summary.csv": "delete",
+    "demand-1/manifest.json": "is no manifest of runs", "demand-1/pi-gating-2000.npz": "is no trajectory",
+    "demand-1/pi-gating-2000.record.npz": "is no record"}
+
+
+@pytest.mark.parametrize("name, expected", DAMAGED.items())
+def test_damaged_files_are_one_line(evaluation, tmp_path, blind, name, expected):
+    """Empty, noise, cut in two, and something else; no page is written."""
+    folder = tmp_path / "runs"
+    shutil.copytree(evaluation, folder, ignore=shutil.ignore_patterns("demand-0.8"))
+    whole = (folder / name).read_bytes()
+    contents = [b"\0\xff\xfe" * 100, whole[: len(whole) // 2]] if name.endswith((".npz", ".json")) else [
+        b"", b"\0\xff\xfe" * 100, b"a,b\n1,2\n"]
+    for content in contents:
+        (folder / name).write_bytes(content)
+        line = error_line(cosim("report", folder))
+        assert name.rpartition("/")[2] in line and expected in line, content
+    assert not (folder / "report.html").exists()
+
+
+@pytest.mark.parametrize("key, value", [("demand_factor", "x"), ("steps", None), ("step_s", [1])])
+def test_a_manifest_with_a_wrong_value(evaluation, tmp_path, key, value):
+    shutil.copytree(evaluation / "demand-1", tmp_path / "one")
+    file = tmp_path / "one" / "manifest.json"
+    content = json.loads(file.read_text())
+    content["configuration"][key] = value
+    file.write_text(json.dumps(content))
+    assert "is no manifest of runs in SUMO" in error_line(cosim("report", tmp_path / "one"))
+
+
+def test_a_run_whose_row_is_gone_is_not_shown(evaluation, tmp_path, monkeypatch):
+    shutil.copytree(evaluation / "demand-1", tmp_path / "one")
+    file, shown = tmp_path / "one" / "sumo.csv", []
+    file.write_text("".join([line for line in file.open() if "pi-gating" not in line]))
+    monkeypatch.setattr(page.report, "draw_accumulations", lambda out, scenario, runs, **_: shown.extend(runs))
+    run = finished.read(tmp_path / "one")
+    page.report.draw(tmp_path / "one", run.scenario, None, run.rows)
+    assert {trajectory.controller for trajectory in shown} == {"no-control", "dpc-pcrg"}
 
 
 def rows(**times):

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_actuate import PHASES, SINGLE, check
+from test_actuate import MIN_GREEN, PHASES, SINGLE, check
 
 from cosim.city import ensure_built
 from cosim.flows import turning_flows
 from cosim.green_wave import offsets
-from cosim.max_pressure import MIN_GREEN, Junction, Roads, transition
+from cosim.max_pressure import Junction, Roads, transition
 from cosim.plant import SumoPlant
 from cosim.regions import gateway_room_taken, load_city
 from cosim.signals import Link, Signal, read_signals
@@ -118,7 +118,7 @@ def test_signals_that_are_not_simple_are_left_alone(city, tmp_path):
 def test_every_way_between_stages_is_safe(phases):
     """Random switching: yellow after green, the minimum green, nothing green together that never was."""
     random = np.random.default_rng(2)
-    junction, states = Junction(signal(phases), 0.0), []
+    junction, states = Junction(signal(phases), 0.0, min_green=MIN_GREEN), []
     for second in range(1500):
         if second >= junction.next_change:
             junction.advance(float(second))
@@ -167,7 +167,7 @@ def test_pressure_is_upstream_minus_downstream(city, scenario):
 def test_rationed_green(phases):
     """Random switching and commands: all is safe; no cycle has more green than its ration; u_max rations nothing."""
     random, links = np.random.default_rng(3), (0, 1)
-    junction = Junction(signal(phases), 0.0, {link: (0, 1) for link in links})
+    junction = Junction(signal(phases), 0.0, {link: (0, 1) for link in links}, min_green=MIN_GREEN)
     cycle, states, budgets = int(sum(d for _, d in phases)), [], []
     for second in range(40 * cycle):
         now = float(second)
@@ -186,6 +186,17 @@ def test_rationed_green(phases):
     limited = np.isfinite(budgets)
     assert (green[limited] >= np.array(budgets)[limited, None] - 1.0).any()  # rations are used up somewhere
     assert junction.green_time(40.0 * cycle) == {link: green[:, n].sum() for n, link in enumerate(links)}
+
+
+@pytest.mark.parametrize("min_green", [2.0, 9.0])
+def test_the_minimum_green_is_that_of_the_settings(min_green):
+    """A stage lasts so long, and so much green has a gateway whose ration is the least."""
+    held = Junction(signal(CROSS), 0.0, {0: (0, 1)}, min_green=min_green)
+    held.command(np.zeros((2, 2)))
+    assert held.may_switch(min_green) and not held.may_switch(min_green - 1.0)
+    while held.next_change < 66.0:
+        held.advance(held.next_change)
+    assert held.green_time(66.0) == {0: min_green}
 
 
 def test_perimeter_control_over_max_pressure(scenario, plant_of):

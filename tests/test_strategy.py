@@ -4,7 +4,7 @@ from dataclasses import fields
 
 import pytest
 
-from cosim.strategy import ALONE, OPTIONS, configured, parse
+from cosim.strategy import ALONE, OPTIONS, configured, model_free, parse
 from cosim.sumo_settings import Settings
 from nmfd.controllers import registry
 from nmfd.errors import InputError
@@ -24,7 +24,7 @@ from nmfd.errors import InputError
 def test_what_a_name_means(name, controller, overrides):
     strategy = parse(name)
     assert (strategy.name, strategy.controller, strategy.overrides) == (name, controller, overrides)
-    assert strategy.model_free == (controller == ALONE)
+    assert model_free(name) == (controller == ALONE)
 
 
 def test_every_controller_and_option_is_a_strategy():

@@ -1,7 +1,6 @@
 """One no-control run of the imported city by SUMO's own program: densities of its streets, and who crossed what."""
 
 import subprocess
-import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -12,6 +11,7 @@ import numpy as np
 
 from cosim.importing.streets import Streets
 from nmfd.errors import InputError
+from nmfd.scratch import Scratch
 
 INTERVAL = 300.0  # s, of the densities
 PEAK = 3          # such intervals, one after the other: those with the most vehicles count for the partition
@@ -84,8 +84,7 @@ def run_baseline(
     options: Sequence[str] = (),
 ) -> Baseline:
     """Simulate without control. Raises InputError with SUMO's own words if it refuses."""
-    with tempfile.TemporaryDirectory(prefix="cosim-import-") as name:
-        folder = Path(name)
+    with Scratch("cosim-") as folder:
         edges = folder / "edges.xml"
         (folder / "measure.add.xml").write_text(
             f'<additional><edgeData id="all" freq="{INTERVAL:g}" file="{edges}" excludeEmpty="true"/></additional>')

@@ -4,10 +4,8 @@ import csv
 import gzip
 import io
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -26,6 +24,7 @@ from cosim.originals import MESOSCOPIC, read_originals, write_originals
 from cosim.regions import City, load_city
 from nmfd.errors import InputError
 from nmfd.network import Network
+from nmfd.scratch import LOCK, Scratch
 
 NET = "city.net.xml.gz"
 LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
@@ -163,24 +162,21 @@ def _windowed(case: Case, order: Order) -> Case:
 @contextmanager
 def _folders(order: Order):
     """Temporary folders for network and scenario, which take their places together at the end."""
-    made: list[tuple[Path, Path]] = []
-    try:
+    with ExitStack() as stack:
+        made: list[tuple[Path, Path]] = []
         for folder in (order.out, order.scenario):
             folder.parent.mkdir(parents=True, exist_ok=True)
-            made.append((Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent)), folder))
+            made.append((stack.enter_context(Scratch(f".{folder.name}-", where=folder.parent)), folder))
         yield tuple(temporary for temporary, _ in made)
         for temporary, folder in made:
-            temporary.chmod(0o755)
             folder.mkdir(exist_ok=True)
             # Without its toml file a folder counts as nothing: it goes first and comes last.
             for old in folder.glob("*.toml"):
                 if (temporary / old.name).exists():
                     old.unlink()
             for file in sorted(temporary.iterdir(), key=lambda file: (file.suffix == ".toml", file.name)):
-                os.replace(file, folder / file.name)
-    finally:
-        for temporary, _ in made:
-            shutil.rmtree(temporary, ignore_errors=True)
+                if file.name != LOCK:
+                    os.replace(file, folder / file.name)
 
 
 class _Baselines:
@@ -196,10 +192,10 @@ class _Baselines:
 
     def run(self, factor: float, mesoscopic: bool) -> Baseline:
         if self._last is None or self._last[0] != (factor, mesoscopic):
-            with tempfile.TemporaryDirectory(prefix="cosim-import-") as name:
+            with Scratch("cosim-") as folder:
                 routes = self._routes
                 if factor != 1.0:
-                    routes = [Path(name) / "vehicles.rou.xml"]
+                    routes = [folder / "vehicles.rou.xml"]
                     write_originals(read_originals(self._routes), routes[0], seed=0, factor=factor, jitter=0.0,
                                     begin=self._clock.begin)
                 self._last = (factor, mesoscopic), run_baseline(

@@ -127,6 +127,11 @@ def is_own(name: str) -> bool:
     return name not in names()
 
 
+def guides(name: str) -> bool:
+    """Whether the controller `name`, which must be known, may guide routes, as one of the user's own might."""
+    return is_own(name) or name == "route-guidance" or "-pcrg" in name
+
+
 def configured_own(name: str, scenario: Scenario) -> tuple[str, Scenario]:
     """Of a controller of the user's own: the name of its table, and `scenario` with the tables of all such."""
     from nmfd.controllers import own

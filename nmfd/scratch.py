@@ -1,0 +1,51 @@
+"""Folders for files that nobody needs afterwards.
+
+A killed process leaves its folder behind. Whoever makes the next one removes those whose process has ended: it had a
+lock on its folder, and the system lets go of that however it ended.
+"""
+
+import fcntl
+import os
+import shutil
+import tempfile
+from contextlib import suppress
+from glob import escape
+from pathlib import Path
+
+LOCK = ".lock"
+
+
+class Scratch:
+    """A new folder, there until `close`, the end of a `with` block (which gets its path), or that of this process."""
+
+    def __init__(self, prefix: str, *, where: Path | None = None):
+        """prefix: of its name, and of those that are looked at; where: the system's place for such folders if None"""
+        where = Path(tempfile.gettempdir()) if where is None else where
+        sweep(where, prefix)
+        while True:
+            self._folder = tempfile.TemporaryDirectory(prefix=prefix, dir=where)
+            self.path = Path(self._folder.name)
+            with suppress(FileNotFoundError):
+                self._lock = (self.path / LOCK).open("x")
+                with suppress(OSError):  # a file system without locks: nothing is ever removed there
+                    fcntl.flock(self._lock, fcntl.LOCK_EX)
+                if os.path.samestat(os.fstat(self._lock.fileno()), os.stat(self.path / LOCK)):
+                    return  # nobody took it for an old one before it was locked
+
+    def close(self) -> None:
+        self._folder.cleanup()
+        self._lock.close()
+
+    def __enter__(self) -> Path:
+        return self.path
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+
+def sweep(where: Path, prefix: str) -> None:
+    """Remove the folders in `where` with this prefix whose processes have ended."""
+    for lock in where.glob(f"{escape(prefix)}*/{LOCK}"):
+        with suppress(OSError), lock.open("r+") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(lock.parent, ignore_errors=True)
