@@ -1,5 +1,6 @@
 """The commands identify and import of `cosim`. Heavy modules are imported inside them."""
 
+import os
 from pathlib import Path
 
 import click
@@ -17,32 +18,35 @@ from nmfd.options import COUNT, FILE, FOLDER, SEED
 @click.option("--seeds", type=COUNT, default=2, show_default=True, metavar="N",
               help="Loading runs per level, with seeds 1000 to 1000 + N - 1.")
 @click.option("--workers", type=COUNT, default=2, show_default=True, metavar="N")
-@click.option("--guided", is_flag=True, help="With route guidance: the model of a city whose drivers are guided.")
+@click.option("--guided/--own", default=None,
+              help="Only the model of guided drivers, or only that of drivers who go their own ways. [default: both]")
 @click.option("--with", "options", metavar="OPTION[+...]",
               help="Of a city with such signals or drivers: max-pressure, rerouting-30, ... as in a strategy's name.")
 @click.option("--network", "target", type=FOLDER, metavar="DIR",
-              help="The folder whose network.toml is written. [default: the scenario's network]")
+              help="The folder whose network.toml is written, for one model. [default: the scenario's network]")
 @click.option("--iterations", type=COUNT, default=600, show_default=True, metavar="N",
               help="Of the fit.")
 @click.option("--out", type=FOLDER, metavar="DIR", help="Samples and pictures. [default: runs/<scenario>-identify]")
 def identify(
-    scenario: Path, levels: str, seeds: int, workers: int, guided: bool, options: str | None, target: Path | None,
-    iterations: int, out: Path | None,
+    scenario: Path, levels: str, seeds: int, workers: int, guided: bool | None, options: str | None,
+    target: Path | None, iterations: int, out: Path | None,
 ) -> None:
     """Fit the regional model and the drivers' own split ratios of a SUMO city; writes a network.toml.
 
     The city is loaded with multiples of the scenario's demand, first without perimeter control, then under a controller
     that probes it. Policies that were trained on the network as it was before do not fit the new one: train them again.
-    A controller plans with a model other than the scenario's if its table says so, such as
-    [controllers.dpc-pcrg] with model = "../../networks/grid7_guided"; one for a strategy with options has a table of
-    its own, such as [controllers."dpc-pcrg+max-pressure"].
+
+    Then the same with guided drivers, who make another model of the same city: it goes to the folder guided within the
+    network's, where the controllers that guide routes find it. Where the scenario tells them of another one, as with
+    [controllers.dpc-pcrg] and model = "../../networks/grid7_guided", and with --with or --network, there is one model
+    only. One for a strategy with options has a table of its own, such as [controllers."dpc-pcrg+max-pressure"].
 
     Of an imported city the network's folder will do.
 
     \b
     Examples:
-      cosim identify scenarios/grid7_peak --levels 0.6,0.8,1.0 --seeds 2
       cosim identify networks/mycity
+      cosim identify networks/mycity --own --levels 0.6,0.8,1.0 --seeds 2
       cosim identify scenarios/grid7_peak --guided --network networks/grid7_guided
       cosim identify scenarios/grid7_peak --guided --with max-pressure --network networks/grid7_max_pressure
     """
@@ -55,19 +59,26 @@ def identify(
     factors = parsed_levels("--levels", levels)
     scenario = find.scenario_of(scenario)
     loaded = load_scenario(scenario)
-    if out is None:
-        kind = f"{'-guided' if guided else ''}{f'-{options}' if options else ''}"
-        out = Path("runs") / f"{runs.file_name(loaded.name)}-identify{kind}"
-    loading = identify.Loading(
-        levels=factors, seeds=range(1000, 1000 + seeds), guided=guided,
-        options=options.split("+") if options else (), network=target, iterations=iterations)
-    try:
-        with progress_line("identify") as progress:
-            text = identify.identify(scenario, loading, out=out, workers=workers, progress=progress)
-    except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; finished loading runs are in {out}: the same command goes on") from None
-    click.echo(text)
-    click.echo(f"Written to {(target or loaded.network.folder) / 'network.toml'}; samples and pictures to {out}")
+    both = guided is None and not options and target is None and identify.without_model(loaded)
+    for guide in (False, True) if both else (bool(guided),):
+        kind = f"{'-guided' if guide else ''}{f'-{options}' if options else ''}"
+        folder = out or Path("runs") / f"{runs.file_name(loaded.name)}-identify{kind}"
+        if out and both and guide:
+            folder = out / "guided"
+        loading = identify.Loading(
+            levels=factors, seeds=range(1000, 1000 + seeds), guided=guide,
+            options=options.split("+") if options else (), network=target, iterations=iterations)
+        try:
+            with progress_line("identify") as progress:
+                text = identify.identify(scenario, loading, out=folder, workers=workers, progress=progress)
+        except KeyboardInterrupt:
+            raise Interrupted(
+                f"interrupted; finished loading runs are in {folder}: the same command goes on") from None
+        if both:
+            click.echo("Drivers who are guided:" if guide else "Drivers who go their own ways:")
+        click.echo(text)
+        written = os.path.normpath(loading.target(loaded) / "network.toml")
+        click.echo(f"Written to {written}; samples and pictures to {folder}")
 
 
 @click.command(name="import")

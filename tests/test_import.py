@@ -2,6 +2,8 @@
 
 import csv
 import gzip
+import re
+import shutil
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
@@ -21,7 +23,7 @@ from cosim.originals import read_originals, read_routes
 from cosim.plant import SumoPlant
 from cosim.regions import load_city
 from cosim.sumo_settings import settings
-from nmfd.scenario import load_scenario
+from nmfd.scenario import as_modelled, load_scenario
 from nmfd.types import Controls
 
 
@@ -308,6 +310,25 @@ def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
         assert plant.record().guided.sum() > 10
     finally:
         plant.close()
+
+
+def test_identification_gives_both_models_and_the_import_takes_the_second_away(imported, config, tmp_path):
+    """Drivers of their own ways and guided ones; an empty region keeps what it has; new regions need new models."""
+    shutil.copytree(imported[0], tmp_path, dirs_exist_ok=True)
+    network, scenario = tmp_path / "networks" / "tiny", tmp_path / "scenarios" / "tiny"
+    file = scenario / "scenario.toml"
+    file.write_text(re.sub(r"\nsteps = \d+", "\nsteps = 10", file.read_text()))
+    text = good(cosim("identify", network, "--levels", "1,2", "--seeds", 1, "--iterations", 3, "--workers", 1, "--out",
+                      tmp_path / "loading"))
+    assert "Drivers who go their own ways:" in text and "Drivers who are guided:" in text
+    assert f"Written to {network / 'guided' / 'network.toml'}" in text
+    assert (tmp_path / "loading" / "guided" / "level-2" / "probing-pcrg-1000.npz").is_file()
+    loaded = load_scenario(scenario)
+    guided = as_modelled(loaded, "dpc-pcrg").network
+    assert guided.hash != loaded.network.hash and guided.own_splits == loaded.network.own_splits
+    assert "PLACEHOLDERS" not in (network / "network.toml").read_text()
+    good(cosim("import", config, "--regions", 2, "--method", "geometric", "--no-run", "--out", network, "--force"))
+    assert as_modelled(load_scenario(scenario), "dpc-pcrg").network.regions == 2
 
 
 def test_the_chain_in_a_city_without_signals(tmp_path):

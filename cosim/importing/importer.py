@@ -26,6 +26,7 @@ from cosim.originals import MESOSCOPIC, read_originals, write_originals
 from cosim.regions import City, load_city
 from nmfd.errors import InputError
 from nmfd.network import Network
+from nmfd.scenario import GUIDED
 
 NET = "city.net.xml.gz"
 LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
@@ -176,6 +177,8 @@ def _folders(order: Order):
             for old in folder.glob("*.toml"):
                 if (temporary / old.name).exists():
                     old.unlink()
+            if folder == order.out:  # the model of guided drivers in other regions
+                (folder / GUIDED / "network.toml").unlink(missing_ok=True)
             for file in sorted(temporary.iterdir(), key=lambda file: (file.suffix == ".toml", file.name)):
                 os.replace(file, folder / file.name)
     finally:
