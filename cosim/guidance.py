@@ -66,8 +66,9 @@ class Guide:
         turn = np.array([city.turn_time[move] for move in moves])
         self._turn_time = dict(zip(zip(first.tolist(), second.tolist(), strict=True), turn.tolist(), strict=True))
         here = [self._region == region for region in range(city.regions)]
-        self._within = [_Moves(first, second, turn, allowed=allowed, reverse=True) for allowed in here]
-        self._without = [_Moves(first, second, turn, allowed=~allowed, reverse=False) for allowed in here]
+        self._within, self._within_back, self._without_back = (
+            [_Moves(first, second, turn, allowed=allowed ^ outside, reverse=reverse) for allowed in here]
+            for outside, reverse in ((False, False), (False, True), (True, True)))
         self._gateways = [
             np.array([(self._index[g.from_edge], self._index[g.to_edge], g.target)
                       for g in city.gateways if g.source == region], dtype=int).reshape(-1, 3).T
@@ -120,9 +121,9 @@ class Guide:
         """The fastest way inside the region of destination."""
         if (event.region, taste) not in self._inside:
             time = self._time * self._taste[taste]
-            self._inside[event.region, taste] = time, self._within[event.region].costing(time)
+            self._inside[event.region, taste] = time, self._within_back[event.region].costing(time)
         time, inside = self._inside[event.region, taste]
-        moves = self._within[event.region]
+        moves = self._within_back[event.region]
         first, last = moves.number[here], moves.number[target]
         if (taste, target) not in self._home:
             self._home[taste, target] = dijkstra(inside, indices=last, return_predecessors=True)
@@ -182,7 +183,7 @@ class Guide:
         if (region, taste) not in self._ways:
             time = self._time * self._taste[taste]
             self._ways[region, taste] = _Ways(
-                *self._gateways[region], inside=self._within[region], outside=self._without[region], time=time)
+                *self._gateways[region], inside=self._within[region], outside=self._without_back[region], time=time)
         return self._ways[region, taste]
 
 
@@ -221,31 +222,34 @@ class _Moves:
 class _Ways:
     """Fastest ways out of one region by each of its G gateways (first[g] -> second[g], into next_region[g]).
 
-    Gateways begins[n] to ends[n] - 1 lead into region neighbours[n].
+    Gateways begins[n] to ends[n] - 1 lead into region neighbours[n]. Searched is from where drivers are and from where
+    they go, when somebody first is or goes there: that is less than from all gateways of a large city.
     """
 
     def __init__(self, first, second, next_region, *, inside: _Moves, outside: _Moves, time: np.ndarray):
-        """first, second, next_region: (G,), the last in rising order; time: (E,) [s]"""
+        """first, second, next_region: (G,), the last in rising order; inside: moves in the region; outside: those
+        elsewhere, back; time: (E,) [s]"""
         self.time, self._inside, self._outside = time, inside, outside
-        self._first, self._second = inside.number[first], outside.number[second]
+        self._first, self._second, self._entering = inside.number[first], outside.number[second], time[second]
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))
-        firsts, self._in = np.unique(self._first, return_inverse=True)  # several gateways share an edge
-        seconds, self._out = np.unique(self._second, return_inverse=True)
-        to_gateway, self._after = dijkstra(inside.costing(time), indices=firsts, return_predecessors=True)
-        from_gateway, self._before = dijkstra(outside.costing(time), indices=seconds, return_predecessors=True)
-        # (nodes, G): the rows are what `cost` adds up
-        self._there = np.ascontiguousarray((to_gateway[self._in] + time[second][:, None]).T)
-        self._onward = np.ascontiguousarray(from_gateway[self._out].T)
+        self._costs = inside.costing(time), outside.costing(time)
+        self._there: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._onward: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def cost(self, here: int, target: int) -> np.ndarray:
         """(G,) [s] from the end of edge `here` to the end of edge `target`; infinite where there is no way."""
-        return self._there[self._inside.number[here]] + self._onward[self._outside.number[target]]
+        if here not in self._there:
+            cost, before = dijkstra(self._costs[0], indices=self._inside.number[here], return_predecessors=True)
+            self._there[here] = cost[self._first] + self._entering, before
+        if target not in self._onward:
+            cost, after = dijkstra(self._costs[1], indices=self._outside.number[target], return_predecessors=True)
+            self._onward[target] = cost[self._second], after
+        return self._there[here][0] + self._onward[target][0]
 
     def route(self, here: int, gateway: int, target: int) -> list[int]:
-        """The edges from `here` to `target` through `gateway`."""
+        """The edges from `here` to `target` through `gateway`, whose cost was asked for."""
         to_gateway = self._inside.path(
-            self._after[self._in[gateway]], self._inside.number[here], self._first[gateway])
-        back = self._outside.path(
-            self._before[self._out[gateway]], self._outside.number[target], self._second[gateway])
-        return to_gateway + back[::-1]
+            self._there[here][1], int(self._first[gateway]), int(self._inside.number[here]))
+        return to_gateway[::-1] + self._outside.path(
+            self._onward[target][1], int(self._second[gateway]), int(self._outside.number[target]))
