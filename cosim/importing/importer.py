@@ -72,6 +72,8 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
     tell("reading")
     case = _windowed(read_case(order.source), order)
     streets = read_streets(case.net, case.additional)
+    order = replace(order, mesoscopic=order.mesoscopic or case.mesoscopic)
+    scale = 1.0 if order.peak else case.scale
     traffic = _traffic(case, streets, order)
     if order.begin is None:
         case = model.without_idle(case, traffic)
@@ -80,10 +82,11 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
         files = _write_traffic(folder, traffic)
         simulate = _Baselines(streets, case, clock, folder, files)
         mesoscopic = order.mesoscopic or streets.drivable.sum() > LARGE
-        factor, congests, baseline = 1.0 if order.peak else order.level, True, None
+        factor, congests, baseline = 1.0 if order.peak else scale * (order.level or 1.0), True, None
         if order.level is None:
-            factor, congests = level.congesting(
-                lambda times, meso: simulate.run(times, meso).pace(streets), mesoscopic=mesoscopic, tell=tell)
+            times, congests = level.congesting(
+                lambda times, meso: simulate.run(scale * times, meso).pace(streets), mesoscopic=mesoscopic, tell=tell)
+            factor = scale * times
         if order.run:
             tell("simulating without control")
             baseline = simulate.run(factor, mesoscopic)
@@ -108,6 +111,10 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
             protected=_protected(streets, regions, baseline, network), factor=factor, mesoscopic=order.mesoscopic))
         report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
         report += _level_line(order, factor, congests)
+        if scale != 1.0:
+            report += f"\nvehicles times {scale:g}, the scale in {case.source.name}"
+        if case.left_out:
+            report += f"\nnot taken over from {case.source.name}: {', '.join(case.left_out)}"
         if mesoscopic and order.run:
             report += "\nsimulated by SUMO's mesoscopic model" + (
                 "" if order.mesoscopic else f": the city has more than {LARGE:,} edges for cars")
