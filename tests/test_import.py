@@ -23,6 +23,7 @@ from cosim.originals import read_originals, read_routes
 from cosim.plant import SumoPlant
 from cosim.regions import load_city
 from cosim.sumo_settings import settings
+from nmfd.errors import InputError
 from nmfd.scenario import as_modelled, load_scenario
 from nmfd.types import Controls
 
@@ -213,6 +214,39 @@ def test_mesoscopic_keeps_the_ledger(imported):
         assert plant.record().crossings.sum() > 0
     finally:
         plant.close()
+
+
+@pytest.mark.parametrize("key, value", [("signals", "max-pressure"), ("measurement", "estimate")])
+def test_mesoscopic_has_no_lanes(imported, key, value):
+    scenario = load_scenario(imported[0] / "scenarios" / "tiny")
+    with pytest.raises(InputError, match=f"sumo.{key}: {value} .* has no lanes"):
+        SumoPlant(scenario, overrides=replace(settings(scenario), mesoscopic=True, **{key: value}))
+
+
+def test_options_and_includes_of_the_user_count(config, tmp_path):
+    """SUMO's short form of values, its scale, its mesoscopic model, files in files; all else is named."""
+    for file in config.parent.glob("*.xml*"):
+        shutil.copy(file, tmp_path)
+    (tmp_path / "cars.rou.xml").write_text('<routes><include href="more/cars.rou.xml"/><flow id="none" begin="600" '
+                                           'end="900" number="0" from="A0A1" to="D1D2"/></routes>')
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more" / "cars.rou.xml").write_text(
+        '<routes><flow id="f" begin="600" end="1200" number="60" from="A1B1" to="C1D1"/></routes>')
+    (tmp_path / "city.sumocfg").write_text(
+        '<configuration><net-file v="city.net.xml"/><route-files v="cars.rou.xml"/><begin v="600"/><scale v="2.5"/>'
+        '<mesosim v="true"/><max-depart-delay value="60"/><tripinfo-output value="trips.xml"/></configuration>')
+    case = read_case(tmp_path / "city.sumocfg")
+    assert case.scale == 2.5 and case.mesoscopic and case.left_out == ["max-depart-delay = 60"]
+    text = good(cosim("import", tmp_path / "city.sumocfg", "--regions", 2, "--method", "geometric", "--no-run",
+                      "--out", tmp_path / "networks" / "x"))
+    assert "60 vehicles in" in text and "vehicles times 2.5, the scale" in text
+    assert "not taken over from city.sumocfg: max-depart-delay = 60" in text
+    scenario = load_scenario(tmp_path / "scenarios" / "x")
+    assert scenario.demand_factor == 2.5 and scenario.demand.sum() * scenario.step == pytest.approx(150.0)
+    assert settings(scenario).mesoscopic
+    (tmp_path / "more" / "cars.rou.xml").write_text('<routes><include href="../cars.rou.xml"/></routes>')
+    with pytest.raises(InputError, match="include each other without end"):
+        read_traffic(case, read_streets(case.net), seed=0)
 
 
 def test_signal_plans_know_the_city_s_own_vehicles(imported):
