@@ -91,6 +91,8 @@ def identify(
 @click.option("--edges", type=FILE, metavar="CSV", help="Or your own regions: a table with the columns edge,region,")
 @click.option("--taz", type=FILE, metavar="FILE", help="or a SUMO file with a TAZ per region,")
 @click.option("--polygons", type=FILE, metavar="FILE", help="or one with a polygon or more (id, id.1, ...) per region.")
+@click.option("--routes", type=FILE, multiple=True, metavar="FILE",
+              help="Vehicles, trips or flows, if not in the sumocfg. May be repeated.")
 @click.option("--od", type=FILE, multiple=True, metavar="FILE",
               help="OD matrix between TAZ: tazRelation XML, or VISUM's O- or V-format. May be repeated.")
 @click.option("--zones", type=FILE, multiple=True, metavar="FILE", help="The TAZ of --od, if not in the sumocfg.")
@@ -106,8 +108,9 @@ def identify(
 @click.option("--force", is_flag=True, help="Replace a network and scenario that are there.")
 def import_(
     source: Path, regions: int | None, out: Path, scenario: Path | None, method: str, edges: Path | None,
-    taz: Path | None, polygons: Path | None, od: tuple[Path, ...], zones: tuple[Path, ...], demand: str | None,
-    level: str, mesoscopic: bool, begin: str | None, end: str | None, seed: int, no_run: bool, force: bool,
+    taz: Path | None, polygons: Path | None, routes: tuple[Path, ...], od: tuple[Path, ...], zones: tuple[Path, ...],
+    demand: str | None, level: str, mesoscopic: bool, begin: str | None, end: str | None, seed: int, no_run: bool,
+    force: bool,
 ) -> None:
     """Turn any SUMO city into a network and a scenario: regions, gateways, demand by pair of regions, map.
 
@@ -116,6 +119,7 @@ def import_(
     \b
     Examples:
       cosim import city.sumocfg --regions 5 --out networks/mycity
+      cosim import city.net.xml.gz --routes cars.rou.xml --regions 5 --out networks/mycity
       cosim import city.net.xml.gz --regions 6 --demand peak --out networks/mycity
       cosim import city.sumocfg --taz districts.taz.xml --out networks/mycity --begin 7:00:00 --end 9:00:00
     """
@@ -132,7 +136,8 @@ def import_(
         source=source, regions=regions, out=out, method=method, given=given, seed=seed, run=not no_run, force=force,
         peak=demand is not None, level=parsed_level(level, no_run), mesoscopic=mesoscopic,
         scenario=scenario or out.parent.parent / "scenarios" / out.name,
-        begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"), od=od, zones=zones)
+        begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"), routes=routes, od=od,
+        zones=zones)
     with progress_line("import") as progress:
         report = import_city(order, (lambda stage: progress(0, 1, stage)) if progress else lambda stage: None)
     click.echo(report)

@@ -244,6 +244,9 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
     scenario = load_scenario(tmp_path / "scenarios" / "x")
     assert scenario.demand_factor == 2.5 and scenario.demand.sum() * scenario.step == pytest.approx(150.0)
     assert settings(scenario).mesoscopic
+    good(cosim("import", tmp_path / "city.net.xml", "--routes", tmp_path / "cars.rou.xml", "--regions", 2, "--method",
+               "geometric", "--no-run", "--out", tmp_path / "networks" / "y"))  # without any sumocfg
+    assert load_scenario(tmp_path / "scenarios" / "y").demand.sum() * scenario.step == pytest.approx(60.0)
     (tmp_path / "more" / "cars.rou.xml").write_text('<routes><include href="../cars.rou.xml"/></routes>')
     with pytest.raises(InputError, match="include each other without end"):
         read_traffic(case, read_streets(case.net), seed=0)
@@ -277,7 +280,7 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
     (lambda folder: (folder / "city.net.xml").write_text("<net></net>"), "has no edge that cars may use"),
     (lambda folder: (folder / "city.sumocfg").write_text("<routes/>"), "expected a sumocfg or a net.xml"),
     (lambda folder: (folder / "city.sumocfg").write_text(
-        '<configuration><net-file value="city.net.xml"/></configuration>'), "or add --od FILE or --demand peak"),
+        '<configuration><net-file value="city.net.xml"/></configuration>'), "or add --routes FILE, --od FILE or --d"),
 ])
 def test_one_clear_line(config, tmp_path, change, expected):
     for file in config.parent.iterdir():

@@ -61,6 +61,7 @@ class Order:
     force: bool = False
     begin: float | None = None
     end: float | None = None
+    routes: tuple[Path, ...] = ()
     od: tuple[Path, ...] = ()
     zones: tuple[Path, ...] = ()
 
@@ -71,6 +72,7 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
     _check_free(order)
     tell("reading")
     case = _windowed(read_case(order.source), order)
+    case = replace(case, routes=(*case.routes, *order.routes))
     streets = read_streets(case.net, case.additional)
     order = replace(order, mesoscopic=order.mesoscopic or case.mesoscopic)
     scale = 1.0 if order.peak else case.scale
@@ -130,7 +132,7 @@ def _traffic(case: Case, streets: Streets, order: Order) -> Traffic:
         if not len(traffic.depart):
             raise InputError(
                 f"{order.source}: names no vehicles for the streets of cars{_notes(traffic)}; give a sumocfg with "
-                "route-files, or add --od FILE or --demand peak")
+                "route-files, or add --routes FILE, --od FILE or --demand peak")
         return traffic
     if len(traffic.depart):
         raise InputError(
