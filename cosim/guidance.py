@@ -129,8 +129,10 @@ class Guide:
         if (taste, target) not in self._home:
             self._home[taste, target] = dijkstra(inside, indices=last, return_predecessors=True)
         cost, after = self._home[taste, target]
-        if first == last or not np.isfinite(cost[first]) or self._keeps(
-                self._present(event.vehicle), here, time, cost[first]):
+        if first == last or not np.isfinite(cost[first]):
+            return
+        present = self._present(event.vehicle)
+        if self._keeps(present, here, self._takes(present, here, time)[0], cost[first]):
             return
         self._send(event.vehicle, moves.path(after, first, last))
 
@@ -138,7 +140,8 @@ class Guide:
         """The next region, and the fastest way through it."""
         ways = self._ways_from(event.region, taste)
         present = self._present(event.vehicle)
-        cost, reached = ways.cost(here, target, self._most_detour + self._at_most(present, here, ways.time))
+        takes, bound = self._takes(present, here, ways.time)
+        cost, reached = ways.cost(here, target, self._most_detour + takes + 1.0 if bound else np.inf)
         least = np.minimum.reduceat(cost, ways.begins)
         if not np.isfinite(least).any():
             return
@@ -156,7 +159,7 @@ class Guide:
         n = int(np.argmin(np.where(allowed, least - BONUS * behind, np.inf)))
         following = int(ways.neighbours[n])
         gateway = int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]]))
-        if self._keeps(present, here, ways.time, cost[gateway], following) or self._send(
+        if self._keeps(present, here, takes, cost[gateway], following) or self._send(
                 event.vehicle, ways.route(here, gateway, target)):
             self.realised[event.region, following, event.destination] += 1
             self._assigned[event.region, following, event.destination] += 1.0
@@ -164,31 +167,25 @@ class Guide:
     def _present(self, vehicle: str) -> list[int] | None:
         """The edges of the driver's present way from where he is; None where it uses roads that are closed to cars."""
         route = self._session.route(vehicle)[self._session.route_index(vehicle):]
-        if any(edge not in self._index for edge in route):
-            return None
-        return [self._index[edge] for edge in route]
+        way = [self._index.get(edge) for edge in route]
+        return None if None in way else way
 
-    def _takes(self, way: list[int], time: np.ndarray) -> float:
-        """[s] from the end of the first edge of `way` to the end of the last, at `time` (E,) [s]."""
-        turns = sum(self._turn_time.get(move, 0.0) for move in zip(way[:-1], way[1:], strict=True))
-        return time[way[1:]].sum() + turns
-
-    def _at_most(self, present: list[int] | None, here: int, time: np.ndarray) -> float:
-        """[s] that the best way out of the region and on to the end can take: what the present one takes, if it is
-        such a way."""
+    def _takes(self, present: list[int] | None, here: int, time: np.ndarray) -> tuple[float, bool]:
+        """[s] from the end of edge `here` to the end of the present way, if it begins there, at `time` (E,) [s]; and
+        whether it is a way that a search would find: by known moves, out of the region of `here` and never back."""
         if present is None or present[0] != here:
-            return np.inf
+            return np.inf, False
+        turns = [self._turn_time.get(move) for move in zip(present[:-1], present[1:], strict=True)]
+        known = None not in turns
         elsewhere = self._region[present] != self._region[here]
-        if (elsewhere[:-1] & ~elsewhere[1:]).any():  # it comes back
-            return np.inf
-        if not all(move in self._turn_time for move in zip(present[:-1], present[1:], strict=True)):
-            return np.inf
-        return self._takes(present, time) + 1.0
+        back = (elsewhere[:-1] & ~elsewhere[1:]).any()
+        return time[present[1:]].sum() + sum(turns if known else filter(None, turns)), known and not back
 
-    def _keeps(self, present: list[int] | None, here: int, time: np.ndarray, cost: float,
+    def _keeps(self, present: list[int] | None, here: int, takes: float, cost: float,
                following: int | None = None) -> bool:
-        """Whether the driver's present way, at `time` (E,) [s], is about as good as one of `cost` [s], and leads into
-        the region `following` next, if that is given; so it is where the way uses roads that are closed to cars."""
+        """Whether the driver's present way, which takes `takes` [s], is about as good as one of `cost` [s], and leads
+        into the region `following` next, if that is given; so it is where the way uses roads that are closed to
+        cars."""
         if present is None:
             return True
         if present[0] != here:
@@ -196,7 +193,7 @@ class Guide:
         regions = self._region[present]
         if following is not None and regions[np.argmax(regions != regions[0])] != following:
             return False
-        return self._takes(present, time) <= (1.0 + LOYALTY) * cost
+        return takes <= (1.0 + LOYALTY) * cost
 
     def _send(self, vehicle: str, way: list[int]) -> bool:
         """Give a vehicle this way; counts the refusals."""
