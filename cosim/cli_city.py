@@ -1,5 +1,6 @@
 """The commands identify and import of `cosim`. Heavy modules are imported inside them."""
 
+import os
 from pathlib import Path
 
 import click
@@ -17,32 +18,35 @@ from nmfd.options import COUNT, FILE, FOLDER, SEED
 @click.option("--seeds", type=COUNT, default=2, show_default=True, metavar="N",
               help="Loading runs per level, with seeds 1000 to 1000 + N - 1.")
 @click.option("--workers", type=COUNT, default=2, show_default=True, metavar="N")
-@click.option("--guided", is_flag=True, help="With route guidance: the model of a city whose drivers are guided.")
+@click.option("--guided/--own", default=None,
+              help="Only the model of guided drivers, or only that of drivers who go their own ways. [default: both]")
 @click.option("--with", "options", metavar="OPTION[+...]",
               help="Of a city with such signals or drivers: max-pressure, rerouting-30, ... as in a strategy's name.")
 @click.option("--network", "target", type=FOLDER, metavar="DIR",
-              help="The folder whose network.toml is written. [default: the scenario's network]")
+              help="The folder whose network.toml is written, for one model. [default: the scenario's network]")
 @click.option("--iterations", type=COUNT, default=600, show_default=True, metavar="N",
               help="Of the fit.")
 @click.option("--out", type=FOLDER, metavar="DIR", help="Samples and pictures. [default: runs/<scenario>-identify]")
 def identify(
-    scenario: Path, levels: str, seeds: int, workers: int, guided: bool, options: str | None, target: Path | None,
-    iterations: int, out: Path | None,
+    scenario: Path, levels: str, seeds: int, workers: int, guided: bool | None, options: str | None,
+    target: Path | None, iterations: int, out: Path | None,
 ) -> None:
     """Fit the regional model and the drivers' own split ratios of a SUMO city; writes a network.toml.
 
     The city is loaded with multiples of the scenario's demand, first without perimeter control, then under a controller
     that probes it. Policies that were trained on the network as it was before do not fit the new one: train them again.
-    A controller plans with a model other than the scenario's if its table says so, such as
-    [controllers.dpc-pcrg] with model = "../../networks/grid7_guided"; one for a strategy with options has a table of
-    its own, such as [controllers."dpc-pcrg+max-pressure"].
+
+    Then the same with guided drivers, who make another model of the same city: it goes to the folder guided within the
+    network's, where the controllers that guide routes find it. Where the scenario tells them of another one, as with
+    [controllers.dpc-pcrg] and model = "../../networks/grid7_guided", and with --with or --network, there is one model
+    only. One for a strategy with options has a table of its own, such as [controllers."dpc-pcrg+max-pressure"].
 
     Of an imported city the network's folder will do.
 
     \b
     Examples:
-      cosim identify scenarios/grid7_peak --levels 0.6,0.8,1.0 --seeds 2
       cosim identify networks/mycity
+      cosim identify networks/mycity --own --levels 0.6,0.8,1.0 --seeds 2
       cosim identify scenarios/grid7_peak --guided --network networks/grid7_guided
       cosim identify scenarios/grid7_peak --guided --with max-pressure --network networks/grid7_max_pressure
     """
@@ -55,19 +59,26 @@ def identify(
     factors = parsed_levels("--levels", levels)
     scenario = find.scenario_of(scenario)
     loaded = load_scenario(scenario)
-    if out is None:
-        kind = f"{'-guided' if guided else ''}{f'-{options}' if options else ''}"
-        out = Path("runs") / f"{runs.file_name(loaded.name)}-identify{kind}"
-    loading = identify.Loading(
-        levels=factors, seeds=range(1000, 1000 + seeds), guided=guided,
-        options=options.split("+") if options else (), network=target, iterations=iterations)
-    try:
-        with progress_line("identify") as progress:
-            text = identify.identify(scenario, loading, out=out, workers=workers, progress=progress)
-    except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; finished loading runs are in {out}: the same command goes on") from None
-    click.echo(text)
-    click.echo(f"Written to {(target or loaded.network.folder) / 'network.toml'}; samples and pictures to {out}")
+    both = guided is None and not options and target is None and identify.without_model(loaded)
+    for guide in (False, True) if both else (bool(guided),):
+        kind = f"{'-guided' if guide else ''}{f'-{options}' if options else ''}"
+        folder = out or Path("runs") / f"{runs.file_name(loaded.name)}-identify{kind}"
+        if out and both and guide:
+            folder = out / "guided"
+        loading = identify.Loading(
+            levels=factors, seeds=range(1000, 1000 + seeds), guided=guide,
+            options=options.split("+") if options else (), network=target, iterations=iterations)
+        try:
+            with progress_line("identify") as progress:
+                text = identify.identify(scenario, loading, out=folder, workers=workers, progress=progress)
+        except KeyboardInterrupt:
+            raise Interrupted(
+                f"interrupted; finished loading runs are in {folder}: the same command goes on") from None
+        if both:
+            click.echo("Drivers who are guided:" if guide else "Drivers who go their own ways:")
+        click.echo(text)
+        written = os.path.normpath(loading.target(loaded) / "network.toml")
+        click.echo(f"Written to {written}; samples and pictures to {folder}")
 
 
 @click.command(name="import")
@@ -80,6 +91,8 @@ def identify(
 @click.option("--edges", type=FILE, metavar="CSV", help="Or your own regions: a table with the columns edge,region,")
 @click.option("--taz", type=FILE, metavar="FILE", help="or a SUMO file with a TAZ per region,")
 @click.option("--polygons", type=FILE, metavar="FILE", help="or one with a polygon or more (id, id.1, ...) per region.")
+@click.option("--routes", type=FILE, multiple=True, metavar="FILE",
+              help="Vehicles, trips or flows, if not in the sumocfg. May be repeated.")
 @click.option("--od", type=FILE, multiple=True, metavar="FILE",
               help="OD matrix between TAZ: tazRelation XML, or VISUM's O- or V-format. May be repeated.")
 @click.option("--zones", type=FILE, multiple=True, metavar="FILE", help="The TAZ of --od, if not in the sumocfg.")
@@ -95,8 +108,9 @@ def identify(
 @click.option("--force", is_flag=True, help="Replace a network and scenario that are there.")
 def import_(
     source: Path, regions: int | None, out: Path, scenario: Path | None, method: str, edges: Path | None,
-    taz: Path | None, polygons: Path | None, od: tuple[Path, ...], zones: tuple[Path, ...], demand: str | None,
-    level: str, mesoscopic: bool, begin: str | None, end: str | None, seed: int, no_run: bool, force: bool,
+    taz: Path | None, polygons: Path | None, routes: tuple[Path, ...], od: tuple[Path, ...], zones: tuple[Path, ...],
+    demand: str | None, level: str, mesoscopic: bool, begin: str | None, end: str | None, seed: int, no_run: bool,
+    force: bool,
 ) -> None:
     """Turn any SUMO city into a network and a scenario: regions, gateways, demand by pair of regions, map.
 
@@ -105,6 +119,7 @@ def import_(
     \b
     Examples:
       cosim import city.sumocfg --regions 5 --out networks/mycity
+      cosim import city.net.xml.gz --routes cars.rou.xml --regions 5 --out networks/mycity
       cosim import city.net.xml.gz --regions 6 --demand peak --out networks/mycity
       cosim import city.sumocfg --taz districts.taz.xml --out networks/mycity --begin 7:00:00 --end 9:00:00
     """
@@ -121,7 +136,8 @@ def import_(
         source=source, regions=regions, out=out, method=method, given=given, seed=seed, run=not no_run, force=force,
         peak=demand is not None, level=parsed_level(level, no_run), mesoscopic=mesoscopic,
         scenario=scenario or out.parent.parent / "scenarios" / out.name,
-        begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"), od=od, zones=zones)
+        begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"), routes=routes, od=od,
+        zones=zones)
     with progress_line("import") as progress:
         report = import_city(order, (lambda stage: progress(0, 1, stage)) if progress else lambda stage: None)
     click.echo(report)

@@ -66,8 +66,9 @@ class Guide:
         turn = np.array([city.turn_time[move] for move in moves])
         self._turn_time = dict(zip(zip(first.tolist(), second.tolist(), strict=True), turn.tolist(), strict=True))
         here = [self._region == region for region in range(city.regions)]
-        self._within = [_Moves(first, second, turn, allowed=allowed, reverse=True) for allowed in here]
-        self._without = [_Moves(first, second, turn, allowed=~allowed, reverse=False) for allowed in here]
+        self._within, self._within_back, self._without_back = (
+            [_Moves(first, second, turn, allowed=allowed ^ outside, reverse=reverse) for allowed in here]
+            for outside, reverse in ((False, False), (False, True), (True, True)))
         self._gateways = [
             np.array([(self._index[g.from_edge], self._index[g.to_edge], g.target)
                       for g in city.gateways if g.source == region], dtype=int).reshape(-1, 3).T
@@ -76,6 +77,7 @@ class Guide:
         self._length = np.array([city.length[edge] for edge in city.edges])
         self._free = self._length / np.array([city.speed[edge] for edge in city.edges])
         self._time = self._free.copy()
+        self._reached: dict[int, np.ndarray] = {}
         self._ways: dict[tuple[int, int], _Ways] = {}
         self._inside: dict[tuple[int, int], tuple[np.ndarray, csr_array]] = {}
         self._home: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
@@ -120,28 +122,33 @@ class Guide:
         """The fastest way inside the region of destination."""
         if (event.region, taste) not in self._inside:
             time = self._time * self._taste[taste]
-            self._inside[event.region, taste] = time, self._within[event.region].costing(time)
+            self._inside[event.region, taste] = time, self._within_back[event.region].costing(time)
         time, inside = self._inside[event.region, taste]
-        moves = self._within[event.region]
+        moves = self._within_back[event.region]
         first, last = moves.number[here], moves.number[target]
         if (taste, target) not in self._home:
             self._home[taste, target] = dijkstra(inside, indices=last, return_predecessors=True)
         cost, after = self._home[taste, target]
-        if first == last or not np.isfinite(cost[first]) or self._keeps(event.vehicle, here, time, cost[first]):
+        if first == last or not np.isfinite(cost[first]):
+            return
+        present = self._present(event.vehicle)
+        if self._keeps(present, here, self._takes(present, here, time)[0], cost[first]):
             return
         self._send(event.vehicle, moves.path(after, first, last))
 
     def _guide_on(self, event: Event, here: int, target: int, taste: int) -> None:
         """The next region, and the fastest way through it."""
         ways = self._ways_from(event.region, taste)
-        cost = ways.cost(here, target)
+        present = self._present(event.vehicle)
+        takes, bound = self._takes(present, here, ways.time)
+        cost, reached = ways.cost(here, target, self._most_detour + takes + 1.0 if bound else np.inf)
         least = np.minimum.reduceat(cost, ways.begins)
         if not np.isfinite(least).any():
             return
         cell = event.region, ways.neighbours, event.destination
         self._wished[event.region, ways.neighbours[np.argmin(least)], event.destination] += 1.0
         wish = self._wished[cell] / self._wished[cell].sum()
-        shares = shifted(wish, self._own[cell], self._splits[cell]) * np.isfinite(least)
+        shares = shifted(wish, self._own[cell], self._splits[cell]) * np.logical_or.reduceat(reached, ways.begins)
         if shares.sum() <= 0:
             return
         shares /= shares.sum()
@@ -152,25 +159,41 @@ class Guide:
         n = int(np.argmin(np.where(allowed, least - BONUS * behind, np.inf)))
         following = int(ways.neighbours[n])
         gateway = int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]]))
-        if self._keeps(event.vehicle, here, ways.time, cost[gateway], following) or self._send(
+        if self._keeps(present, here, takes, cost[gateway], following) or self._send(
                 event.vehicle, ways.route(here, gateway, target)):
             self.realised[event.region, following, event.destination] += 1
             self._assigned[event.region, following, event.destination] += 1.0
 
-    def _keeps(self, vehicle: str, here: int, time: np.ndarray, cost: float, following: int | None = None) -> bool:
-        """Whether the driver's present way, at `time` (E,) [s], is about as good as one of `cost` [s], and leads into
-        the region `following` next, if that is given; so it is where the way uses roads that are closed to cars."""
+    def _present(self, vehicle: str) -> list[int] | None:
+        """The edges of the driver's present way from where he is; None where it uses roads that are closed to cars."""
         route = self._session.route(vehicle)[self._session.route_index(vehicle):]
-        if any(edge not in self._index for edge in route):
+        way = [self._index.get(edge) for edge in route]
+        return None if None in way else way
+
+    def _takes(self, present: list[int] | None, here: int, time: np.ndarray) -> tuple[float, bool]:
+        """[s] from the end of edge `here` to the end of the present way, if it begins there, at `time` (E,) [s]; and
+        whether it is a way that a search would find: by known moves, out of the region of `here` and never back."""
+        if present is None or present[0] != here:
+            return np.inf, False
+        turns = [self._turn_time.get(move) for move in zip(present[:-1], present[1:], strict=True)]
+        known = None not in turns
+        elsewhere = self._region[present] != self._region[here]
+        back = (elsewhere[:-1] & ~elsewhere[1:]).any()
+        return time[present[1:]].sum() + sum(turns if known else filter(None, turns)), known and not back
+
+    def _keeps(self, present: list[int] | None, here: int, takes: float, cost: float,
+               following: int | None = None) -> bool:
+        """Whether the driver's present way, which takes `takes` [s], is about as good as one of `cost` [s], and leads
+        into the region `following` next, if that is given; so it is where the way uses roads that are closed to
+        cars."""
+        if present is None:
             return True
-        way = [self._index[edge] for edge in route]
-        if way[0] != here:
+        if present[0] != here:
             return False
-        regions = self._region[way]
+        regions = self._region[present]
         if following is not None and regions[np.argmax(regions != regions[0])] != following:
             return False
-        turns = sum(self._turn_time.get(move, 0.0) for move in zip(way[:-1], way[1:], strict=True))
-        return time[way[1:]].sum() + turns <= (1.0 + LOYALTY) * cost
+        return takes <= (1.0 + LOYALTY) * cost
 
     def _send(self, vehicle: str, way: list[int]) -> bool:
         """Give a vehicle this way; counts the refusals."""
@@ -179,10 +202,14 @@ class Guide:
         return taken
 
     def _ways_from(self, region: int, taste: int) -> "_Ways":
+        if region not in self._reached:
+            outside = self._without_back[region]
+            self._reached[region] = outside.leading_to(outside.number[self._gateways[region][1]])
         if (region, taste) not in self._ways:
             time = self._time * self._taste[taste]
             self._ways[region, taste] = _Ways(
-                *self._gateways[region], inside=self._within[region], outside=self._without[region], time=time)
+                *self._gateways[region], inside=self._within[region], outside=self._without_back[region],
+                reached=self._reached[region], time=time)
         return self._ways[region, taste]
 
 
@@ -209,6 +236,13 @@ class _Moves:
         cost = np.maximum(time[self._second] + self._turn, 1e-3)
         return csr_array((cost, self._columns, self._begins), shape=(len(self.edges),) * 2)
 
+    def leading_to(self, nodes: np.ndarray) -> np.ndarray:
+        """(len(nodes), nodes) bool: from which of all nodes each of `nodes` can be reached."""
+        once, which = np.unique(nodes, return_inverse=True)
+        steps = csr_array(
+            (np.ones(len(self._columns)), self._columns, self._begins), shape=(len(self.edges),) * 2).T.tocsr()
+        return np.isfinite(dijkstra(steps, indices=once, unweighted=True))[which]
+
     def path(self, before: np.ndarray, first: int, last: int) -> list[int]:
         """The edges from node `first` to node `last` by the predecessors `before` of a search from `last`."""
         way = [self._ids[first]]
@@ -221,31 +255,42 @@ class _Moves:
 class _Ways:
     """Fastest ways out of one region by each of its G gateways (first[g] -> second[g], into next_region[g]).
 
-    Gateways begins[n] to ends[n] - 1 lead into region neighbours[n].
+    Gateways begins[n] to ends[n] - 1 lead into region neighbours[n]. Searched is from where drivers are and from where
+    they go, when somebody first is or goes there, and no further than they would go: in a large city that is much less
+    than from all gateways to everywhere.
     """
 
-    def __init__(self, first, second, next_region, *, inside: _Moves, outside: _Moves, time: np.ndarray):
-        """first, second, next_region: (G,), the last in rising order; time: (E,) [s]"""
-        self.time, self._inside, self._outside = time, inside, outside
-        self._first, self._second = inside.number[first], outside.number[second]
+    def __init__(
+        self, first, second, next_region, *, inside: _Moves, outside: _Moves, reached: np.ndarray, time: np.ndarray,
+    ):
+        """first, second, next_region: (G,), the last in rising order; inside: moves in the region; outside: those
+        elsewhere, back; reached: (G, nodes of `outside`), which edges can be reached from second[g]; time: (E,) [s]"""
+        self.time, self._inside, self._outside, self._reached = time, inside, outside, reached
+        self._first, self._second, self._entering = inside.number[first], outside.number[second], time[second]
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))
-        firsts, self._in = np.unique(self._first, return_inverse=True)  # several gateways share an edge
-        seconds, self._out = np.unique(self._second, return_inverse=True)
-        to_gateway, self._after = dijkstra(inside.costing(time), indices=firsts, return_predecessors=True)
-        from_gateway, self._before = dijkstra(outside.costing(time), indices=seconds, return_predecessors=True)
-        # (nodes, G): the rows are what `cost` adds up
-        self._there = np.ascontiguousarray((to_gateway[self._in] + time[second][:, None]).T)
-        self._onward = np.ascontiguousarray(from_gateway[self._out].T)
+        self._costs = inside.costing(time), outside.costing(time)
+        self._there: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._onward: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
 
-    def cost(self, here: int, target: int) -> np.ndarray:
-        """(G,) [s] from the end of edge `here` to the end of edge `target`; infinite where there is no way."""
-        return self._there[self._inside.number[here]] + self._onward[self._outside.number[target]]
+    def cost(self, here: int, target: int, most: float) -> tuple[np.ndarray, np.ndarray]:
+        """(G,) [s] from the end of edge `here` to the end of edge `target`, infinite if it is more than `most`, and
+        (G,) bool, whether there is a way at all."""
+        if here not in self._there:
+            cost, before = dijkstra(self._costs[0], indices=self._inside.number[here], return_predecessors=True)
+            self._there[here] = cost[self._first] + self._entering, before
+        there = self._there[here][0]
+        left = most - there.min(initial=most)
+        if target not in self._onward or self._onward[target][0] < left:
+            cost, after = dijkstra(
+                self._costs[1], indices=self._outside.number[target], return_predecessors=True, limit=left)
+            self._onward[target] = left, cost[self._second], after
+        reached = np.isfinite(there) & self._reached[:, self._outside.number[target]]
+        return there + self._onward[target][1], reached
 
     def route(self, here: int, gateway: int, target: int) -> list[int]:
-        """The edges from `here` to `target` through `gateway`."""
+        """The edges from `here` to `target` through `gateway`, whose cost was asked for."""
         to_gateway = self._inside.path(
-            self._after[self._in[gateway]], self._inside.number[here], self._first[gateway])
-        back = self._outside.path(
-            self._before[self._out[gateway]], self._outside.number[target], self._second[gateway])
-        return to_gateway + back[::-1]
+            self._there[here][1], int(self._first[gateway]), int(self._inside.number[here]))
+        return to_gateway[::-1] + self._outside.path(
+            self._onward[target][2], int(self._second[gateway]), int(self._outside.number[target]))

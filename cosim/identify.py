@@ -21,10 +21,11 @@ from nmfd import identification, mfd, runs, toml
 from nmfd.errors import InputError
 from nmfd.identification import Observed
 from nmfd.network import Network
-from nmfd.scenario import Scenario, load_scenario
+from nmfd.scenario import GUIDED, GUIDING, Scenario, load_scenario
 from nmfd.workers import ended
 
 FEWEST = 30.0   # vehicles that must have crossed before their split ratios count
+SAMPLES = 10    # of a region: with fewer it is as good as empty, and keeps the MFD that it has
 AHEAD = 900.0   # s, of the longer prediction that is judged
 BINS = 12       # of accumulation, for the hysteresis
 PATHS = ("recipe", "net", "regions")  # keys of [sumo] in network.toml
@@ -35,7 +36,8 @@ class Loading:
     """levels: multiples of the scenario's demand; seeds: of the runs at every level
     guided: with route guidance, first towards the drivers' own split ratios, then probing; else without
     options: of the strategies (cosim.strategy.OPTIONS), of a city that has, say, max-pressure signals
-    network: the folder whose network.toml is written, None for the scenario's own
+    network: the folder whose network.toml is written; None for the scenario's own or, if guided, the one where
+        controllers that guide look for their model (nmfd.scenario.guided_model)
     iterations: of the fit
     """
 
@@ -52,6 +54,18 @@ class Loading:
         first, second = ("route-guidance", "probing-pcrg") if self.guided else ("no-control", "probing-pc")
         return "+".join([first, *self.options]), "+".join([second, *self.options])
 
+    def target(self, scenario: Scenario) -> Path:
+        """The folder whose network.toml is written."""
+        own = scenario.network.folder
+        alone = self.guided and not self.options and without_model(scenario)
+        return self.network or (own / GUIDED if alone else own)
+
+
+def without_model(scenario: Scenario) -> bool:
+    """Whether controllers that guide routes are told of no model of their own: they need that of guided drivers."""
+    return not any(name.startswith(GUIDING) and "model" in options
+                   for name, options in scenario.controller_options.items())
+
 
 def identify(
     scenario: Path, loading: Loading, *, out: Path, workers: int = 1,
@@ -64,7 +78,7 @@ def identify(
     the same call goes on where it was interrupted, and gives the same model.
     """
     loaded = load_scenario(scenario)
-    target = loaded.network.folder if loading.network is None else loading.network
+    target = loading.target(loaded)
     if (loading.guided or loading.options) and target.resolve() == loaded.network.folder.resolve():
         raise InputError(
             f"{'--guided' if loading.guided else '--with'}: {loaded.name} runs on {target}, whose model must stay that "
@@ -84,9 +98,9 @@ def identify(
         def tell(done, total, note):
             progress(done, total, f"{what}, {note}")
 
-        return identification.fit(
+        return as_it_was(network, identification.fit(
             network, [observed(result) for result in results], iterations=loading.iterations,
-            progress=tell if progress else None, **scheme)
+            progress=tell if progress else None, **scheme), nearly_empty(samples_of(network, results)))
 
     model = fitted(found, "fitting")
     samples = samples_of(network, found)
@@ -126,8 +140,16 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
     """The scenario's network with the published model: an MFD per region, fitted to outflow samples, and own splits,
     if drivers were not guided."""
     network = replace(scenario.network, exit_rates=None, capacity=None, storage=None)
-    network = replace(
-        network, mfds=tuple(_fit(cloud, scenario.step / scenario.substeps) for cloud in samples_of(network, results)))
+    samples = samples_of(network, results)
+    empty = nearly_empty(samples)
+    if len(empty) == network.regions:
+        raise InputError(
+            "--levels: every region was nearly empty in all loading runs; give higher levels, or a scenario with more "
+            "vehicles")
+    network = replace(network, mfds=tuple(
+        network.mfds[region] if region in empty else
+        mfd.fit(*own_points(cloud).T, max_rate=scenario.substeps / scenario.step)
+        for region, cloud in enumerate(samples)))
     if guided:  # what theta is compared with stays what it is for the plant (cosim.guidance)
         return network
     return replace(network, own_splits=own_splits(network, [result.record for result in results]))
@@ -149,12 +171,19 @@ def observed(result: Result) -> Observed:
         perimeter=trajectory.perimeter, splits=trajectory.splits, crossings=record["crossings"].sum(axis=3))
 
 
-def _fit(cloud: dict[str, np.ndarray], step: float) -> mfd.Mfd:
-    points = own_points(cloud)
-    if len(points) < 10:
-        raise InputError(
-            "--levels: a region was nearly empty in all loading runs; give higher levels, or a scenario that uses it")
-    return mfd.fit(points[:, 0], points[:, 1], max_rate=1.0 / step)
+def nearly_empty(samples: Sequence[dict[str, np.ndarray]]) -> list[int]:
+    """The regions with too few samples to fit anything to."""
+    return [region for region, cloud in enumerate(samples) if len(own_points(cloud)) < SAMPLES]
+
+
+def as_it_was(network: Network, model: Network, regions: Sequence[int]) -> Network:
+    """`model` with these regions as they are in `network`, and room for as many vehicles as their MFDs are meant for:
+    what was fitted to hardly any vehicles knows nothing of more."""
+    alone = np.isin(np.arange(model.regions), regions)
+    mfds = tuple((network if alone[n] else model).mfds[n] for n in range(model.regions))
+    return replace(
+        model, mfds=mfds, exit_rates=np.where(alone[:, None], 1.0, model.exit_rates),
+        storage=np.where(alone, np.maximum(model.storage, [mfd.jam for mfd in mfds]), model.storage))
 
 
 def own_points(cloud: dict[str, np.ndarray]) -> np.ndarray:
@@ -196,12 +225,16 @@ def fit_table(network: Network, samples: Sequence[dict]) -> str:
              f"{'hysteresis':>12}   [veh, veh/s]"]
     for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
         points = own_points(cloud)
-        residual = points[:, 1] - curve.outflow(points[:, 0])
-        explained = 1.0 - (residual**2).mean() / points[:, 1].var()
+        explained = float("nan")
+        if len(points) >= SAMPLES and points[:, 1].var() > 0:
+            explained = 1.0 - ((points[:, 1] - curve.outflow(points[:, 0])) ** 2).mean() / points[:, 1].var()
         storage = float("inf") if network.storage is None else network.storage[region]
         lines.append(
             f"{f'{region} {network.region_names[region]}':<16}{curve.critical:>10.0f}{curve.jam:>8.0f}{storage:>9.0f}"
             f"{curve.capacity:>13.3f}{len(points):>9}{explained:>7.2f}{100 * hysteresis(cloud):>10.0f} %")
+    if empty := nearly_empty(samples):
+        left = ", ".join(f"{region} {network.region_names[region]}" for region in empty)
+        lines.append(f"nearly empty in all loading runs: {left}; the MFD stays as it was there")
     return "\n".join(lines)
 
 

@@ -69,6 +69,7 @@ class SumoPlant:
         self._originals: Originals | None = None
         self._outputs = dict(outputs or {})
         self._settings = overrides or settings(scenario)
+        _check_mesoscopic(scenario, self._settings)
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
         check_adjacency(self.city, scenario.network)
@@ -348,3 +349,14 @@ class SumoPlant:
             "gateway_green": np.array([
                 np.mean([green[g.signal][link] for link in g.links]) if g.signal in green else np.nan
                 for g in self.city.gateways])}
+
+
+def _check_mesoscopic(scenario: Scenario, chosen: Settings) -> None:
+    """InputError for what needs lanes where there are none."""
+    for key, value, what in (("signals", MAX_PRESSURE, "counts vehicles lane by lane"),
+                             ("measurement", ESTIMATE, "needs loop detectors on lanes")):
+        if chosen.mesoscopic and getattr(chosen, key) == value:
+            where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
+            raise InputError(
+                f"{where}: sumo.{key}: {value} {what}, but SUMO's mesoscopic model has no lanes; leave it away, or set "
+                "mesoscopic = false (import the city without --mesoscopic)")

@@ -129,6 +129,8 @@ def verdict(
     if pair.percent < 0 and (pair.excludes_zero or pair.seeds == 1):
         return f"gains ({size})" + ("" if unmodelled else f"; {done}")
     kind = "loses" if pair.excludes_zero or pair.seeds == 1 else "gains nothing that stands out from the seeds"
+    if pair.percent == 0.0:
+        kind = "changes nothing"
     reasons = [] if unmodelled else _reasons(rows, name, found, leaking, done, network)
     return f"{kind} ({size})" + (f": {'; '.join(reasons)}" if reasons else "")
 

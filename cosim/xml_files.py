@@ -9,6 +9,7 @@ from nmfd.errors import InputError
 
 # Of a file that is cut off, no XML, of an encoding that there is not, or whose attributes are missing or no numbers.
 BROKEN = (OSError, EOFError, zlib.error, ElementTree.ParseError, LookupError, TypeError, ValueError)
+DEEPEST = 20  # of files that include each other
 
 
 def opened(path: Path):
@@ -16,12 +17,19 @@ def opened(path: Path):
     return (gzip.open if path.suffix == ".gz" else open)(path, "rb")
 
 
-def read_xml(path: Path) -> ElementTree.Element:
-    """The root of an XML file. Raises InputError."""
+def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:
+    """The root of an XML file, with what it includes of others (<include href="..."/>). Raises InputError."""
     try:
         with opened(path) as stream:
-            return ElementTree.parse(stream).getroot()
+            root = ElementTree.parse(stream).getroot()
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; give the path of an existing one") from None
     except BROKEN as error:
         raise InputError(f"{path}: is not an XML file that SUMO could read ({error}); correct or replace it") from None
+    if any(element.tag == "include" for element in root):
+        if depth > DEEPEST:
+            raise InputError(f"{path}: include: files include each other without end; remove one of the includes")
+        parts = list(root)
+        root[:] = [found for part in parts for found in (
+            read_xml(path.parent / part.get("href", ""), depth + 1) if part.tag == "include" else [part])]
+    return root

@@ -150,7 +150,8 @@ def _network(network: Network, model: _Model, runs: Sequence[Observed], off_diag
         p = model.parameters_of(off_diagonal)
     rates = p.exit_rates.double().numpy()
     weight = sum(run.accumulation.sum(axis=0) for run in runs)
-    mean = (weight * rates).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9)
+    weight[weight.sum(axis=1) == 0] = 1.0  # nobody was ever there
+    mean = (weight * rates).sum(axis=1) / weight.sum(axis=1)
     mfds = tuple(
         Mfd(a=float(a) * m, b=float(b) * m, c=float(c) * m, jam=float(jam))
         for a, b, c, jam, m in zip(p.a, p.b, p.c, p.jam, mean, strict=True))

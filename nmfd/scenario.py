@@ -1,6 +1,7 @@
 """Demand, noise, horizon: loaded from scenario.toml and checked."""
 
 import csv
+import functools
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -16,6 +17,8 @@ from nmfd.network import LONGEST_NAME, Network, check_step, load_network
 
 MOST_NUMBERS = 2 * 10**8  # of a demand table: more would not fit into memory
 LONGEST_STEP = 86_400.0   # s
+GUIDED = "guided"         # in a network's folder: that of the same city's model with guided drivers
+GUIDING = ("mpc-pcrg", "dpc-pcrg")  # beginnings of the names of the controllers that plan with it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,8 +209,15 @@ def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
     return demand
 
 
+def guided_model(network: Network) -> Path | None:
+    """The folder of the same city's model with guided drivers, if there is one beside that of the drivers' own."""
+    folder = None if network.folder is None else network.folder / GUIDED
+    return folder if folder is not None and (folder / "network.toml").is_file() else None
+
+
 def as_modelled(scenario: Scenario, controller: str) -> Scenario:
-    """`scenario` with the regional model that `controller` plans with: the network that its option `model` names.
+    """`scenario` with the regional model that `controller` plans with: the network that its option `model` names, or
+    else, where it guides routes, the one in the folder GUIDED of the scenario's network, if there is one.
 
     Drivers who are guided, or who reroute by themselves, make another model of the same city. A controller "NAME+..."
     is NAME with the options of [controllers."NAME+..."] over those of [controllers.NAME]. Raises InputError.
@@ -215,14 +225,17 @@ def as_modelled(scenario: Scenario, controller: str) -> Scenario:
     name, tables = controller.partition("+")[0], scenario.controller_options
     options = {**tables.get(name, {}), **tables.get(controller, {})}
     configured = replace(scenario, controller_options={**tables, name: options})
-    if "model" not in options or scenario.folder is None:
+    if "model" in options and scenario.folder is not None:
+        table = toml.Table(options, scenario.folder / "scenario.toml", f"controllers.{controller}.")
+        model, wrong = load_network(scenario.folder / table.text("model")), functools.partial(table.error, "model")
+        del options["model"]
+    elif name.startswith(GUIDING) and (folder := guided_model(scenario.network)) is not None:
+        model, wrong = load_network(folder), lambda text: InputError(f"{folder / 'network.toml'}: {text}")
+    else:
         return configured
-    table = toml.Table(options, scenario.folder / "scenario.toml", f"controllers.{controller}.")
-    model = load_network(scenario.folder / table.text("model"))
     if not np.array_equal(model.adjacency, scenario.network.adjacency):
-        raise table.error("model", f"network {model.name} has other regions or boundaries than {scenario.network.name}"
-                          "; identify one for the same city with 'cosim identify'")
-    del options["model"]
+        raise wrong(f"network {model.name} has other regions or boundaries than {scenario.network.name}; identify one "
+                    "for the same city with 'cosim identify'")
     check_step(model, scenario.step / scenario.substeps, f"{model.folder}")
     return replace(configured, network=model)
 

@@ -9,7 +9,16 @@ import tiny
 import torch
 
 from cosim.compare import errors, held_up, outflow_samples, predict, predict_next
-from cosim.identify import network_toml, own_splits, unreached
+from cosim.identify import (
+    as_it_was,
+    fit_table,
+    nearly_empty,
+    network_toml,
+    own_splits,
+    samples_of,
+    static_model,
+    unreached,
+)
 from cosim.simulate import Result
 from nmfd import dynamics, mfd
 from nmfd.network import load_network
@@ -139,3 +148,20 @@ def test_regions_that_no_loading_run_filled_are_named(scenario):
     line = unreached(network, [state, 0.5 * state])
     assert "1 " + network.region_names[1] + " (40 % of it)" in line and line.count("% of it") == 1
     assert unreached(network, [3.0 * state]) == ""
+
+
+def test_an_empty_region_keeps_its_model_in_identification(scenario, result):
+    """Nobody is ever in region 0: all others are fitted, and 0 stays as it was."""
+    network = scenario.network
+    state, record = result.trajectory.accumulation.copy(), {key: value.copy() for key, value in result.record.items()}
+    state[:, 0], record["crossings"][:, 0], record["arrivals"][:, 0] = 0.0, 0.0, 0.0
+    alone = Result(trajectory=replace(result.trajectory, accumulation=state), record=record, facts={})
+    static = static_model(scenario, [alone], guided=False)
+    assert static.mfds[0] == network.mfds[0] and static.mfds[3] != network.mfds[3]
+    assert 0 in nearly_empty(samples_of(network, [alone])) and 3 not in nearly_empty(samples_of(network, [alone]))
+    table = fit_table(static, samples_of(network, [alone]))
+    assert f"nearly empty in all loading runs: 0 {network.region_names[0]}" in table
+    fitted = replace(static, exit_rates=np.full((7, 7), 2.0), storage=np.full(7, 10.0))
+    kept = as_it_was(static, fitted, [0])
+    assert (kept.exit_rates[0] == 1.0).all() and kept.storage[0] == network.mfds[0].jam
+    assert (kept.exit_rates[1:] == 2.0).all() and (kept.storage[1:] == 10.0).all()

@@ -2,6 +2,8 @@
 
 import csv
 import gzip
+import re
+import shutil
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
@@ -21,7 +23,8 @@ from cosim.originals import read_originals, read_routes
 from cosim.plant import SumoPlant
 from cosim.regions import load_city
 from cosim.sumo_settings import settings
-from nmfd.scenario import load_scenario
+from nmfd.errors import InputError
+from nmfd.scenario import as_modelled, load_scenario
 from nmfd.types import Controls
 
 
@@ -213,6 +216,42 @@ def test_mesoscopic_keeps_the_ledger(imported):
         plant.close()
 
 
+@pytest.mark.parametrize("key, value", [("signals", "max-pressure"), ("measurement", "estimate")])
+def test_mesoscopic_has_no_lanes(imported, key, value):
+    scenario = load_scenario(imported[0] / "scenarios" / "tiny")
+    with pytest.raises(InputError, match=f"sumo.{key}: {value} .* has no lanes"):
+        SumoPlant(scenario, overrides=replace(settings(scenario), mesoscopic=True, **{key: value}))
+
+
+def test_options_and_includes_of_the_user_count(config, tmp_path):
+    """SUMO's short form of values, its scale, its mesoscopic model, files in files; all else is named."""
+    for file in config.parent.glob("*.xml*"):
+        shutil.copy(file, tmp_path)
+    (tmp_path / "cars.rou.xml").write_text('<routes><include href="more/cars.rou.xml"/><flow id="none" begin="600" '
+                                           'end="900" number="0" from="A0A1" to="D1D2"/></routes>')
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more" / "cars.rou.xml").write_text(
+        '<routes><flow id="f" begin="600" end="1200" number="60" from="A1B1" to="C1D1"/></routes>')
+    (tmp_path / "city.sumocfg").write_text(
+        '<configuration><net-file v="city.net.xml"/><route-files v="cars.rou.xml"/><begin v="600"/><scale v="2.5"/>'
+        '<mesosim v="true"/><max-depart-delay value="60"/><tripinfo-output value="trips.xml"/></configuration>')
+    case = read_case(tmp_path / "city.sumocfg")
+    assert case.scale == 2.5 and case.mesoscopic and case.left_out == ["max-depart-delay = 60"]
+    text = good(cosim("import", tmp_path / "city.sumocfg", "--regions", 2, "--method", "geometric", "--no-run",
+                      "--out", tmp_path / "networks" / "x"))
+    assert "60 vehicles in" in text and "vehicles times 2.5, the scale" in text
+    assert "not taken over from city.sumocfg: max-depart-delay = 60" in text
+    scenario = load_scenario(tmp_path / "scenarios" / "x")
+    assert scenario.demand_factor == 2.5 and scenario.demand.sum() * scenario.step == pytest.approx(150.0)
+    assert settings(scenario).mesoscopic
+    good(cosim("import", tmp_path / "city.net.xml", "--routes", tmp_path / "cars.rou.xml", "--regions", 2, "--method",
+               "geometric", "--no-run", "--out", tmp_path / "networks" / "y"))  # without any sumocfg
+    assert load_scenario(tmp_path / "scenarios" / "y").demand.sum() * scenario.step == pytest.approx(60.0)
+    (tmp_path / "more" / "cars.rou.xml").write_text('<routes><include href="../cars.rou.xml"/></routes>')
+    with pytest.raises(InputError, match="include each other without end"):
+        read_traffic(case, read_streets(case.net), seed=0)
+
+
 def test_signal_plans_know_the_city_s_own_vehicles(imported):
     """Turning flows are those of its routes, and of fastest ways; every signal plan runs on its signals."""
     scenario = replace(load_scenario(imported[0] / "scenarios" / "tiny"), steps=2)
@@ -241,7 +280,7 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
     (lambda folder: (folder / "city.net.xml").write_text("<net></net>"), "has no edge that cars may use"),
     (lambda folder: (folder / "city.sumocfg").write_text("<routes/>"), "expected a sumocfg or a net.xml"),
     (lambda folder: (folder / "city.sumocfg").write_text(
-        '<configuration><net-file value="city.net.xml"/></configuration>'), "or add --od FILE or --demand peak"),
+        '<configuration><net-file value="city.net.xml"/></configuration>'), "or add --routes FILE, --od FILE or --d"),
 ])
 def test_one_clear_line(config, tmp_path, change, expected):
     for file in config.parent.iterdir():
@@ -308,6 +347,25 @@ def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
         assert plant.record().guided.sum() > 10
     finally:
         plant.close()
+
+
+def test_identification_gives_both_models_and_the_import_takes_the_second_away(imported, config, tmp_path):
+    """Drivers of their own ways and guided ones; an empty region keeps what it has; new regions need new models."""
+    shutil.copytree(imported[0], tmp_path, dirs_exist_ok=True)
+    network, scenario = tmp_path / "networks" / "tiny", tmp_path / "scenarios" / "tiny"
+    file = scenario / "scenario.toml"
+    file.write_text(re.sub(r"\nsteps = \d+", "\nsteps = 10", file.read_text()))
+    text = good(cosim("identify", network, "--levels", "1,2", "--seeds", 1, "--iterations", 3, "--workers", 1, "--out",
+                      tmp_path / "loading"))
+    assert "Drivers who go their own ways:" in text and "Drivers who are guided:" in text
+    assert f"Written to {network / 'guided' / 'network.toml'}" in text
+    assert (tmp_path / "loading" / "guided" / "level-2" / "probing-pcrg-1000.npz").is_file()
+    loaded = load_scenario(scenario)
+    guided = as_modelled(loaded, "dpc-pcrg").network
+    assert guided.hash != loaded.network.hash and guided.own_splits == loaded.network.own_splits
+    assert "PLACEHOLDERS" not in (network / "network.toml").read_text()
+    good(cosim("import", config, "--regions", 2, "--method", "geometric", "--no-run", "--out", network, "--force"))
+    assert as_modelled(load_scenario(scenario), "dpc-pcrg").network.regions == 2
 
 
 def test_the_chain_in_a_city_without_signals(tmp_path):

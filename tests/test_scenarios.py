@@ -68,6 +68,22 @@ def test_a_controller_plans_with_the_model_that_it_names(base, tmp_path):
     assert registry.make("mpc-pc", scenario).options.horizon == 4
 
 
+def test_guiding_controllers_find_the_model_of_guided_drivers(base, tmp_path):
+    network = load_scenario(base).network.folder
+    (network / "guided").mkdir()
+    (network / "guided" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 800.0"))
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 700.0"))
+    scenario = load_scenario(beside(
+        base, 'name = "x"\nbase = "../scenario"\n[controllers."dpc-pcrg+max-pressure"]\nmodel = "../model"\n'))
+    jam = {name: as_modelled(scenario, name).network.mfds[0].jam for name in (
+        "dpc-pcrg", "mpc-pcrg", "dpc-pcrg-robust", "dpc-pc", "bound-pcrg", "dpc-pcrg+max-pressure")}
+    assert list(jam.values()) == [800.0, 800.0, 800.0, 1000.0, 1000.0, 700.0]
+    (network / "guided" / "network.toml").write_text(tiny.row_network(3))
+    with pytest.raises(InputError, match="guided/network.toml: network .* has other regions"):
+        as_modelled(scenario, "dpc-pcrg")
+
+
 def test_an_inherited_model_lies_where_the_base_says(base, tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 800.0"))

@@ -1,6 +1,7 @@
 """What the user gives: a sumocfg with all it names, or a bare network."""
 
 import math
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,6 +15,12 @@ FILES = {
     "net-file": ("net-file", "net", "n"), "route-files": ("route-files", "routes", "r"),
     "additional-files": ("additional-files", "additional", "a"), "begin": ("begin", "b"), "end": ("end", "e")}
 FOREVER = 1e9  # s; a later end is none
+TAKEN = ("step-length", "time-to-teleport", "scale", "mesosim")
+# Options that change what is written or shown, or how fast, but not what drives: all others are worth a word.
+IDLE = re.compile(
+    r".*output.*|.*log.*|.*threads|(verbose|no-warnings|quit|start|delay|seed|random|precision|version|remote|xml|gui|"
+    r"window|tracker|breakpoints|print|human|save|summary|tripinfo|vehroute|fcd|netstate|statistic|queue|emission|"
+    r"device\.emissions|link|save-|load|osg|demo|game|language|registry|meso-).*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +40,28 @@ class Case:
     end: float | None = None
     options: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def scale(self) -> float:
+        """What SUMO multiplies the vehicles by. Raises InputError."""
+        text = self.options.get("scale", "1")
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not 0.0 < value <= 100.0:
+            raise InputError(f"{self.source}: scale: expected a number above 0 up to 100, got {text!r} instead")
+        return value
+
+    @property
+    def mesoscopic(self) -> bool:
+        return self.options.get("mesosim", "false").lower() in ("true", "1", "yes", "on", "x")
+
+    @property
+    def left_out(self) -> list[str]:
+        """Options that are not taken over although they may change what drives, as NAME = VALUE."""
+        return [f"{name} = {value}" for name, value in sorted(self.options.items())
+                if name not in TAKEN and not IDLE.fullmatch(name)]
+
 
 def read_case(path: Path) -> Case:
     """Read a sumocfg, or take a net.xml(.gz) as a case without demand. Raises InputError, also for a file it names
@@ -44,8 +73,9 @@ def read_case(path: Path) -> Case:
         raise InputError(f"{path}: expected a sumocfg or a net.xml, got a file of <{root.tag}> instead")
     given = {}
     for element in read_xml(path).iter():
-        if element.get("value") is not None:
-            given[element.tag] = element.get("value")
+        value = element.get("value", element.get("v"))
+        if value is not None:
+            given[element.tag] = value
     options = {}
     for name, alike in FILES.items():
         options[name] = next((given.pop(other) for other in alike if other in given), "")

@@ -146,9 +146,11 @@ class _Reader:
         begin = seconds(flow.get("begin", str(self._case.begin)), f"{where}: begin")
         end = seconds(flow.get("end"), f"{where}: end") if flow.get("end") else None
         stop = min(end if end is not None else self._case.end or begin + OPEN_END, self._case.end or np.inf)
-        number = int(flow.get("number")) if flow.get("number") else None
         per_hour, period = flow.get("vehsPerHour") or flow.get("perHour"), flow.get("period")
         try:
+            number = int(flow.get("number")) if flow.get("number") else None
+            if number == 0 or 0.0 in [float(rate) for rate in (per_hour, flow.get("probability")) if rate]:
+                return []
             if match := re.fullmatch(r"exp\((.+)\)", period or ""):
                 rate = float(match[1])
                 gaps = self._random.exponential(1.0 / rate, size=number or int(3 * rate * (stop - begin) + 30))

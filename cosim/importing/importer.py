@@ -24,6 +24,7 @@ from cosim.originals import MESOSCOPIC, read_originals, write_originals
 from cosim.regions import City, load_city
 from nmfd.errors import InputError
 from nmfd.network import Network
+from nmfd.scenario import GUIDED
 from nmfd.scratch import LOCK, Scratch
 
 NET = "city.net.xml.gz"
@@ -59,6 +60,7 @@ class Order:
     force: bool = False
     begin: float | None = None
     end: float | None = None
+    routes: tuple[Path, ...] = ()
     od: tuple[Path, ...] = ()
     zones: tuple[Path, ...] = ()
 
@@ -69,7 +71,10 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
     _check_free(order)
     tell("reading")
     case = _windowed(read_case(order.source), order)
+    case = replace(case, routes=(*case.routes, *order.routes))
     streets = read_streets(case.net, case.additional)
+    order = replace(order, mesoscopic=order.mesoscopic or case.mesoscopic)
+    scale = 1.0 if order.peak else case.scale
     traffic = _traffic(case, streets, order)
     if order.begin is None:
         case = model.without_idle(case, traffic)
@@ -78,10 +83,11 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
         files = _write_traffic(folder, traffic)
         simulate = _Baselines(streets, case, clock, folder, files)
         mesoscopic = order.mesoscopic or streets.drivable.sum() > LARGE
-        factor, congests, baseline = 1.0 if order.peak else order.level, True, None
+        factor, congests, baseline = 1.0 if order.peak else scale * (order.level or 1.0), True, None
         if order.level is None:
-            factor, congests = level.congesting(
-                lambda times, meso: simulate.run(times, meso).pace(streets), mesoscopic=mesoscopic, tell=tell)
+            times, congests = level.congesting(
+                lambda times, meso: simulate.run(scale * times, meso).pace(streets), mesoscopic=mesoscopic, tell=tell)
+            factor = scale * times
         if order.run:
             tell("simulating without control")
             baseline = simulate.run(factor, mesoscopic)
@@ -106,6 +112,10 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
             protected=_protected(streets, regions, baseline, network), factor=factor, mesoscopic=order.mesoscopic))
         report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
         report += _level_line(order, factor, congests)
+        if scale != 1.0:
+            report += f"\nvehicles times {scale:g}, the scale in {case.source.name}"
+        if case.left_out:
+            report += f"\nnot taken over from {case.source.name}: {', '.join(case.left_out)}"
         if mesoscopic and order.run:
             report += "\nsimulated by SUMO's mesoscopic model" + (
                 "" if order.mesoscopic else f": the city has more than {LARGE:,} edges for cars")
@@ -121,7 +131,7 @@ def _traffic(case: Case, streets: Streets, order: Order) -> Traffic:
         if not len(traffic.depart):
             raise InputError(
                 f"{order.source}: names no vehicles for the streets of cars{_notes(traffic)}; give a sumocfg with "
-                "route-files, or add --od FILE or --demand peak")
+                "route-files, or add --routes FILE, --od FILE or --demand peak")
         return traffic
     if len(traffic.depart):
         raise InputError(
@@ -174,6 +184,8 @@ def _folders(order: Order):
             for old in folder.glob("*.toml"):
                 if (temporary / old.name).exists():
                     old.unlink()
+            if folder == order.out:  # the model of guided drivers in other regions
+                (folder / GUIDED / "network.toml").unlink(missing_ok=True)
             for file in sorted(temporary.iterdir(), key=lambda file: (file.suffix == ".toml", file.name)):
                 if file.name != LOCK:
                     os.replace(file, folder / file.name)
