@@ -3,7 +3,7 @@
 import csv
 import functools
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -225,6 +225,7 @@ def as_modelled(scenario: Scenario, controller: str) -> Scenario:
     name, tables = controller.partition("+")[0], scenario.controller_options
     options = {**tables.get(name, {}), **tables.get(controller, {})}
     configured = replace(scenario, controller_options={**tables, name: options})
+    wrong: Callable[[str], InputError]
     if "model" in options and scenario.folder is not None:
         table = toml.Table(options, scenario.folder / "scenario.toml", f"controllers.{controller}.")
         model, wrong = load_network(scenario.folder / table.text("model")), functools.partial(table.error, "model")

@@ -12,7 +12,7 @@ from contextlib import suppress
 from glob import escape
 from pathlib import Path
 
-LOCK = ".lock"
+LOCK = ".scratch"  # not the name of any other file: folders that have one, locked by nobody, are removed
 
 
 class Scratch:
