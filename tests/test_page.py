@@ -213,7 +213,7 @@ DAMAGED = {
 def test_damaged_files_are_one_line(evaluation, tmp_path, blind, name, expected):
     """Empty, noise, cut in two, and something else; no page is written."""
     folder = tmp_path / "runs"
-    shutil.copytree(evaluation, folder, ignore=shutil.ignore_patterns("demand-0.8"))
+    shutil.copytree(evaluation, folder, ignore=shutil.ignore_patterns("demand-0.8", "report.html"))
     whole = (folder / name).read_bytes()
     contents = [b"\0\xff\xfe" * 100, whole[: len(whole) // 2]] if name.endswith((".npz", ".json")) else [
         b"", b"\0\xff\xfe" * 100, b"a,b\n1,2\n"]
