@@ -123,6 +123,8 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
     table.close()
     if chosen.from_gating and not scenario.protected:
         raise table.error("from_gating", "expected a scenario with protected regions; name them, or leave it out")
+    if chosen.from_gating and chosen.from_no_control:
+        raise table.error("from_gating", "a policy cannot begin as both, a gate and no control; leave one out")
     return chosen if steps is None else Training(**{**asdict(chosen), "steps": steps})
 
 

@@ -324,6 +324,9 @@ def test_a_gate_needs_a_protected_region(scenario):
     open_city = replace(scenario, protected=(), controller_options={"dpc-pc": {"from_gating": True}})
     with pytest.raises(InputError, match="controllers.dpc-pc.from_gating: expected a scenario with protected regions"):
         training.settings(open_city, "dpc-pc")
+    both = replace(scenario, controller_options={"dpc-pc": {"from_gating": True, "from_no_control": True}})
+    with pytest.raises(InputError, match="cannot begin as both"):
+        training.settings(both, "dpc-pc")
 
 
 def test_detours_cost_what_they_divert(scenario):
