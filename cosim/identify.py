@@ -94,21 +94,21 @@ def identify(
     held_out = [result for result in found if len(loading.seeds) > 1 and result.trajectory.seed == loading.seeds[-1]]
     scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
-    def fitted(results: Sequence[Result], what: str) -> Network:
+    def fitted(results: Sequence[Result], samples: Sequence[dict], what: str) -> Network:
         def tell(done, total, note):
             progress(done, total, f"{what}, {note}")
 
         return as_it_was(network, identification.fit(
             network, [observed(result) for result in results], iterations=loading.iterations,
-            progress=tell if progress else None, **scheme), nearly_empty(samples_of(network, results)))
+            progress=tell if progress else None, **scheme), nearly_empty(samples))
 
-    model = fitted(found, "fitting")
     samples = samples_of(network, found)
+    model = fitted(found, samples, "fitting")
     text = fit_table(model, samples) + unreached(model, [result.trajectory.accumulation for result in found])
     if held_out:
         kept = [result for result in found if not any(result is other for other in held_out)]
-        text += "\n" + prediction_table(
-            fitted(kept, "fitting without the last seed"), [observed(result) for result in held_out], scheme)
+        without = fitted(kept, samples_of(network, kept), "fitting without the last seed")
+        text += "\n" + prediction_table(without, [observed(result) for result in held_out], scheme)
     _write_samples(out / "samples.csv", samples)
     by_run = [[own_points(cloud) for cloud in samples_of(network, [result])] for result in found]
     draw_mfds(out / "mfd.png", model, samples, [bands.band(runs) for runs in zip(*by_run, strict=True)])

@@ -52,9 +52,15 @@ def check_whole(outputs: Mapping[str, Path]) -> None:
                 while part := stream.read(1 << 20):
                     end = (end + part)[-TAIL:]
         except BROKEN as error:
-            raise RunFailed(f"{path}: SUMO did not finish this file ({error}): is the disk full?") from None
+            raise unfinished(path, error) from None
         if not re.search(rb"</[\w-]+>\s*$", end):
-            raise RunFailed(f"{path}: SUMO did not finish this file: is the disk full?")
+            raise unfinished(path)
+
+
+def unfinished(path: Path, error: Exception | None = None) -> RunFailed:
+    """For a file of SUMO's that ends too early; error: how that was noticed"""
+    noticed = "" if error is None else f" ({error})"
+    return RunFailed(f"{path}: SUMO did not finish this file{noticed}: is the disk full?")
 
 
 def write_edge_data(path: Path, target: Path, every: float) -> Path:

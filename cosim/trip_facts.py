@@ -9,8 +9,8 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
 
+from cosim.sumo_output import unfinished
 from cosim.xml_files import BROKEN
-from nmfd.workers import RunFailed
 
 CLASS = "HBEFA4/PC_petrol_Euro-4"
 MILLIGRAMS = 1e-6  # kg
@@ -44,7 +44,7 @@ def read_trip_facts(path: Path) -> TripFacts:
     try:
         return _read(path)
     except BROKEN as error:
-        raise RunFailed(f"{path}: SUMO did not finish this file ({error}): is the disk full?") from None
+        raise unfinished(path, error) from None
 
 
 def _read(path: Path) -> TripFacts:
