@@ -224,28 +224,42 @@ def sweep(
 
 @main.command()
 @click.argument("target", type=FOLDER, metavar="SCENARIO|RUN")
-@click.option("--controller", default="no-control", show_default=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
+@click.option("--controller", metavar="NAME[+...]",
+              help=CONTROLLER_HELP + " [default: no-control; all runs of a RUN folder]")
 @click.option("--seed", type=SEED, default=0, show_default=True)
+@click.option("--model", type=FOLDER, metavar="DIR",
+              help="A network of the same city, whose regional model predicts. [default: that with which the "
+                   "controller plans]")
 @click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
 @click.option("--out", type=FOLDER, metavar="DIR", help="Run folder of a SCENARIO. [default: runs/<scenario>-<time>]")
-def compare(target: Path, controller: str, seed: int, steps: int | None, out: Path | None) -> None:
+def compare(
+    target: Path, controller: str | None, seed: int, model: Path | None, steps: int | None, out: Path | None,
+) -> None:
     """Compare microsimulated accumulations with what the regional model predicts.
 
     For a scenario, the microsimulation is run first; for the run folder of `cosim run`, its record is used. Then the
-    regional model is driven with the recorded departures and controls. Writes compare.csv and pictures beside the run.
+    regional model is driven with the recorded departures and controls. Writes compare-NAME-SEED.csv and pictures
+    beside the run. For a RUN folder without --controller, `cosim evaluate`'s too: how far ahead the models foresee all
+    of its runs, as a table and foresight.csv.
 
     \b
     Examples:
       cosim compare scenarios/grid7_peak --controller no-control
       cosim compare runs/gating --controller pi-gating --seed 3
+      cosim compare runs/grid7_peak-evaluate
     """
     from cosim import compare, experiment
     from cosim.simulate import Task, scenario_of
     from nmfd import runs
 
+    finished = (target / "manifest.json").is_file() or any(target.glob("demand-*/manifest.json"))
+    if finished and out is not None:
+        raise InputError(f"--out: {out}: a comparison is written into its run folder {target}; leave --out away")
+    if finished and controller is None:
+        _foresight(target, model)
+        return
+    controller = controller or "no-control"
     if (target / "manifest.json").is_file():
-        if out is not None:
-            raise InputError(f"--out: {out}: a comparison is written into its run folder {target}; leave --out away")
         manifest = runs.read_manifest(target / "manifest.json")
         try:
             task = Task(
@@ -255,14 +269,29 @@ def compare(target: Path, controller: str, seed: int, steps: int | None, out: Pa
             raise InputError(
                 f"{target / 'manifest.json'}: is not that of a run in SUMO; choose another folder") from None
         out = target
+    elif finished:
+        raise InputError(
+            f"{target}: holds runs of several demand levels; give one of its folders {target}/demand-..., or leave "
+            "--controller away")
     else:
         task = Task(scenario=target, controller=controller, seed=seed, steps=steps)
         out, _ = _experiment([task], out)
     result = experiment.read_run(out, controller, seed)
-    rows = compare.write(out, scenario_of(task), result)
+    scenario = compare.modelled(scenario_of(task), controller, model)
+    rows = compare.write(out, scenario, result)
     click.echo(compare.table(rows))
     name = runs.run_name(controller, seed)
     click.echo(f"Written to {out}: see compare-{name}-accumulation.png and ...-mfd.png")
+
+
+def _foresight(target: Path, model: Path | None) -> None:
+    """All runs of a folder against the regional models."""
+    from cosim import finished, foresight
+
+    found = foresight.foresee(finished.read(target), model)
+    foresight.write(target / "foresight.csv", found)
+    click.echo(foresight.table(found))
+    click.echo(f"Written to {target / 'foresight.csv'}")
 
 
 def _experiment(tasks: list, out: Path | None, sumo_output: tuple[str, ...] = ()) -> tuple:

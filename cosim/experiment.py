@@ -127,7 +127,8 @@ def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> d
         return {}
     tables = scenario.controller_options
     options = {**tables.get(controller, {}), **tables.get(variant, {})}
-    if controller in LOADING:
+    if controller in LOADING:  # its model only says what `cosim compare` predicts with
+        options = {key: value for key, value in options.items() if key != "model"}
         splits = scenario.network.nominal_splits if LOADING[controller] else np.empty(0)
         return {"options": options, "splits_hash": hashlib.sha256(splits.round(9).tobytes()).hexdigest()[:16]}
     path = registry.policy_path(variant, scenario, policy)

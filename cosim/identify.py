@@ -251,11 +251,8 @@ def unreached(network: Network, accumulations: Sequence[np.ndarray]) -> str:
 
 def prediction_table(network: Network, held_out: Sequence[Observed], scheme: dict) -> str:
     """RMSE of the accumulation one control interval and AHEAD seconds ahead, in runs that the fit did not see."""
-    critical = np.array([curve.critical for curve in network.mfds])
-    intervals = min(max(1, round(AHEAD / scheme["step"])), max(len(run.demand) for run in held_out))
-    share = [
-        np.sqrt((identification.prediction_errors(network, held_out, n, **scheme) ** 2).mean(axis=0)) / critical
-        for n in (1, intervals)]
+    intervals = identification.intervals_within(AHEAD, scheme["step"], held_out)
+    share = identification.prediction_shares(network, held_out, (1, intervals), **scheme)
     heads = [f"{n * scheme['step']:g} s ahead" for n in (1, intervals)]
     lines = [f"{'region':<16}{heads[0]:>14}{heads[1]:>14}   RMSE of critical, runs of the last seed, fit without them"]
     for region, (one, many) in enumerate(zip(*share, strict=True)):

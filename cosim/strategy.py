@@ -70,7 +70,8 @@ def configured(name: str, tables: Iterable[str]) -> str:
 
     tables: names CONTROLLER+OPTION... of tables in [controllers], each with a regional model or a policy for that city
     """
-    controller, words = parse(name).controller, set(name.split("+"))
+    controller = parse(name).controller
+    words = {controller, *name.split("+")}
     fitting = [table for table in tables if table.startswith(f"{controller}+") and set(table.split("+")) <= words]
     return max(fitting, key=lambda table: table.count("+"), default=controller)
 

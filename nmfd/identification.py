@@ -173,3 +173,14 @@ def prediction_errors(
             x = dynamics.advance(
                 p, x, demand[:, k], perimeter[:, k], splits[:, k], step, substeps=substeps, integrator=integrator)
     return (x - observed[:, -1]).sum(-1).numpy()
+
+
+def intervals_within(ahead: float, step: float, runs: Sequence[Observed]) -> int:
+    """Control intervals of `step` [s] in `ahead` [s], no more than the longest run has and at least one."""
+    return min(max(1, round(ahead / step)), max(len(run.demand) for run in runs))
+
+
+def prediction_shares(network: Network, runs: Sequence[Observed], intervals: Sequence[int], **scheme) -> np.ndarray:
+    """(len(intervals), R) [-]: RMSE of `prediction_errors`, as a share of the critical accumulation."""
+    errors = [prediction_errors(network, runs, n, **scheme) for n in intervals]
+    return np.sqrt([(error**2).mean(axis=0) for error in errors]) / [curve.critical for curve in network.mfds]

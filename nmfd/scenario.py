@@ -225,20 +225,27 @@ def as_modelled(scenario: Scenario, controller: str) -> Scenario:
     name, tables = controller.partition("+")[0], scenario.controller_options
     options = {**tables.get(name, {}), **tables.get(controller, {})}
     configured = replace(scenario, controller_options={**tables, name: options})
-    wrong: Callable[[str], InputError]
     if "model" in options and scenario.folder is not None:
         table = toml.Table(options, scenario.folder / "scenario.toml", f"controllers.{controller}.")
-        model, wrong = load_network(scenario.folder / table.text("model")), functools.partial(table.error, "model")
+        folder = scenario.folder / table.text("model")
         del options["model"]
-    elif name.startswith(GUIDING) and (folder := guided_model(scenario.network)) is not None:
-        model, wrong = load_network(folder), lambda text: InputError(f"{folder / 'network.toml'}: {text}")
-    else:
-        return configured
+        return with_model(configured, folder, functools.partial(table.error, "model"))
+    if name.startswith(GUIDING) and (folder := guided_model(scenario.network)) is not None:
+        return with_model(configured, folder)
+    return configured
+
+
+def with_model(
+    scenario: Scenario, folder: Path, wrong: Callable[[str], InputError] | None = None,
+) -> Scenario:
+    """`scenario` with another regional model of the same city. wrong: the error that there is with it, of its words."""
+    model = load_network(folder)
     if not np.array_equal(model.adjacency, scenario.network.adjacency):
-        raise wrong(f"network {model.name} has other regions or boundaries than {scenario.network.name}; identify one "
-                    "for the same city with 'cosim identify'")
+        error = f"network {model.name} has other regions or boundaries than {scenario.network.name}; identify one " \
+                "for the same city with 'cosim identify'"
+        raise wrong(error) if wrong else InputError(f"{folder / 'network.toml'}: {error}")
     check_step(model, scenario.step / scenario.substeps, f"{model.folder}")
-    return replace(configured, network=model)
+    return replace(scenario, network=model)
 
 
 def _region(row: toml.Table, key: str, network: Network) -> int:

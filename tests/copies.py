@@ -7,8 +7,9 @@ ROOT = Path(__file__).parents[1]
 
 
 def peak(folder: Path) -> Path:
-    """The scenario grid7_peak in `folder`, with its network and without the reference results."""
-    shutil.copytree(ROOT / "networks" / "grid7", folder / "networks" / "grid7")
+    """The scenario grid7_peak in `folder`, with its network and models and without the reference results."""
+    for network in (ROOT / "networks").glob("grid7*"):
+        shutil.copytree(network, folder / "networks" / network.name)
     shutil.copytree(ROOT / "scenarios" / "grid7_peak", folder / "scenarios" / "peak",
                     ignore=shutil.ignore_patterns("reference"))
     return folder / "scenarios" / "peak"

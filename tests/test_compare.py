@@ -8,7 +8,7 @@ import pytest
 import tiny
 import torch
 
-from cosim.compare import errors, held_up, outflow_samples, predict, predict_next
+from cosim.compare import errors, held_up, modelled, outflow_samples, predict, predict_next
 from cosim.identify import (
     as_it_was,
     fit_table,
@@ -76,6 +76,20 @@ def test_a_model_that_discharges_too_slowly_holds_too_many(scenario, result):
 def test_several_intervals_ahead(scenario, result):
     simulated = result.trajectory.accumulation.sum(-1)
     assert np.abs(predict_next(scenario, result, 10) - simulated[10:]).max() < 1e-6
+
+
+def test_the_model_of_those_who_drive():
+    """A controller's own model, or what the scenario names for a strategy; else the scenario's; or another one."""
+    scenario = load_scenario(ROOT / "scenarios" / "grid7_peak")
+    network = scenario.network.folder
+    names = {strategy: modelled(scenario, strategy).network.folder.resolve().name for strategy in (
+        "no-control", "pi-gating", "dpc-pcrg", "dpc-pcrg+max-pressure+compliance-50", "route-guidance",
+        "rerouting-30", "max-pressure+rerouting-30")}
+    assert names == {
+        "no-control": "grid7", "pi-gating": "grid7", "dpc-pcrg": "grid7_guided", "route-guidance": "grid7_guided",
+        "dpc-pcrg+max-pressure+compliance-50": "grid7_max_pressure", "rerouting-30": "grid7_rerouting",
+        "max-pressure+rerouting-30": "grid7_rerouting"}
+    assert modelled(scenario, "dpc-pcrg", network).network.folder == network
 
 
 def test_outflow_samples_lie_on_the_mfd(scenario, result):

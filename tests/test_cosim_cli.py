@@ -5,6 +5,7 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -90,6 +91,21 @@ def test_run_against_and_compare(small, tmp_path):
     assert (rows["rmse_veh"] >= rows["bias_veh"].abs() - 1e-9).all()
     for picture in ("accumulation", "mfd"):
         assert (out / f"compare-pi-gating-0-{picture}.png").stat().st_size > 10_000
+
+    def foreseen(*options):
+        good(cosim("compare", out, *options))
+        rows = pd.read_csv(out / "foresight.csv")
+        assert set(rows["controller"]) == {"no-control", "pi-gating"} and (rows["runs"] == 1).all()
+        return rows[rows["controller"] == "pi-gating"]["next_interval_rmse_share"].to_numpy()
+
+    own = rows["next_interval_rmse_share"][:-1].to_numpy()  # of the one run of this strategy
+    np.testing.assert_allclose(foreseen(), own, rtol=1e-3)
+    assert np.abs(foreseen("--model", ROOT / "networks" / "grid7_guided") - own).max() > 1e-3
+    assert "none/network.toml: no such file" in error_line(cosim("compare", out, "--model", tmp_path / "none"))
+    (tmp_path / "several").mkdir()
+    out.rename(tmp_path / "several" / "demand-1")
+    good(cosim("compare", tmp_path / "several"))
+    assert "several demand levels" in error_line(cosim("compare", tmp_path / "several", "--controller", "pi-gating"))
 
 
 def test_compare_runs_a_scenario_itself(small, tmp_path):
