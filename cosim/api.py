@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from cosim.simulate import Result, drive
-from cosim.strategy import ALONE, configured, parse
+from cosim.strategy import ALONE, configured, modelled, parse
 from cosim.sumo_output import check
 from nmfd.api import named
 from nmfd.errors import InputError
@@ -49,12 +49,13 @@ def run(
     if isinstance(controller, str):
         strategy = parse(f"{controller}+{city}" if city else controller)
         _, acting = named(configured(strategy.name, scenario.controller_options), scenario, policy)
+        model = modelled(scenario, strategy.name)
     else:
-        name, acting = named(controller, scenario, policy)
+        name, acting, model = *named(controller, scenario, policy), scenario
         strategy = parse(city or ALONE)
         strategy = replace(
             strategy, name=f"{name}+{city}" if city else name, controller=name,
             overrides={**strategy.overrides, "gateways_fixed": name != ALONE})
     outputs = {kind: Path(file) for kind, file in (sumo_output or {}).items()}
     check(outputs)
-    return drive(scenario, strategy, acting, seed=seed, progress=progress, outputs=outputs)
+    return drive(scenario, strategy, acting, seed=seed, progress=progress, outputs=outputs, model=model)

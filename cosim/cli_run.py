@@ -96,7 +96,7 @@ def compare(
       cosim compare runs/gating --controller pi-gating --seed 3
       cosim compare runs/grid7_peak-evaluate
     """
-    from cosim import compare, experiment
+    from cosim import compare, experiment, strategy
     from cosim.simulate import Task, scenario_of
     from nmfd import runs
 
@@ -125,7 +125,7 @@ def compare(
         task = Task(scenario=target, controller=controller, seed=seed, steps=steps)
         out, _ = _experiment([task], out)
     result = experiment.read_run(out, controller, seed)
-    scenario = compare.modelled(scenario_of(task), controller, model)
+    scenario = strategy.modelled(scenario_of(task), controller, model)
     rows = compare.write(out, scenario, result)
     click.echo(compare.table(rows))
     name = runs.run_name(controller, seed)

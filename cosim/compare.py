@@ -9,13 +9,11 @@ import pandas as pd
 
 from cosim import bands
 from cosim.simulate import Result
-from cosim.strategy import configured, parse
 from nmfd import closed_loop, plots, runs
-from nmfd.controllers import registry
 from nmfd.dynamics import advance, parameters
 from nmfd.network import Network
 from nmfd.plant import NmfdPlant
-from nmfd.scenario import Scenario, as_modelled, guided_model, with_model
+from nmfd.scenario import Scenario
 from nmfd.types import Controls, Measurement, Trajectory
 
 COLUMNS = (
@@ -40,24 +38,6 @@ class Replay:
     def act(self, measurement: Measurement) -> Controls:
         k = measurement.step
         return Controls(perimeter=self._trajectory.perimeter[k], splits=self._trajectory.splits[k])
-
-
-def modelled(scenario: Scenario, strategy: str, model: Path | None = None) -> Scenario:
-    """`scenario` with the regional model to predict the runs of `strategy` with: that with which its controller plans,
-    or, of one that guides routes and plans with none, that of guided drivers, if the network has one beside it.
-
-    model: the folder of a network, instead. Raises InputError.
-    """
-    if model is not None:
-        return with_model(scenario, model)
-    controller, variant = parse(strategy).controller, configured(strategy, scenario.controller_options)
-    if registry.is_own(controller):
-        variant, scenario = registry.configured_own(controller, scenario)
-    planned = as_modelled(scenario, variant)
-    if planned.network is scenario.network and registry.guides(controller) and (
-            folder := guided_model(scenario.network)) is not None:
-        return with_model(scenario, folder)
-    return planned
 
 
 def predict(scenario: Scenario, result: Result) -> Trajectory:

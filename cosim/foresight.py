@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from cosim import experiment
-from cosim.compare import modelled
 from cosim.finished import Finished
 from cosim.identify import AHEAD, observed
+from cosim.strategy import modelled
 from nmfd import identification, runs
 from nmfd.errors import InputError
 from nmfd.scenario import Scenario

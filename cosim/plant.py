@@ -58,14 +58,15 @@ class SumoPlant:
 
     def __init__(
         self, scenario: Scenario, *, overrides: Settings | None = None, outputs: Mapping[str, Path] | None = None,
-        window: Window | None = None,
+        window: Window | None = None, model: Scenario | None = None,
     ):
         """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network.
 
         outputs: kind (cosim.sumo_output) -> file, of SUMO's own outputs; complete after `trip_facts` or `close`
         window: to watch; the simulation is the same, only slower
+        model: `scenario` with the regional model with which states are estimated, if not its own
         """
-        self._scenario, self._window = scenario, window
+        self._scenario, self._window, self._model = scenario, window, model or scenario
         self._originals: Originals | None = None
         self._outputs = dict(outputs or {})
         self._settings = overrides or settings(scenario)
@@ -131,7 +132,7 @@ class SumoPlant:
         self._detectors, self._estimator = None, None
         if estimating:
             self._detectors = Detectors(self._session, self.city, self._layout, self._meter, self._instruments)
-            self._estimator = Estimator(scenario, self._instruments)
+            self._estimator = Estimator(self._model, self._instruments)
         self._guide = Guide(
             self._session, self.city, scenario.network.nominal_splits, compliance=chosen.compliance,
             most_detour=chosen.most_detour, random=np.random.default_rng([seed, 0x67756964]))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.strategy import Strategy, configured, parse
+from cosim.strategy import Strategy, configured, modelled, parse
 from nmfd.faults import with_faults
 from nmfd.scenario import Scenario, load_scenario
 from nmfd.types import Controller, Trajectory
@@ -76,18 +76,20 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
     scenario, strategy = scenario_of(task), parse(task.controller)
     controller = registry.make(configured(task.controller, scenario.controller_options), scenario, policy=task.policy)
     return drive(
-        scenario, strategy, controller, seed=task.seed, progress=progress, begin=begin, outputs=dict(task.sumo_output))
+        scenario, strategy, controller, seed=task.seed, progress=progress, begin=begin, outputs=dict(task.sumo_output),
+        model=modelled(scenario, task.controller))
 
 
 def drive(
     scenario: Scenario, strategy: Strategy, controller: Controller, *, seed: int,
     progress: Callable[[int, int], None] | None = None, begin: float | None = None,
-    outputs: Mapping[str, Path] | None = None,
+    outputs: Mapping[str, Path] | None = None, model: Scenario | None = None,
 ) -> Result:
     """The closed loop of `controller` in SUMO, filed under `strategy.name`, whose options the city takes.
 
     begin: when the setting up began (time.perf_counter); outputs: SUMO's own, kind (cosim.sumo_output) -> file, there
-    only if all goes well. Raises InputError.
+    only if all goes well; model: `scenario` with the regional model with which states are estimated, if not its own.
+    Raises InputError.
     """
     from cosim import facts, sumo_output
     from cosim.plant import SumoPlant
@@ -97,7 +99,9 @@ def drive(
     begin = time.perf_counter() if begin is None else begin
     with ExitStack() as stack:
         files = {kind: stack.enter_context(runs.atomic(path)) for kind, path in (outputs or {}).items()}
-        plant = SumoPlant(scenario, overrides=replace(settings(scenario), **strategy.overrides), outputs=files)
+        plant = SumoPlant(
+            scenario, overrides=replace(settings(scenario), **strategy.overrides), outputs=files,
+            model=model)
         stack.callback(plant.close)
         trajectory = runs.labelled(
             closed_loop.run(plant, controller, scenario, seed=seed, progress=progress),

@@ -7,10 +7,12 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from nmfd.controllers import registry
 from nmfd.errors import InputError
+from nmfd.scenario import Scenario, as_modelled, guided_model, with_model
 
 ALONE = "no-control"  # the controller of a name that is only options
 FIXED, WEBSTER, ACTUATED, MAX_PRESSURE = "fixed", "webster", "actuated", "max-pressure"
@@ -74,6 +76,24 @@ def configured(name: str, tables: Iterable[str]) -> str:
     words = {controller, *name.split("+")}
     fitting = [table for table in tables if table.startswith(f"{controller}+") and set(table.split("+")) <= words]
     return max(fitting, key=lambda table: table.count("+"), default=controller)
+
+
+def modelled(scenario: Scenario, strategy: str, model: Path | None = None) -> Scenario:
+    """`scenario` with the regional model to predict the runs of `strategy` with: that with which its controller plans,
+    or, of one that guides routes and plans with none, that of guided drivers, if the network has one beside it.
+
+    model: the folder of a network, instead. Raises InputError.
+    """
+    if model is not None:
+        return with_model(scenario, model)
+    controller, variant = parse(strategy).controller, configured(strategy, scenario.controller_options)
+    if registry.is_own(controller):
+        variant, scenario = registry.configured_own(controller, scenario)
+    planned = as_modelled(scenario, variant)
+    if planned.network is scenario.network and registry.guides(controller) and (
+            folder := guided_model(scenario.network)) is not None:
+        return with_model(scenario, folder)
+    return planned
 
 
 def _option(word: str) -> tuple[str, object] | None:

@@ -13,7 +13,7 @@ from cosim.importing.layers import colour as region_colour
 from cosim.plant import SumoPlant
 from cosim.regions import City, Gateway, edge_shapes
 from cosim.simulate import Task, scenario_of
-from cosim.strategy import configured, parse
+from cosim.strategy import configured, modelled, parse
 from cosim.sumo import LOST, Window
 from cosim.sumo_settings import settings
 from nmfd import closed_loop, runs
@@ -74,7 +74,8 @@ def watch(
                      "--window-size", "1200,900", *options),
             additional=(drawn,), program=program)
         plant = SumoPlant(
-            scenario, overrides=replace(settings(scenario), **strategy.overrides), window=window)
+            scenario, overrides=replace(settings(scenario), **strategy.overrides), window=window,
+            model=modelled(scenario, task.controller))
         shapes = edge_shapes(plant.city)
         drawn.write_text(layers_xml(plant.city, shapes))
         view.write_text(view_xml(shapes, delay))

@@ -8,7 +8,7 @@ import pytest
 import tiny
 import torch
 
-from cosim.compare import errors, held_up, modelled, outflow_samples, predict, predict_next
+from cosim.compare import errors, held_up, outflow_samples, predict, predict_next
 from cosim.identify import (
     as_it_was,
     fit_table,
@@ -20,6 +20,7 @@ from cosim.identify import (
     unreached,
 )
 from cosim.simulate import Result
+from cosim.strategy import modelled
 from nmfd import dynamics, mfd
 from nmfd.network import load_network
 from nmfd.scenario import load_scenario
