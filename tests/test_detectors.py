@@ -12,8 +12,11 @@ from cosim.city import ensure_built
 from cosim.detectors import instruments, lay_out, probes
 from cosim.plant import SumoPlant
 from cosim.regions import load_city
+from cosim.simulate import Task, scenario_of, simulate
+from cosim.strategy import modelled
 from cosim.sumo_settings import Settings, settings
 from nmfd import closed_loop, plots, runs
+from nmfd.controllers import registry
 from nmfd.controllers.gating import PiGating
 from nmfd.errors import InputError
 from nmfd.scenario import load_scenario
@@ -132,6 +135,25 @@ def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
         plant.close()
     assert exact.estimate is None
     assert (exact.accumulation == run.accumulation).all()
+
+
+def test_states_are_estimated_with_the_model_of_those_who_drive():
+    """`simulate` gives the plant the model with which the controller plans: another estimate of the same city."""
+    tasks = [Task(scenario=SCENARIO, controller=name, seed=3, steps=INTERVALS)
+             for name in ("route-guidance+estimate", "route-guidance+estimate+max-pressure")]
+    models = [modelled(scenario_of(task), task.controller).network for task in tasks]
+    assert [model.folder.name for model in models] == ["grid7_guided", "grid7_max_pressure"]
+    scenario = scenario_of(tasks[0])
+    found = simulate(tasks[0]).trajectory
+    for model, same in zip(models, (True, False), strict=True):
+        plant = SumoPlant(scenario, overrides=replace(settings(scenario), measurement="estimate"),
+                          model=replace(scenario, network=model))
+        try:
+            again = closed_loop.run(plant, registry.make("route-guidance", scenario), scenario, seed=3)
+        finally:
+            plant.close()
+        assert (again.accumulation == found.accumulation).all()
+        assert (again.estimate == found.estimate).all() == same
 
 
 def test_same_seed_same_bytes(scenario, run, tmp_path):
