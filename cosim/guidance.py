@@ -304,7 +304,7 @@ class _Ways:
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))
         self._costs = inside.costing(time), outside.costing(time, ahead)
-        self._there: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._there: dict[int, tuple[np.ndarray, np.ndarray, float, np.ndarray]] = {}
         self._onward: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
 
     def cost(self, here: int, target: int, most: float) -> tuple[np.ndarray, np.ndarray]:
@@ -312,17 +312,18 @@ class _Ways:
         (G,) bool, whether there is a way at all."""
         if here not in self._there:
             cost, before = dijkstra(self._costs[0], indices=self._inside.number[here], return_predecessors=True)
-            self._there[here] = cost[self._first] + self._entering, before
-        there, last = self._there[here][0], self._outside.number[target]
-        left = max(most - there.min(initial=most) - self._ahead[last], 0.0)
+            there = cost[self._first] + self._entering
+            self._there[here] = there, np.isfinite(there), float(there.min(initial=np.inf)), before
+        (there, leads_out, nearest, _), last = self._there[here], int(self._outside.number[target])
+        left = max(most - min(nearest, most) - self._ahead[last], 0.0)
         if target not in self._onward or self._onward[target][0] < left:
             cost, after = dijkstra(self._costs[1], indices=last, return_predecessors=True, limit=left)
             self._onward[target] = left, cost[self._second] + self._ahead[last], after
-        return there + self._onward[target][1], np.isfinite(there) & self._reached[last]
+        return there + self._onward[target][1], leads_out & self._reached[last]
 
     def route(self, here: int, gateway: int, target: int) -> list[int]:
         """The edges from `here` to `target` through `gateway`, whose cost was asked for."""
         to_gateway = self._inside.path(
-            self._there[here][1], int(self._first[gateway]), int(self._inside.number[here]))
+            self._there[here][-1], int(self._first[gateway]), int(self._inside.number[here]))
         return to_gateway[::-1] + self._outside.path(
             self._onward[target][2], int(self._second[gateway]), int(self._outside.number[target]))
