@@ -126,7 +126,8 @@ def test_the_samples_are_those_of_every_edge(scenario, plant_of):
         asked.append(len(plant._travelled()))
         session, edges = plant.session, plant.city.edges
         assert counts.tolist() == [session.vehicle_count(edge) for edge in edges]
-        assert speeds.tolist() == [session.mean_speed(edge) if n else 0.0 for edge, n in zip(edges, counts, strict=True)]
+        assert speeds.tolist() == [
+            session.mean_speed(edge) if n else 0.0 for edge, n in zip(edges, counts, strict=True)]
         return counts, speeds
 
     plant._sample = compared
