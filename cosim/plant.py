@@ -1,7 +1,7 @@
 """The SUMO city as a plant: the same protocol as the regional plants, the same controllers."""
 
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -329,18 +329,19 @@ class SumoPlant:
 
     def _sample(self) -> tuple[np.ndarray, np.ndarray]:
         """Vehicles (E,) [veh] and mean speed (E,) [m/s] by edge, now."""
-        session, edges = self._session, self.city.edges
+        count, mean_speed, edges = self._session.vehicle_count, self._session.mean_speed, self.city.edges
         counts, speeds = np.zeros((2, len(edges)))
-        for n in self._travelled():
-            if count := session.vehicle_count(edges[n]):
-                counts[n], speeds[n] = count, session.mean_speed(edges[n])
+        travelled = self._travelled()
+        counts[travelled] = [count(edges[n]) for n in travelled]
+        for n in np.flatnonzero(counts):
+            speeds[n] = mean_speed(edges[n])
         return counts, speeds
 
-    def _travelled(self) -> Collection[int]:
+    def _travelled(self) -> list[int]:
         """Numbers of edges, among them all that have vehicles: a large city has more edges than vehicles under way."""
         vehicles = self._session.running()
         if 2 * len(vehicles) > len(self.city.edges):
-            return range(len(self.city.edges))
+            return list(range(len(self.city.edges)))
         roads = set(map(self._session.road, vehicles))  # some may be junctions, or closed to cars
         return [self._number[road] for road in roads & self._number.keys()]
 
