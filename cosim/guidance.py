@@ -16,9 +16,12 @@ that takes much longer, whatever theta says, and nobody leaves the way that he i
 changes his way makes the travel times that the others were told wrong.
 """
 
+from collections.abc import Sequence
+from itertools import groupby, pairwise
+
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from cosim.measure import Event
 from cosim.regions import City
@@ -31,17 +34,19 @@ SLOWEST = 0.1    # m/s; slower is as good as standing
 BONUS = 30.0     # s per vehicle that a region is behind its share
 LOYALTY = 0.3    # a driver keeps his way if the best one does not save more than this share of its own time
 MEMORY = 0.9     # of the vehicles assigned before and of their wishes, per control interval
+FAR = 1e9        # s, longer than any way
 
 
-def shifted(wish: np.ndarray, own: np.ndarray, theta: np.ndarray) -> np.ndarray:
+def shifted(wish: Sequence[float], own: Sequence[float], theta: Sequence[float]) -> list[float]:
     """Shares (n,) [-] that differ from `wish` as `theta` does from `own`.
 
     A next region that theta lowers loses the same part of those who wish to go there, and what is freed goes to the
     regions that theta raises, in proportion to by how much.
     """
-    kept = wish * np.where(theta < own, theta / np.where(own > 0, own, 1.0), 1.0)
-    raised = np.maximum(theta - own, 0.0)
-    return kept + (wish.sum() - kept.sum()) * raised / max(raised.sum(), 1e-12)
+    kept = [w * (t / o) if t < o else w for w, o, t in zip(wish, own, theta, strict=True)]
+    raised = [max(t - o, 0.0) for o, t in zip(own, theta, strict=True)]
+    freed, total = sum(wish) - sum(kept), max(sum(raised), 1e-12)
+    return [k + freed * r / total for k, r in zip(kept, raised, strict=True)]
 
 
 class Guide:
@@ -60,12 +65,12 @@ class Guide:
         self._most_detour = most_detour
         self._session, self._city, self._compliance, self._random = session, city, compliance, random
         self._index = {edge: n for n, edge in enumerate(city.edges)}
-        self._region = np.array([city.region_of[edge] for edge in city.edges])
+        self._region = [city.region_of[edge] for edge in city.edges]
         moves = [(e, f) for e, after in city.successors.items() for f in after]
         first, second = np.array([(self._index[e], self._index[f]) for e, f in moves]).T
         turn = np.array([city.turn_time[move] for move in moves])
         self._turn_time = dict(zip(zip(first.tolist(), second.tolist(), strict=True), turn.tolist(), strict=True))
-        here = [self._region == region for region in range(city.regions)]
+        here = [np.array(self._region) == region for region in range(city.regions)]
         self._within, self._within_back, self._without_back = (
             [_Moves(first, second, turn, allowed=allowed ^ outside, reverse=reverse) for allowed in here]
             for outside, reverse in ((False, False), (False, True), (True, True)))
@@ -78,6 +83,7 @@ class Guide:
         self._free = self._length / np.array([city.speed[edge] for edge in city.edges])
         self._time = self._free.copy()
         self._reached: dict[int, np.ndarray] = {}
+        self._ahead: dict[tuple[int, int], np.ndarray] = {}
         self._ways: dict[tuple[int, int], _Ways] = {}
         self._inside: dict[tuple[int, int], tuple[np.ndarray, csr_array]] = {}
         self._home: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
@@ -142,21 +148,29 @@ class Guide:
         present = self._present(event.vehicle)
         takes, bound = self._takes(present, here, ways.time)
         cost, reached = ways.cost(here, target, self._most_detour + takes + 1.0 if bound else np.inf)
-        least = np.minimum.reduceat(cost, ways.begins)
-        if not np.isfinite(least).any():
+        # Plain numbers from here on: there are a handful of next regions, too few for arrays to pay.
+        least = np.minimum.reduceat(cost, ways.begins).tolist()
+        fastest = min(least, default=np.inf)
+        if fastest == np.inf:
             return
-        cell = event.region, ways.neighbours, event.destination
-        self._wished[event.region, ways.neighbours[np.argmin(least)], event.destination] += 1.0
-        wish = self._wished[cell] / self._wished[cell].sum()
-        shares = shifted(wish, self._own[cell], self._splits[cell]) * np.logical_or.reduceat(reached, ways.begins)
-        if shares.sum() <= 0:
+        self._wished[event.region, ways.neighbours[least.index(fastest)], event.destination] += 1.0
+        wish, own, theta, assigned = (
+            values[event.region, ways.neighbours, event.destination].tolist()
+            for values in (self._wished, self._own, self._splits, self._assigned))
+        wishes, open_ways = sum(wish), np.logical_or.reduceat(reached, ways.begins).tolist()
+        shares = [
+            share * is_open
+            for share, is_open in zip(shifted([w / wishes for w in wish], own, theta), open_ways, strict=True)]
+        if (total := sum(shares)) <= 0:
             return
-        shares /= shares.sum()
-        behind = shares * (self._assigned[cell].sum() + 1.0) - self._assigned[cell]
-        allowed = (shares > 1e-3) & (least <= least.min() + self._most_detour)
-        if not allowed.any():  # every region with a share is too far out of the way
-            allowed = least <= least.min()
-        n = int(np.argmin(np.where(allowed, least - BONUS * behind, np.inf)))
+        shares, everybody = [share / total for share in shares], sum(assigned) + 1.0
+        allowed = [share > 1e-3 and c <= fastest + self._most_detour for share, c in zip(shares, least, strict=True)]
+        if not any(allowed):  # every region with a share is too far out of the way
+            allowed = [c <= fastest for c in least]
+        price = [
+            c - BONUS * (share * everybody - sent) if good else np.inf
+            for c, share, sent, good in zip(least, shares, assigned, allowed, strict=True)]
+        n = price.index(min(price))
         following = int(ways.neighbours[n])
         gateway = int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]]))
         if self._keeps(present, here, takes, cost[gateway], following) or self._send(
@@ -167,7 +181,7 @@ class Guide:
     def _present(self, vehicle: str) -> list[int] | None:
         """The edges of the driver's present way from where he is; None where it uses roads that are closed to cars."""
         route = self._session.route(vehicle)[self._session.route_index(vehicle):]
-        way = [self._index.get(edge) for edge in route]
+        way = list(map(self._index.get, route))
         return None if None in way else way
 
     def _takes(self, present: list[int] | None, here: int, time: np.ndarray) -> tuple[float, bool]:
@@ -175,11 +189,14 @@ class Guide:
         whether it is a way that a search would find: by known moves, out of the region of `here` and never back."""
         if present is None or present[0] != here:
             return np.inf, False
-        turns = [self._turn_time.get(move) for move in zip(present[:-1], present[1:], strict=True)]
-        known = None not in turns
-        elsewhere = self._region[present] != self._region[here]
-        back = (elsewhere[:-1] & ~elsewhere[1:]).any()
+        turns = list(map(self._turn_time.get, pairwise(present)))
+        known, regions = None not in turns, self._regions(present)
+        back = regions.count(regions[0]) > 1
         return time[present[1:]].sum() + sum(turns if known else filter(None, turns)), known and not back
+
+    def _regions(self, way: list[int]) -> list[int]:
+        """The regions that a way leads through, one after the other."""
+        return [region for region, _ in groupby(map(self._region.__getitem__, way))]
 
     def _keeps(self, present: list[int] | None, here: int, takes: float, cost: float,
                following: int | None = None) -> bool:
@@ -190,8 +207,7 @@ class Guide:
             return True
         if present[0] != here:
             return False
-        regions = self._region[present]
-        if following is not None and regions[np.argmax(regions != regions[0])] != following:
+        if following is not None and self._regions(present)[1:2] != [following]:
             return False
         return takes <= (1.0 + LOYALTY) * cost
 
@@ -205,11 +221,15 @@ class Guide:
         if region not in self._reached:
             outside = self._without_back[region]
             self._reached[region] = outside.leading_to(outside.number[self._gateways[region][1]])
+        if (region, taste) not in self._ahead:
+            outside = self._without_back[region]
+            self._ahead[region, taste] = outside.ahead(
+                outside.number[self._gateways[region][1]], self._free * self._taste[taste])
         if (region, taste) not in self._ways:
             time = self._time * self._taste[taste]
             self._ways[region, taste] = _Ways(
                 *self._gateways[region], inside=self._within[region], outside=self._without_back[region],
-                reached=self._reached[region], time=time)
+                reached=self._reached[region], ahead=self._ahead[region, taste], time=time)
         return self._ways[region, taste]
 
 
@@ -231,17 +251,29 @@ class _Moves:
         self._begins = np.searchsorted(rows[kept], np.arange(len(self.edges) + 1)).astype(np.int32)
         self._ids = self.edges.tolist()
 
-    def costing(self, time: np.ndarray) -> csr_array:
-        """A move costs the time of the turn and `time` (E,) [s] of the edge that it leads to."""
+    def costing(self, time: np.ndarray, ahead: np.ndarray | None = None) -> csr_array:
+        """A move costs the time of the turn and `time` (E,) [s] of the edge that it leads to; less the time by which
+        it comes nearer, of `ahead` (nodes,) [s], if that is given: then a search from t finds cost + ahead - ahead[t],
+        and what leads astray last (A*)."""
         cost = np.maximum(time[self._second] + self._turn, 1e-3)
+        if ahead is not None:
+            cost += ahead[self._columns] - np.repeat(ahead, np.diff(self._begins))
         return csr_array((cost, self._columns, self._begins), shape=(len(self.edges),) * 2)
 
     def leading_to(self, nodes: np.ndarray) -> np.ndarray:
-        """(len(nodes), nodes) bool: from which of all nodes each of `nodes` can be reached."""
-        once, which = np.unique(nodes, return_inverse=True)
-        steps = csr_array(
-            (np.ones(len(self._columns)), self._columns, self._begins), shape=(len(self.edges),) * 2).T.tocsr()
-        return np.isfinite(dijkstra(steps, indices=once, unweighted=True))[which]
+        """(nodes, len(nodes)) bool: from which of all nodes each of `nodes` can be reached."""
+        moves = csr_array(
+            (np.ones(len(self._columns)), self._columns, self._begins), shape=(len(self.edges),) * 2)
+        # Nodes that lead to each other are reached from the same ones: in most cities nearly all.
+        _, part = connected_components(moves, connection="strong")
+        _, once, which = np.unique(part[nodes], return_index=True, return_inverse=True)
+        return np.isfinite(dijkstra(moves.T.tocsr(), indices=nodes[once], unweighted=True)).T[:, which]
+
+    def ahead(self, nodes: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """(nodes,) [s]: hardly less than the time from each to the nearest of `nodes` at `time` (E,) [s], and FAR where
+        none can be reached."""
+        least = dijkstra(self.costing(time).T.tocsr(), indices=nodes, min_only=True)
+        return np.where(np.isfinite(least), (1.0 - 1e-6) * least, FAR)  # less, for no move may cost nothing
 
     def path(self, before: np.ndarray, first: int, last: int) -> list[int]:
         """The edges from node `first` to node `last` by the predecessors `before` of a search from `last`."""
@@ -261,16 +293,18 @@ class _Ways:
     """
 
     def __init__(
-        self, first, second, next_region, *, inside: _Moves, outside: _Moves, reached: np.ndarray, time: np.ndarray,
+        self, first, second, next_region, *, inside: _Moves, outside: _Moves, reached: np.ndarray, ahead: np.ndarray,
+        time: np.ndarray,
     ):
         """first, second, next_region: (G,), the last in rising order; inside: moves in the region; outside: those
-        elsewhere, back; reached: (G, nodes of `outside`), which edges can be reached from second[g]; time: (E,) [s]"""
-        self.time, self._inside, self._outside, self._reached = time, inside, outside, reached
+        elsewhere, back; reached: (nodes of `outside`, G), which edges can be reached from second[g]; ahead: (nodes of
+        `outside`,) [s], to the nearest second[g] at times that are no more than `time` (E,) [s]"""
+        self.time, self._inside, self._outside, self._reached, self._ahead = time, inside, outside, reached, ahead
         self._first, self._second, self._entering = inside.number[first], outside.number[second], time[second]
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))
-        self._costs = inside.costing(time), outside.costing(time)
-        self._there: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._costs = inside.costing(time), outside.costing(time, ahead)
+        self._there: dict[int, tuple[np.ndarray, np.ndarray, float, np.ndarray]] = {}
         self._onward: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
 
     def cost(self, here: int, target: int, most: float) -> tuple[np.ndarray, np.ndarray]:
@@ -278,19 +312,18 @@ class _Ways:
         (G,) bool, whether there is a way at all."""
         if here not in self._there:
             cost, before = dijkstra(self._costs[0], indices=self._inside.number[here], return_predecessors=True)
-            self._there[here] = cost[self._first] + self._entering, before
-        there = self._there[here][0]
-        left = most - there.min(initial=most)
+            there = cost[self._first] + self._entering
+            self._there[here] = there, np.isfinite(there), float(there.min(initial=np.inf)), before
+        (there, leads_out, nearest, _), last = self._there[here], int(self._outside.number[target])
+        left = max(most - min(nearest, most) - self._ahead[last], 0.0)
         if target not in self._onward or self._onward[target][0] < left:
-            cost, after = dijkstra(
-                self._costs[1], indices=self._outside.number[target], return_predecessors=True, limit=left)
-            self._onward[target] = left, cost[self._second], after
-        reached = np.isfinite(there) & self._reached[:, self._outside.number[target]]
-        return there + self._onward[target][1], reached
+            cost, after = dijkstra(self._costs[1], indices=last, return_predecessors=True, limit=left)
+            self._onward[target] = left, cost[self._second] + self._ahead[last], after
+        return there + self._onward[target][1], leads_out & self._reached[last]
 
     def route(self, here: int, gateway: int, target: int) -> list[int]:
         """The edges from `here` to `target` through `gateway`, whose cost was asked for."""
         to_gateway = self._inside.path(
-            self._there[here][1], int(self._first[gateway]), int(self._inside.number[here]))
+            self._there[here][-1], int(self._first[gateway]), int(self._inside.number[here]))
         return to_gateway[::-1] + self._outside.path(
             self._onward[target][2], int(self._second[gateway]), int(self._outside.number[target]))

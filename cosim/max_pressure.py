@@ -41,19 +41,20 @@ class MaxPressure:
         pairs = gateway_movements(city)
         self._junctions = [
             Junction(signal, session.time, pairs.get(signal.id), min_green=min_green) for signal in signals]
+        self._rationed = [junction for junction in self._junctions if junction.rationed]
         self._next = session.time
         for junction in self._junctions:
             show(junction.signal, junction.state)
 
     def command(self, share: np.ndarray, opened: Mapping[str, Collection[int]]) -> None:
         """share: (R, R) [-], (u - u_min) / (u_max - u_min); opened: signal -> gateway links without a ration."""
-        for junction in self._junctions:
+        for junction in self._rationed:
             junction.command(share, opened.get(junction.signal, ()))
 
     def green_time(self) -> dict[str, dict[int, float]]:
         """Signal -> gateway link -> seconds of green shown so far."""
         now = self._session.time
-        return {junction.signal: junction.green_time(now) for junction in self._junctions if junction.rationed}
+        return {junction.signal: junction.green_time(now) for junction in self._rationed}
 
     def play(self, now: float) -> None:
         """Show what holds from `now` [s] on."""
@@ -75,7 +76,7 @@ class MaxPressure:
         count = self._session.lane_vehicles
         present = np.array([count(lane) for lane in self._lanes], dtype=float)
         weight = np.maximum(self._weights @ present, 0.0)
-        for junction in self._junctions:
+        for junction in self._rationed:
             for movement in junction.exhausted():
                 weight[self._movements[movement]] = 0.0
         return self._gain @ weight
@@ -98,6 +99,7 @@ class Junction:
             for link, pair in (gateways or {}).items()}
         self._movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
         self._coming: list[tuple[float, str]] = []
+        self._between: dict[tuple[int, int], list[Phase]] = {}  # stage, next stage -> what is shown between them
         self.state = self._base
         self.next_change = now if self._rations else NEVER  # until then, commands hold from the first second on
 
@@ -121,8 +123,10 @@ class Junction:
 
     def switch(self, stage: int, now: float) -> str:
         """Leave the stage that is shown for another; the state from `now` on."""
-        begin, self._coming = now, []
-        for phase in transition(self._phases, self._numbers[self.stage], self._numbers[stage]):
+        begin, self._coming, change = now, [], (self.stage, stage)
+        if change not in self._between:
+            self._between[change] = transition(self._phases, *(self._numbers[n] for n in change))
+        for phase in self._between[change]:
             self._coming.append((begin, phase.state))
             begin += phase.duration
         self._coming.append((begin, self._phases[self._numbers[stage]].state))

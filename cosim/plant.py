@@ -75,6 +75,7 @@ class SumoPlant:
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
         check_adjacency(self.city, scenario.network)
         self._edge_region = np.array([self.city.region_of[edge] for edge in self.city.edges])
+        self._number = {edge: n for n, edge in enumerate(self.city.edges)}
         self._upstream = sorted({g.from_edge for g in self.city.gateways})
         self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in self.city.gateways], dtype=int)
         self._net_file = files.net_file
@@ -329,12 +330,21 @@ class SumoPlant:
 
     def _sample(self) -> tuple[np.ndarray, np.ndarray]:
         """Vehicles (E,) [veh] and mean speed (E,) [m/s] by edge, now."""
-        count, mean_speed = self._session.vehicle_count, self._session.mean_speed
-        counts = np.array([count(edge) for edge in self.city.edges], dtype=float)
-        speeds = np.zeros(len(counts))
+        count, mean_speed, edges = self._session.vehicle_count, self._session.mean_speed, self.city.edges
+        counts, speeds = np.zeros((2, len(edges)))
+        travelled = self._travelled()
+        counts[travelled] = [count(edges[n]) for n in travelled]
         for n in np.flatnonzero(counts):
-            speeds[n] = mean_speed(self.city.edges[n])
+            speeds[n] = mean_speed(edges[n])
         return counts, speeds
+
+    def _travelled(self) -> list[int]:
+        """Numbers of edges, among them all that have vehicles: a large city has more edges than vehicles under way."""
+        vehicles = self._session.running()
+        if 2 * len(vehicles) > len(self.city.edges):
+            return list(range(len(self.city.edges)))
+        roads = set(map(self._session.road, vehicles))  # some may be junctions, or closed to cars
+        return [self._number[road] for road in roads & self._number.keys()]
 
     def _totals(self) -> dict[str, np.ndarray]:
         # Several movements may lead from one region to one edge: they share its flow.
@@ -348,7 +358,7 @@ class SumoPlant:
             "gateway_flow": np.array([
                 self._meter.entry_flow[g.source, g.to_edge] / alike[g.source, g.to_edge] for g in self.city.gateways]),
             "gateway_green": np.array([
-                np.mean([green[g.signal][link] for link in g.links]) if g.signal in green else np.nan
+                sum(green[g.signal][link] for link in g.links) / len(g.links) if g.signal in green else np.nan
                 for g in self.city.gateways])}
 
 

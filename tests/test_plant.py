@@ -116,6 +116,25 @@ def test_ledger_and_crossings_balance(scenario, plant_of, guidance):
     assert record.arrivals.sum() > 100
 
 
+def test_the_samples_are_those_of_every_edge(scenario, plant_of):
+    """Both while there are fewer vehicles than edges, and later."""
+    plant, asked = plant_of(), []
+    sample = plant._sample
+
+    def compared():
+        counts, speeds = sample()
+        asked.append(len(plant._travelled()))
+        session, edges = plant.session, plant.city.edges
+        assert counts.tolist() == [session.vehicle_count(edge) for edge in edges]
+        assert speeds.tolist() == [
+            session.mean_speed(edge) if n else 0.0 for edge, n in zip(edges, counts, strict=True)]
+        return counts, speeds
+
+    plant._sample = compared
+    drive(plant, replace(scenario, steps=2))
+    assert 0 < min(asked) < max(asked) == len(plant.city.edges)
+
+
 def test_ledger_notices_a_lost_vehicle(scenario, plant_of):
     plant = plant_of()
     plant.reset(1)
