@@ -14,6 +14,10 @@ without coming back to i, at the travel times of the last control interval (smoo
 them. In h it is guided again, and in the region of d it is sent there on the fastest way. Nobody is sent on a detour
 that takes much longer, whatever theta says, and nobody leaves the way that he is on for a small gain: everybody who
 changes his way makes the travel times that the others were told wrong.
+
+Where the boundaries of the regions are ragged, a main road may leave i and come back. With `ways_return` the fastest
+way of all is open to everybody, wherever it leads, and counts for the first region that it enters; other ways into h
+still never come back. Without it such a road is closed to guided drivers, however much it costs them.
 """
 
 import numpy as np
@@ -53,7 +57,7 @@ class Guide:
 
     def __init__(
         self, session: Session, city: City, own: np.ndarray, *, compliance: float, most_detour: float,
-        random: np.random.Generator,
+        random: np.random.Generator, ways_return: bool = False,
     ):
         """own: (R, R, R) [-], the drivers' own split ratios, which controllers mean as well"""
         self._own = own
@@ -66,9 +70,13 @@ class Guide:
         turn = np.array([city.turn_time[move] for move in moves])
         self._turn_time = dict(zip(zip(first.tolist(), second.tolist(), strict=True), turn.tolist(), strict=True))
         here = [self._region == region for region in range(city.regions)]
-        self._within, self._within_back, self._without_back = (
+        self._within, within_back, self._without_back = (
             [_Moves(first, second, turn, allowed=allowed ^ outside, reverse=reverse) for allowed in here]
             for outside, reverse in ((False, False), (False, True), (True, True)))
+        self._ways_return = ways_return
+        if ways_return:
+            within_back = [_Moves(first, second, turn, allowed=np.full(len(city.edges), True), reverse=True)]
+        self._homeward = within_back  # by region, or one for all
         self._gateways = [
             np.array([(self._index[g.from_edge], self._index[g.to_edge], g.target)
                       for g in city.gateways if g.source == region], dtype=int).reshape(-1, 3).T
@@ -79,8 +87,7 @@ class Guide:
         self._time = self._free.copy()
         self._reached: dict[int, np.ndarray] = {}
         self._ways: dict[tuple[int, int], _Ways] = {}
-        self._inside: dict[tuple[int, int], tuple[np.ndarray, csr_array]] = {}
-        self._home: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
+        self._homes: dict[tuple[int, int], _Home] = {}
         self._splits: np.ndarray | None = None
         self._assigned, self._wished = np.zeros((2, *(city.regions,) * 3))
         self.realised = np.zeros((city.regions,) * 3, dtype=int)
@@ -97,7 +104,7 @@ class Guide:
             if speed is not None:
                 now = np.where(np.isnan(speed), self._free, self._length / np.maximum(speed, SLOWEST))
                 self._time += SMOOTHING * (np.maximum(now, self._free) - self._time)
-            self._ways, self._inside, self._home = {}, {}, {}
+            self._ways, self._homes = {}, {}
             self._assigned *= MEMORY
             self._wished *= MEMORY
 
@@ -119,22 +126,14 @@ class Guide:
                     self._guide_on(event, here, target, taste)
 
     def _guide_home(self, event: Event, here: int, target: int, taste: int) -> None:
-        """The fastest way inside the region of destination."""
-        if (event.region, taste) not in self._inside:
-            time = self._time * self._taste[taste]
-            self._inside[event.region, taste] = time, self._within_back[event.region].costing(time)
-        time, inside = self._inside[event.region, taste]
-        moves = self._within_back[event.region]
-        first, last = moves.number[here], moves.number[target]
-        if (taste, target) not in self._home:
-            self._home[taste, target] = dijkstra(inside, indices=last, return_predecessors=True)
-        cost, after = self._home[taste, target]
-        if first == last or not np.isfinite(cost[first]):
-            return
+        """The fastest way inside the region of destination; if ways may return, the fastest of all."""
+        home = self._home(event.region, taste)
         present = self._present(event.vehicle)
-        if self._keeps(present, here, self._takes(present, here, time)[0], cost[first]):
+        takes, bound = self._takes(present, here, home.time)
+        cost = home.cost(here, target, takes + 1.0 if bound else np.inf)
+        if here == target or not np.isfinite(cost) or self._keeps(present, here, takes, cost):
             return
-        self._send(event.vehicle, moves.path(after, first, last))
+        self._send(event.vehicle, home.route(here, target))
 
     def _guide_on(self, event: Event, here: int, target: int, taste: int) -> None:
         """The next region, and the fastest way through it."""
@@ -142,13 +141,21 @@ class Guide:
         present = self._present(event.vehicle)
         takes, bound = self._takes(present, here, ways.time)
         cost, reached = ways.cost(here, target, self._most_detour + takes + 1.0 if bound else np.inf)
-        least = np.minimum.reduceat(cost, ways.begins)
+        least, open_ = np.minimum.reduceat(cost, ways.begins), np.logical_or.reduceat(reached, ways.begins)
+        returning = None  # the next region of the fastest way of all, if it is faster than those that do not return
+        if self._ways_return:
+            home = self._home(event.region, taste)
+            fastest = home.cost(here, target, takes + 1.0 if bound else np.inf)
+            if fastest < least.min(initial=np.inf):
+                way = home.route(here, target)
+                returning = int(np.searchsorted(ways.neighbours, self._next_region(way)))
+                least[returning], open_[returning] = fastest, True
         if not np.isfinite(least).any():
             return
         cell = event.region, ways.neighbours, event.destination
         self._wished[event.region, ways.neighbours[np.argmin(least)], event.destination] += 1.0
         wish = self._wished[cell] / self._wished[cell].sum()
-        shares = shifted(wish, self._own[cell], self._splits[cell]) * np.logical_or.reduceat(reached, ways.begins)
+        shares = shifted(wish, self._own[cell], self._splits[cell]) * open_
         if shares.sum() <= 0:
             return
         shares /= shares.sum()
@@ -158,11 +165,13 @@ class Guide:
             allowed = least <= least.min()
         n = int(np.argmin(np.where(allowed, least - BONUS * behind, np.inf)))
         following = int(ways.neighbours[n])
-        gateway = int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]]))
-        if self._keeps(present, here, takes, cost[gateway], following) or self._send(
-                event.vehicle, ways.route(here, gateway, target)):
-            self.realised[event.region, following, event.destination] += 1
-            self._assigned[event.region, following, event.destination] += 1.0
+        if not self._keeps(present, here, takes, least[n], following):
+            if n != returning:
+                way = ways.route(here, int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]])), target)
+            if not self._send(event.vehicle, way):
+                return
+        self.realised[event.region, following, event.destination] += 1
+        self._assigned[event.region, following, event.destination] += 1.0
 
     def _present(self, vehicle: str) -> list[int] | None:
         """The edges of the driver's present way from where he is; None where it uses roads that are closed to cars."""
@@ -172,13 +181,14 @@ class Guide:
 
     def _takes(self, present: list[int] | None, here: int, time: np.ndarray) -> tuple[float, bool]:
         """[s] from the end of edge `here` to the end of the present way, if it begins there, at `time` (E,) [s]; and
-        whether it is a way that a search would find: by known moves, out of the region of `here` and never back."""
+        whether it is a way that a search would find: by known moves and, unless ways may return, out of the region of
+        `here` and never back."""
         if present is None or present[0] != here:
             return np.inf, False
         turns = [self._turn_time.get(move) for move in zip(present[:-1], present[1:], strict=True)]
         known = None not in turns
         elsewhere = self._region[present] != self._region[here]
-        back = (elsewhere[:-1] & ~elsewhere[1:]).any()
+        back = not self._ways_return and (elsewhere[:-1] & ~elsewhere[1:]).any()
         return time[present[1:]].sum() + sum(turns if known else filter(None, turns)), known and not back
 
     def _keeps(self, present: list[int] | None, here: int, takes: float, cost: float,
@@ -190,16 +200,26 @@ class Guide:
             return True
         if present[0] != here:
             return False
-        regions = self._region[present]
-        if following is not None and regions[np.argmax(regions != regions[0])] != following:
+        if following is not None and self._next_region(present) != following:
             return False
         return takes <= (1.0 + LOYALTY) * cost
+
+    def _next_region(self, way: list[int]) -> int:
+        """The first region that a way enters; its own if it enters none."""
+        regions = self._region[way]
+        return int(regions[np.argmax(regions != regions[0])])
 
     def _send(self, vehicle: str, way: list[int]) -> bool:
         """Give a vehicle this way; counts the refusals."""
         taken = self._session.set_route(vehicle, [self._city.edges[n] for n in way])
         self.refused += not taken
         return taken
+
+    def _home(self, region: int, taste: int) -> "_Home":
+        region = 0 if self._ways_return else region
+        if (region, taste) not in self._homes:
+            self._homes[region, taste] = _Home(self._homeward[region], self._time * self._taste[taste])
+        return self._homes[region, taste]
 
     def _ways_from(self, region: int, taste: int) -> "_Ways":
         if region not in self._reached:
@@ -252,6 +272,28 @@ class _Moves:
         return way
 
 
+class _Home:
+    """Fastest ways to single edges by `moves`, searched back from them when somebody first goes there."""
+
+    def __init__(self, moves: _Moves, time: np.ndarray):
+        """time: (E,) [s]"""
+        self.time, self._moves, self._costs = time, moves, moves.costing(time)
+        self._found: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
+
+    def cost(self, here: int, target: int, most: float) -> float:
+        """[s] from the end of edge `here` to the end of edge `target`, infinite if it is more than `most`."""
+        if target not in self._found or self._found[target][0] < most:
+            self._found[target] = most, *dijkstra(
+                self._costs, indices=self._moves.number[target], return_predecessors=True, limit=most)
+        cost = self._found[target][1][self._moves.number[here]]
+        return float(cost) if cost <= most else np.inf
+
+    def route(self, here: int, target: int) -> list[int]:
+        """The edges from `here` to `target`, whose cost was asked for."""
+        number = self._moves.number
+        return self._moves.path(self._found[target][2], int(number[here]), int(number[target]))
+
+
 class _Ways:
     """Fastest ways out of one region by each of its G gateways (first[g] -> second[g], into next_region[g]).
 
@@ -280,6 +322,8 @@ class _Ways:
             cost, before = dijkstra(self._costs[0], indices=self._inside.number[here], return_predecessors=True)
             self._there[here] = cost[self._first] + self._entering, before
         there = self._there[here][0]
+        if not np.isfinite(there).any():
+            return there, np.full(len(there), False)
         left = most - there.min(initial=most)
         if target not in self._onward or self._onward[target][0] < left:
             cost, after = dijkstra(
