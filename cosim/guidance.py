@@ -16,8 +16,8 @@ that takes much longer, whatever theta says, and nobody leaves the way that he i
 changes his way makes the travel times that the others were told wrong.
 
 Where the boundaries of the regions are ragged, a main road may leave i and come back. With `ways_return` the fastest
-way of all is open to everybody, wherever it leads, and counts for the first region that it enters; other ways into h
-still never come back. Without it such a road is closed to guided drivers, however much it costs them.
+way of all is open to everybody, wherever it leads, and counts for the region that it enters when it leaves i for good;
+other ways into h still never come back. Without it such a road is closed to guided drivers, however much it costs them.
 """
 
 import numpy as np
@@ -142,7 +142,7 @@ class Guide:
         takes, bound = self._takes(present, here, ways.time)
         cost, reached = ways.cost(here, target, self._most_detour + takes + 1.0 if bound else np.inf)
         least, open_ = np.minimum.reduceat(cost, ways.begins), np.logical_or.reduceat(reached, ways.begins)
-        returning = None  # the next region of the fastest way of all, if it is faster than those that do not return
+        returning = None  # the next region of the fastest way of all, where that is one that comes back
         if self._ways_return:
             home = self._home(event.region, taste)
             fastest = home.cost(here, target, takes + 1.0 if bound else np.inf)
@@ -205,8 +205,11 @@ class Guide:
         return takes <= (1.0 + LOYALTY) * cost
 
     def _next_region(self, way: list[int]) -> int:
-        """The first region that a way enters; its own if it enters none."""
+        """The region that a way enters first, or, if ways may return, when it leaves its own for good; its own if it
+        stays there."""
         regions = self._region[way]
+        if self._ways_return:
+            regions = regions[np.flatnonzero(regions == regions[0])[-1] :]
         return int(regions[np.argmax(regions != regions[0])])
 
     def _send(self, vehicle: str, way: list[int]) -> bool:
