@@ -14,18 +14,21 @@ without coming back to i, at the travel times of the last control interval (smoo
 them. In h it is guided again, and in the region of d it is sent there on the fastest way. Nobody is sent on a detour
 that takes much longer, whatever theta says, and nobody leaves the way that he is on for a small gain: everybody who
 changes his way makes the travel times that the others were told wrong.
+
+Where the boundaries of the regions are ragged, a main road may leave i and come back. With `ways_return` the fastest
+way of all is open to everybody, wherever it leads, and counts for the region that it enters when it leaves i for good;
+other ways into h still never come back. Without it such a road is closed to guided drivers, however much it costs them.
 """
 
 from collections.abc import Sequence
 from itertools import groupby, pairwise
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
 
 from cosim.measure import Event
 from cosim.regions import City
 from cosim.sumo import Session
+from cosim.ways import Home, Moves, Ways
 
 SMOOTHING = 0.5  # weight of the newest travel times
 TASTES = 4       # groups of drivers who see different travel times: were they all sent one way, it would jam
@@ -34,7 +37,6 @@ SLOWEST = 0.1    # m/s; slower is as good as standing
 BONUS = 30.0     # s per vehicle that a region is behind its share
 LOYALTY = 0.3    # a driver keeps his way if the best one does not save more than this share of its own time
 MEMORY = 0.9     # of the vehicles assigned before and of their wishes, per control interval
-FAR = 1e9        # s, longer than any way
 
 
 def shifted(wish: Sequence[float], own: Sequence[float], theta: Sequence[float]) -> list[float]:
@@ -58,7 +60,7 @@ class Guide:
 
     def __init__(
         self, session: Session, city: City, own: np.ndarray, *, compliance: float, most_detour: float,
-        random: np.random.Generator,
+        random: np.random.Generator, ways_return: bool = False,
     ):
         """own: (R, R, R) [-], the drivers' own split ratios, which controllers mean as well"""
         self._own = own
@@ -71,9 +73,13 @@ class Guide:
         turn = np.array([city.turn_time[move] for move in moves])
         self._turn_time = dict(zip(zip(first.tolist(), second.tolist(), strict=True), turn.tolist(), strict=True))
         here = [np.array(self._region) == region for region in range(city.regions)]
-        self._within, self._within_back, self._without_back = (
-            [_Moves(first, second, turn, allowed=allowed ^ outside, reverse=reverse) for allowed in here]
+        self._within, within_back, self._without_back = (
+            [Moves(first, second, turn, allowed=allowed ^ outside, reverse=reverse) for allowed in here]
             for outside, reverse in ((False, False), (False, True), (True, True)))
+        self._ways_return = ways_return
+        if ways_return:
+            within_back = [Moves(first, second, turn, allowed=np.full(len(city.edges), True), reverse=True)]
+        self._homeward = within_back  # by region, or one for all
         self._gateways = [
             np.array([(self._index[g.from_edge], self._index[g.to_edge], g.target)
                       for g in city.gateways if g.source == region], dtype=int).reshape(-1, 3).T
@@ -84,9 +90,8 @@ class Guide:
         self._time = self._free.copy()
         self._reached: dict[int, np.ndarray] = {}
         self._ahead: dict[tuple[int, int], np.ndarray] = {}
-        self._ways: dict[tuple[int, int], _Ways] = {}
-        self._inside: dict[tuple[int, int], tuple[np.ndarray, csr_array]] = {}
-        self._home: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
+        self._ways: dict[tuple[int, int], Ways] = {}
+        self._homes: dict[tuple[int, int], Home] = {}
         self._splits: np.ndarray | None = None
         self._assigned, self._wished = np.zeros((2, *(city.regions,) * 3))
         self.realised = np.zeros((city.regions,) * 3, dtype=int)
@@ -103,7 +108,7 @@ class Guide:
             if speed is not None:
                 now = np.where(np.isnan(speed), self._free, self._length / np.maximum(speed, SLOWEST))
                 self._time += SMOOTHING * (np.maximum(now, self._free) - self._time)
-            self._ways, self._inside, self._home = {}, {}, {}
+            self._ways, self._homes = {}, {}
             self._assigned *= MEMORY
             self._wished *= MEMORY
 
@@ -125,22 +130,14 @@ class Guide:
                     self._guide_on(event, here, target, taste)
 
     def _guide_home(self, event: Event, here: int, target: int, taste: int) -> None:
-        """The fastest way inside the region of destination."""
-        if (event.region, taste) not in self._inside:
-            time = self._time * self._taste[taste]
-            self._inside[event.region, taste] = time, self._within_back[event.region].costing(time)
-        time, inside = self._inside[event.region, taste]
-        moves = self._within_back[event.region]
-        first, last = moves.number[here], moves.number[target]
-        if (taste, target) not in self._home:
-            self._home[taste, target] = dijkstra(inside, indices=last, return_predecessors=True)
-        cost, after = self._home[taste, target]
-        if first == last or not np.isfinite(cost[first]):
-            return
+        """The fastest way inside the region of destination; if ways may return, the fastest of all."""
+        home = self._home(event.region, taste)
         present = self._present(event.vehicle)
-        if self._keeps(present, here, self._takes(present, here, time)[0], cost[first]):
+        takes, bound = self._takes(present, here, home.time)
+        cost = home.cost(here, target, takes + 1.0 if bound else np.inf)
+        if here == target or not np.isfinite(cost) or self._keeps(present, here, takes, cost):
             return
-        self._send(event.vehicle, moves.path(after, first, last))
+        self._send(event.vehicle, home.route(here, target))
 
     def _guide_on(self, event: Event, here: int, target: int, taste: int) -> None:
         """The next region, and the fastest way through it."""
@@ -149,15 +146,25 @@ class Guide:
         takes, bound = self._takes(present, here, ways.time)
         cost, reached = ways.cost(here, target, self._most_detour + takes + 1.0 if bound else np.inf)
         # Plain numbers from here on: there are a handful of next regions, too few for arrays to pay.
-        least = np.minimum.reduceat(cost, ways.begins).tolist()
+        least, open_ways = (
+            best.reduceat(values, ways.begins).tolist()
+            for best, values in ((np.minimum, cost), (np.logical_or, reached)))
         fastest = min(least, default=np.inf)
+        returning = None  # the next region of the fastest way of all, where that is one that comes back
+        if self._ways_return:
+            home = self._home(event.region, taste)
+            of_all = home.cost(here, target, takes + 1.0 if bound else np.inf)
+            if of_all < fastest:
+                way, fastest = home.route(here, target), of_all
+                returning = int(np.searchsorted(ways.neighbours, self._next_region(way)))
+                least[returning], open_ways[returning] = fastest, True
         if fastest == np.inf:
             return
         self._wished[event.region, ways.neighbours[least.index(fastest)], event.destination] += 1.0
         wish, own, theta, assigned = (
             values[event.region, ways.neighbours, event.destination].tolist()
             for values in (self._wished, self._own, self._splits, self._assigned))
-        wishes, open_ways = sum(wish), np.logical_or.reduceat(reached, ways.begins).tolist()
+        wishes = sum(wish)
         shares = [
             share * is_open
             for share, is_open in zip(shifted([w / wishes for w in wish], own, theta), open_ways, strict=True)]
@@ -172,11 +179,13 @@ class Guide:
             for c, share, sent, good in zip(least, shares, assigned, allowed, strict=True)]
         n = price.index(min(price))
         following = int(ways.neighbours[n])
-        gateway = int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]]))
-        if self._keeps(present, here, takes, cost[gateway], following) or self._send(
-                event.vehicle, ways.route(here, gateway, target)):
-            self.realised[event.region, following, event.destination] += 1
-            self._assigned[event.region, following, event.destination] += 1.0
+        if not self._keeps(present, here, takes, least[n], following):
+            if n != returning:
+                way = ways.route(here, int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]])), target)
+            if not self._send(event.vehicle, way):
+                return
+        self.realised[event.region, following, event.destination] += 1
+        self._assigned[event.region, following, event.destination] += 1.0
 
     def _present(self, vehicle: str) -> list[int] | None:
         """The edges of the driver's present way from where he is; None where it uses roads that are closed to cars."""
@@ -186,12 +195,13 @@ class Guide:
 
     def _takes(self, present: list[int] | None, here: int, time: np.ndarray) -> tuple[float, bool]:
         """[s] from the end of edge `here` to the end of the present way, if it begins there, at `time` (E,) [s]; and
-        whether it is a way that a search would find: by known moves, out of the region of `here` and never back."""
+        whether it is a way that a search would find: by known moves and, unless ways may return, out of the region of
+        `here` and never back."""
         if present is None or present[0] != here:
             return np.inf, False
         turns = list(map(self._turn_time.get, pairwise(present)))
         known, regions = None not in turns, self._regions(present)
-        back = regions.count(regions[0]) > 1
+        back = not self._ways_return and regions.count(regions[0]) > 1
         return time[present[1:]].sum() + sum(turns if known else filter(None, turns)), known and not back
 
     def _regions(self, way: list[int]) -> list[int]:
@@ -207,9 +217,16 @@ class Guide:
             return True
         if present[0] != here:
             return False
-        if following is not None and self._regions(present)[1:2] != [following]:
+        if following is not None and self._next_region(present) != following:
             return False
         return takes <= (1.0 + LOYALTY) * cost
+
+    def _next_region(self, way: list[int]) -> int:
+        """The region that a way enters first, or, if ways may return, when it leaves its own for good; its own if it
+        stays there."""
+        regions = self._regions(way)
+        left = max(n for n, region in enumerate(regions) if region == regions[0]) if self._ways_return else 0
+        return regions[min(left + 1, len(regions) - 1)]
 
     def _send(self, vehicle: str, way: list[int]) -> bool:
         """Give a vehicle this way; counts the refusals."""
@@ -217,7 +234,13 @@ class Guide:
         self.refused += not taken
         return taken
 
-    def _ways_from(self, region: int, taste: int) -> "_Ways":
+    def _home(self, region: int, taste: int) -> "Home":
+        region = 0 if self._ways_return else region
+        if (region, taste) not in self._homes:
+            self._homes[region, taste] = Home(self._homeward[region], self._time * self._taste[taste])
+        return self._homes[region, taste]
+
+    def _ways_from(self, region: int, taste: int) -> "Ways":
         if region not in self._reached:
             outside = self._without_back[region]
             self._reached[region] = outside.leading_to(outside.number[self._gateways[region][1]])
@@ -227,103 +250,7 @@ class Guide:
                 outside.number[self._gateways[region][1]], self._free * self._taste[taste])
         if (region, taste) not in self._ways:
             time = self._time * self._taste[taste]
-            self._ways[region, taste] = _Ways(
+            self._ways[region, taste] = Ways(
                 *self._gateways[region], inside=self._within[region], outside=self._without_back[region],
                 reached=self._reached[region], ahead=self._ahead[region, taste], time=time)
         return self._ways[region, taste]
-
-
-class _Moves:
-    """The moves between allowed edges as a graph of these edges, from first[n] to second[n] or, reversed, back.
-
-    number: edge -> its node, -1 for edges that are not allowed
-    """
-
-    def __init__(self, first: np.ndarray, second: np.ndarray, turn: np.ndarray, *, allowed: np.ndarray, reverse: bool):
-        """turn: [s], the time of a move; allowed: (E,), edges"""
-        self.edges = np.flatnonzero(allowed)
-        self.number = np.full(len(allowed), -1)
-        self.number[self.edges] = np.arange(len(self.edges))
-        rows, columns = (self.number[part] for part in ((second, first) if reverse else (first, second)))
-        kept = np.flatnonzero(allowed[first] & allowed[second])
-        kept = kept[np.lexsort((columns[kept], rows[kept]))]
-        self._second, self._turn, self._columns = second[kept], turn[kept], columns[kept].astype(np.int32)
-        self._begins = np.searchsorted(rows[kept], np.arange(len(self.edges) + 1)).astype(np.int32)
-        self._ids = self.edges.tolist()
-
-    def costing(self, time: np.ndarray, ahead: np.ndarray | None = None) -> csr_array:
-        """A move costs the time of the turn and `time` (E,) [s] of the edge that it leads to; less the time by which
-        it comes nearer, of `ahead` (nodes,) [s], if that is given: then a search from t finds cost + ahead - ahead[t],
-        and what leads astray last (A*)."""
-        cost = np.maximum(time[self._second] + self._turn, 1e-3)
-        if ahead is not None:
-            cost += ahead[self._columns] - np.repeat(ahead, np.diff(self._begins))
-        return csr_array((cost, self._columns, self._begins), shape=(len(self.edges),) * 2)
-
-    def leading_to(self, nodes: np.ndarray) -> np.ndarray:
-        """(nodes, len(nodes)) bool: from which of all nodes each of `nodes` can be reached."""
-        moves = csr_array(
-            (np.ones(len(self._columns)), self._columns, self._begins), shape=(len(self.edges),) * 2)
-        # Nodes that lead to each other are reached from the same ones: in most cities nearly all.
-        _, part = connected_components(moves, connection="strong")
-        _, once, which = np.unique(part[nodes], return_index=True, return_inverse=True)
-        return np.isfinite(dijkstra(moves.T.tocsr(), indices=nodes[once], unweighted=True)).T[:, which]
-
-    def ahead(self, nodes: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """(nodes,) [s]: hardly less than the time from each to the nearest of `nodes` at `time` (E,) [s], and FAR where
-        none can be reached."""
-        least = dijkstra(self.costing(time).T.tocsr(), indices=nodes, min_only=True)
-        return np.where(np.isfinite(least), (1.0 - 1e-6) * least, FAR)  # less, for no move may cost nothing
-
-    def path(self, before: np.ndarray, first: int, last: int) -> list[int]:
-        """The edges from node `first` to node `last` by the predecessors `before` of a search from `last`."""
-        way = [self._ids[first]]
-        while first != last:
-            first = before[first]
-            way.append(self._ids[first])
-        return way
-
-
-class _Ways:
-    """Fastest ways out of one region by each of its G gateways (first[g] -> second[g], into next_region[g]).
-
-    Gateways begins[n] to ends[n] - 1 lead into region neighbours[n]. Searched is from where drivers are and from where
-    they go, when somebody first is or goes there, and no further than they would go: in a large city that is much less
-    than from all gateways to everywhere.
-    """
-
-    def __init__(
-        self, first, second, next_region, *, inside: _Moves, outside: _Moves, reached: np.ndarray, ahead: np.ndarray,
-        time: np.ndarray,
-    ):
-        """first, second, next_region: (G,), the last in rising order; inside: moves in the region; outside: those
-        elsewhere, back; reached: (nodes of `outside`, G), which edges can be reached from second[g]; ahead: (nodes of
-        `outside`,) [s], to the nearest second[g] at times that are no more than `time` (E,) [s]"""
-        self.time, self._inside, self._outside, self._reached, self._ahead = time, inside, outside, reached, ahead
-        self._first, self._second, self._entering = inside.number[first], outside.number[second], time[second]
-        self.neighbours, self.begins = np.unique(next_region, return_index=True)
-        self.ends = np.append(self.begins[1:], len(next_region))
-        self._costs = inside.costing(time), outside.costing(time, ahead)
-        self._there: dict[int, tuple[np.ndarray, np.ndarray, float, np.ndarray]] = {}
-        self._onward: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
-
-    def cost(self, here: int, target: int, most: float) -> tuple[np.ndarray, np.ndarray]:
-        """(G,) [s] from the end of edge `here` to the end of edge `target`, infinite if it is more than `most`, and
-        (G,) bool, whether there is a way at all."""
-        if here not in self._there:
-            cost, before = dijkstra(self._costs[0], indices=self._inside.number[here], return_predecessors=True)
-            there = cost[self._first] + self._entering
-            self._there[here] = there, np.isfinite(there), float(there.min(initial=np.inf)), before
-        (there, leads_out, nearest, _), last = self._there[here], int(self._outside.number[target])
-        left = max(most - min(nearest, most) - self._ahead[last], 0.0)
-        if target not in self._onward or self._onward[target][0] < left:
-            cost, after = dijkstra(self._costs[1], indices=last, return_predecessors=True, limit=left)
-            self._onward[target] = left, cost[self._second] + self._ahead[last], after
-        return there + self._onward[target][1], leads_out & self._reached[last]
-
-    def route(self, here: int, gateway: int, target: int) -> list[int]:
-        """The edges from `here` to `target` through `gateway`, whose cost was asked for."""
-        to_gateway = self._inside.path(
-            self._there[here][-1], int(self._first[gateway]), int(self._inside.number[here]))
-        return to_gateway[::-1] + self._outside.path(
-            self._onward[target][2], int(self._second[gateway]), int(self._outside.number[target]))

@@ -21,6 +21,8 @@ class Settings:
         never [-]
     compliance: share of the decisions in which a driver follows the route guidance [-]
     most_detour: a driver does not follow route guidance into a next region that costs him more than this [s]
+    ways_return: whether guided drivers may leave a region and come back to it where that is the fastest way of all, as
+        on a main road along a ragged boundary
     rerouting: share of the drivers with SUMO's own rerouting device [-]
     measurement: "exact", or "estimate": controllers see what detectors and probes tell (cosim/detectors.py)
     detector_share: of the links, with loop detectors [-]; probe_share: of the vehicles [-]
@@ -47,6 +49,7 @@ class Settings:
     queue_override: float = 0.0
     compliance: float = 1.0
     most_detour: float = 60.0
+    ways_return: bool = False
     rerouting: float = 0.0
     measurement: str = EXACT
     detector_share: float = 0.3
@@ -78,6 +81,7 @@ def settings(scenario: Scenario) -> Settings:
         queue_override=table.number("queue_override", default.queue_override, low=0.0, high=1.0),
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
         most_detour=table.number("most_detour", default.most_detour, low=0.0),
+        ways_return=table.flag("ways_return", default.ways_return),
         rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0),
         signals=table.text("signals", default.signals, SIGNALS),
         measurement=table.text("measurement", default.measurement, (EXACT, ESTIMATE)),

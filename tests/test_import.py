@@ -132,7 +132,7 @@ def test_scenario_drives_the_original_vehicles(imported, config):
     case = read_case(config)
     traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
     assert scenario.demand.sum() * scenario.step == pytest.approx(len(traffic.vehicles), rel=1e-4)
-    assert settings(scenario).begin == 600.0
+    assert settings(scenario).begin == 600.0 and settings(scenario).ways_return
     scenario = replace(scenario, steps=10)
     network = scenario.network
     plant = SumoPlant(scenario)

@@ -140,6 +140,7 @@ def scenario_text(
         "", "[sumo]", f"begin = {clock.begin:.1f}", f"step_length = {_step_length(case, clock):g}",
         f"time_to_teleport = {seconds(teleport, 'time-to-teleport'):g}      # s; every table counts the teleports",
         "departure_jitter = 10.0     # s, either way: what seeds differ in, beside SUMO's own randomness",
+        "ways_return = true          # guided drivers may leave a region and come back, as main roads here do",
         *(f"{key} = [{', '.join(_quoted(value) for value in values)}]" for key, values in files.items() if values)]
     if mesoscopic:
         lines.append("mesoscopic = true           # SUMO's queue model: fast, without lanes; for quick studies")

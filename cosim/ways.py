@@ -1,0 +1,127 @@
+"""Searches for fastest ways in a city of regions, at given travel times."""
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+FAR = 1e9  # s, longer than any way
+
+
+class Moves:
+    """The moves between allowed edges as a graph of these edges, from first[n] to second[n] or, reversed, back.
+
+    number: edge -> its node, -1 for edges that are not allowed
+    """
+
+    def __init__(self, first: np.ndarray, second: np.ndarray, turn: np.ndarray, *, allowed: np.ndarray, reverse: bool):
+        """turn: [s], the time of a move; allowed: (E,), edges"""
+        self.edges = np.flatnonzero(allowed)
+        self.number = np.full(len(allowed), -1)
+        self.number[self.edges] = np.arange(len(self.edges))
+        rows, columns = (self.number[part] for part in ((second, first) if reverse else (first, second)))
+        kept = np.flatnonzero(allowed[first] & allowed[second])
+        kept = kept[np.lexsort((columns[kept], rows[kept]))]
+        self._second, self._turn, self._columns = second[kept], turn[kept], columns[kept].astype(np.int32)
+        self._begins = np.searchsorted(rows[kept], np.arange(len(self.edges) + 1)).astype(np.int32)
+        self._ids = self.edges.tolist()
+
+    def costing(self, time: np.ndarray, ahead: np.ndarray | None = None) -> csr_array:
+        """A move costs the time of the turn and `time` (E,) [s] of the edge that it leads to; less the time by which
+        it comes nearer, of `ahead` (nodes,) [s], if that is given: then a search from t finds cost + ahead - ahead[t],
+        and what leads astray last (A*)."""
+        cost = np.maximum(time[self._second] + self._turn, 1e-3)
+        if ahead is not None:
+            cost += ahead[self._columns] - np.repeat(ahead, np.diff(self._begins))
+        return csr_array((cost, self._columns, self._begins), shape=(len(self.edges),) * 2)
+
+    def leading_to(self, nodes: np.ndarray) -> np.ndarray:
+        """(nodes, len(nodes)) bool: from which of all nodes each of `nodes` can be reached."""
+        moves = csr_array(
+            (np.ones(len(self._columns)), self._columns, self._begins), shape=(len(self.edges),) * 2)
+        # Nodes that lead to each other are reached from the same ones: in most cities nearly all.
+        _, part = connected_components(moves, connection="strong")
+        _, once, which = np.unique(part[nodes], return_index=True, return_inverse=True)
+        return np.isfinite(dijkstra(moves.T.tocsr(), indices=nodes[once], unweighted=True)).T[:, which]
+
+    def ahead(self, nodes: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """(nodes,) [s]: hardly less than the time from each to the nearest of `nodes` at `time` (E,) [s], and FAR where
+        none can be reached."""
+        least = dijkstra(self.costing(time).T.tocsr(), indices=nodes, min_only=True)
+        return np.where(np.isfinite(least), (1.0 - 1e-6) * least, FAR)  # less, for no move may cost nothing
+
+    def path(self, before: np.ndarray, first: int, last: int) -> list[int]:
+        """The edges from node `first` to node `last` by the predecessors `before` of a search from `last`."""
+        way = [self._ids[first]]
+        while first != last:
+            first = before[first]
+            way.append(self._ids[first])
+        return way
+
+
+class Home:
+    """Fastest ways to single edges by `moves`, searched back from them when somebody first goes there."""
+
+    def __init__(self, moves: Moves, time: np.ndarray):
+        """time: (E,) [s]"""
+        self.time, self._moves, self._costs = time, moves, moves.costing(time)
+        self._found: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
+
+    def cost(self, here: int, target: int, most: float) -> float:
+        """[s] from the end of edge `here` to the end of edge `target`, infinite if it is more than `most`."""
+        if target not in self._found or self._found[target][0] < most:
+            self._found[target] = most, *dijkstra(
+                self._costs, indices=self._moves.number[target], return_predecessors=True, limit=most)
+        cost = self._found[target][1][self._moves.number[here]]
+        return float(cost) if cost <= most else np.inf
+
+    def route(self, here: int, target: int) -> list[int]:
+        """The edges from `here` to `target`, whose cost was asked for."""
+        number = self._moves.number
+        return self._moves.path(self._found[target][2], int(number[here]), int(number[target]))
+
+
+class Ways:
+    """Fastest ways out of one region by each of its G gateways (first[g] -> second[g], into next_region[g]).
+
+    Gateways begins[n] to ends[n] - 1 lead into region neighbours[n]. Searched is from where drivers are and from where
+    they go, when somebody first is or goes there, and no further than they would go: in a large city that is much less
+    than from all gateways to everywhere.
+    """
+
+    def __init__(
+        self, first, second, next_region, *, inside: Moves, outside: Moves, reached: np.ndarray, ahead: np.ndarray,
+        time: np.ndarray,
+    ):
+        """first, second, next_region: (G,), the last in rising order; inside: moves in the region; outside: those
+        elsewhere, back; reached: (nodes of `outside`, G), which edges can be reached from second[g]; ahead: (nodes of
+        `outside`,) [s], to the nearest second[g] at times that are no more than `time` (E,) [s]"""
+        self.time, self._inside, self._outside, self._reached, self._ahead = time, inside, outside, reached, ahead
+        self._first, self._second, self._entering = inside.number[first], outside.number[second], time[second]
+        self.neighbours, self.begins = np.unique(next_region, return_index=True)
+        self.ends = np.append(self.begins[1:], len(next_region))
+        self._costs = inside.costing(time), outside.costing(time, ahead)
+        self._there: dict[int, tuple[np.ndarray, np.ndarray, float, np.ndarray]] = {}
+        self._onward: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
+
+    def cost(self, here: int, target: int, most: float) -> tuple[np.ndarray, np.ndarray]:
+        """(G,) [s] from the end of edge `here` to the end of edge `target`, infinite if it is more than `most`, and
+        (G,) bool, whether there is a way at all."""
+        if here not in self._there:
+            cost, before = dijkstra(self._costs[0], indices=self._inside.number[here], return_predecessors=True)
+            there = cost[self._first] + self._entering
+            self._there[here] = there, np.isfinite(there), float(there.min(initial=np.inf)), before
+        (there, leads_out, nearest, _), last = self._there[here], int(self._outside.number[target])
+        if nearest == np.inf:
+            return there, leads_out
+        left = max(most - min(nearest, most) - self._ahead[last], 0.0)
+        if target not in self._onward or self._onward[target][0] < left:
+            cost, after = dijkstra(self._costs[1], indices=last, return_predecessors=True, limit=left)
+            self._onward[target] = left, cost[self._second] + self._ahead[last], after
+        return there + self._onward[target][1], leads_out & self._reached[last]
+
+    def route(self, here: int, gateway: int, target: int) -> list[int]:
+        """The edges from `here` to `target` through `gateway`, whose cost was asked for."""
+        to_gateway = self._inside.path(
+            self._there[here][-1], int(self._first[gateway]), int(self._inside.number[here]))
+        return to_gateway[::-1] + self._outside.path(
+            self._onward[target][2], int(self._second[gateway]), int(self._outside.number[target]))
