@@ -100,15 +100,15 @@ def compare(
     from cosim.simulate import Task, scenario_of
     from nmfd import runs
 
-    finished = (target / "manifest.json").is_file() or any(target.glob("demand-*/manifest.json"))
+    manifest = runs.read_manifest(target / "manifest.json") if (target / "manifest.json").is_file() else None
+    finished = manifest is not None or any(target.glob("demand-*/manifest.json"))
     if finished and out is not None:
         raise InputError(f"--out: {out}: a comparison is written into its run folder {target}; leave --out away")
     if finished and controller is None:
         _foresight(target, model)
         return
     controller = controller or "no-control"
-    if (target / "manifest.json").is_file():
-        manifest = runs.read_manifest(target / "manifest.json")
+    if manifest is not None:
         try:
             task = Task(
                 scenario=Path(manifest["sessions"][-1]["scenario_folder"]), controller=controller, seed=seed,
