@@ -1,5 +1,6 @@
 """How far ahead the regional models foresee the accumulations of finished runs, over all runs of a folder."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,7 +61,8 @@ def _of(demand: float, controller: str, scenario: Scenario, results: Sequence[ex
     intervals = identification.intervals_within(AHEAD, scenario.step, seen)
     critical = np.array([curve.critical for curve in network.mfds])
     return Foresight(
-        demand=demand, controller=controller, runs=len(results), model=network.folder, critical=critical,
+        demand=demand, controller=controller, runs=len(results), critical=critical,
+        model=network.folder and Path(os.path.normpath(network.folder)),
         most=np.max([run.accumulation.sum(axis=2).max(axis=0) for run in seen], axis=0) / critical,
         ahead=intervals * scenario.step,
         errors=identification.prediction_shares(
