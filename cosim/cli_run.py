@@ -74,14 +74,14 @@ def run(
 @click.argument("target", type=FOLDER, metavar="SCENARIO|RUN")
 @click.option("--controller", metavar="NAME[+...]",
               help=CONTROLLER_HELP + " [default: no-control; all runs of a RUN folder]")
-@click.option("--seed", type=SEED, default=0, show_default=True)
+@click.option("--seed", type=SEED, help="[default: 0]")
 @click.option("--model", type=FOLDER, metavar="DIR",
               help="A network of the same city, whose regional model predicts. [default: that with which the "
                    "controller plans]")
 @click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
 @click.option("--out", type=FOLDER, metavar="DIR", help="Run folder of a SCENARIO. [default: runs/<scenario>-<time>]")
 def compare(
-    target: Path, controller: str | None, seed: int, model: Path | None, steps: int | None, out: Path | None,
+    target: Path, controller: str | None, seed: int | None, model: Path | None, steps: int | None, out: Path | None,
 ) -> None:
     """Compare microsimulated accumulations with what the regional model predicts.
 
@@ -105,9 +105,13 @@ def compare(
     if finished and out is not None:
         raise InputError(f"--out: {out}: a comparison is written into its run folder {target}; leave --out away")
     if finished and controller is None:
+        if seed is not None or steps is not None:
+            raise InputError(
+                f"--{'seed' if steps is None else 'steps'}: without --controller all runs of {target} are compared, "
+                "whole; name a controller, or leave it away")
         _foresight(target, model)
         return
-    controller = controller or "no-control"
+    controller, seed = controller or "no-control", seed or 0
     if manifest is not None:
         try:
             task = Task(

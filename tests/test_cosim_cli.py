@@ -102,6 +102,7 @@ def test_run_against_and_compare(small, tmp_path):
     np.testing.assert_allclose(foreseen(), own, rtol=1e-3)
     assert np.abs(foreseen("--model", ROOT / "networks" / "grid7_guided") - own).max() > 1e-3
     assert "none/network.toml: no such file" in error_line(cosim("compare", out, "--model", tmp_path / "none"))
+    assert "--seed: without --controller all runs" in error_line(cosim("compare", out, "--seed", "0"))
     (tmp_path / "several").mkdir()
     out.rename(tmp_path / "several" / "demand-1")
     good(cosim("compare", tmp_path / "several"))
