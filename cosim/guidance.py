@@ -241,16 +241,15 @@ class Guide:
         return self._homes[region, taste]
 
     def _ways_from(self, region: int, taste: int) -> "Ways":
-        if region not in self._reached:
-            outside = self._without_back[region]
-            self._reached[region] = outside.leading_to(outside.number[self._gateways[region][1]])
-        if (region, taste) not in self._ahead:
-            outside = self._without_back[region]
-            self._ahead[region, taste] = outside.ahead(
-                outside.number[self._gateways[region][1]], self._free * self._taste[taste])
         if (region, taste) not in self._ways:
-            time = self._time * self._taste[taste]
+            outside = self._without_back[region]
+            entries = outside.number[self._gateways[region][1]]
+            if region not in self._reached:
+                self._reached[region] = outside.leading_to(entries)
+            if (region, taste) not in self._ahead:
+                self._ahead[region, taste] = outside.ahead(entries, self._free * self._taste[taste])
             self._ways[region, taste] = Ways(
-                *self._gateways[region], inside=self._within[region], outside=self._without_back[region],
-                reached=self._reached[region], ahead=self._ahead[region, taste], time=time)
+                *self._gateways[region], inside=self._within[region], outside=outside,
+                reached=self._reached[region], ahead=self._ahead[region, taste],
+                time=self._time * self._taste[taste])
         return self._ways[region, taste]

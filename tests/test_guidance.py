@@ -33,8 +33,8 @@ def ways(city):
                     if REGION[a] == 0 and REGION[b] != 0})
     following, gate, entry = np.array(gates).T
     return Ways(gate, entry, following, inside=inside, outside=back, time=time,
-                 reached=back.leading_to(back.number[entry]), ahead=back.ahead(back.number[entry], 0.8 * time)
-                 ), gate, entry
+                reached=back.leading_to(back.number[entry]), ahead=back.ahead(back.number[entry], 0.8 * time)
+                ), gate, entry
 
 
 def least(city, allowed):
