@@ -69,7 +69,7 @@ def evaluate(
     import os
 
     from cosim import evaluate, tables
-    from nmfd import runs
+    from nmfd import disk
     from nmfd.progress import progress_line
     from nmfd.scenario import load_scenario
 
@@ -77,7 +77,7 @@ def evaluate(
     chosen = evaluate.Evaluation(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
         levels=tuple(parsed_levels("--demand", demand)), steps=steps, policies=files, reference=reference,
-        out=Path("runs") / f"{runs.file_name(loaded.name)}-evaluate" if out is None else out)
+        out=Path("runs") / f"{disk.file_name(loaded.name)}-evaluate" if out is None else out)
     workers = len(os.sched_getaffinity(0)) if workers is None else workers
     try:
         with progress_line("evaluate") as progress:
@@ -142,7 +142,7 @@ def sweep(
     import os
 
     from cosim import sweeps
-    from nmfd import runs
+    from nmfd import disk
     from nmfd.progress import progress_line
     from nmfd.scenario import load_scenario
 
@@ -150,7 +150,7 @@ def sweep(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
         levels=tuple(parsed_levels("--demand", demand)), compliance=parsed_compliance(compliance), steps=steps,
         policies=files,
-        out=Path("runs") / f"{runs.file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
+        out=Path("runs") / f"{disk.file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
     workers = len(os.sched_getaffinity(0)) if workers is None else workers
     try:
         with progress_line("sweep") as progress:

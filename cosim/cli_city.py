@@ -52,7 +52,7 @@ def identify(
     """
     from cosim import identify
     from cosim.importing import find
-    from nmfd import runs
+    from nmfd import disk
     from nmfd.progress import progress_line
     from nmfd.scenario import load_scenario
 
@@ -62,7 +62,7 @@ def identify(
     both = guided is None and not options and target is None and identify.without_model(loaded)
     for guide in (False, True) if both else (bool(guided),):
         kind = f"{'-guided' if guide else ''}{f'-{options}' if options else ''}"
-        folder = out or Path("runs") / f"{runs.file_name(loaded.name)}-identify{kind}"
+        folder = out or Path("runs") / f"{disk.file_name(loaded.name)}-identify{kind}"
         if out and both and guide:
             folder = out / "guided"
         loading = identify.Loading(

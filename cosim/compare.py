@@ -9,7 +9,7 @@ import pandas as pd
 
 from cosim import bands
 from cosim.simulate import Result
-from nmfd import closed_loop, plots, runs
+from nmfd import closed_loop, disk, plots, runs
 from nmfd.dynamics import advance, parameters
 from nmfd.network import Network
 from nmfd.plant import NmfdPlant
@@ -159,7 +159,7 @@ def write(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
     predicted = predict(scenario, result)
     rows = pd.DataFrame(errors(scenario, result, predicted), columns=COLUMNS)
     name = runs.run_name(result.trajectory.controller, result.trajectory.seed)
-    with runs.atomic(folder / f"compare-{name}.csv") as temporary:
+    with disk.atomic(folder / f"compare-{name}.csv") as temporary:
         rows.to_csv(temporary, index=False)
     drawing, axes = plots.panels(scenario.network.regions + 1)
     for region, ax in enumerate(axes[:-1]):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nmfd import runs
+from nmfd import disk, runs
 from nmfd.network import Network
 from nmfd.types import Trajectory
 
@@ -47,7 +47,7 @@ def write(folder: Path, network: Network, trajectories: Sequence[Trajectory]) ->
         return rows
     from nmfd import plots
 
-    with runs.atomic(folder / "estimation.csv") as temporary:
+    with disk.atomic(folder / "estimation.csv") as temporary:
         rows.to_csv(temporary, index=False)
     for trajectory in estimated:
         path = folder / f"estimate-{runs.run_name(trajectory.controller, trajectory.seed)}.png"

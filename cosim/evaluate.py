@@ -15,7 +15,7 @@ import pandas as pd
 
 from cosim import experiment, reasons, report, tables
 from cosim.simulate import Task
-from nmfd import runs
+from nmfd import disk
 from nmfd.errors import InputError
 from nmfd.scenario import load_scenario
 from nmfd.workers import ended
@@ -70,7 +70,7 @@ def evaluate(
         table = tables.write(out, rows, evaluation.reference)
         scenario = load_scenario(evaluation.scenario)
         why = reasons.text(level_folders(out), scenario.network, rows)
-        runs.write_text(out / "evaluate.md", tables.markdown(table, evaluation.reference) + "\n" + why)
+        disk.write_text(out / "evaluate.md", tables.markdown(table, evaluation.reference) + "\n" + why)
         report.draw_all(out, level_folders(out), scenario, rows)
     if failures and table.empty and all(failure.mistake for _, failure in failures):
         raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])

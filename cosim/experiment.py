@@ -19,7 +19,7 @@ from cosim.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.strategy import MAX_PRESSURE, configured, parse
 from cosim.sumo_settings import Settings, settings
 from cosim.xml_files import read_xml
-from nmfd import faults, runs
+from nmfd import disk, faults, runs
 from nmfd.benchmarks import REFERENCE, draw_accumulations, interval
 from nmfd.controllers import registry
 from nmfd.errors import InputError
@@ -163,7 +163,7 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
         "scenario": scenario.name, "network": scenario.network.name, "plant": "sumo", "step_s": scenario.step,
         "steps": scenario.steps, "demand_factor": first.demand_factor,
         "demand_hash": hashlib.sha256(np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16],
-        "net_file_hash": runs.file_hash(files.net_file), "regions_hash": runs.file_hash(files.regions_csv),
+        "net_file_hash": disk.file_hash(files.net_file), "regions_hash": disk.file_hash(files.regions_csv),
         "measurement_std_veh": scenario.measurement_std, "sumo": _plain(chosen, scenario.folder),
         "libsumo": metadata.version("libsumo"), **({"faults": list(scenario.faults)} if scenario.faults else {})}
     return configuration, controllers
@@ -179,7 +179,7 @@ def _plain(chosen: Settings, folder: Path | None) -> dict:
         if value != usual[key]:
             found[key] = list(value) if isinstance(value, tuple) else value
             if key in ("routes", "background", "additional"):
-                found[key] = [runs.file_hash(folder / name) for name in value]
+                found[key] = [disk.file_hash(folder / name) for name in value]
     return found
 
 
@@ -217,7 +217,7 @@ def record_path(folder: Path, controller: str, seed: int) -> Path:
 
 def write_record(path: Path, result: Result) -> None:
     """The fields of cosim.record.Record, atomically."""
-    with runs.atomic(path) as temporary:
+    with disk.atomic(path) as temporary:
         np.savez_compressed(temporary, **result.record)
 
 
@@ -247,7 +247,7 @@ def _write_facts(folder: runs.RunFolder, result: Result) -> None:
     rows = read_facts(path) if path.is_file() else pd.DataFrame(columns=FACTS)
     same = (rows["controller"] == result.facts["controller"]) & (rows["seed"] == result.facts["seed"])
     rows = pd.DataFrame([*rows[~same].to_dict("records"), result.facts], columns=FACTS)
-    with runs.atomic(path) as temporary:
+    with disk.atomic(path) as temporary:
         rows.to_csv(temporary, index=False)
 
 

@@ -11,7 +11,7 @@ from cosim import evaluate, experiment
 from cosim.city import SumoFiles, ensure_built
 from cosim.regions import City, load_city
 from cosim.simulate import FACTS
-from nmfd import runs
+from nmfd import disk
 from nmfd.errors import InputError
 from nmfd.scenario import Scenario, load_scenario
 
@@ -134,6 +134,6 @@ def _scenario_folder(level: Level) -> Path:
 def _changed(configuration: Mapping, files: SumoFiles) -> str:
     """Why the city is not the one of the runs; empty if it is."""
     for key, file in (("net_file_hash", files.net_file), ("regions_hash", files.regions_csv)):
-        if configuration.get(key) not in (None, runs.file_hash(file)):
+        if configuration.get(key) not in (None, disk.file_hash(file)):
             return f"{file} has changed since the runs were made"
     return ""

@@ -12,7 +12,7 @@ from cosim import experiment
 from cosim.finished import Finished
 from cosim.identify import AHEAD, observed
 from cosim.strategy import modelled
-from nmfd import identification, runs
+from nmfd import disk, identification
 from nmfd.errors import InputError
 from nmfd.scenario import Scenario
 
@@ -86,5 +86,5 @@ def write(path: Path, foresights: Sequence[Foresight]) -> None:
         (one.demand, one.controller, one.runs, one.model, region, one.critical[region], one.most[region],
          one.errors[0, region], one.ahead, one.errors[1, region])
         for one in foresights for region in range(len(one.critical))]
-    with runs.atomic(path) as temporary:
+    with disk.atomic(path) as temporary:
         pd.DataFrame(rows, columns=COLUMNS).to_csv(temporary, index=False, float_format="%.6g")

@@ -17,7 +17,7 @@ import numpy as np
 from cosim import bands, experiment
 from cosim.compare import HELD_UP, draw_mfds, outflow_samples
 from cosim.simulate import Result, Task
-from nmfd import identification, mfd, runs, toml
+from nmfd import disk, identification, mfd, toml
 from nmfd.errors import InputError
 from nmfd.identification import Observed
 from nmfd.network import Network
@@ -115,7 +115,7 @@ def identify(
     bands.draw_production(out / "production.png", model, [result.record for result in found])
     levels, seeds = ", ".join(f"{level:g}" for level in loading.levels), f"{min(loading.seeds)} to {max(loading.seeds)}"
     target.mkdir(parents=True, exist_ok=True)
-    runs.write_text(target / "network.toml", network_toml(
+    disk.write_text(target / "network.toml", network_toml(
         model, _sumo_table(loaded.network.folder, target),
         f"Regional model: written by cosim identify from {len(found)} loading runs of {loaded.name} under {first} and\n"
         f"# {second}, demand times {levels}, seeds {seeds}."))
@@ -309,7 +309,7 @@ def _options(network: Network, region: int) -> str:
 
 
 def _write_samples(path: Path, samples: Sequence[dict]) -> None:
-    with runs.atomic(path) as temporary, temporary.open("w", newline="") as file:
+    with disk.atomic(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["region", "branch", "accumulation_veh", "outflow_veh_s"])
         for region, cloud in enumerate(samples):

@@ -10,7 +10,7 @@ import numpy as np
 
 from cosim.regions import City
 from cosim.xml_files import read_xml
-from nmfd import runs
+from nmfd import disk
 from nmfd.errors import InputError
 
 STREAM = 7102  # keeps these random numbers apart from others of the same seed
@@ -124,5 +124,5 @@ def write_originals(
         element.attrib.update(id=name, depart=f"{depart:.2f}")
         lines.append(f"  {ElementTree.tostring(element, encoding='unicode').strip()}\n")
         element.attrib.update(before)
-    runs.write_text(path, "".join([*lines, "</routes>\n"]))
+    disk.write_text(path, "".join([*lines, "</routes>\n"]))
     return [name for _, _, name in drawn]

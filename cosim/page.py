@@ -9,7 +9,7 @@ import pandas as pd
 from cosim import reasons, report, story, tables
 from cosim.finished import Finished, Level
 from cosim.markup import cell, fold, items, page, picture, table, tag, text, typeset
-from nmfd import runs
+from nmfd import disk
 from nmfd.benchmarks import REFERENCE
 from nmfd.scratch import Scratch
 
@@ -63,7 +63,7 @@ def write(
     names = ", ".join(dict.fromkeys(run.scenario.name for run in found))
     header = text("h1", f"Traffic control in SUMO: {names}") + text("p", WORDS, class_="note")
     version = found[-1].levels[-1].manifest["sessions"][-1].get("versions", {}).get("perimeter-cosim", "")
-    runs.write_text(path, page(
+    disk.write_text(path, page(
         f"{names}: report", header + (contents if len(found) > 1 else ""), "\n".join(parts),
         text("p", f"Made by cosim report from {', '.join(map(str, (run.path for run in found)))}; perimeter-cosim "
              f"{version}. The page holds everything it shows.")))

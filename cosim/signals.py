@@ -9,7 +9,7 @@ from xml.sax.saxutils import quoteattr
 from cosim.regions import City
 from cosim.sumo import Phase
 from cosim.xml_files import BROKEN, read_xml
-from nmfd import runs
+from nmfd import disk
 from nmfd.errors import InputError
 
 GREEN = frozenset("Gg")
@@ -93,7 +93,7 @@ def _simple(logic: ElementTree.Element, links: tuple[Link, ...]) -> Signal | Non
 
 def write_programmes(path: Path, rows: Iterable[str]) -> None:
     """An additional file of SUMO with rows from `programme_row`."""
-    runs.write_text(path, "".join(["<additional>\n", *rows, "</additional>\n"]))
+    disk.write_text(path, "".join(["<additional>\n", *rows, "</additional>\n"]))
 
 
 def programme_row(signal: Signal, kind: str, *, limits: Mapping[int, tuple[float, float]] | None = None) -> str:

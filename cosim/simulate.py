@@ -94,11 +94,11 @@ def drive(
     from cosim import facts, sumo_output
     from cosim.plant import SumoPlant
     from cosim.sumo_settings import settings
-    from nmfd import closed_loop, runs
+    from nmfd import closed_loop, disk, runs
 
     begin = time.perf_counter() if begin is None else begin
     with ExitStack() as stack:
-        files = {kind: stack.enter_context(runs.atomic(path)) for kind, path in (outputs or {}).items()}
+        files = {kind: stack.enter_context(disk.atomic(path)) for kind, path in (outputs or {}).items()}
         plant = SumoPlant(
             scenario, overrides=replace(settings(scenario), **strategy.overrides), outputs=files,
             model=model)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nmfd import runs
+from nmfd import disk
 from nmfd.benchmarks import REFERENCE, interval
 
 TTS = "total_time_spent_veh_s"
@@ -178,7 +178,7 @@ def write(folder: Path, rows: pd.DataFrame, reference: str | None = None) -> pd.
     """evaluate.csv, evaluate.md, pairs.csv and runs.csv in `folder`; returns `statistics`."""
     table = statistics(rows, reference)
     for name, content in (("runs.csv", rows), ("evaluate.csv", table), ("pairs.csv", pairs(rows))):
-        with runs.atomic(folder / name) as temporary:
+        with disk.atomic(folder / name) as temporary:
             content.to_csv(temporary, index=False)
-    runs.write_text(folder / "evaluate.md", markdown(table, reference))
+    disk.write_text(folder / "evaluate.md", markdown(table, reference))
     return table

@@ -13,8 +13,8 @@ from cosim.finished import Finished, Level
 from cosim.regions import City, edge_shapes
 from cosim.simulate import Result
 from nmfd import plots
+from nmfd.disk import atomic, file_name
 from nmfd.errors import InputError
-from nmfd.runs import atomic, file_name
 
 FRAMES = 120        # at most: of a longer run every second, third ... interval is shown
 DPI = 80

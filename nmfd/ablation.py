@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from nmfd import closed_loop, rollout, runs, training
+from nmfd import closed_loop, disk, rollout, runs, training
 from nmfd.benchmarks import PLANTS, configuration, interval, results
 from nmfd.controllers import registry
 from nmfd.errors import InputError
@@ -127,7 +127,7 @@ def _kept(
     with runs.manifest(
             out, configuration={**configuration, "ablation": name}, results=out / f"{name}.csv",
             session={"workers": workers}):
-        rows = {file: runs.read_rows(out / f"{file}.csv", kinds) if (out / f"{file}.csv").is_file() else []
+        rows = {file: disk.read_rows(out / f"{file}.csv", kinds) if (out / f"{file}.csv").is_file() else []
                 for file, kinds in columns.items()}
         done = {_run(row) for row in rows[name]}
         missing = [run for run in todo if run not in done]
@@ -138,7 +138,7 @@ def _kept(
             for file, kinds in columns.items():  # the last makes the run count: others may be there already
                 kept = [row for row in rows[file] if _run(row) != run]
                 rows[file] = sorted([*kept, *outcome[file]], key=lambda row: tuple(row.values())[:3])
-                runs.write_rows(out / f"{file}.csv", kinds, rows[file])
+                disk.write_rows(out / f"{file}.csv", kinds, rows[file])
         if rows[name]:
             draw(out, rows)
     if failures:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from nmfd import closed_loop, runs
+from nmfd import closed_loop, disk, runs
 from nmfd.benchmarks import PLANTS, REFERENCE, configuration, results
 from nmfd.controllers import registry
 from nmfd.errors import InputError
@@ -100,7 +100,7 @@ def adaptation(
     file, failures = out / "adaptation.csv", []
     with runs.manifest(out, configuration=common, controllers=settings, results=file,
                        session={"scenario_folder": str(scenario.folder), "workers": workers}):
-        rows = {_run(row): row for row in (runs.read_rows(file, COLUMNS) if file.is_file() else [])}
+        rows = {_run(row): row for row in (disk.read_rows(file, COLUMNS) if file.is_file() else [])}
         todo = [run for run in wanted if run not in rows]
         work = partial(run_one, scenario=scenario, plant=plant, policies=policies)
         for run, outcome in results(work, todo, workers, scenario.steps, progress, label=_label):
@@ -108,7 +108,7 @@ def adaptation(
                 failures.append((_label(run), outcome))
             else:
                 rows[run] = outcome
-                runs.write_rows(file, COLUMNS, list(rows.values()))
+                disk.write_rows(file, COLUMNS, list(rows.values()))
     if failures:
         raise ended(failures)
     return list(rows.values())

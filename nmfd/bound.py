@@ -15,10 +15,11 @@ import torch
 
 from nmfd import closed_loop, dynamics
 from nmfd.controllers import registry
+from nmfd.disk import atomic
 from nmfd.errors import InputError
 from nmfd.network import Network
 from nmfd.plant import NmfdPlant
-from nmfd.runs import atomic, scenario_hash
+from nmfd.runs import scenario_hash
 from nmfd.scenario import Scenario
 from nmfd.types import Controls, Measurement
 

@@ -173,11 +173,11 @@ def show(scenario: Path, out: Path | None) -> None:
     Example:
       nmfd show scenarios/economic_mpc --out figures
     """
-    from nmfd import benchmarks, runs
+    from nmfd import benchmarks, disk
     from nmfd.scenario import load_scenario
 
     loaded = load_scenario(scenario)
-    out = Path("runs") / f"{runs.file_name(loaded.name)}-show" if out is None else out
+    out = Path("runs") / f"{disk.file_name(loaded.name)}-show" if out is None else out
     out.mkdir(parents=True, exist_ok=True)
     files = benchmarks.draw_scenario(out, loaded)
     total = loaded.step * loaded.demand.sum()

@@ -98,12 +98,12 @@ def adaptation(
     files = policy_files(policies, names)
 
     from nmfd import adaptation as method
-    from nmfd import runs
+    from nmfd import disk
     from nmfd.progress import progress_line
     from nmfd.scenario import load_scenario
 
     loaded = load_scenario(scenario)
-    out = Path("runs") / f"{runs.file_name(loaded.name)}-adaptation" if out is None else out
+    out = Path("runs") / f"{disk.file_name(loaded.name)}-adaptation" if out is None else out
     chosen = list(dict.fromkeys(case.strip() for case in cases.split(",")))
     try:
         with progress_line("adaptation") as progress:

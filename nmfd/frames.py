@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from nmfd.runs import atomic
+from nmfd.disk import atomic
 from nmfd.types import Trajectory
 
 

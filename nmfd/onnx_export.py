@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from nmfd.controllers.dpc import Policy, load_policy
+from nmfd.disk import atomic
 from nmfd.errors import InputError
 from nmfd.extras import need
-from nmfd.runs import atomic
 from nmfd.scenario import Scenario, as_modelled, load_scenario
 from nmfd.workers import RunFailed
 

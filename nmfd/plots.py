@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator, MultipleLocator, StrMethodFormatter
 
+from nmfd.disk import atomic
 from nmfd.mfd import Mfd
 from nmfd.network import Network
-from nmfd.runs import atomic
 from nmfd.scenario import Scenario
 from nmfd.types import Trajectory
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import torch
 
-from nmfd import closed_loop, runs
+from nmfd import closed_loop, disk, runs
 from nmfd.benchmarks import PLANTS, REFERENCE, configuration, interval, results
 from nmfd.controllers import registry
 from nmfd.demand_noise import perturbed
@@ -81,7 +81,7 @@ def robustness(
                 failures.append((_label(run), outcome))
             else:
                 rows[run] = outcome
-                runs.write_rows(file, COLUMNS, [rows[run] for run in sorted(rows)])
+                disk.write_rows(file, COLUMNS, [rows[run] for run in sorted(rows)])
         if rows:
             draw(out, [rows[run] for run in sorted(rows)])
     if failures:
@@ -99,7 +99,7 @@ def _run(row: Mapping) -> Run:
 
 def read(path: Path) -> list[dict]:
     """The rows of robustness.csv. Raises InputError."""
-    return runs.read_rows(path, COLUMNS)
+    return disk.read_rows(path, COLUMNS)
 
 
 def improvements(rows: Sequence[Mapping], controller: str) -> dict[float, tuple[float, float]]:

@@ -5,19 +5,14 @@
     <folder>/<controller>-<seed>.npz    its trajectory, without wall times: the same run gives the same bytes
 """
 
-import csv
-import errno
-import fcntl
 import hashlib
 import json
 import math
-import os
 import platform
-import re
 import subprocess
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
@@ -27,6 +22,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from nmfd import disk
 from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.scenario import Scenario
@@ -38,86 +34,15 @@ COLUMNS = {
     "control_step_ms_median": float, "control_step_ms_max": float, "solver_failures": int,
 }
 LOCK = ".lock"  # of a run folder
-TEMPORARY = re.compile(r"\.(?P<stem>.+)-\d+\.tmp(\.\w+)?")  # names that `atomic` gives
 PACKAGES = ("numpy", "torch", "casadi", "libsumo", "perimeter-cosim")
 # What NumPy raises for a file that is no .npz, cut off, changed, or without an array that it should have.
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 _ARRAYS = ("accumulation", "backlog", "completed", "perimeter", "splits")
 
 
-@contextmanager
-def atomic(path: Path) -> Iterator[Path]:
-    """A temporary name in the folder of `path` to write to; it becomes `path` if all goes well, else it goes.
-
-    The suffix of `path` is kept, because matplotlib and NumPy choose the format by it. A process that is killed leaves
-    the temporary file behind; `sweep` removes it.
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except BaseException as error:
-        if isinstance(error, OSError) and error.filename in (None, str(temporary)):  # a full disk is met without a name
-            error.filename = str(path)
-        with suppress(OSError):
-            temporary.unlink()
-        raise
-
-
-def sweep(folder: Path, stems: Collection[str] | None = None) -> None:
-    """Remove what killed processes left half-written in `folder`, of files with these stems, or of all.
-
-    To be called by whoever has the folder or the files to himself (`locked`).
-    """
-    for path in folder.iterdir():
-        name = TEMPORARY.fullmatch(path.name)
-        if name and (stems is None or name["stem"] in stems):
-            path.unlink(missing_ok=True)
-
-
-@contextmanager
-def locked(file: Path, what: Path) -> Iterator[None]:
-    """`what` to oneself: InputError if another process has it.
-
-    file: the lock, which holds process and host. The system lets go of it when the process ends, however it ends.
-    """
-    while True:
-        handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.read(handle, 200).decode(errors="replace") or "another process"
-            os.close(handle)
-            raise InputError(
-                f"{what}: {holder} is writing to it; wait for its end, or choose another name with --out") from None
-        except OSError as error:
-            if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
-                os.close(handle)
-                raise
-        with suppress(FileNotFoundError):  # whoever had it may have removed it meanwhile
-            if os.path.samestat(os.fstat(handle), os.stat(file)):
-                break
-        os.close(handle)
-    try:
-        os.ftruncate(handle, 0)
-        os.write(handle, f"process {os.getpid()} on {platform.node()}".encode())
-        yield
-    finally:
-        with suppress(OSError):
-            os.unlink(file)
-        os.close(handle)
-
-
-def write_text(path: Path, text: str) -> None:
-    """`text` in `path`, atomically."""
-    with atomic(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-
-
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     """All of `trajectory` but its wall times in an .npz file without pickles, atomically."""
-    with atomic(path) as temporary:
+    with disk.atomic(path) as temporary:
         np.savez_compressed(
             temporary, controller=np.array(trajectory.controller), plant=np.array(trajectory.plant),
             seed=np.array(trajectory.seed), step=np.array(trajectory.step), status=np.array(trajectory.status),
@@ -141,31 +66,9 @@ def read_trajectory(path: Path) -> Trajectory:
         raise InputError(f"{path}: is no trajectory ({error}); delete it and run it again") from None
 
 
-def write_rows(path: Path, columns: Mapping[str, type], rows: Sequence[Mapping]) -> None:
-    """`rows` as a csv file with `columns`, atomically."""
-    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(columns), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-def read_rows(path: Path, columns: Mapping[str, type]) -> list[dict]:
-    """The rows of a csv file with `columns`: name -> type. Raises InputError."""
-    try:
-        with Path(path).open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            if reader.fieldnames != list(columns):
-                raise ValueError(f"expected the columns {', '.join(columns)}")
-            return [{name: convert(row[name]) for name, convert in columns.items()} for row in reader]
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; delete the folder and run again") from None
-    except (OSError, TypeError, ValueError, csv.Error) as error:
-        raise InputError(f"{path}: {error}; delete the folder and run again") from None
-
-
 def write_summary(path: Path, rows: list[dict]) -> None:
     """`rows` of metrics.summary as summary.csv, atomically."""
-    write_rows(path, COLUMNS, rows)
+    disk.write_rows(path, COLUMNS, rows)
 
 
 def read_manifest(path: Path) -> dict:
@@ -184,7 +87,7 @@ def read_manifest(path: Path) -> dict:
 
 def read_summary(path: Path) -> list[dict]:
     """The rows of summary.csv with the types of metrics.summary. Raises InputError."""
-    return read_rows(path, COLUMNS)
+    return disk.read_rows(path, COLUMNS)
 
 
 def scenario_hash(scenario: Scenario) -> str:
@@ -198,11 +101,6 @@ def scenario_hash(scenario: Scenario) -> str:
         settings.append(scenario.faults)
     text = json.dumps(settings, sort_keys=True, default=str)
     return hashlib.sha256(text.encode() + np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16]
-
-
-def file_hash(path: Path) -> str:
-    """A fingerprint of the bytes of a file."""
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
 
 
 def provenance() -> dict:
@@ -229,11 +127,6 @@ def _git(folder: Path, *arguments: str) -> str | None:
     return done.stdout.strip() if done.returncode == 0 else None
 
 
-def file_name(name: str) -> str:
-    """`name` with everything that is awkward in a file name replaced."""
-    return re.sub(r"[^\w.-]+", "-", name)
-
-
 def run_name(controller: str, seed: int) -> str:
     """What the files of a run are called; of a controller in a file, path/to/file.py:Class, without the / and :."""
     return f"{quote(controller, safe='+,-._ ')}-{seed}"
@@ -241,7 +134,7 @@ def run_name(controller: str, seed: int) -> str:
 
 def default_folder(scenario: Scenario) -> Path:
     """runs/<scenario>-<timestamp> in the current folder, a name not taken yet."""
-    stem = f"{file_name(scenario.name)}-{datetime.now():%Y%m%d-%H%M%S}"
+    stem = f"{disk.file_name(scenario.name)}-{datetime.now():%Y%m%d-%H%M%S}"
     candidates = (Path("runs") / (stem + (f"-{n}" if n > 1 else "")) for n in range(1, 1000))
     return next(folder for folder in candidates if not folder.exists())
 
@@ -339,13 +232,13 @@ def manifest(
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; choose another folder with --out")
     if path.is_dir() and not file.is_file() and any(
-            found.name != LOCK and not TEMPORARY.fullmatch(found.name) for found in path.iterdir()):
+            found.name != LOCK and not disk.TEMPORARY.fullmatch(found.name) for found in path.iterdir()):
         raise InputError(f"{path}: is not empty and holds no manifest.json; choose another folder with --out")
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
-        with locked(path / LOCK, path):
-            sweep(path)
+        with disk.locked(path / LOCK, path):
+            disk.sweep(path)
             if file.is_file():
                 sessions, controllers, changed = _continued(
                     file, configuration, controllers, renewable=renew is not None)
@@ -355,11 +248,11 @@ def manifest(
             sessions.append({**provenance(), **(session or {})})
             content = {"configuration": configuration, "controllers": controllers, "sessions": sessions}
             try:
-                write_text(file, json.dumps(content, indent=2) + "\n")
+                disk.write_text(file, json.dumps(content, indent=2) + "\n")
                 yield
             finally:
                 if not results.exists() and first:
-                    sweep(path)  # what a process that died at work for this one has left
+                    disk.sweep(path)  # what a process that died at work for this one has left
                     with suppress(OSError):
                         file.unlink()
     finally:

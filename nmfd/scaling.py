@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nmfd import runs, turns
+from nmfd import disk, runs, turns
 from nmfd.errors import InputError
 from nmfd.mfd import Mfd
 from nmfd.network import Network
@@ -165,13 +165,13 @@ def scaling(
         "experiment": "scaling", "step_s": INTERVAL, "steps": INTERVALS, "memory_gib": memory_gib,
         "time_limit_s": time_limit}
     with runs.manifest(out, configuration=configuration, results=file, session={"workers": workers}):
-        rows = {_case(row): row for row in (runs.read_rows(file, COLUMNS) if file.is_file() else [])}
+        rows = {_case(row): row for row in (disk.read_rows(file, COLUMNS) if file.is_file() else [])}
         todo = [case for case in cases if case not in rows]
         work = partial(run_one, memory_gib=memory_gib)
         for done, (case, outcome) in enumerate(
                 outcomes(work, todo, workers, fresh=True, seconds=time_limit), start=1):
             rows[case] = failed(case, outcome.reason) if isinstance(outcome, Failure) else outcome
-            runs.write_rows(file, COLUMNS, ordered(rows))
+            disk.write_rows(file, COLUMNS, ordered(rows))
             if progress:
                 progress(done, len(todo), f"last {case.controller}, {case.regions} regions")
         draw(out, ordered(rows))

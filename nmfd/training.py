@@ -17,10 +17,10 @@ from nmfd import toml
 from nmfd.controllers import guarded
 from nmfd.controllers.dpc import ACTIVATIONS, DEEPEST, WIDEST, Architecture, Policy, checkpoint
 from nmfd.controllers.gating import PiGating
+from nmfd.disk import atomic, locked, sweep
 from nmfd.errors import InputError
 from nmfd.network import Network
 from nmfd.rollout import Rollout, compiled_step
-from nmfd.runs import atomic, locked, sweep
 from nmfd.scenario import Scenario, as_modelled
 from nmfd.workers import RunFailed
 

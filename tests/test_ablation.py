@@ -4,7 +4,7 @@ import pytest
 import tiny
 from click.testing import CliRunner
 
-from nmfd import ablation, plots, plots_experiments, runs, training
+from nmfd import ablation, disk, plots, plots_experiments, training
 from nmfd.cli import main
 
 
@@ -27,11 +27,11 @@ def test_training_compares_both_methods_on_the_plant(training_command, tmp_path)
     out = tmp_path / "out"
     result = nmfd(*training_command)
     assert result.exit_code == 0, result.stderr
-    curve = runs.read_rows(out / "validation.csv", ablation.VALIDATION_COLUMNS)
+    curve = disk.read_rows(out / "validation.csv", ablation.VALIDATION_COLUMNS)
     assert [(row["method"], row["adam_step"]) for row in curve] == [
         ("alternating", 1), ("alternating", 2), ("joint", 1), ("joint", 2)]
     assert curve[1]["total_time_spent_veh_s"] != curve[3]["total_time_spent_veh_s"]
-    rows = runs.read_rows(out / "training.csv", ablation.TRAINING_COLUMNS)
+    rows = disk.read_rows(out / "training.csv", ablation.TRAINING_COLUMNS)
     assert [(row["method"], row["seed"], row["adam_steps"]) for row in rows] == [("alternating", 0, 2), ("joint", 0, 2)]
     for row in rows:
         points = [point["total_time_spent_veh_s"] for point in curve if point["method"] == row["method"]]
@@ -54,7 +54,7 @@ def test_training_is_not_repeated_and_seeds_can_be_added(training_command, tmp_p
     assert nmfd(*training_command).stdout == result.stdout and not trained
     assert nmfd(*training_command, "--seeds", 2).exit_code == 0
     assert trained == [1, 1]
-    assert len(runs.read_rows(tmp_path / "out" / "validation.csv", ablation.VALIDATION_COLUMNS)) == 8
+    assert len(disk.read_rows(tmp_path / "out" / "validation.csv", ablation.VALIDATION_COLUMNS)) == 8
     refused = nmfd(*training_command, "--steps", 3)
     assert refused.exit_code == 2 and "adam_steps: 2 there, 3 asked for" in refused.stderr
 
@@ -84,7 +84,7 @@ def test_horizon_runs_every_length_and_can_be_extended(folder, tmp_path):
     assert nmfd(*command, "2").exit_code == 0
     result = nmfd(*command, "2,4")
     assert result.exit_code == 0, result.stderr
-    rows = runs.read_rows(out / "horizon.csv", ablation.HORIZON_COLUMNS)
+    rows = disk.read_rows(out / "horizon.csv", ablation.HORIZON_COLUMNS)
     assert [(row["controller"], row["horizon"]) for row in rows] == [("mpc-pc", 2), ("mpc-pc", 4)]
     assert "horizon  4" in result.stdout and (out / "horizon.png").stat().st_size > 1000
 

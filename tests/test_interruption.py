@@ -23,9 +23,10 @@ from click.testing import CliRunner
 import cosim.cli
 import nmfd.cli
 from cosim.plant import SumoPlant
-from nmfd import runs, training, workers
+from nmfd import disk, runs, training, workers
+from nmfd.disk import TEMPORARY
 from nmfd.errors import InputError
-from nmfd.runs import LOCK, TEMPORARY
+from nmfd.runs import LOCK
 from nmfd.scenario import load_scenario
 from nmfd.scratch import Scratch, sweep
 
@@ -302,7 +303,7 @@ def wait_for(condition, seconds: float) -> bool:
 def test_the_second_of_two_runs_into_one_folder_is_told(tmp_path):
     scenario, out = tiny.write(tmp_path), tmp_path / "out"
     out.mkdir()
-    with runs.locked(out / LOCK, out):
+    with disk.locked(out / LOCK, out):
         for program, command in (
                 ("nmfd", ("benchmark", scenario, "--controllers", "no-control", "--out", out)),
                 ("nmfd", ("robustness", scenario, "--controllers", "no-control", "--scenarios", 1, "--out", out))):
@@ -316,7 +317,7 @@ def test_the_second_of_two_runs_into_one_folder_is_told(tmp_path):
 
 def test_the_second_of_two_trainings_of_one_policy_is_told(tmp_path):
     scenario = tiny.write(tmp_path)
-    with runs.locked(scenario / ".dpc-pc.pt.lock", scenario / "dpc-pc.pt"):
+    with disk.locked(scenario / ".dpc-pc.pt.lock", scenario / "dpc-pc.pt"):
         result = call("nmfd", "train", scenario, "--controller", "dpc-pc", "--steps", 1, "--device", "cpu")
     assert result.exit_code == 2 and "is writing to it" in result.stderr
     good(call("nmfd", "train", scenario, "--controller", "dpc-pc", "--steps", 1, "--device", "cpu"))
@@ -325,12 +326,12 @@ def test_the_second_of_two_trainings_of_one_policy_is_told(tmp_path):
 def test_the_lock_of_a_killed_process_is_no_lock(tmp_path):
     child = os.fork()
     if child == 0:
-        with runs.locked(tmp_path / LOCK, tmp_path):
+        with disk.locked(tmp_path / LOCK, tmp_path):
             os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
     assert (tmp_path / LOCK).exists()
-    with runs.locked(tmp_path / LOCK, tmp_path):
-        with pytest.raises(InputError, match="is writing to it"), runs.locked(tmp_path / LOCK, tmp_path):
+    with disk.locked(tmp_path / LOCK, tmp_path):
+        with pytest.raises(InputError, match="is writing to it"), disk.locked(tmp_path / LOCK, tmp_path):
             pass
     assert not (tmp_path / LOCK).exists()
 
@@ -339,9 +340,9 @@ def test_temporary_files_of_others_are_left_alone(tmp_path):
     (tmp_path / ".dpc-pc-12.tmp.pt").write_text("")
     (tmp_path / ".dpc-pc-robust-12.tmp.pt").write_text("")
     (tmp_path / ".mine").write_text("")
-    runs.sweep(tmp_path, {"dpc-pc"})
+    disk.sweep(tmp_path, {"dpc-pc"})
     assert {path.name for path in tmp_path.iterdir()} == {".dpc-pc-robust-12.tmp.pt", ".mine"}
-    runs.sweep(tmp_path)
+    disk.sweep(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {".mine"}
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nmfd import runs, workers
+from nmfd import disk, runs, workers
 from nmfd.errors import InputError
 from nmfd.progress import ProgressLine, progress_line
 from nmfd.types import Trajectory
@@ -52,7 +52,7 @@ def test_a_file_that_is_no_trajectory(tmp_path, content):
 def test_atomic_leaves_the_old_file_and_nothing_else_when_writing_fails(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(KeyboardInterrupt), runs.atomic(path) as temporary:
+    with pytest.raises(KeyboardInterrupt), disk.atomic(path) as temporary:
         temporary.write_text("half")
         raise KeyboardInterrupt
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]

@@ -46,7 +46,7 @@ def check(name: str) -> None:
 
 def fingerprint(name: str) -> dict[str, object]:
     """What the runs of `name` depend on: its file, and the files that its class names in `files`, or its package."""
-    from nmfd.runs import file_hash
+    from nmfd.disk import file_hash
 
     if not is_file(name):
         point = entry_points()[name]

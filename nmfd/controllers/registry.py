@@ -145,7 +145,7 @@ def fingerprint(name: str, policy: Path | None) -> dict[str, object]:
         from nmfd.controllers import own
 
         return own.fingerprint(name)
-    from nmfd.runs import file_hash
+    from nmfd.disk import file_hash
 
     return {} if policy is None else {"policy_hash": file_hash(policy)}
 
