@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cosim.importing.streets import Streets
+from cosim.xml_files import file_list, read_xml
 from nmfd.errors import InputError
 from nmfd.scratch import Scratch
 
@@ -84,16 +85,18 @@ def run_baseline(
     options: Sequence[str] = (),
 ) -> Baseline:
     """Simulate without control. Raises InputError with SUMO's own words if it refuses."""
+    # A vehicle that a rerouter gives another route makes SUMO fail when it writes the times of the edges it has left.
+    rerouted = any(next(read_xml(path).iter("routeProbReroute"), None) is not None for path in additional)
     with Scratch("cosim-") as folder:
         edges = folder / "edges.xml"
         (folder / "measure.add.xml").write_text(
             f'<additional><edgeData id="all" freq="{INTERVAL:g}" file="{edges}" excludeEmpty="true"/></additional>')
         run_sumo(
-            "sumo", "--net-file", str(streets.path), "--route-files", ",".join(map(str, routes)),
-            "--additional-files", ",".join(map(str, [*additional, folder / "measure.add.xml"])), "--begin", str(begin),
+            "sumo", "--net-file", file_list([streets.path]), "--route-files", file_list(routes),
+            "--additional-files", file_list([*additional, folder / "measure.add.xml"]), "--begin", str(begin),
             "--end", str(end), "--seed", "0", "--no-step-log", "true", "--no-warnings", "true",
             "--ignore-route-errors", "true", "--vehroute-output", str(folder / "ways.xml"),
-            "--vehroute-output.exit-times", "true", "--vehroute-output.last-route", "true",
+            "--vehroute-output.exit-times", str(not rerouted).lower(), "--vehroute-output.last-route", "true",
             "--vehroute-output.write-unfinished", "true", "--statistic-output", str(folder / "statistic.xml"),
             "--duration-log.statistics", "true",
             *options, where=str(streets.path))
@@ -137,7 +140,8 @@ def _ways(path: Path, streets: Streets) -> Counter:
             route = element.find("route")
             if route is not None and route.get("edges"):
                 edges = [streets.number.get(edge, -1) for edge in route.get("edges").split()]
-                left = [float(time) >= 0 for time in route.get("exitTimes", "").split()] or [False] * len(edges)
+                left = [float(time) >= 0 for time in route.get("exitTimes", "").split()] or (
+                    [element.get("arrival") is not None] * len(edges))
                 driven = tuple(n for n, gone in zip(edges, left, strict=False) if gone and n >= 0)
                 if edges[-1] >= 0:
                     ways[driven, edges[-1]] += 1

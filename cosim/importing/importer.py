@@ -114,8 +114,10 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
         report += _level_line(order, factor, congests)
         if scale != 1.0:
             report += f"\nvehicles times {scale:g}, the scale in {case.source.name}"
-        if case.left_out:
-            report += f"\nnot taken over from {case.source.name}: {', '.join(case.left_out)}"
+        left_out = [*case.left_out, *(
+            [] if case.step_length == model.step_length(case, clock) else [f"step-length = {case.step_length:g}"])]
+        if left_out:
+            report += f"\nnot taken over from {case.source.name}: {', '.join(left_out)}"
         if mesoscopic and order.run:
             report += "\nsimulated by SUMO's mesoscopic model" + (
                 "" if order.mesoscopic else f": the city has more than {LARGE:,} edges for cars")
@@ -145,15 +147,19 @@ def _traffic(case: Case, streets: Streets, order: Order) -> Traffic:
 
 def left_alone(streets: Streets, traffic: Traffic) -> dict[str, str]:
     """Signal -> why perimeter control leaves it alone: only fixed-time programmes that always run are changed."""
-    found = {
-        signal: f"{logics[-1].kind} signal" for signal, logics in streets.logics.items()
-        if logics[-1].kind != "static"}
+    found = {signal: "no programme" for signal in streets.link_signals if signal and signal not in streets.logics}
+    found |= {
+        signal: "switched off" if logics[-1].programme == "off" else f"{logics[-1].kind} signal"
+        for signal, logics in streets.logics.items() if logics[-1].kind != "static" or logics[-1].programme == "off"}
     found |= {signal: "programme follows a timetable" for signal in traffic.switched}
     return found
 
 
 def _check_free(order: Order) -> None:
     for folder, file, option in ((order.out, "network.toml", "--out"), (order.scenario, "scenario.toml", "--scenario")):
+        if folder.name in ("", "..") or "," in str(folder):
+            raise InputError(f"{option}: expected a folder such as {option[2:]}/mycity, without a comma, which SUMO "
+                             f"cannot read, got {folder} instead")
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{option}: {folder}: is not a folder; choose another name")
         if (folder / file).exists() and not order.force:
@@ -164,8 +170,12 @@ def _windowed(case: Case, order: Order) -> Case:
     """The case from --begin to --end, where these are given."""
     begin = case.begin if order.begin is None else order.begin
     end = case.end if order.end is None else order.end
+    if begin < 0:
+        where = f"{case.source}: begin" if order.begin is None else "--begin"
+        raise InputError(f"{where}: expected a time from 0 s up, got {begin:g} instead")
     if end is not None and end <= begin:
-        raise InputError(f"--end: expected a time after the beginning at {begin:g} s, got {end:g} instead")
+        where = f"{case.source}: end" if order.end is None else "--end"
+        raise InputError(f"{where}: expected a time after the beginning at {begin:g} s, got {end:g} instead")
     return replace(case, begin=begin, end=end)
 
 
@@ -198,8 +208,8 @@ class _Baselines:
         self._streets, self._clock, self._files = streets, clock, files
         self._routes, self._background, self._additional = (
             [folder / name for name in files[key]] for key in ("routes", "background", "additional"))
-        self._options = ["--step-length", case.options.get("step-length", "1"),
-                         "--time-to-teleport", case.options.get("time-to-teleport", "300")]
+        self._options = ["--step-length", f"{model.step_length(case, clock):g}",
+                         "--time-to-teleport", f"{case.time_to_teleport:g}"]
         self._last: tuple[tuple[float, bool], Baseline] | None = None
 
     def run(self, factor: float, mesoscopic: bool) -> Baseline:

@@ -95,9 +95,10 @@ class Streets:
                                   return_predecessors=False)] = True
         return found
 
-    def connected(self, pairs: Iterable[tuple[int, int]]) -> dict[tuple[int, int], bool]:
-        """Whether a way leads from the first edge of each pair to its second, for a vehicle that may use every lane."""
-        onward = graph(self.all_links, len(self.edges))
+    def connected(self, pairs: Iterable[tuple[int, int]], *, cars: bool) -> dict[tuple[int, int], bool]:
+        """Whether a way leads from the first edge of each pair to its second, for cars, or else for a vehicle that may
+        use every lane."""
+        onward = graph(self.links if cars else self.all_links, len(self.edges))
         wanted: dict[int, list[int]] = {}
         for first, last in sorted(set(pairs)):
             wanted.setdefault(first, []).append(last)
