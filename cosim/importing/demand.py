@@ -83,6 +83,7 @@ class _Reader:
                     shared.append(element)
         vehicles, background = [], others
         for element, path in drivers:
+            self._soften(element)
             if element.get("line") or self._classes.get(element.get("type", ""), "passenger") in BOUND:
                 background.append(element)
                 self._notes[f"public transport and other classes left alone ({element.tag})"] += 1
@@ -92,6 +93,13 @@ class _Reader:
                 vehicles.append((element, path))
         vehicles += self._from_matrices(cells, od, len(vehicles))
         return self._checked(vehicles, background, shared, switched)
+
+    def _soften(self, element: Element) -> None:
+        """SUMO deletes a vehicle whose speed at the departure is fixed where it then could not stop at a signal that
+        somebody else switches, as perimeter control does."""
+        if element.get("departSpeed", "max") not in ("max", "random", "0", "0.0", "0.00"):
+            element.set("departSpeed", "max")
+            self._notes["fixed speeds at the departure, made the highest safe ones"] += 1
 
     def _from_matrices(self, cells: list[Cell], od: Sequence[Path], vehicles: int) -> list[tuple[Element, Path]]:
         """Trips of the matrices, those of the case's own files only where it has no vehicles."""
@@ -144,12 +152,15 @@ class _Reader:
 
     def _likeliest(self, distribution: Element) -> list[str]:
         """The edges of the route in a distribution that is driven most."""
+        return max(self._distribution(distribution), key=lambda route: route[0], default=(0.0, []))[1]
+
+    def _distribution(self, distribution: Element) -> list[tuple[float, list[str]]]:
+        """(probability, edges) of every route in a distribution."""
         routes = [(float(r.get("probability", 1.0)), r.get("edges", "").split() or self._routes.get(
             r.get("refId", ""), [])) for r in distribution.iter("route")]
         names = distribution.get("routes", "").split()
         shares = [float(p) for p in distribution.get("probabilities", "").split()] or [1.0] * len(names)
-        routes += [(p, self._routes.get(name, [])) for p, name in zip(shares, names, strict=False)]
-        return max(routes, key=lambda route: route[0], default=(0.0, []))[1]
+        return routes + [(p, self._routes.get(name, [])) for p, name in zip(shares, names, strict=False)]
 
     def _expand(self, flow: Element, path) -> list[Element]:
         """The single vehicles of a flow."""
@@ -179,7 +190,8 @@ class _Reader:
             raise InputError(
                 f"{where}: expected a number, period, vehsPerHour or probability above 0; correct it") from None
         times = times[times < stop][:number]
-        tag = "vehicle" if flow.get("route") or flow.find("route") is not None else "trip"
+        routed = flow.get("route") or any(flow.find(tag) is not None for tag in ("route", "routeDistribution"))
+        tag = "vehicle" if routed else "trip"
         kept = {key: value for key, value in flow.attrib.items() if key not in FLOW}
         singles = []
         for n, time in enumerate(times):
@@ -249,8 +261,13 @@ class _Reader:
         """(the edges of a vehicle's route, True), or (those that a trip must pass, False)."""
         nested = element.find("routeDistribution")
         route = element.find("route") if nested is None else None
-        if nested is not None:
-            return self._likeliest(nested), True
+        if nested is not None:  # as marouter and duarouter write them: a vehicle keeps the route drawn for it here
+            edges = self._pick([(edges, share) for share, edges in self._distribution(nested)]) or []
+            element.remove(nested)
+            element.append(Element("route", {"edges": " ".join(edges)}))
+            for other in (*ENDS["from"], *ENDS["to"]):
+                element.attrib.pop(other, None)
+            return edges, True
         if route is not None:
             route.attrib.pop("id", None)
             return route.get("edges", "").split(), True
@@ -275,6 +292,10 @@ class _Reader:
             place = self._streets.places.get(junction or "", -1)
             at = self._streets.junctions[:, 0 if key == "from" else 1] == place
             options = [(self._streets.edges[n], 1.0) for n in np.flatnonzero(at & self._streets.drivable)]
+        return self._pick(options)
+
+    def _pick(self, options: Sequence[tuple]):
+        """One of (what, weight), drawn by weight; None where there is none."""
         weights = np.cumsum([weight for _, weight in options])
         if not options or weights[-1] <= 0:
             return None

@@ -93,7 +93,7 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
             baseline = simulate.run(factor, mesoscopic)
         left = left_alone(streets, traffic)
         tell("partition")
-        regions, asked = partition(
+        regions, asked, moved = partition(
             streets, baseline, regions=order.regions, method=order.method, given=order.given, seed=order.seed,
             left_alone=left)
         name = order.out.name
@@ -112,6 +112,9 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
             protected=_protected(streets, regions, baseline, network), factor=factor, mesoscopic=order.mesoscopic))
         report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
         report += _level_line(order, factor, congests)
+        if moved:
+            report += (f"\n{moved:,} streets are in other regions than {order.given.name} says: theirs was in several "
+                       "pieces, or could not be reached from the rest")
         if scale != 1.0:
             report += f"\nvehicles times {scale:g}, the scale in {case.source.name}"
         left_out = [*case.left_out, *(
