@@ -81,7 +81,7 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
     clock = model.clock(case, streets, traffic)
     with _folders(order) as (net_folder, folder):
         files = _write_traffic(folder, traffic)
-        simulate = _Baselines(streets, case, clock, folder, files)
+        simulate = _Baselines(streets, case, clock, folder, files, [v.get("id", "") for v in traffic.vehicles])
         mesoscopic = order.mesoscopic or streets.drivable.sum() > LARGE
         factor, congests, baseline = 1.0 if order.peak else scale * (order.level or 1.0), True, None
         if order.level is None:
@@ -143,8 +143,10 @@ def _traffic(case: Case, streets: Streets, order: Order) -> Traffic:
             f"--demand: {order.source} has {len(traffic.depart):,} vehicles of its own; leave --demand away, or give "
             "the network alone")
     peak = morning_peak(streets, level=order.level or 1.0, begin=case.begin, seed=order.seed)
+    known = {part.get("id") for element in traffic.shared for part in element.iter("vType")}
+    own = tuple(element for element in peak.shared if element.get("id") not in known)  # a type car of the city will do
     return replace(
-        peak, background=traffic.background, shared=traffic.shared + peak.shared, switched=traffic.switched,
+        peak, background=traffic.background, shared=traffic.shared + own, switched=traffic.switched,
         notes={**traffic.notes, **peak.notes})
 
 
@@ -207,8 +209,9 @@ def _folders(order: Order):
 class _Baselines:
     """Runs without control at any multiple of the demand; the last one is kept."""
 
-    def __init__(self, streets: Streets, case: Case, clock: model.Clock, folder: Path, files: Mapping):
-        self._streets, self._clock, self._files = streets, clock, files
+    def __init__(self, streets: Streets, case: Case, clock: model.Clock, folder: Path, files: Mapping,
+                 vehicles: Sequence[str]):
+        self._streets, self._clock, self._files, self._vehicles = streets, clock, files, vehicles
         self._routes, self._background, self._additional = (
             [folder / name for name in files[key]] for key in ("routes", "background", "additional"))
         self._options = ["--step-length", f"{model.step_length(case, clock):g}",
@@ -218,14 +221,15 @@ class _Baselines:
     def run(self, factor: float, mesoscopic: bool) -> Baseline:
         if self._last is None or self._last[0] != (factor, mesoscopic):
             with Scratch("cosim-") as folder:
-                routes = self._routes
+                routes, vehicles = self._routes, self._vehicles
                 if factor != 1.0:
                     routes = [folder / "vehicles.rou.xml"]
-                    write_originals(read_originals(self._routes), routes[0], seed=0, factor=factor, jitter=0.0,
-                                    begin=self._clock.begin)
+                    vehicles = write_originals(
+                        read_originals(self._routes), routes[0], seed=0, factor=factor, jitter=0.0,
+                        begin=self._clock.begin)
                 self._last = (factor, mesoscopic), run_baseline(
                     self._streets, routes=[*routes, *self._background], additional=self._additional,
-                    begin=self._clock.begin, end=self._clock.end,
+                    begin=self._clock.begin, end=self._clock.end, vehicles=vehicles,
                     options=[*self._options, *(MESOSCOPIC if mesoscopic else ())])
         return self._last[1]
 
@@ -337,6 +341,9 @@ def _report(order: Order, case: Case, streets: Streets, traffic: Traffic, clock:
             f"without control: driving takes {baseline.pace(streets):.1f} times as long as at the speed limits; "
             f"{baseline.teleports} teleports, {baseline.running} vehicles on the road and {baseline.waiting} waiting "
             "to enter at the end")
+        if baseline.dropped:
+            lines.append(
+                f"{baseline.dropped:,} vehicles never drove: SUMO found no way, or no lane to depart on, for them")
     return "\n".join(lines)
 
 
