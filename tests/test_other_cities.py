@@ -209,6 +209,13 @@ def test_signals_that_cannot_be_controlled(net, city, tmp_path):
     assert found == {"C2": "no programme"}
 
 
+def test_cycles_shorter_than_half_a_second(net, tmp_path):
+    """Of a network that somebody made for something else: control intervals are the usual 90 s."""
+    (tmp_path / "fast.net.xml").write_text(re.sub(r'(<phase duration=")\d+', r"\g<1>0.05", net.read_text()))
+    _, scenario = imported(tmp_path / "fast.net.xml", "--demand", "peak", "--level", 0.1, *FAST)
+    assert scenario.step == 90.0
+
+
 def test_a_city_along_a_straight_road(tmp_path):
     """It has no width: k-means and the map must do without."""
     nodes = "".join(f'<node id="{n}" x="{200 * n}" y="0" type="traffic_light"/>' for n in range(9))

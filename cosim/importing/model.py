@@ -68,7 +68,7 @@ def without_idle(case: Case, traffic: Traffic) -> Case:
 
 def clock(case: Case, streets: Streets, traffic: Traffic) -> Clock:
     """Control intervals of the most common signal cycle, until RECOVERY after the last departure."""
-    running = [found[-1] for found in streets.logics.values() if found[-1].cycle > 0]
+    running = [found[-1] for found in streets.logics.values() if round(found[-1].cycle) > 0]
     cycles = Counter(round(logic.cycle) for logic in running if logic.kind == "static")
     cycle = float(max(sorted(cycles), key=cycles.get)) if cycles else DEFAULT_CYCLE
     step = cycle * np.ceil(CYCLES[0] / cycle)
