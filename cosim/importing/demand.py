@@ -11,6 +11,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from cosim.importing.case import Case, seconds
+from cosim.importing.harmless import silent, softened
 from cosim.importing.od import Cell, read_od, relations, trips
 from cosim.importing.streets import Streets
 from cosim.originals import BOUND
@@ -21,7 +22,6 @@ DRIVERS = ("vehicle", "trip", "flow")
 OTHERS = ("person", "personFlow", "container", "containerFlow")
 DROPPED = ("poly", "poi", "edgeData", "laneData", "timedEvent", "vTypeProbe")  # only draw or write
 FLOW = ("begin", "end", "number", "period", "vehsPerHour", "perHour", "probability")
-WRITING = ("file", "has.ssm.device", "device.toc.file")  # parameters that only make SUMO write
 ENDS = {"from": ("fromTaz", "fromJunction"), "to": ("toTaz", "toJunction")}
 OPEN_END = 3600.0  # s, of a flow that never ends in a simulation that never ends
 
@@ -70,7 +70,7 @@ class _Reader:
         for path in zones:
             self._learn(read_xml(path), path)
         for path in (*self._case.additional, *self._case.routes):
-            for element in map(_silent, read_xml(path)):
+            for element in map(silent, read_xml(path)):
                 if element.tag in DRIVERS:
                     drivers.append((element, path))
                 elif element.tag in OTHERS:
@@ -83,7 +83,8 @@ class _Reader:
                     shared.append(element)
         vehicles, background = [], others
         for element, path in drivers:
-            self._soften(element)
+            if softened(element):
+                self._notes["fixed speeds at the departure, made the highest safe ones"] += 1
             if element.get("line") or self._classes.get(element.get("type", ""), "passenger") in BOUND:
                 background.append(element)
                 self._notes[f"public transport and other classes left alone ({element.tag})"] += 1
@@ -93,13 +94,6 @@ class _Reader:
                 vehicles.append((element, path))
         vehicles += self._from_matrices(cells, od, len(vehicles))
         return self._checked(vehicles, background, shared, switched)
-
-    def _soften(self, element: Element) -> None:
-        """SUMO deletes a vehicle whose speed at the departure is fixed where it then could not stop at a signal that
-        somebody else switches, as perimeter control does."""
-        if element.get("departSpeed", "max") not in ("max", "random", "0", "0.0", "0.00"):
-            element.set("departSpeed", "max")
-            self._notes["fixed speeds at the departure, made the highest safe ones"] += 1
 
     def _from_matrices(self, cells: list[Cell], od: Sequence[Path], vehicles: int) -> list[tuple[Element, Path]]:
         """Trips of the matrices, those of the case's own files only where it has no vehicles."""
@@ -207,12 +201,6 @@ class _Reader:
         begin, end = self._case.begin, np.inf if self._case.end is None else self._case.end
         files: dict[str | None, Path] = {}
         for element, path in vehicles:
-            name = element.get("id")
-            if not name or name in files:
-                raise InputError(
-                    f"{path}: {element.tag}: id: expected one that no other vehicle has, got {name!r}"
-                    + (f", which {files[name]} has too" if name else "") + "; give it another one")
-            files[name] = path
             try:
                 depart = begin if element.get("depart") == "begin" else seconds(element.get("depart", ""), "")
             except InputError:
@@ -236,6 +224,12 @@ class _Reader:
             elif self._is_car(element) and not self._open_to_cars([number[edge] for edge in edges], driven):
                 self._notes["cars on streets that are closed to cars, left out"] += 1
             else:
+                name = element.get("id")
+                if not name or name in files:
+                    raise InputError(
+                        f"{path}: {element.tag}: id: expected one that no other vehicle has, got {name!r}"
+                        + (f", which {files[name]} has too" if name else "") + "; give it another one")
+                files[name] = path
                 element.set("depart", f"{depart:.2f}")
                 kept.append((depart, number[edges[0]], number[edges[-1]], driven, element))
         kept.sort(key=lambda row: row[0])
@@ -323,18 +317,6 @@ class _Reader:
 def _no_number(element: Element, path: Path, error: ValueError) -> InputError:
     return InputError(
         f"{path}: {element.tag} {element.get('id')}: weight or probability: expected a number ({error}); correct it")
-
-
-def _silent(element: Element) -> Element:
-    """The element; what it writes goes nowhere."""
-    for part in element.iter():
-        if part.tag.endswith(("Detector", "Loop", "calibrator", "routeProbe")):
-            for key in {"file", "output"} & set(part.keys()):
-                part.set(key, "NUL")
-        for parameter in part.findall("param"):
-            if parameter.get("key") in WRITING:
-                part.remove(parameter)
-    return element
 
 
 def _begin(element: Element) -> float:
