@@ -47,7 +47,8 @@ class Phase:
 
 @dataclass(frozen=True, kw_only=True)
 class Programme:
-    """A signal programme. position [s]: where in its cycle it was when it was read; static: fixed-time."""
+    """A signal programme. position [s]: where in its cycle it was when it was read; static: fixed-time,
+    one phase after the other."""
 
     signal: str
     phases: tuple[Phase, ...]
@@ -200,7 +201,8 @@ class Session:
                 return Programme(
                     signal=signal, phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
                     position=elapsed - left,
-                    static=logic.type == self._sumo.constants.TRAFFICLIGHT_TYPE_STATIC)
+                    static=logic.type == self._sumo.constants.TRAFFICLIGHT_TYPE_STATIC
+                    and not any(phase.next for phase in logic.phases))
         raise RuntimeError(f"signal {signal} has no programme {active}")
 
     def signals(self) -> tuple[str, ...]:

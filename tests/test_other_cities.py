@@ -209,6 +209,21 @@ def test_signals_that_cannot_be_controlled(net, city, tmp_path):
     assert found == {"C2": "no programme"}
 
 
+def test_phases_that_do_not_follow_in_order(net, city):
+    """Perimeter control would play them one after the other: it leaves such signals alone, in report and run."""
+    text = re.sub(r'(<phase duration="\d+")', r'\1 next="0 1"', net.read_text())
+    branching = net.with_name("branching.net.xml")
+    branching.write_text(text)
+    said, scenario = imported(city(net_file=branching), *FAST)
+    assert "(branching signal)" in said and "no gateway has a signal that perimeter control can use" in said
+    plant = SumoPlant(scenario)
+    try:
+        plant.reset(0)
+        assert len(plant.leaks()) == len(plant.city.gateways) > 0
+    finally:
+        plant.close()
+
+
 def test_cycles_shorter_than_half_a_second(net, tmp_path):
     """Of a network that somebody made for something else: control intervals are the usual 90 s."""
     (tmp_path / "fast.net.xml").write_text(re.sub(r'(<phase duration=")\d+', r"\g<1>0.05", net.read_text()))
