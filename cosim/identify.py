@@ -22,6 +22,7 @@ from nmfd.errors import InputError
 from nmfd.identification import Observed
 from nmfd.network import Network
 from nmfd.scenario import GUIDED, GUIDING, Scenario, load_scenario
+from nmfd.toml import quoted
 from nmfd.workers import ended
 
 FEWEST = 30.0   # vehicles that must have crossed before their split ratios count
@@ -272,10 +273,10 @@ def _sumo_table(folder: Path, target: Path) -> dict[str, str]:
 def network_toml(network: Network, sumo: Mapping[str, str], comment: str) -> str:
     """network.toml of `network` with this table [sumo]."""
     out = io.StringIO()
-    out.write(f"# {comment}\nname = \"{network.name}\"\n\n")
+    out.write(f"# {comment}\nname = {quoted(network.name)}\n\n")
     out.write(f"[perimeter]\nmin = {network.u_min:g}\nmax = {network.u_max:g}\n")
     if sumo:
-        out.write("\n[sumo]\n" + "".join(f'{key} = "{value}"\n' for key, value in sumo.items()))
+        out.write("\n[sumo]\n" + "".join(f"{key} = {quoted(value)}\n" for key, value in sumo.items()))
     for region in range(network.regions):
         x, y = network.positions[region]
         adjacent = np.flatnonzero((network.adjacency | network.adjacency.T)[region])
@@ -284,7 +285,7 @@ def network_toml(network: Network, sumo: Mapping[str, str], comment: str) -> str
         neighbours = ", ".join(str(h) for h in adjacent)
         curve = network.mfds[region]
         out.write(
-            f'\n[[regions]]\nname = "{network.region_names[region]}"\nposition = [{x:.6g}, {y:.6g}]\n'
+            f'\n[[regions]]\nname = {quoted(network.region_names[region])}\nposition = [{x:.6g}, {y:.6g}]\n'
             f"adjacent = [{neighbours}]\n{barred}{_options(network, region)}\n"
             f"[regions.mfd]\na = {curve.a:.6g}\nb = {curve.b:.6g}\nc = {curve.c:.6g}\n"
             f"jam = {curve.jam:.6g}\n")

@@ -2,12 +2,13 @@
 
 from collections import Counter
 from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from cosim.regions import City
-from cosim.sumo import Session
+from cosim.sumo import REFUSALS, Session
 from nmfd.ledger import LedgerError
 
 
@@ -71,7 +72,8 @@ class Meter:
         """Account for the last simulation step; call after every one. Departures first, then entries."""
         session, events = self._session, []
         for vehicle in session.loaded():
-            self._load(vehicle)
+            with suppress(*REFUSALS):  # gone already, where SUMO found no way for it when it was due
+                self._load(vehicle)
         for vehicle in session.started_teleport():
             self.teleports += 1
             self._teleporting.add(vehicle)

@@ -73,6 +73,8 @@ def check_edges(originals: Originals, city: City, where: str) -> None:
                 raise InputError(
                     f"{where}: {element.tag} {element.get('id')}: edge {edge} is not in {city.net_file}; remove the "
                     "vehicle, or give the routes of this network")
+
+
 def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
     """Name -> edges of the routes that additional files define for vehicles to share; of a distribution, its first."""
     found: dict[str, tuple[str, ...]] = {}
@@ -103,13 +105,21 @@ def draw(
     chosen = np.full(count, int(factor))
     chosen[rng.permutation(count)[: round((factor - int(factor)) * count)]] += 1
     shifts = rng.uniform(-jitter, jitter, size=(max(int(chosen.max(initial=0)), 1), count))
+    taken = {element.get("id") for element in originals.elements}
     drawn = []
     for n, times in enumerate(chosen):
         name = originals.elements[n].get("id")
         for copy in range(times):
             depart = max(float(originals.depart[n] + shifts[copy, n]), min(begin, float(originals.depart[n])))
-            drawn.append((round(depart, 2), n, f"{name}.{copy}" if copy else name))
+            drawn.append((round(depart, 2), n, _copy(name, copy, taken) if copy else name))
     return sorted(drawn, key=lambda vehicle: vehicle[:2])
+
+
+def _copy(name: str, number: int, taken: set[str]) -> str:
+    """An id that no other vehicle has: the flow x has an x.1 of its own, and so may a vehicle x."""
+    while (found := f"{name}.{number}") in taken:
+        name += "."
+    return found
 
 
 def write_originals(

@@ -22,10 +22,11 @@ from cosim.record import Record
 from cosim.regions import City, Gateway, check_adjacency, gateway_movements, gateway_room_taken, load_city
 from cosim.signals import Signal, read_signals, write_programmes
 from cosim.strategy import ACTUATED, FIXED, MAX_PRESSURE, WEBSTER
-from cosim.sumo import Session, Window, file_list
+from cosim.sumo import Session, Window
 from cosim.sumo_settings import ESTIMATE, Settings, settings
 from cosim.trip_facts import TripFacts, read_trip_facts, trip_options
 from cosim.trips import write_trips
+from cosim.xml_files import file_list
 from nmfd import faults
 from nmfd.errors import InputError
 from nmfd.estimation import Estimator

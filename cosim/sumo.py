@@ -5,7 +5,9 @@ functions, talks to it.
 """
 
 import io
+import os
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -17,6 +19,7 @@ import libsumo
 import traci
 
 from cosim.originals import BOUND
+from cosim.xml_files import file_list
 from nmfd.errors import InputError
 from nmfd.workers import RunFailed
 
@@ -44,7 +47,8 @@ class Phase:
 
 @dataclass(frozen=True, kw_only=True)
 class Programme:
-    """A signal programme. position [s]: where in its cycle it was when it was read; static: fixed-time."""
+    """A signal programme. position [s]: where in its cycle it was when it was read; static: fixed-time,
+    one phase after the other."""
 
     signal: str
     phases: tuple[Phase, ...]
@@ -84,7 +88,7 @@ class Session:
         self._sumo = sumo = libsumo if window is None else traci
         try:
             if window is None:
-                libsumo.start(self.command)
+                _start_quietly(self.command)
             else:
                 _start(window, self.command)
         except (*REFUSALS, *FATAL) as error:
@@ -197,7 +201,8 @@ class Session:
                 return Programme(
                     signal=signal, phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
                     position=elapsed - left,
-                    static=logic.type == self._sumo.constants.TRAFFICLIGHT_TYPE_STATIC)
+                    static=logic.type == self._sumo.constants.TRAFFICLIGHT_TYPE_STATIC
+                    and not any(phase.next for phase in logic.phases))
         raise RuntimeError(f"signal {signal} has no programme {active}")
 
     def signals(self) -> tuple[str, ...]:
@@ -244,12 +249,27 @@ class Session:
             self._sumo.poi.setColor(mark, (*colour, 255))
 
 
-def file_list(files: Sequence[Path]) -> str:
-    """Files as an option of SUMO. InputError for a name with a comma, where SUMO would take the next one to begin."""
-    for file in files:
-        if "," in str(file):
-            raise InputError(f"{file}: SUMO cannot read a file with a comma in its path; rename it, or its folder")
-    return ",".join(map(str, files))
+def _start_quietly(command: list[str]) -> None:
+    """libsumo.start. Raises FatalTraCIError with what SUMO says: it tells stderr what is wrong, not the caller."""
+    with tempfile.TemporaryFile() as said:
+        sys.stderr.flush()
+        stderr = os.dup(2)
+        os.dup2(said.fileno(), 2)
+        try:
+            libsumo.start(command)
+            failure = None
+        except (*REFUSALS, *FATAL) as error:
+            failure = error
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+        said.seek(0)
+        words = said.read().decode(errors="replace")
+    if failure is None:
+        sys.stderr.write(words)
+        return
+    lines = [line.removeprefix("Error: ") for line in words.splitlines() if line.startswith("Error: ")]
+    raise libsumo.FatalTraCIError(lines[0] if lines else _one_line(failure))
 
 
 def _start(window: Window, command: list[str]) -> None:

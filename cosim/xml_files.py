@@ -1,8 +1,9 @@
-"""Opening SUMO's XML files, gzipped or not, and all that reading a broken one can raise."""
+"""SUMO's XML files: opening them, gzipped or not, all that reading a broken one can raise, naming several to SUMO."""
 
 import gzip
 import xml.etree.ElementTree as ElementTree
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 from nmfd.errors import InputError
@@ -33,3 +34,11 @@ def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:
         root[:] = [found for part in parts for found in (
             read_xml(path.parent / part.get("href", ""), depth + 1) if part.tag == "include" else [part])]
     return root
+
+
+def file_list(files: Sequence[Path]) -> str:
+    """Files as an option of SUMO. InputError for a name with a comma, where SUMO would take the next one to begin."""
+    for file in files:
+        if "," in str(file):
+            raise InputError(f"{file}: SUMO cannot read a file with a comma in its path; rename it, or its folder")
+    return ",".join(map(str, files))

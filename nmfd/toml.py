@@ -31,6 +31,11 @@ def read(path: Path) -> "Table":
         raise InputError(f"{path}: is not valid TOML: nested too deeply; write it anew") from None
 
 
+def quoted(text: str) -> str:
+    """A text without line breaks as TOML writes it."""
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
 def shown(value) -> str:
     """A wrong value as a message repeats it: not more than the beginning of a long one."""
     try:

@@ -3,13 +3,14 @@
 import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from cosim.importing.streets import Streets
+from cosim.xml_files import file_list, read_xml
 from nmfd.errors import InputError
 from nmfd.scratch import Scratch
 
@@ -26,6 +27,7 @@ class Baseline:
         together -> how many
     teleports; waiting: vehicles not inserted at the end; running: on the road at the end
     delay: of departures, all vehicles [veh s]
+    dropped: vehicles of the demand that SUMO gave up without a word
     """
 
     presence: np.ndarray
@@ -34,6 +36,7 @@ class Baseline:
     waiting: int
     running: int
     delay: float = 0.0
+    dropped: int = 0
 
     def pace(self, streets: Streets) -> float:
         """Time that vehicles spent, running and waiting to enter, over what it takes at the speed limits [-]."""
@@ -81,29 +84,32 @@ class Baseline:
 
 def run_baseline(
     streets: Streets, *, routes: Sequence[Path], additional: Sequence[Path], begin: float, end: float,
-    options: Sequence[str] = (),
+    vehicles: Collection[str] = (), options: Sequence[str] = (),
 ) -> Baseline:
-    """Simulate without control. Raises InputError with SUMO's own words if it refuses."""
+    """Simulate without control; vehicles: ids of the demand. Raises InputError with SUMO's own words if it refuses."""
+    # A vehicle that a rerouter gives another route makes SUMO fail when it writes the times of the edges it has left.
+    rerouted = any(next(read_xml(path).iter("routeProbReroute"), None) is not None for path in additional)
     with Scratch("cosim-") as folder:
         edges = folder / "edges.xml"
         (folder / "measure.add.xml").write_text(
             f'<additional><edgeData id="all" freq="{INTERVAL:g}" file="{edges}" excludeEmpty="true"/></additional>')
         run_sumo(
-            "sumo", "--net-file", str(streets.path), "--route-files", ",".join(map(str, routes)),
-            "--additional-files", ",".join(map(str, [*additional, folder / "measure.add.xml"])), "--begin", str(begin),
+            "sumo", "--net-file", file_list([streets.path]), "--route-files", file_list(routes),
+            "--additional-files", file_list([*additional, folder / "measure.add.xml"]), "--begin", str(begin),
             "--end", str(end), "--seed", "0", "--no-step-log", "true", "--no-warnings", "true",
             "--ignore-route-errors", "true", "--vehroute-output", str(folder / "ways.xml"),
-            "--vehroute-output.exit-times", "true", "--vehroute-output.last-route", "true",
+            "--vehroute-output.exit-times", str(not rerouted).lower(), "--vehroute-output.last-route", "true",
             "--vehroute-output.write-unfinished", "true", "--statistic-output", str(folder / "statistic.xml"),
             "--duration-log.statistics", "true",
             *options, where=str(streets.path))
         statistic = ElementTree.parse(folder / "statistic.xml").getroot()
-        vehicles, trips = statistic.find("vehicles"), statistic.find("vehicleTripStatistics")
-        waiting = int(vehicles.get("waiting"))
+        counts, trips = statistic.find("vehicles"), statistic.find("vehicleTripStatistics")
+        waiting = int(counts.get("waiting"))
+        ways, driven = _ways(folder / "ways.xml", streets)
         return Baseline(
-            presence=_presence(edges, streets, begin, end), ways=_ways(folder / "ways.xml", streets),
+            presence=_presence(edges, streets, begin, end), ways=ways,
             teleports=int(statistic.find("teleports").get("total")), waiting=waiting,
-            running=int(vehicles.get("running")),
+            running=int(counts.get("running")), dropped=max(len(set(vehicles) - driven) - waiting, 0),
             delay=float(trips.get("totalDepartDelay")) + waiting * max(float(trips.get("departDelayWaiting")), 0.0))
 
 
@@ -130,16 +136,20 @@ def _presence(path: Path, streets: Streets, begin: float, end: float) -> np.ndar
     return presence
 
 
-def _ways(path: Path, streets: Streets) -> Counter:
+def _ways(path: Path, streets: Streets) -> tuple[Counter, set[str]]:
+    """(Baseline.ways, the vehicles that drove)"""
     ways: Counter[tuple[tuple[int, ...], int]] = Counter()
+    driven_by = set()
     for _, element in ElementTree.iterparse(path):
         if element.tag == "vehicle":
+            driven_by.add(element.get("id"))
             route = element.find("route")
             if route is not None and route.get("edges"):
                 edges = [streets.number.get(edge, -1) for edge in route.get("edges").split()]
-                left = [float(time) >= 0 for time in route.get("exitTimes", "").split()] or [False] * len(edges)
+                left = [float(time) >= 0 for time in route.get("exitTimes", "").split()] or (
+                    [element.get("arrival") is not None] * len(edges))
                 driven = tuple(n for n, gone in zip(edges, left, strict=False) if gone and n >= 0)
                 if edges[-1] >= 0:
                     ways[driven, edges[-1]] += 1
             element.clear()
-    return ways
+    return ways, driven_by

@@ -1,6 +1,7 @@
 """What the user gives: a sumocfg with all it names, or a bare network."""
 
 import math
+import os
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
@@ -53,6 +54,17 @@ class Case:
         return value
 
     @property
+    def step_length(self) -> float:
+        """[s] of SUMO's own steps. Raises InputError."""
+        return seconds(self.options.get("step-length", "1"), f"{self.source}: step-length")
+
+    @property
+    def time_to_teleport(self) -> float:
+        """[s], -1 for never. Raises InputError."""
+        given = seconds(self.options.get("time-to-teleport", "300"), f"{self.source}: time-to-teleport")
+        return given if given > 0 else -1.0
+
+    @property
     def mesoscopic(self) -> bool:
         return self.options.get("mesosim", "false").lower() in ("true", "1", "yes", "on", "x")
 
@@ -91,7 +103,9 @@ def read_case(path: Path) -> Case:
 
 
 def _files(config: Path, key: str, value: str) -> tuple[Path, ...]:
+    """Files separated by commas, as seen from the sumocfg; ${NAME} stands for a variable of the environment."""
     found = []
+    value = re.sub(r"\$\{(\w+)\}", lambda name: os.environ.get(name[1], name[0]), value)
     for name in value.replace(";", ",").split(","):
         if name := name.strip():
             file = config.parent / name

@@ -4,12 +4,14 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from cosim.importing.case import Case, seconds
+from cosim.importing.harmless import silent, softened
 from cosim.importing.od import Cell, read_od, relations, trips
 from cosim.importing.streets import Streets
 from cosim.originals import BOUND
@@ -18,7 +20,7 @@ from nmfd.errors import InputError
 
 DRIVERS = ("vehicle", "trip", "flow")
 OTHERS = ("person", "personFlow", "container", "containerFlow")
-DROPPED = ("poly", "poi", "edgeData", "laneData", "timedEvent", "routeProbe", "vTypeProbe")  # only draw or write
+DROPPED = ("poly", "poi", "edgeData", "laneData", "timedEvent", "vTypeProbe")  # only draw or write
 FLOW = ("begin", "end", "number", "period", "vehsPerHour", "perHour", "probability")
 ENDS = {"from": ("fromTaz", "fromJunction"), "to": ("toTaz", "toJunction")}
 OPEN_END = 3600.0  # s, of a flow that never ends in a simulation that never ends
@@ -56,7 +58,7 @@ def read_traffic(
 class _Reader:
     def __init__(self, case: Case, streets: Streets, random: np.random.Generator):
         self._case, self._streets, self._random = case, streets, random
-        self._moves = set(map(tuple, streets.all_links))
+        self._moves, self._car_moves = set(map(tuple, streets.all_links)), set(map(tuple, streets.links))
         self._classes: dict[str, str] = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_PEDTYPE": "pedestrian"}
         self._routes: dict[str, list[str]] = {}
         self._zones: dict[str, dict[str, list[tuple[str, float]]]] = {}
@@ -66,9 +68,9 @@ class _Reader:
         shared, drivers, others, switched = [], [], [], []
         cells: list[Cell] = []
         for path in zones:
-            self._learn(read_xml(path))
+            self._learn(read_xml(path), path)
         for path in (*self._case.additional, *self._case.routes):
-            for element in read_xml(path):
+            for element in map(silent, read_xml(path)):
                 if element.tag in DRIVERS:
                     drivers.append((element, path))
                 elif element.tag in OTHERS:
@@ -76,11 +78,13 @@ class _Reader:
                 elif element.tag == "interval":
                     cells += relations(wrapped([element], "data"), path)
                 elif element.tag not in DROPPED:
-                    self._learn(element)
+                    self._learn(element, path)
                     switched += [e.get("junctionID") for e in element.iter("wautJunction")]
-                    shared.append(_silent(element))
+                    shared.append(element)
         vehicles, background = [], others
         for element, path in drivers:
+            if softened(element):
+                self._notes["fixed speeds at the departure, made the highest safe ones"] += 1
             if element.get("line") or self._classes.get(element.get("type", ""), "passenger") in BOUND:
                 background.append(element)
                 self._notes[f"public transport and other classes left alone ({element.tag})"] += 1
@@ -109,14 +113,23 @@ class _Reader:
         made = trips(cells, self._random, self._classes.keys(), self._notes.__setitem__) if cells else []
         return [(trip, self._case.source) for trip in made]
 
-    def _learn(self, element: Element) -> None:
+    def _learn(self, element: Element, path: Path) -> None:
         """Types, routes and zones that vehicles refer to."""
+        try:
+            self._learn_one(element)
+        except ValueError as error:
+            raise _no_number(element, path, error) from None
+
+    def _learn_one(self, element: Element) -> None:
         if element.tag == "vType":
             self._classes[element.get("id")] = element.get("vClass", "passenger")
         elif element.tag == "vTypeDistribution":
             members = [e.get("vClass", "passenger") for e in element.iter("vType")]
             members += [self._classes.get(name, "passenger") for name in element.get("vTypes", "").split()]
-            self._classes[element.get("id")] = members[0] if members else "passenger"
+            first = members[0] if members else "passenger"
+            if first == "passenger":  # what lorries among them may drive is not held against the cars
+                first = next((kind for kind in members if kind not in (first, *BOUND)), first)
+            self._classes[element.get("id")] = first
             for member in element.iter("vType"):
                 self._classes[member.get("id")] = member.get("vClass", "passenger")
         elif element.tag in ("route", "routeDistribution"):
@@ -133,12 +146,15 @@ class _Reader:
 
     def _likeliest(self, distribution: Element) -> list[str]:
         """The edges of the route in a distribution that is driven most."""
+        return max(self._distribution(distribution), key=lambda route: route[0], default=(0.0, []))[1]
+
+    def _distribution(self, distribution: Element) -> list[tuple[float, list[str]]]:
+        """(probability, edges) of every route in a distribution."""
         routes = [(float(r.get("probability", 1.0)), r.get("edges", "").split() or self._routes.get(
             r.get("refId", ""), [])) for r in distribution.iter("route")]
         names = distribution.get("routes", "").split()
         shares = [float(p) for p in distribution.get("probabilities", "").split()] or [1.0] * len(names)
-        routes += [(p, self._routes.get(name, [])) for p, name in zip(shares, names, strict=False)]
-        return max(routes, key=lambda route: route[0], default=(0.0, []))[1]
+        return routes + [(p, self._routes.get(name, [])) for p, name in zip(shares, names, strict=False)]
 
     def _expand(self, flow: Element, path) -> list[Element]:
         """The single vehicles of a flow."""
@@ -168,7 +184,8 @@ class _Reader:
             raise InputError(
                 f"{where}: expected a number, period, vehsPerHour or probability above 0; correct it") from None
         times = times[times < stop][:number]
-        tag = "vehicle" if flow.get("route") or flow.find("route") is not None else "trip"
+        routed = flow.get("route") or any(flow.find(tag) is not None for tag in ("route", "routeDistribution"))
+        tag = "vehicle" if routed else "trip"
         kept = {key: value for key, value in flow.attrib.items() if key not in FLOW}
         singles = []
         for n, time in enumerate(times):
@@ -182,9 +199,10 @@ class _Reader:
         """Only what can be driven from its first to its last edge within the simulation."""
         kept, number = [], self._streets.number
         begin, end = self._case.begin, np.inf if self._case.end is None else self._case.end
+        files: dict[str | None, Path] = {}
         for element, path in vehicles:
             try:
-                depart = seconds(element.get("depart", ""), "")
+                depart = begin if element.get("depart") == "begin" else seconds(element.get("depart", ""), "")
             except InputError:
                 background.append(element)
                 self._notes["vehicles without a time of departure, left alone"] += 1
@@ -192,13 +210,26 @@ class _Reader:
             if not begin <= depart < end:
                 self._notes["vehicles outside the simulated time, left out"] += 1
                 continue
-            edges, driven = self._edges(element, path)
-            if not edges or any(edge not in number for edge in edges):
+            try:
+                edges, driven = self._edges(element, path)
+            except ValueError as error:
+                raise _no_number(element, path, error) from None
+            if not edges and any(key.endswith(("XY", "LonLat")) for key in element.keys()):
+                self._notes["trips between coordinates, left out: give them edges with duarouter"] += 1
+            elif not edges or any(edge not in number for edge in edges):
                 self._notes["vehicles with unknown edges or none, left out"] += 1
             elif driven and any((number[a], number[b]) not in self._moves
                                 for a, b in zip(edges, edges[1:], strict=False)):
                 self._notes["vehicles on routes with gaps, left out"] += 1
+            elif self._is_car(element) and not self._open_to_cars([number[edge] for edge in edges], driven):
+                self._notes["cars on streets that are closed to cars, left out"] += 1
             else:
+                name = element.get("id")
+                if not name or name in files:
+                    raise InputError(
+                        f"{path}: {element.tag}: id: expected one that no other vehicle has, got {name!r}"
+                        + (f", which {files[name]} has too" if name else "") + "; give it another one")
+                files[name] = path
                 element.set("depart", f"{depart:.2f}")
                 kept.append((depart, number[edges[0]], number[edges[-1]], driven, element))
         kept.sort(key=lambda row: row[0])
@@ -213,12 +244,24 @@ class _Reader:
             background=tuple(background), shared=tuple(shared), switched=tuple(sorted(set(switched))),
             notes=dict(self._notes))
 
+    def _is_car(self, element: Element) -> bool:
+        return self._classes.get(element.get("type", ""), "passenger") == "passenger"
+
+    def _open_to_cars(self, edges: Sequence[int], driven: bool) -> bool:
+        return bool(self._streets.drivable[list(edges)].all()) and (
+            not driven or self._car_moves.issuperset(pairwise(edges)))
+
     def _edges(self, element: Element, path) -> tuple[list[str], bool]:
         """(the edges of a vehicle's route, True), or (those that a trip must pass, False)."""
         nested = element.find("routeDistribution")
         route = element.find("route") if nested is None else None
-        if nested is not None:
-            return self._likeliest(nested), True
+        if nested is not None:  # as marouter and duarouter write them: a vehicle keeps the route drawn for it here
+            edges = self._pick([(edges, share) for share, edges in self._distribution(nested)]) or []
+            element.remove(nested)
+            element.append(Element("route", {"edges": " ".join(edges)}))
+            for other in (*ENDS["from"], *ENDS["to"]):
+                element.attrib.pop(other, None)
+            return edges, True
         if route is not None:
             route.attrib.pop("id", None)
             return route.get("edges", "").split(), True
@@ -243,6 +286,10 @@ class _Reader:
             place = self._streets.places.get(junction or "", -1)
             at = self._streets.junctions[:, 0 if key == "from" else 1] == place
             options = [(self._streets.edges[n], 1.0) for n in np.flatnonzero(at & self._streets.drivable)]
+        return self._pick(options)
+
+    def _pick(self, options: Sequence[tuple]):
+        """One of (what, weight), drawn by weight; None where there is none."""
         weights = np.cumsum([weight for _, weight in options])
         if not options or weights[-1] <= 0:
             return None
@@ -256,22 +303,20 @@ class _Reader:
         return [option for option in options if joined[number[option[0]]]] or options
 
     def _reachable(self, kept: list[tuple]) -> list[tuple]:
-        """Without trips whose end cannot be reached from their beginning by any vehicle."""
-        pairs = {row[1:3] for row in kept if not row[3]}
-        apart = {pair for pair, ok in self._streets.connected(pairs).items() if not ok}
-        good = [row for row in kept if row[3] or row[1:3] not in apart]
+        """Without trips whose end cannot be reached from their beginning by any vehicle, or that of cars by cars."""
+        lost = set()
+        for cars in (False, True):
+            pairs = {row[1:3] for row in kept if not row[3] and self._is_car(row[4]) == cars}
+            lost |= {(*pair, cars) for pair, ok in self._streets.connected(pairs, cars=cars).items() if not ok}
+        good = [row for row in kept if row[3] or (*row[1:3], self._is_car(row[4])) not in lost]
         if len(good) < len(kept):
             self._notes["trips without a way to their end, left out"] += len(kept) - len(good)
         return good
 
 
-def _silent(element: Element) -> Element:
-    """The element; what a detector or calibrator writes goes nowhere."""
-    for part in element.iter():
-        if part.tag.endswith(("Detector", "Loop", "calibrator")):
-            for key in {"file", "output"} & set(part.keys()):
-                part.set(key, "NUL")
-    return element
+def _no_number(element: Element, path: Path, error: ValueError) -> InputError:
+    return InputError(
+        f"{path}: {element.tag} {element.get('id')}: weight or probability: expected a number ({error}); correct it")
 
 
 def _begin(element: Element) -> float:

@@ -11,6 +11,7 @@ from cosim.importing.blocks import Blocks
 
 ROUNDS = 40
 GAIN = 0.3  # of the handicap's growth per round, in mean radii
+THINNEST = 0.05  # width over length that a city counts with at least: one along a straight road has no area
 
 
 def k_means(blocks: Blocks, regions: int, seed: int) -> np.ndarray:
@@ -18,7 +19,8 @@ def k_means(blocks: Blocks, regions: int, seed: int) -> np.ndarray:
     random = np.random.default_rng([seed, 0x6B6D])
     blocks = replace(blocks, weight=blocks.core + 0.1 * blocks.weight)  # ways in and out make no region
     centres = _start(blocks, regions, random)
-    radius = np.sqrt(np.ptp(blocks.position, axis=0).prod() / regions) / 2
+    extent = np.ptp(blocks.position, axis=0)
+    radius = np.sqrt(np.maximum(extent, max(THINNEST * extent.max(), 1.0)).prod() / regions) / 2
     handicap, share = np.zeros(regions), blocks.weight.sum() / regions
     best, least = None, np.inf
     for _ in range(ROUNDS):

@@ -29,15 +29,15 @@ def read_given(streets: Streets, path: Path, method: str) -> np.ndarray:
 
 def _edges(streets: Streets, path: Path) -> np.ndarray:
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.reader(stream))
+        with path.open(newline="", encoding="utf-8-sig") as stream:  # spreadsheets begin with a mark
+            rows = [(number, row) for number, row in enumerate(csv.reader(stream), start=1) if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read ({error}); give a csv with the columns edge,region") from None
-    if not rows or [cell.strip() for cell in rows[0]] != ["edge", "region"]:
+    if not rows or [cell.strip() for cell in rows[0][1]] != ["edge", "region"]:
         raise InputError(
-            f"{path}: line 1: expected edge,region, got {','.join(rows[0]) if rows else 'nothing'} instead")
+            f"{path}: line 1: expected edge,region, got {','.join(rows[0][1]) if rows else 'nothing'} instead")
     labels = np.full(len(streets.edges), -1)
-    for number, row in enumerate(rows[1:], start=2):
+    for number, row in rows[1:]:
         if len(row) != 2 or not row[1].strip().isdecimal() or len(row[1].strip()) > 6:
             raise InputError(
                 f"{path}: line {number}: expected an edge and a region from 0 up, got {','.join(row)} instead")
@@ -49,7 +49,7 @@ def _taz(streets: Streets, path: Path) -> np.ndarray:
     labels, zones = np.full(len(streets.edges), -1), list(read_xml(path).iter("taz"))
     for region, zone in enumerate(zones):
         edges = zone.get("edges", "").split() + [
-            part.get("id") for part in zone if part.tag in ("tazSource", "tazSink")]
+            part.get("id", "") for part in zone if part.tag in ("tazSource", "tazSink")]
         for edge in dict.fromkeys(edges):
             _assign(labels, streets, edge, region, f"{path}: taz {zone.get('id')}")
     if not zones:

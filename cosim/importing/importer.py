@@ -81,7 +81,7 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
     clock = model.clock(case, streets, traffic)
     with _folders(order) as (net_folder, folder):
         files = _write_traffic(folder, traffic)
-        simulate = _Baselines(streets, case, clock, folder, files)
+        simulate = _Baselines(streets, case, clock, folder, files, [v.get("id", "") for v in traffic.vehicles])
         mesoscopic = order.mesoscopic or streets.drivable.sum() > LARGE
         factor, congests, baseline = 1.0 if order.peak else scale * (order.level or 1.0), True, None
         if order.level is None:
@@ -93,7 +93,7 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
             baseline = simulate.run(factor, mesoscopic)
         left = left_alone(streets, traffic)
         tell("partition")
-        regions, asked = partition(
+        regions, asked, moved = partition(
             streets, baseline, regions=order.regions, method=order.method, given=order.given, seed=order.seed,
             left_alone=left)
         name = order.out.name
@@ -112,10 +112,15 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
             protected=_protected(streets, regions, baseline, network), factor=factor, mesoscopic=order.mesoscopic))
         report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
         report += _level_line(order, factor, congests)
+        if moved:
+            report += (f"\n{moved:,} streets are in other regions than {order.given.name} says: theirs was in several "
+                       "pieces, or could not be reached from the rest")
         if scale != 1.0:
             report += f"\nvehicles times {scale:g}, the scale in {case.source.name}"
-        if case.left_out:
-            report += f"\nnot taken over from {case.source.name}: {', '.join(case.left_out)}"
+        left_out = [*case.left_out, *(
+            [] if case.step_length == model.step_length(case, clock) else [f"step-length = {case.step_length:g}"])]
+        if left_out:
+            report += f"\nnot taken over from {case.source.name}: {', '.join(left_out)}"
         if mesoscopic and order.run:
             report += "\nsimulated by SUMO's mesoscopic model" + (
                 "" if order.mesoscopic else f": the city has more than {LARGE:,} edges for cars")
@@ -138,22 +143,28 @@ def _traffic(case: Case, streets: Streets, order: Order) -> Traffic:
             f"--demand: {order.source} has {len(traffic.depart):,} vehicles of its own; leave --demand away, or give "
             "the network alone")
     peak = morning_peak(streets, level=order.level or 1.0, begin=case.begin, seed=order.seed)
+    known = {part.get("id") for element in traffic.shared for part in element.iter("vType")}
+    own = tuple(element for element in peak.shared if element.get("id") not in known)  # a type car of the city will do
     return replace(
-        peak, background=traffic.background, shared=traffic.shared + peak.shared, switched=traffic.switched,
+        peak, background=traffic.background, shared=traffic.shared + own, switched=traffic.switched,
         notes={**traffic.notes, **peak.notes})
 
 
 def left_alone(streets: Streets, traffic: Traffic) -> dict[str, str]:
     """Signal -> why perimeter control leaves it alone: only fixed-time programmes that always run are changed."""
-    found = {
-        signal: f"{logics[-1].kind} signal" for signal, logics in streets.logics.items()
-        if logics[-1].kind != "static"}
+    found = {signal: "no programme" for signal in streets.link_signals if signal and signal not in streets.logics}
+    found |= {
+        signal: "switched off" if logics[-1].programme == "off" else f"{logics[-1].kind} signal"
+        for signal, logics in streets.logics.items() if logics[-1].kind != "static" or logics[-1].programme == "off"}
     found |= {signal: "programme follows a timetable" for signal in traffic.switched}
     return found
 
 
 def _check_free(order: Order) -> None:
     for folder, file, option in ((order.out, "network.toml", "--out"), (order.scenario, "scenario.toml", "--scenario")):
+        if folder.name in ("", "..") or "," in str(folder):
+            raise InputError(f"{option}: expected a folder such as {option[2:]}/mycity, without a comma, which SUMO "
+                             f"cannot read, got {folder} instead")
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{option}: {folder}: is not a folder; choose another name")
         if (folder / file).exists() and not order.force:
@@ -164,8 +175,12 @@ def _windowed(case: Case, order: Order) -> Case:
     """The case from --begin to --end, where these are given."""
     begin = case.begin if order.begin is None else order.begin
     end = case.end if order.end is None else order.end
+    if begin < 0:
+        where = f"{case.source}: begin" if order.begin is None else "--begin"
+        raise InputError(f"{where}: expected a time from 0 s up, got {begin:g} instead")
     if end is not None and end <= begin:
-        raise InputError(f"--end: expected a time after the beginning at {begin:g} s, got {end:g} instead")
+        where = f"{case.source}: end" if order.end is None else "--end"
+        raise InputError(f"{where}: expected a time after the beginning at {begin:g} s, got {end:g} instead")
     return replace(case, begin=begin, end=end)
 
 
@@ -194,25 +209,27 @@ def _folders(order: Order):
 class _Baselines:
     """Runs without control at any multiple of the demand; the last one is kept."""
 
-    def __init__(self, streets: Streets, case: Case, clock: model.Clock, folder: Path, files: Mapping):
-        self._streets, self._clock, self._files = streets, clock, files
+    def __init__(self, streets: Streets, case: Case, clock: model.Clock, folder: Path, files: Mapping,
+                 vehicles: Sequence[str]):
+        self._streets, self._clock, self._files, self._vehicles = streets, clock, files, vehicles
         self._routes, self._background, self._additional = (
             [folder / name for name in files[key]] for key in ("routes", "background", "additional"))
-        self._options = ["--step-length", case.options.get("step-length", "1"),
-                         "--time-to-teleport", case.options.get("time-to-teleport", "300")]
+        self._options = ["--step-length", f"{model.step_length(case, clock):g}",
+                         "--time-to-teleport", f"{case.time_to_teleport:g}"]
         self._last: tuple[tuple[float, bool], Baseline] | None = None
 
     def run(self, factor: float, mesoscopic: bool) -> Baseline:
         if self._last is None or self._last[0] != (factor, mesoscopic):
             with Scratch("cosim-") as folder:
-                routes = self._routes
+                routes, vehicles = self._routes, self._vehicles
                 if factor != 1.0:
                     routes = [folder / "vehicles.rou.xml"]
-                    write_originals(read_originals(self._routes), routes[0], seed=0, factor=factor, jitter=0.0,
-                                    begin=self._clock.begin)
+                    vehicles = write_originals(
+                        read_originals(self._routes), routes[0], seed=0, factor=factor, jitter=0.0,
+                        begin=self._clock.begin)
                 self._last = (factor, mesoscopic), run_baseline(
                     self._streets, routes=[*routes, *self._background], additional=self._additional,
-                    begin=self._clock.begin, end=self._clock.end,
+                    begin=self._clock.begin, end=self._clock.end, vehicles=vehicles,
                     options=[*self._options, *(MESOSCOPIC if mesoscopic else ())])
         return self._last[1]
 
@@ -324,6 +341,9 @@ def _report(order: Order, case: Case, streets: Streets, traffic: Traffic, clock:
             f"without control: driving takes {baseline.pace(streets):.1f} times as long as at the speed limits; "
             f"{baseline.teleports} teleports, {baseline.running} vehicles on the road and {baseline.waiting} waiting "
             "to enter at the end")
+        if baseline.dropped:
+            lines.append(
+                f"{baseline.dropped:,} vehicles never drove: SUMO found no way, or no lane to depart on, for them")
     return "\n".join(lines)
 
 

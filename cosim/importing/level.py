@@ -27,7 +27,7 @@ def congesting(pace: Pace, *, mesoscopic: bool, tell: Callable[[str], None]) -> 
         tell(f"demand times {level(n):g}{', mesoscopic' if meso else ''}")
         return pace(level(n), meso) >= CONGESTED * light
 
-    light = pace(LIGHT, True)
+    light = pace(LIGHT, True) or 1.0  # a tenth of a few vehicles is none
     n = 0
     if congested(n, True, light):
         while n > -MOST and congested(n - 1, True, light):
@@ -36,7 +36,7 @@ def congesting(pace: Pace, *, mesoscopic: bool, tell: Callable[[str], None]) -> 
         while n < MOST and not congested(n, True, light):
             n += 1
     if not mesoscopic:
-        light = pace(LIGHT, False)
+        light = pace(LIGHT, False) or 1.0
     while not congested(n, mesoscopic, light):
         if n == MOST:
             return level(n), False

@@ -8,13 +8,14 @@ import numpy as np
 
 from cosim.identify import network_toml, own_splits
 from cosim.importing.baseline import Baseline
-from cosim.importing.case import Case, seconds
+from cosim.importing.case import Case
 from cosim.importing.demand import Traffic
 from cosim.importing.regions import digraph, names, positions
 from cosim.importing.streets import Streets
 from cosim.regions import JAM_SPACING
 from nmfd.mfd import Mfd
 from nmfd.network import Network
+from nmfd.toml import quoted
 
 # The shape of the published MFD, g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam, for want of anything measured.
 ALPHA, BETA = 0.98405, -1.97190
@@ -67,7 +68,7 @@ def without_idle(case: Case, traffic: Traffic) -> Case:
 
 def clock(case: Case, streets: Streets, traffic: Traffic) -> Clock:
     """Control intervals of the most common signal cycle, until RECOVERY after the last departure."""
-    running = [found[-1] for found in streets.logics.values() if found[-1].cycle > 0]
+    running = [found[-1] for found in streets.logics.values() if round(found[-1].cycle) > 0]
     cycles = Counter(round(logic.cycle) for logic in running if logic.kind == "static")
     cycle = float(max(sorted(cycles), key=cycles.get)) if cycles else DEFAULT_CYCLE
     step = cycle * np.ceil(CYCLES[0] / cycle)
@@ -127,33 +128,28 @@ def scenario_text(
     """scenario.toml; files: routes, background, additional -> file names beside it."""
     fastest = max(mfd.c for mfd in network.mfds)
     substeps = int(np.ceil(clock.step / min(30.0, 0.5 / fastest)))
-    teleport = case.options.get("time-to-teleport", "300")
     lines = [
         f"# Imported from {case.source.name}: its own vehicles, with their routes, departures and types.",
-        f'name = "{name}"', f'network = "{network_path}"',
+        f"name = {quoted(name)}", f"network = {quoted(network_path)}",
         f"step = {clock.step:.1f}                 # s, control interval = most common signal cycle",
         f"steps = {clock.steps}", f"substeps = {substeps}",
         f"protected = [{protected}]             # the densest region; {network.region_names[protected]}",
         'demand_file = "demand.csv"  # veh/s by interval and pair of regions, counted from the vehicles',
         f"demand_factor = {factor:g}         # vehicles are left out, or drive twice", "",
         "[forecast]", "error = 0.0                 # of what controllers are told of the demand, std of its logarithm",
-        "", "[sumo]", f"begin = {clock.begin:.1f}", f"step_length = {_step_length(case, clock):g}",
-        f"time_to_teleport = {seconds(teleport, 'time-to-teleport'):g}      # s; every table counts the teleports",
+        "", "[sumo]", f"begin = {clock.begin:.1f}", f"step_length = {step_length(case, clock):g}",
+        f"time_to_teleport = {case.time_to_teleport:g}      # s; every table counts the teleports",
         "departure_jitter = 10.0     # s, either way: what seeds differ in, beside SUMO's own randomness",
         "ways_return = true          # guided drivers may leave a region and come back, as main roads here do",
-        *(f"{key} = [{', '.join(_quoted(value) for value in values)}]" for key, values in files.items() if values)]
+        *(f"{key} = [{', '.join(quoted(value) for value in values)}]" for key, values in files.items() if values)]
     if mesoscopic:
         lines.append("mesoscopic = true           # SUMO's queue model: fast, without lanes; for quick studies")
     if leave:
-        lines.append(f"leave_signals = [{', '.join(_quoted(signal) for signal in leave)}]")
+        lines.append(f"leave_signals = [{', '.join(quoted(signal) for signal in leave)}]")
     return "\n".join(lines) + "\n" + TRAINING
 
 
-def _step_length(case: Case, clock: Clock) -> float:
-    """The city's own step where the control interval is a multiple of it, else 1 s."""
-    own = seconds(case.options.get("step-length", "1"), f"{case.source}: step-length")
+def step_length(case: Case, clock: Clock) -> float:
+    """[s] The city's own step where the control interval is a multiple of it, else 1 s."""
+    own = case.step_length
     return own if 0.0 < own <= 1.0 and abs(clock.step / own - round(clock.step / own)) < 1e-9 else 1.0
-
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -29,9 +29,9 @@ GIVEN = ("edges", "taz", "polygons")
 def partition(
     streets: Streets, baseline: Baseline | None, *, regions: int | None, method: str, given: Path | None, seed: int,
     left_alone: Collection[str] = (),
-) -> tuple[np.ndarray, int]:
-    """(E,) region of every edge, numbered from 0, by a method of METHODS, and how many were asked for; `given` is the
-    file for those that read one.
+) -> tuple[np.ndarray, int, int]:
+    """(E,) region of every edge, numbered from 0, by a method of METHODS, how many were asked for, and how many streets
+    are in another one than the file `given` says, for those that read one.
 
     left_alone: signals that perimeter control cannot use. Regions of the user's own keep their order and edges, but
     edges without a region get one. Raises InputError where there are no two regions to be had.
@@ -39,7 +39,9 @@ def partition(
     if method in GIVEN:
         labels = read_given(streets, given, method)
         found, regions = finish(streets, labels, renumber=False), int(labels.max()) + 1
+        moved = _moved(labels, found, streets.drivable & (labels >= 0))
     else:
+        moved = 0
         blocks = make_blocks(streets)
         if regions > len(blocks.weight):
             raise InputError(
@@ -61,4 +63,11 @@ def partition(
         raise InputError(
             f"{streets.path}: no two regions can be made that can be reached from each other; give a network with "
             "more streets, or other regions")
-    return found, regions
+    return found, regions, moved
+
+
+def _moved(labels: np.ndarray, found: np.ndarray, members: np.ndarray) -> int:
+    """How many of some edges are not in the region that most of those with the same label are in."""
+    votes = np.zeros((int(labels.max()) + 1, int(found.max()) + 1), dtype=int)
+    np.add.at(votes, (labels[members], found[members]), 1)
+    return int(votes.sum() - votes.max(axis=1).sum())

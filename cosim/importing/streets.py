@@ -18,7 +18,8 @@ from nmfd.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Logic:
-    """A signal programme. kind: SUMO's type, "static" or "actuated" and so on; cycle [s]; links: their number."""
+    """A signal programme. kind: SUMO's type, "static" or "actuated" and so on, or "branching" for a static one whose
+    phases do not follow each other in order; cycle [s]; links: their number."""
 
     signal: str
     programme: str
@@ -95,9 +96,10 @@ class Streets:
                                   return_predecessors=False)] = True
         return found
 
-    def connected(self, pairs: Iterable[tuple[int, int]]) -> dict[tuple[int, int], bool]:
-        """Whether a way leads from the first edge of each pair to its second, for a vehicle that may use every lane."""
-        onward = graph(self.all_links, len(self.edges))
+    def connected(self, pairs: Iterable[tuple[int, int]], *, cars: bool) -> dict[tuple[int, int], bool]:
+        """Whether a way leads from the first edge of each pair to its second, for cars, or else for a vehicle that may
+        use every lane."""
+        onward = graph(self.links if cars else self.all_links, len(self.edges))
         wanted: dict[int, list[int]] = {}
         for first, last in sorted(set(pairs)):
             wanted.setdefault(first, []).append(last)
@@ -182,8 +184,11 @@ def _edge(element: ElementTree.Element) -> tuple:
 def _logic(element: ElementTree.Element, path: Path) -> Logic:
     phases = list(element.iter("phase"))
     where = f"{path}: tlLogic {element.get('id')}: phase duration"
+    kind = element.get("type", "static")
+    if kind == "static" and any(phase.get("next") for phase in phases):
+        kind = "branching"
     return Logic(
-        signal=element.get("id"), programme=element.get("programID", "0"), kind=element.get("type", "static"),
+        signal=element.get("id"), programme=element.get("programID", "0"), kind=kind,
         cycle=sum(seconds(phase.get("duration", "0"), where) for phase in phases),
         links=max((len(phase.get("state", "")) for phase in phases), default=0))
 

@@ -1,0 +1,331 @@
+"""What cities of others bring: each gives a working result or one clear line, and loses no vehicle without a word."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny_city
+from click.testing import CliRunner
+
+from cosim.cli import main
+from cosim.importing.case import read_case
+from cosim.importing.demand import read_traffic
+from cosim.importing.importer import left_alone
+from cosim.importing.level import congesting
+from cosim.importing.streets import read_streets
+from cosim.measure import Meter
+from cosim.originals import draw, read_originals
+from cosim.plant import SumoPlant
+from cosim.sumo import REFUSALS
+from cosim.sumo_settings import settings
+from nmfd.errors import InputError
+from nmfd.scenario import load_scenario
+from nmfd.types import Controls
+
+FLOW = '<flow id="f" begin="0" end="600" number="60" from="A1B1" to="C1D1"/>'
+FAST = ("--method", "geometric", "--no-run")
+
+
+def cosim(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def net(tmp_path_factory):
+    return tiny_city.network(tmp_path_factory.mktemp("net"))
+
+
+@pytest.fixture
+def city(net, tmp_path):
+    """city(routes, additional, options, net) writes a sumocfg with these contents."""
+    def write(routes=FLOW, additional="", options="", net_file=net):
+        (tmp_path / "c.rou.xml").write_text(f"<routes>{routes}</routes>")
+        (tmp_path / "c.add.xml").write_text(f"<additional>{additional}</additional>")
+        config = tmp_path / "c.sumocfg"
+        config.write_text(
+            f'<configuration><net-file value="{net_file}"/><route-files value="c.rou.xml"/>'
+            f'<additional-files value="c.add.xml"/>{options}</configuration>')
+        return config
+    return write
+
+
+def traffic_of(config):
+    case = read_case(config)
+    return read_traffic(case, read_streets(case.net, case.additional), seed=0)
+
+
+def imported(config, *options):
+    """(what it says, the scenario) of an import into two regions."""
+    out = config.parent / "networks" / "x"
+    result = cosim("import", config, "--regions", 2, "--out", out, "--force", *options)
+    assert result.exit_code == 0, result.stderr + str(result.exception)
+    return result.stdout, load_scenario(config.parent / "scenarios" / "x")
+
+
+def refused(config, *options):
+    """The one line of an import that fails and leaves nothing behind."""
+    result = cosim("import", config, "--regions", 2, "--out", config.parent / "networks" / "x", *options)
+    assert result.exit_code == 2, result.stdout + str(result.exception)
+    assert result.stderr.count("\n") == 1 and "Traceback" not in result.stderr
+    assert not list(config.parent.glob("*/x/*"))
+    return result.stderr
+
+
+def driven(scenario, intervals, **overrides):
+    """(plant.trips, departures, arrivals, accumulation, backlog) of a run with the gates half shut; in every interval
+    the ledger is checked."""
+    scenario = replace(scenario, steps=intervals)
+    plant = SumoPlant(scenario, overrides=replace(settings(scenario), **overrides))
+    try:
+        plant.reset(0)
+        for _ in range(intervals):
+            measured = plant.step(Controls(
+                perimeter=np.where(scenario.network.adjacency, 0.4, 0.0), splits=scenario.network.nominal_splits))
+        record = plant.record()
+        return (plant.trips, record.departures.sum(), record.arrivals.sum(), measured.accumulation.sum(),
+                measured.backlog.sum())
+    finally:
+        plant.close()
+
+
+def test_files_are_found_wherever_they_are(net, tmp_path, monkeypatch):
+    """By a variable of the environment, upwards, in folders with spaces and letters of all kinds."""
+    below = tmp_path / "stra\u00dfe 1" / "deep"
+    below.mkdir(parents=True)
+    (tmp_path / "n\u00e9t 1.net.xml").write_bytes(net.read_bytes())
+    (below.parent / "c.rou.xml").write_text(f"<routes>{FLOW}</routes>")
+    monkeypatch.setenv("MY_CITY", str(below.parent))
+    config = below / "\u57ce.sumocfg"
+    config.write_text('<configuration><n v="../../n\u00e9t 1.net.xml"/><r v="${MY_CITY}/c.rou.xml"/></configuration>')
+    out = tmp_path / "networks" / "d'\"x\" \\ y"
+    result = cosim("import", config, "--regions", 2, *FAST, "--out", out)
+    assert result.exit_code == 0, result.stderr
+    scenario = load_scenario(tmp_path / "scenarios" / out.name)
+    assert scenario.name == out.name and scenario.demand.sum() * scenario.step == pytest.approx(60)
+    config.write_text('<configuration><n v="${NO_SUCH}/a.net.xml"/></configuration>')
+    result = cosim("import", config, "--regions", 2, *FAST, "--out", tmp_path / "networks" / "y")
+    assert result.exit_code == 2 and "no such file" in result.stderr and "${NO_SUCH}" in result.stderr
+
+
+@pytest.mark.parametrize("options, expected", [
+    ('<begin value="-10"/>', "c.sumocfg: begin: expected a time from 0 s up, got -10"),
+    ('<begin value="600"/><end value="300"/>', "c.sumocfg: end: expected a time after the beginning at 600 s, got 300"),
+    ('<time-to-teleport value="abc"/>', "c.sumocfg: time-to-teleport: expected seconds"),
+    ('<step-length value="abc"/>', "c.sumocfg: step-length: expected seconds"),
+])
+def test_options_that_are_wrong(city, options, expected):
+    assert expected in refused(city(options=options), *FAST)
+
+
+@pytest.mark.parametrize("name", [".", "..", "networks/a,b"])
+def test_folders_that_can_have_no_city(city, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    result = cosim("import", city(), "--regions", 2, *FAST, "--out", name)
+    assert result.exit_code == 2 and "--out: expected a folder such as out/mycity" in result.stderr
+    assert not list(tmp_path.rglob("*.toml"))
+
+
+def test_steps_and_teleports_of_the_city(city):
+    """Any negative time means never; steps that do not fit are not simulated before either, and that is said."""
+    text, scenario = imported(city(options='<time-to-teleport value="-10"/><step-length value="2"/>'))
+    assert settings(scenario).time_to_teleport == -1.0 and settings(scenario).step_length == 1.0
+    assert "not taken over from c.sumocfg: step-length = 2" in text and " 0 teleports" in text
+
+
+def test_an_id_twice(city):
+    line = refused(city(FLOW + '<trip id="f.3" depart="5" from="A1B1" to="C1D1"/>'), *FAST)
+    assert "c.rou.xml: trip: id: expected one that no other vehicle has, got 'f.3'" in line
+
+
+def test_copies_of_vehicles_get_ids_of_their_own(tmp_path):
+    (tmp_path / "a.rou.xml").write_text("<routes>" + "".join(
+        f'<trip id="{name}" depart="1" from="a" to="b"/>' for name in ("0", "0.1", "0.1.1", "1")) + "</routes>")
+    drawn = draw(read_originals([tmp_path / "a.rou.xml"]), seed=0, factor=3.0, jitter=0.0, begin=0.0)
+    names = [name for _, _, name in drawn]
+    assert len(names) == len(set(names)) == 12 and {"0", "0.1", "0.1.1", "1", "1.1", "1.2", "0.2"} <= set(names)
+
+
+def test_cars_for_streets_that_are_closed_to_them(net, city, tmp_path):
+    """SUMO would keep them waiting for ever: they are left out, with a word; lorries that may go there are not."""
+    text = re.sub(r'(<lane id="C1D1_\d" index="\d") ', r'\1 allow="bus truck" ', net.read_text())
+    (tmp_path / "closed.net.xml").write_text(text)
+    said, scenario = imported(city(
+        FLOW + '<vType id="lorry" vClass="truck"/><trip id="lorry" type="lorry" depart="9" from="A1B1" to="C1D1"/>'
+        '<vehicle id="over" depart="10"><route edges="B1C1 C1D1 D1D2"/></vehicle>'
+        '<trip id="by" depart="11" from="A1B1" to="D1D2" via="C1D1"/>'
+        '<trip id="car" depart="12" from="A1B1" to="D1D2"/>',
+        net_file="closed.net.xml"), *FAST)
+    assert "2 vehicles in" in said and "cars on streets that are closed to cars, left out: 62" in said
+    due, departed, *_, backlog = driven(scenario, 2)
+    assert due == departed == 2 and backlog == 0
+
+
+def test_routes_of_a_nested_distribution(city):
+    """As marouter writes them: every vehicle of such a flow gets a route, by their shares."""
+    config = city(
+        '<flow id="f" begin="0" end="600" number="200" fromTaz="1" toTaz="2"><routeDistribution>'
+        '<route probability="150" edges="A1B1 B1C1"/><route probability="50" edges="D1C1 C1B1"/></routeDistribution>'
+        "</flow>")
+    vehicles = traffic_of(config).vehicles
+    edges = [vehicle.find("route").get("edges") for vehicle in vehicles]
+    assert len(edges) == 200 and 120 < edges.count("A1B1 B1C1") < 180 and "D1C1 C1B1" in edges
+    assert not any({"fromTaz", "toTaz"} & set(vehicle.keys()) for vehicle in vehicles)
+    due, departed, *_, backlog = driven(imported(config, *FAST)[1], 2)
+    assert due == departed + backlog > 40
+
+
+def test_what_else_changes_routes_and_vehicles(city, tmp_path, monkeypatch):
+    """Rerouters with other routes, closed streets and calibrators: SUMO runs them, the ledger is exact; vehicles that
+    SUMO gives up are told; nothing is written where the user is."""
+    monkeypatch.chdir(tmp_path)
+    config = city(
+        FLOW + '<trip id="shut" depart="100" from="C2D2" to="D1D0"/><trip id="begins" depart="begin" from="A1B1" '
+        'to="D1D0"><param key="has.ssm.device" value="true"/></trip>',
+        '<routeProbe id="probe" edge="A1B1" freq="60" file="probe.xml"/><route id="other" edges="B1C1 C1C2"/>'
+        '<route id="more" edges="B2C2 C2D2"/>'
+        '<rerouter id="r" edges="B1C1"><interval begin="0" end="600"><routeProbReroute id="other" probability="1"/>'
+        '</interval></rerouter><rerouter id="s" edges="C2D2"><interval begin="0" end="600"><closingReroute id="C2D2" '
+        'disallow="passenger"/></interval></rerouter><calibrator id="c" edge="B2C2" pos="0" output="calibrator.xml" '
+        'routeProbe="probe" freq="60"><flow begin="0" end="600" route="more" vehsPerHour="600"/></calibrator>')
+    text, scenario = imported(config)
+    assert "61 vehicles never drove" not in text and "1 vehicles never drove" in text
+    assert {element.get("id") for element in traffic_of(config).vehicles} >= {"begins", "shut"}
+    due, departed, arrived, inside, _ = driven(scenario, 5, rerouting=0.5)
+    assert departed - arrived == inside and departed > 40
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "c.rou.xml", "c.add.xml", "c.sumocfg", "networks", "scenarios"}
+
+
+def test_signals_that_cannot_be_controlled(net, city, tmp_path):
+    """Off, or without any programme, as railway crossings are: no gateway counts as controlled by them."""
+    config = city(additional='<tlLogic id="B1" programID="off" type="static" offset="0"/>')
+    case = read_case(config)
+    found = left_alone(read_streets(case.net, case.additional), traffic_of(config))
+    assert found == {"B1": "switched off"}
+    text = re.sub(r'<tlLogic id="C2".*?</tlLogic>', "", net.read_text(), flags=re.DOTALL)
+    (tmp_path / "other.net.xml").write_text(text)
+    found = left_alone(read_streets(tmp_path / "other.net.xml"), traffic_of(config))
+    assert found == {"C2": "no programme"}
+
+
+def test_phases_that_do_not_follow_in_order(net, city):
+    """Perimeter control would play them one after the other: it leaves such signals alone, in report and run."""
+    text = re.sub(r'(<phase duration="\d+")', r'\1 next="0 1"', net.read_text())
+    branching = net.with_name("branching.net.xml")
+    branching.write_text(text)
+    said, scenario = imported(city(net_file=branching), *FAST)
+    assert "(branching signal)" in said and "no gateway has a signal that perimeter control can use" in said
+    plant = SumoPlant(scenario)
+    try:
+        plant.reset(0)
+        assert len(plant.leaks()) == len(plant.city.gateways) > 0
+    finally:
+        plant.close()
+
+
+def test_cycles_shorter_than_half_a_second(net, tmp_path):
+    """Of a network that somebody made for something else: control intervals are the usual 90 s."""
+    (tmp_path / "fast.net.xml").write_text(re.sub(r'(<phase duration=")\d+', r"\g<1>0.05", net.read_text()))
+    _, scenario = imported(tmp_path / "fast.net.xml", "--demand", "peak", "--level", 0.1, *FAST)
+    assert scenario.step == 90.0
+
+
+def test_a_city_along_a_straight_road(tmp_path):
+    """It has no width: k-means and the map must do without."""
+    nodes = "".join(f'<node id="{n}" x="{200 * n}" y="0" type="traffic_light"/>' for n in range(9))
+    edges = "".join(f'<edge id="f{n}" from="{n}" to="{n + 1}"/><edge id="b{n}" from="{n + 1}" to="{n}"/>'
+                    for n in range(8))
+    (tmp_path / "n.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
+    (tmp_path / "e.edg.xml").write_text(f"<edges>{edges}</edges>")
+    net = tmp_path / "road.net.xml"
+    tiny_city.run("netconvert", "-n", tmp_path / "n.nod.xml", "-e", tmp_path / "e.edg.xml", "-o", net)
+    text, scenario = imported(net, "--demand", "peak", "--level", 0.2)
+    assert "2 regions by method density" in text and scenario.network.adjacency.sum() == 2
+    sizes = np.bincount(np.loadtxt(
+        tmp_path / "networks" / "x" / "regions.csv", dtype=int, delimiter=",", skiprows=1, usecols=1))
+    assert sizes.min() >= 4
+
+
+def test_own_regions_from_a_spreadsheet_and_in_pieces(net, city, tmp_path):
+    """A mark at the beginning and empty lines do not matter; streets that cannot stay where they were put are told."""
+    config, edges = city(), read_streets(net).edges
+    rows = [f"{edge},{int(edge[0] in 'CD')}" for edge in edges]
+    csv = tmp_path / "own.csv"
+    csv.write_bytes("\r\n".join(["\ufeffedge,region", *rows, "", ""]).encode())
+    arguments = ("import", config, "--edges", csv, "--no-run", "--force", "--out", tmp_path / "networks" / "x")
+    result = cosim(*arguments)
+    assert result.exit_code == 0 and "are in other regions" not in result.stdout, result.stderr
+    apart = {"A0A1", "A1A2", "D2D3"}
+    csv.write_text("\n".join(["edge,region", *(f"{edge},{int(edge in apart)}" for edge in edges)]))
+    result = cosim(*arguments)
+    assert result.exit_code == 0 and "1 streets are in other regions than own.csv says" in result.stdout
+
+
+def test_sumos_own_words_in_one_line(city, capfd):
+    """SUMO tells stderr what is wrong with the input; here it is in the error, and nothing else is printed."""
+    phases = '<phase duration="30" state="Gr"/><phase duration="30" state="rG"/>'
+    _, scenario = imported(city(additional=f'<tlLogic id="none" type="static" programID="1">{phases}</tlLogic>'), *FAST)
+    capfd.readouterr()
+    with pytest.raises(InputError, match="SUMO cannot run it .* plan loaded for tls 'none'"):
+        driven(scenario, 1)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_vehicle_that_sumo_gives_up_at_once(net, city):
+    """It is loaded and gone in the same step: nothing to follow, and nothing breaks."""
+    _, scenario = imported(city(), *FAST)
+    plant = SumoPlant(scenario)
+    try:
+        plant.reset(0)
+
+        class Session:
+            step_length = 1.0
+
+            def loaded(self):
+                return ("ghost",)
+
+            def route(self, vehicle):
+                raise REFUSALS[0](f"Vehicle '{vehicle}' is not known.")
+
+            def __getattr__(self, name):
+                return lambda *_: ()
+
+        assert Meter(Session(), plant.city).observe() == []
+    finally:
+        plant.close()
+
+
+@pytest.mark.parametrize("routes, expected", [
+    ('<taz id="z"><tazSource id="A0A1" weight="x"/></taz>', "taz z: weight or probability: expected a number"),
+    ('<routeDistribution id="z"><route edges="A0A1" probability="x"/></routeDistribution>',
+     "routeDistribution z: weight or probability: expected a number"),
+    ('<vehicle id="v" depart="1"><routeDistribution><route edges="A0A1" probability="x"/></routeDistribution>'
+     "</vehicle>", "vehicle v: weight or probability: expected a number"),
+])
+def test_numbers_that_are_none(city, routes, expected):
+    assert f"c.rou.xml: {expected}" in refused(city(FLOW + routes), *FAST)
+
+
+def test_speeds_and_coordinates(city):
+    """A fixed speed is deadly before a signal under control; trips between coordinates are not silently lost."""
+    traffic = traffic_of(city(
+        '<trip id="a" depart="1" from="A1B1" to="C1D1" departSpeed="13.9"/><trip id="b" depart="1" fromXY="1,1" '
+        'toXY="9,9"/><trip id="c" depart="1" from="A1B1" to="C1D1" departSpeed="random"/>'))
+    assert [vehicle.get("departSpeed") for vehicle in traffic.vehicles] == ["max", "random"]
+    assert traffic.notes == {"fixed speeds at the departure, made the highest safe ones": 1,
+                             "trips between coordinates, left out: give them edges with duarouter": 1}
+
+
+def test_a_generated_peak_beside_types_of_the_city(net, city):
+    config = city("", '<vType id="car" vClass="passenger" sigma="0.9"/>')
+    text, _ = imported(config, "--demand", "peak", "--level", 0.1)
+    assert "trips of a generated morning peak" in text
+
+
+def test_level_of_a_city_with_a_vehicle_or_two():
+    """A tenth of them is none, who drive in no time at all: that is not what the others are compared with."""
+    def pace(times, mesoscopic):
+        return 0.0 if times < 0.5 else 1.2
+
+    assert congesting(pace, mesoscopic=False, tell=lambda line: None) == (2.99, False)
