@@ -1,21 +1,17 @@
 """`cosim import`: from a sumocfg to networks/NAME and scenarios/NAME."""
 
-import csv
-import gzip
-import io
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 
-from cosim.importing import atlas, layers, level, model, quality
+from cosim.importing import level, model, quality, written
 from cosim.importing.baseline import Baseline, run_baseline
 from cosim.importing.case import Case, read_case, seconds
-from cosim.importing.demand import Traffic, read_traffic, wrapped
+from cosim.importing.demand import Traffic, read_traffic
 from cosim.importing.generated import morning_peak
 from cosim.importing.partition import partition
 from cosim.importing.regions import positions
@@ -27,10 +23,8 @@ from nmfd.network import Network
 from nmfd.scenario import GUIDED
 from nmfd.scratch import LOCK, Scratch
 
-NET = "city.net.xml.gz"
 LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
 LITTLE = 0.3  # of the flow over the boundaries passes no signal under control: worth a word
-FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz", "additional": "city.add.xml.gz"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +74,7 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
         case = model.without_idle(case, traffic)
     clock = model.clock(case, streets, traffic)
     with _folders(order) as (net_folder, folder):
-        files = _write_traffic(folder, traffic)
+        files = written.write_traffic(folder, traffic)
         simulate = _Baselines(streets, case, clock, folder, files, [v.get("id", "") for v in traffic.vehicles])
         mesoscopic = order.mesoscopic or streets.drivable.sum() > LARGE
         factor, congests, baseline = 1.0 if order.peak else scale * (order.level or 1.0), True, None
@@ -98,14 +92,14 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
             left_alone=left)
         name = order.out.name
         network = model.network_of(streets, regions, name, baseline)
-        _write_net(case.net, net_folder / NET)
-        _write_csv(net_folder / "regions.csv", ("edge", "region"), zip(streets.edges, regions, strict=True))
-        city = load_city(net_folder / NET, net_folder / "regions.csv", network.regions)
+        written.write_net(case.net, net_folder / written.NET)
+        written.write_table(net_folder / "regions.csv", ("edge", "region"), zip(streets.edges, regions, strict=True))
+        city = load_city(net_folder / written.NET, net_folder / "regions.csv", network.regions)
         found = quality.tables(streets, regions, network.region_names, city, baseline, left)
         tell("writing")
-        _write_network(net_folder, streets, regions, network, found, baseline, order)
+        written.write_network(net_folder, streets, regions, network, found, baseline, order.source.name)
         demand = model.region_demand(traffic, regions, clock)
-        _write_demand(folder / "demand.csv", demand)
+        written.write_demand(folder / "demand.csv", demand)
         (folder / "scenario.toml").write_text(model.scenario_text(
             network, clock, case, name=order.scenario.name, files=files, leave=traffic.switched,
             network_path=os.path.relpath(order.out, order.scenario).replace(os.sep, "/"),
@@ -251,58 +245,6 @@ def _protected(streets: Streets, regions: np.ndarray, baseline: Baseline | None,
         return int(np.argmax(load / np.bincount(regions, streets.lane_metres, network.regions)))
     middle = np.average(streets.centre, axis=0, weights=streets.lane_metres)
     return int(((positions(streets, regions) - middle) ** 2).sum(axis=1).argmin())
-
-
-def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
-    """The vehicles, what is left alone and what both refer to; returns the file names by key of [sumo]."""
-    contents = {"routes": (traffic.vehicles, "routes"), "background": (traffic.background, "routes"),
-                "additional": (traffic.shared, "additional")}
-    files: dict[str, list[str]] = {}
-    for key, (elements, tag) in contents.items():
-        files[key] = [FILES[key]] if len(elements) else []
-        if len(elements):
-            root = wrapped(elements, tag)
-            ElementTree.indent(root)
-            _zip(folder / FILES[key], ElementTree.tostring(root))
-    return files
-
-
-def _write_net(net: Path, target: Path) -> None:
-    """A gzipped copy."""
-    _zip(target, gzip.decompress(net.read_bytes()) if net.suffix == ".gz" else net.read_bytes())
-
-
-def _zip(path: Path, content: bytes) -> None:
-    """Without a date, so that the same content gives the same bytes."""
-    with path.open("wb") as stream, gzip.GzipFile(fileobj=stream, mode="wb", filename="", mtime=0) as packed:
-        packed.write(content)
-
-
-def _write_csv(path: Path, header: Sequence[str], rows) -> None:
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    path.write_text(out.getvalue(), encoding="utf-8")
-
-
-def _write_demand(path: Path, demand: np.ndarray) -> None:
-    _write_csv(path, ("interval", "from", "to", "veh_s"), (
-        (k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)))
-
-
-def _write_network(folder: Path, streets: Streets, regions: np.ndarray, network: Network, found: quality.Tables,
-                   baseline: Baseline | None, order: Order) -> None:
-    (folder / "network.toml").write_text(model.network_text(
-        network, {"net": NET, "regions": "regions.csv"}, order.source.name))
-    for name, columns, rows in (("quality.csv", quality.QUALITY, found.quality),
-                                ("gateways.csv", quality.GATEWAYS, found.gateways)):
-        _write_csv(folder / name, columns, ([row[column] for column in columns] for row in rows))
-    names = network.region_names
-    (folder / "regions.taz.xml").write_text(layers.taz_xml(streets, regions, names))
-    (folder / "regions.poly.xml").write_text(layers.polygons_xml(streets, regions, names))
-    density = None if baseline is None else 1000.0 * baseline.density(streets)
-    atlas.draw_map(folder / "map.png", streets, regions, names, network.positions, found, density)
 
 
 def _notes(traffic: Traffic) -> str:
