@@ -4,21 +4,18 @@ Each must give a network and a scenario that run, or one clear line.
 """
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
 import sumo
 from click.testing import CliRunner
+from tiny_city import driven
 
 from cosim.cli import main
 from cosim.importing.quality import pieces
 from cosim.importing.streets import read_streets
-from cosim.plant import SumoPlant
 from nmfd.scenario import load_scenario
-from nmfd.types import Controls
 
 GAMES = Path(sumo.SUMO_HOME) / "tools" / "game"
 CITIES = Path(os.environ.get("CITIES", Path(__file__).parents[2] / "shared" / "cities"))
@@ -39,18 +36,9 @@ def check(folder: Path, name: str, intervals: int) -> None:
     regions = table["region"].to_numpy()
     for region in range(regions.max() + 1):
         assert pieces(streets, streets.main_part & (regions == region)) == 1
-    scenario = replace(load_scenario(folder / "scenarios" / name), steps=intervals)
-    plant = SumoPlant(scenario)
-    try:
-        plant.reset(0)
-        for _ in range(intervals):
-            measurement = plant.step(Controls(
-                perimeter=np.where(scenario.network.adjacency, 0.3, 0.0), splits=scenario.network.nominal_splits))
-        record = plant.record()
-        assert record.departures.sum() > 0
-        assert record.departures.sum() - record.arrivals.sum() == measurement.accumulation.sum()
-    finally:
-        plant.close()
+    _, departed, arrived, inside, _ = driven(load_scenario(folder / "scenarios" / name), intervals, 0.3)
+    assert departed > 0
+    assert departed - arrived == inside
 
 
 @pytest.mark.skipif(not GAMES.is_dir(), reason="this SUMO comes without its demos")

@@ -1,12 +1,12 @@
 """What cities of others bring: each gives a working result or one clear line, and loses no vehicle without a word."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import tiny_city
 from click.testing import CliRunner
+from tiny_city import driven
 
 from cosim.cli import main
 from cosim.importing.case import read_case
@@ -21,7 +21,6 @@ from cosim.sumo import REFUSALS
 from cosim.sumo_settings import settings
 from nmfd.errors import InputError
 from nmfd.scenario import load_scenario
-from nmfd.types import Controls
 
 FLOW = '<flow id="f" begin="0" end="600" number="60" from="A1B1" to="C1D1"/>'
 FAST = ("--method", "geometric", "--no-run")
@@ -70,23 +69,6 @@ def refused(config, *options):
     assert result.stderr.count("\n") == 1 and "Traceback" not in result.stderr
     assert not list(config.parent.glob("*/x/*"))
     return result.stderr
-
-
-def driven(scenario, intervals, **overrides):
-    """(plant.trips, departures, arrivals, accumulation, backlog) of a run with the gates half shut; in every interval
-    the ledger is checked."""
-    scenario = replace(scenario, steps=intervals)
-    plant = SumoPlant(scenario, overrides=replace(settings(scenario), **overrides))
-    try:
-        plant.reset(0)
-        for _ in range(intervals):
-            measured = plant.step(Controls(
-                perimeter=np.where(scenario.network.adjacency, 0.4, 0.0), splits=scenario.network.nominal_splits))
-        record = plant.record()
-        return (plant.trips, record.departures.sum(), record.arrivals.sum(), measured.accumulation.sum(),
-                measured.backlog.sum())
-    finally:
-        plant.close()
 
 
 def test_files_are_found_wherever_they_are(net, tmp_path, monkeypatch):
@@ -157,7 +139,7 @@ def test_cars_for_streets_that_are_closed_to_them(net, city, tmp_path):
         '<trip id="car" depart="12" from="A1B1" to="D1D2"/>',
         net_file="closed.net.xml"), *FAST)
     assert "2 vehicles in" in said and "cars on streets that are closed to cars, left out: 62" in said
-    due, departed, *_, backlog = driven(scenario, 2)
+    due, departed, *_, backlog = driven(scenario, 2, 0.4)
     assert due == departed == 2 and backlog == 0
 
 
@@ -171,7 +153,7 @@ def test_routes_of_a_nested_distribution(city):
     edges = [vehicle.find("route").get("edges") for vehicle in vehicles]
     assert len(edges) == 200 and 120 < edges.count("A1B1 B1C1") < 180 and "D1C1 C1B1" in edges
     assert not any({"fromTaz", "toTaz"} & set(vehicle.keys()) for vehicle in vehicles)
-    due, departed, *_, backlog = driven(imported(config, *FAST)[1], 2)
+    due, departed, *_, backlog = driven(imported(config, *FAST)[1], 2, 0.4)
     assert due == departed + backlog > 40
 
 
@@ -191,7 +173,7 @@ def test_what_else_changes_routes_and_vehicles(city, tmp_path, monkeypatch):
     text, scenario = imported(config)
     assert "61 vehicles never drove" not in text and "1 vehicles never drove" in text
     assert {element.get("id") for element in traffic_of(config).vehicles} >= {"begins", "shut"}
-    due, departed, arrived, inside, _ = driven(scenario, 5, rerouting=0.5)
+    due, departed, arrived, inside, _ = driven(scenario, 5, 0.4, rerouting=0.5)
     assert departed - arrived == inside and departed > 40
     assert {path.name for path in tmp_path.iterdir()} == {
         "c.rou.xml", "c.add.xml", "c.sumocfg", "networks", "scenarios"}
@@ -268,7 +250,7 @@ def test_sumos_own_words_in_one_line(city, capfd):
     _, scenario = imported(city(additional=f'<tlLogic id="none" type="static" programID="1">{phases}</tlLogic>'), *FAST)
     capfd.readouterr()
     with pytest.raises(InputError, match="SUMO cannot run it .* plan loaded for tls 'none'"):
-        driven(scenario, 1)
+        driven(scenario, 1, 0.4)
     assert capfd.readouterr().err == ""
 
 

@@ -2,9 +2,16 @@
 
 import gzip
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import sumo
+
+from cosim.plant import SumoPlant
+from cosim.sumo_settings import settings
+from nmfd.scenario import Scenario
+from nmfd.types import Controls
 
 CONFIG = """<configuration>
   <input><net-file value="city.net.xml"/><route-files value="cars.rou.xml.gz,buses.rou.xml"/>
@@ -67,3 +74,20 @@ def city(folder: Path, *options: str) -> Path:
         stream.write(CARS)
     (folder / "city.sumocfg").write_text(CONFIG)
     return folder / "city.sumocfg"
+
+
+def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tuple:
+    """(plant.trips, departures, arrivals, accumulation, backlog) of a run with all u at `gates`; in every interval the
+    ledger is checked."""
+    scenario = replace(scenario, steps=intervals)
+    plant = SumoPlant(scenario, overrides=replace(settings(scenario), **overrides))
+    try:
+        plant.reset(0)
+        for _ in range(intervals):
+            measured = plant.step(Controls(
+                perimeter=np.where(scenario.network.adjacency, gates, 0.0), splits=scenario.network.nominal_splits))
+        record = plant.record()
+        return (plant.trips, record.departures.sum(), record.arrivals.sum(), measured.accumulation.sum(),
+                measured.backlog.sum())
+    finally:
+        plant.close()

@@ -218,8 +218,7 @@ class _Reader:
                 self._notes["trips between coordinates, left out: give them edges with duarouter"] += 1
             elif not edges or any(edge not in number for edge in edges):
                 self._notes["vehicles with unknown edges or none, left out"] += 1
-            elif driven and any((number[a], number[b]) not in self._moves
-                                for a, b in zip(edges, edges[1:], strict=False)):
+            elif driven and not self._moves.issuperset(pairwise(map(number.get, edges))):
                 self._notes["vehicles on routes with gaps, left out"] += 1
             elif self._is_car(element) and not self._open_to_cars([number[edge] for edge in edges], driven):
                 self._notes["cars on streets that are closed to cars, left out"] += 1
