@@ -1,4 +1,4 @@
-"""Route guidance to reroutes: every vehicle is given its next region once per region it enters, in shares theta.
+"""Route guidance to reroutes: every vehicle is given its next region when it enters a region, in shares theta.
 
 Drivers who are told travel times do not keep to the split ratios that they had without: what they would choose now is
 followed up, and theta shifts it as it shifts the drivers' own split ratios in the regional model (`shifted`). A
@@ -11,23 +11,27 @@ regions that are behind their share; the bonus grows until the shares are met, b
 
 A guided vehicle in region i bound for edge d takes the fastest way inside i to a gateway i -> h, and from there to d
 without coming back to i, at the travel times of the last control interval (smoothed), as its group of drivers sees
-them. In h it is guided again, and in the region of d it is sent there on the fastest way. Nobody is sent on a detour
-that takes much longer, whatever theta says, and nobody leaves the way that he is on for a small gain: everybody who
-changes his way makes the travel times that the others were told wrong.
+them. In h it is guided again, and in the region of d it is sent there on the fastest way. With a period it is asked
+again where it is, every so often as long as it stays in i: in a city that congests, the fastest way when it came may
+be a standing one soon. Nobody is sent on a detour that takes much longer, whatever theta says, and nobody leaves the
+way that he is on for a small gain: everybody who changes his way makes the travel times that the others were told
+wrong.
 
 Where the boundaries of the regions are ragged, a main road may leave i and come back. With `ways_return` the fastest
 way of all is open to everybody, wherever it leads, and counts for the region that it enters when it leaves i for good;
 other ways into h still never come back. Without it such a road is closed to guided drivers, however much it costs them.
 """
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import groupby, pairwise
 
 import numpy as np
 
 from cosim.measure import Event
 from cosim.regions import City
-from cosim.sumo import Session
+from cosim.sumo import REFUSALS, Session
 from cosim.ways import Home, Moves, Ways
 
 SMOOTHING = 0.5  # weight of the newest travel times
@@ -51,19 +55,36 @@ def shifted(wish: Sequence[float], own: Sequence[float], theta: Sequence[float])
     return [k + freed * r / total for k, r in zip(kept, raised, strict=True)]
 
 
-class Guide:
-    """Reroutes vehicles; `compliance` is the probability that a driver follows, drawn anew in every region, and
-    `most_detour` [s] the most that a commanded next region may cost him.
+@dataclass(eq=False)
+class _Visit:
+    """A driver who follows, in one region: how he came, and how he sees travel times; following: where he was sent
+    last, and in which control interval."""
 
-    realised: (R, R, R) [veh], [i, h, j] = vehicles sent from i to h on their way to j since the start
+    event: Event
+    taste: int
+    following: int | None = None
+    interval: int = 0
+
+
+class Guide:
+    """Reroutes vehicles; `compliance` is the probability that a driver follows, drawn anew in every region,
+    `most_detour` [s] the most that a commanded next region may cost him, and `period` [s] the time after which he is
+    asked again; 0: never in the same region.
+
+    realised: (R, R, R) [veh], [i, h, j] = vehicles sent from i to h on their way to j since the start, those who were
+    asked several times as they were sent last
     """
 
     def __init__(
         self, session: Session, city: City, own: np.ndarray, *, compliance: float, most_detour: float,
-        random: np.random.Generator, ways_return: bool = False,
+        random: np.random.Generator, ways_return: bool = False, period: float = 0.0,
     ):
         """own: (R, R, R) [-], the drivers' own split ratios, which controllers mean as well"""
         self._own = own
+        self._period = math.ceil(period / session.step_length - 1e-6) if period else 0  # simulation steps
+        self._steps = self._interval = 0
+        self._visits: dict[str, _Visit] = {}
+        self._due: dict[int, list[_Visit]] = {}  # simulation step -> whom to ask again then
         self._most_detour = most_detour
         self._session, self._city, self._compliance, self._random = session, city, compliance, random
         self._index = {edge: n for n, edge in enumerate(city.edges)}
@@ -104,6 +125,7 @@ class Guide:
         A mean, because the speed at one instant is that of a red or a green signal, every time the same one.
         """
         self._splits = splits
+        self._interval += 1
         if splits is not None:
             if speed is not None:
                 now = np.where(np.isnan(speed), self._free, self._length / np.maximum(speed, SLOWEST))
@@ -113,25 +135,41 @@ class Guide:
             self._wished *= MEMORY
 
     def apply(self, events: list[Event]) -> None:
-        """Guide the vehicles that departed or entered a region in the last step."""
+        """Guide the vehicles that departed or entered a region in the last step, and those whose time has come."""
         if self._splits is None:
             return
+        self._steps += 1
         for event in events:
+            self._visits.pop(event.vehicle, None)
             if event.free and self._random.random() < self._compliance:
-                taste, target = int(self._random.integers(TASTES)), self._index.get(event.edge)
-                here = self._index.get(self._session.road(event.vehicle))
-                if target is None:  # it may use roads that are closed to cars, a taxi on its way to a bus road
-                    continue
-                if here is None or self._region[here] != event.region:  # on a junction already: too late to turn
-                    continue
-                if event.region == event.destination:
-                    self._guide_home(event, here, target, taste)
-                else:
-                    self._guide_on(event, here, target, taste)
+                visit = _Visit(event, int(self._random.integers(TASTES)))
+                if event.edge in self._index:  # or it may use roads that are closed to cars, as taxis do
+                    self._ask(visit)
+        for visit in self._due.pop(self._steps, ()):
+            if self._visits.get(visit.event.vehicle) is visit:
+                self._ask(visit)
 
-    def _guide_home(self, event: Event, here: int, target: int, taste: int) -> None:
+    def _ask(self, visit: _Visit) -> None:
+        """Guide a driver, unless he is on a junction or in the next region already: too late to turn."""
+        event, after = visit.event, self._period
+        try:
+            here = self._index.get(self._session.road(event.vehicle))
+        except REFUSALS:  # he has arrived
+            self._visits.pop(event.vehicle, None)
+            return
+        if here is None or self._region[here] != event.region:
+            after = min(self._period, 1)
+        elif event.region == event.destination:
+            self._guide_home(visit, here, self._index[event.edge])
+        else:
+            self._guide_on(visit, here, self._index[event.edge])
+        if after:
+            self._visits[event.vehicle] = visit
+            self._due.setdefault(self._steps + after, []).append(visit)
+
+    def _guide_home(self, visit: _Visit, here: int, target: int) -> None:
         """The fastest way inside the region of destination; if ways may return, the fastest of all."""
-        home = self._home(event.region, taste)
+        event, home = visit.event, self._home(visit.event.region, visit.taste)
         present = self._present(event.vehicle)
         takes, bound = self._takes(present, here, home.time)
         cost = home.cost(here, target, takes + 1.0 if bound else np.inf)
@@ -139,9 +177,9 @@ class Guide:
             return
         self._send(event.vehicle, home.route(here, target))
 
-    def _guide_on(self, event: Event, here: int, target: int, taste: int) -> None:
+    def _guide_on(self, visit: _Visit, here: int, target: int) -> None:
         """The next region, and the fastest way through it."""
-        ways = self._ways_from(event.region, taste)
+        event, ways = visit.event, self._ways_from(visit.event.region, visit.taste)
         present = self._present(event.vehicle)
         takes, bound = self._takes(present, here, ways.time)
         cost, reached = ways.cost(here, target, self._most_detour + takes + 1.0 if bound else np.inf)
@@ -152,7 +190,7 @@ class Guide:
         fastest = min(least, default=np.inf)
         returning = None  # the next region of the fastest way of all, where that is one that comes back
         if self._ways_return:
-            home = self._home(event.region, taste)
+            home = self._home(event.region, visit.taste)
             of_all = home.cost(here, target, takes + 1.0 if bound else np.inf)
             if of_all < fastest:
                 way, fastest = home.route(here, target), of_all
@@ -184,8 +222,13 @@ class Guide:
                 way = ways.route(here, int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]])), target)
             if not self._send(event.vehicle, way):
                 return
+        if visit.following is not None:  # what he was told before does not count any more
+            before = event.region, visit.following, event.destination
+            self.realised[before] -= 1
+            self._assigned[before] -= MEMORY ** (self._interval - visit.interval)
         self.realised[event.region, following, event.destination] += 1
         self._assigned[event.region, following, event.destination] += 1.0
+        visit.following, visit.interval = following, self._interval
 
     def _present(self, vehicle: str) -> list[int] | None:
         """The edges of the driver's present way from where he is; None where it uses roads that are closed to cars."""

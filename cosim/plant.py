@@ -137,7 +137,7 @@ class SumoPlant:
             self._estimator = Estimator(self._model, self._instruments)
         self._guide = Guide(
             self._session, self.city, scenario.network.nominal_splits, compliance=chosen.compliance,
-            most_detour=chosen.most_detour, ways_return=chosen.ways_return,
+            most_detour=chosen.most_detour, ways_return=chosen.ways_return, period=chosen.guidance_period,
             random=np.random.default_rng([seed, 0x67756964]))
         self._incidents = Incidents(faults.of(scenario), self._session, self.city)
         self._max_pressure, self._rationed = None, {}

@@ -24,10 +24,13 @@ MODES = (HOLD_BACK, REDISTRIBUTE)
 _WORDS = {
     **{name: ("signals", name) for name in SIGNALS[1:]}, **{name: ("actuation", name) for name in MODES},
     "estimate": ("measurement", "estimate")}
-# Option with a number -> (field of cosim.sumo_settings.Settings, least percentage); at most 100.
-_PERCENTAGES = {
-    "rerouting": ("rerouting", 1), "compliance": ("compliance", 0), "queue-override": ("queue_override", 1)}
-OPTIONS = (*_WORDS, *(f"{name}-N" for name in _PERCENTAGES))
+PERCENT, SECONDS = "percent", "seconds"
+# Option with a whole number -> (field of cosim.sumo_settings.Settings, least, most, its unit).
+_NUMBERS = {
+    "rerouting": ("rerouting", 1, 100, PERCENT), "compliance": ("compliance", 0, 100, PERCENT),
+    "queue-override": ("queue_override", 1, 100, PERCENT),
+    "guidance-period": ("guidance_period", 1, 3600, SECONDS)}
+OPTIONS = (*_WORDS, *(f"{name}-N" for name in _NUMBERS))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,15 +103,15 @@ def _option(word: str) -> tuple[str, object] | None:
     if word in _WORDS:
         return _WORDS[word]
     stem, _, digits = word.rpartition("-")
-    if stem in _PERCENTAGES and digits.isascii() and digits.isdigit():
-        key, least = _PERCENTAGES[stem]
-        if least <= int(digits) <= 100 and digits == str(int(digits)):
-            return key, int(digits) / 100
+    if stem in _NUMBERS and digits.isascii() and digits.isdigit():
+        key, least, most, unit = _NUMBERS[stem]
+        if least <= int(digits) <= most and digits == str(int(digits)):
+            return key, int(digits) / 100 if unit == PERCENT else float(digits)
     return None
 
 
 def _unknown(name: str, word: str, *, controllers: bool) -> InputError:
     where = f"controller {name!r}" if word == name else f"strategy {name!r}: {word!r}"
-    ranges = ", ".join(f"{stem}-N from {least} to 100" for stem, (_, least) in _PERCENTAGES.items())
+    ranges = ", ".join(f"{stem}-N from {least} to {most} {unit}" for stem, (_, least, most, unit) in _NUMBERS.items())
     first = f"{', '.join(registry.choice())} or file.py:Class, with options joined by +: " if controllers else ""
-    return InputError(f"{where} is unknown; choose from {first}{', '.join(OPTIONS)} (in whole percent, {ranges})")
+    return InputError(f"{where} is unknown; choose from {first}{', '.join(OPTIONS)} (whole numbers, {ranges})")

@@ -20,6 +20,8 @@ class Settings:
     queue_override: a gateway whose edge held this share of its room in the last control interval is left open, 0 for
         never [-]
     compliance: share of the decisions in which a driver follows the route guidance [-]
+    guidance_period: guided drivers are asked again after this time in the same region [s]; 0: when they depart and
+        when they enter a region only
     most_detour: a driver does not follow route guidance into a next region that costs him more than this [s]
     ways_return: whether guided drivers may leave a region and come back to it where that is the fastest way of all, as
         on a main road along a ragged boundary
@@ -48,6 +50,7 @@ class Settings:
     min_green: float = 5.0
     queue_override: float = 0.0
     compliance: float = 1.0
+    guidance_period: float = 0.0
     most_detour: float = 60.0
     ways_return: bool = False
     rerouting: float = 0.0
@@ -80,6 +83,7 @@ def settings(scenario: Scenario) -> Settings:
         min_green=table.number("min_green", default.min_green, low=1.0),
         queue_override=table.number("queue_override", default.queue_override, low=0.0, high=1.0),
         compliance=table.number("compliance", default.compliance, low=0.0, high=1.0),
+        guidance_period=table.number("guidance_period", default.guidance_period, low=0.0),
         most_detour=table.number("most_detour", default.most_detour, low=0.0),
         ways_return=table.flag("ways_return", default.ways_return),
         rerouting=table.number("rerouting", default.rerouting, low=0.0, high=1.0),

@@ -493,6 +493,7 @@ LINES = {
     """,
     "cosim": """
         run {g} --controller x|pi-gating+|+|pi-gating+x|rerouting-0|rerouting-101|webster+actuated|compliance-1.5
+        run {g} --controller dpc-pcrg+guidance-period-0|guidance-period-2.5
         run {g} --controller
         run {g}
         run

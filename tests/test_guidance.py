@@ -1,8 +1,11 @@
 """The searches of route guidance against all ways there are, in a small random city."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
+import libsumo
 import numpy as np
 import pytest
 
@@ -97,8 +100,11 @@ REGION_OF = {"a": 0, "b": 0, "m": 1, "s": 0, "t": 2}
 AFTER = {"a": ("m", "s"), "b": ("t",), "m": ("b",), "s": ("t",), "t": ()}
 
 
-def guided(route, *, ways_return, side=40.0, to_region_1=0.5):
-    """The route of a driver on a bound for t after guidance, and the region for which he is said to leave."""
+DRIVER = Event(vehicle="driver", source=None, region=0, destination=2, edge="t")
+
+
+def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0):
+    """A guide, its commands, the routes of the drivers, and where they are, which is at their routes' first edges."""
     moves = [(e, f) for e, after in AFTER.items() for f in after]
     edges = tuple(sorted(AFTER))
     city = City(
@@ -108,17 +114,23 @@ def guided(route, *, ways_return, side=40.0, to_region_1=0.5):
         gateways=tuple(sorted((
             Gateway(source=REGION_OF[e], target=REGION_OF[f], from_edge=e, to_edge=f, signal=None, links=())
             for e, f in moves if REGION_OF[e] != REGION_OF[f]), key=lambda g: (g.source, g.target))))
-    routes = {"driver": route}
+    routes, road = {"driver": route}, Mock(side_effect=lambda vehicle: routes[vehicle][0])
     session = SimpleNamespace(
-        road=lambda vehicle: routes[vehicle][0], route=routes.get, route_index=lambda vehicle: 0,
+        road=road, route=routes.get, route_index=lambda vehicle: 0, step_length=1.0,
         set_route=lambda vehicle, way: routes.update({vehicle: tuple(way)}) or True)
     own, splits = np.zeros((2, 3, 3, 3))
     own[0, 1:, 2], own[1, 0, 2] = 0.5, 1.0
     splits[0, 1:, 2], splits[1, 0, 2] = (to_region_1, 1.0 - to_region_1), 1.0
     guide = Guide(session, city, own, compliance=1.0, most_detour=60.0, random=np.random.default_rng(0),
-                  ways_return=ways_return)
+                  ways_return=ways_return, period=period)
     guide.command(splits, None)
-    guide.apply([Event(vehicle="driver", source=None, region=0, destination=2, edge="t")])
+    return guide, splits, routes, road
+
+
+def guided(route, **chosen):
+    """The route of a driver on a bound for t after guidance, and the region for which he is said to leave."""
+    guide, _, routes, _ = crossroads(route, **chosen)
+    guide.apply([DRIVER])
     return "".join(routes["driver"]), int(guide.realised[0, :, 2].argmax())
 
 
@@ -133,6 +145,40 @@ def test_ways_that_return_are_taken_where_they_are_faster_and_no_command_for_the
     assert guided(tuple("ambt"), ways_return=True, side=2.0) == ("ast", 2)
     for to_region_1 in (0.0, 0.5, 1.0):  # nobody can leave for 1 for good: there is no other way on than back
         assert guided(tuple("ambt"), ways_return=True, to_region_1=to_region_1)[0] == "ambt"
+
+
+def test_drivers_are_asked_again_where_they_are():
+    """On his way over m, which comes to a stand, a driver turns into the side street if he is asked in time."""
+    for period, asked in ((0.0, 99), (2.5, 3), (6.0, 6)):
+        guide, splits, routes, _ = crossroads(tuple("ambt"), ways_return=True, period=period)
+        guide.apply([DRIVER])
+        guide.command(splits, np.array([np.nan, np.nan, 0.1, np.nan, np.nan]))  # m/s on a, b, m, s, t
+        for step in range(1, 9):
+            guide.apply([])
+            assert "".join(routes["driver"]) == ("ast" if step >= asked else "ambt")
+            assert guide.realised.sum() == guide.realised[0, 2, 2] == 1
+
+
+def test_on_a_junction_it_is_too_late_and_who_arrived_is_not_asked():
+    guide, splits, routes, road = crossroads(tuple("ambt"), ways_return=True, period=2.0)
+    guide.apply([DRIVER])
+    guide.command(splits, np.array([np.nan, np.nan, 0.1, np.nan, np.nan]))
+    road.side_effect = [":junction", ":junction", "a", libsumo.TraCIException("not known")]
+    for expected in ("ambt", "ambt", "ambt", "ast", "ast", "ast", "ast", "ast", "ast"):
+        guide.apply([])
+        assert "".join(routes["driver"]) == expected
+    assert road.call_count == 5  # when he came, twice on the junction, behind it, and when he had arrived
+
+
+def test_whoever_comes_into_another_region_is_no_more_asked_as_in_the_one_before():
+    guide, _, routes, road = crossroads(tuple("ambt"), ways_return=True, period=2.0)
+    guide.apply([DRIVER])
+    routes["driver"] = tuple("mbt")
+    guide.apply([replace(DRIVER, source=0, region=1)])
+    for calls in (2, 3, 3, 4):  # every two steps, since he came to m
+        guide.apply([])
+        assert road.call_count == calls
+    assert guide.realised.sum() == 2
 
 
 def test_shifted_shares_keep_their_sum_and_follow_theta():

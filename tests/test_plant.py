@@ -191,6 +191,19 @@ def test_compliance_zero_reroutes_nobody(scenario, plant_of):
     assert record.guided.sum() == 0
 
 
+def test_guided_vehicles_are_asked_again(scenario, plant_of):
+    """The ledger is checked at every step; who was told something else counts for the last only."""
+    plant = plant_of()
+    _, once = drive(plant, scenario, guidance=True)
+    plant.close()
+    asked = plant_of(guidance_period=5.0)
+    (first, record), (second, _) = (drive(asked, scenario, guidance=True) for _ in range(2))
+    assert (record.arrivals != once.arrivals).any()
+    assert 0 < record.guided.sum() <= record.departures.sum() + record.crossings.sum()
+    assert (record.guided.sum(axis=0) >= 0).all()
+    assert [m.accumulation.tolist() for m in first] == [m.accumulation.tolist() for m in second]
+
+
 def test_same_seed_same_city(scenario, plant_of):
     plant = plant_of()
     runs = [drive(plant, scenario, seed=seed, guidance=True) for seed in (3, 3, 4)]

@@ -20,6 +20,7 @@ from nmfd.errors import InputError
     ("pi-gating+estimate", "pi-gating", {"gateways_fixed": True, "measurement": "estimate"}),
     ("dpc-pcrg+redistribute+compliance-0", "dpc-pcrg",
      {"gateways_fixed": True, "actuation": "redistribute", "compliance": 0.0}),
+    ("dpc-pcrg+guidance-period-90", "dpc-pcrg", {"gateways_fixed": True, "guidance_period": 90.0}),
 ])
 def test_what_a_name_means(name, controller, overrides):
     strategy = parse(name)
@@ -54,7 +55,9 @@ def test_a_strategy_uses_the_table_that_fits_it_best():
     ("dpc-pc+pi-gating", "'pi-gating' is unknown"),
     ("webster+no-control", "'no-control' is unknown"),
     ("rerouting-0", "rerouting-N from 1 to 100"),
-    ("rerouting-101", "unknown"),
+    ("rerouting-101", "rerouting-N from 1 to 100 percent"),
+    ("guidance-period-0", "guidance-period-N from 1 to 3600 seconds"),
+    ("dpc-pcrg+guidance-period-3601", "unknown"),
     ("rerouting-05", "unknown"),
     ("rerouting", "unknown"),
     ("rerouting-2.5", "unknown"),
