@@ -125,8 +125,8 @@ class Guide:
         A mean, because the speed at one instant is that of a red or a green signal, every time the same one.
         """
         self._splits = splits
-        self._interval += 1
         if splits is not None:
+            self._interval += 1
             if speed is not None:
                 now = np.where(np.isnan(speed), self._free, self._length / np.maximum(speed, SLOWEST))
                 self._time += SMOOTHING * (np.maximum(now, self._free) - self._time)
