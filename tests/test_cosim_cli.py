@@ -138,7 +138,7 @@ def error_line(result):
 @pytest.mark.parametrize("old, new, expected", [
     ("compliance = 1.0", "complience = 1.0", "sumo.complience: unknown key"),
     ("compliance = 1.0", "compliance = 2.0", "sumo.compliance: expected a number in [0, 1], got 2.0 instead"),
-    ("compliance = 1.0", "guidance_period = -1", "sumo.guidance_period: expected a number"),
+    ("guidance_period = 0.0", "guidance_period = -1", "sumo.guidance_period: expected a number"),
     ('actuation = "hold-back"', 'actuation = "hold"', "sumo.actuation: expected one of hold-back, redistribute"),
     ('actuation = "hold-back"', 'signals = "green"', "sumo.signals: expected one of fixed, webster, actuated, max-pr"),
     ("step_length = 1.0", "step_length = 0.7", "sumo.step_length: expected a divisor of the control interval"),
