@@ -151,7 +151,7 @@ class Guide:
 
     def _ask(self, visit: _Visit) -> None:
         """Guide a driver, unless he is on a junction or in the next region already: too late to turn."""
-        event, after = visit.event, self._period
+        event, target, after = visit.event, self._index[visit.event.edge], self._period
         try:
             here = self._index.get(self._session.road(event.vehicle))
         except REFUSALS:  # he has arrived
@@ -160,9 +160,9 @@ class Guide:
         if here is None or self._region[here] != event.region:
             after = min(self._period, 1)
         elif event.region == event.destination:
-            self._guide_home(visit, here, self._index[event.edge])
+            self._guide_home(visit, here, target)
         else:
-            self._guide_on(visit, here, self._index[event.edge])
+            self._guide_on(visit, here, target)
         if after:
             self._visits[event.vehicle] = visit
             self._due.setdefault(self._steps + after, []).append(visit)
