@@ -14,27 +14,26 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from cosim.api import run
-    from cosim.experiment import experiment as run_tasks
-    from cosim.experiment import overview, read_run
-    from cosim.plant import SumoPlant
-    from cosim.simulate import Result, Task
-    from cosim.sumo_settings import Settings, settings
-    from cosim.sweeps import Sweep, sweep
+    from cosim.evaluation.experiment import experiment as run_tasks
+    from cosim.evaluation.experiment import overview, read_run
+    from cosim.evaluation.simulate import Result, Task
+    from cosim.evaluation.sweeps import Sweep, sweep
+    from cosim.plant.plant import SumoPlant
+    from cosim.plant.settings import Settings, settings
 
 __all__ = [
     "Result", "Settings", "SumoPlant", "Sweep", "Task", "overview", "read_run", "run", "run_tasks", "settings", "sweep"]
 _PLACES = {
-    "Result": "simulate.Result", "Settings": "sumo_settings.Settings", "SumoPlant": "plant.SumoPlant",
-    "Task": "simulate.Task",
-    "overview": "experiment.overview", "read_run": "experiment.read_run", "run": "api.run",
-    "run_tasks": "experiment.experiment", "settings": "sumo_settings.settings", "Sweep": "sweeps.Sweep",
-    "sweep": "sweeps.sweep"}
+    "Result": "evaluation.simulate.Result", "Settings": "plant.settings.Settings", "SumoPlant": "plant.plant.SumoPlant",
+    "Task": "evaluation.simulate.Task", "overview": "evaluation.experiment.overview",
+    "read_run": "evaluation.experiment.read_run", "run": "api.run", "run_tasks": "evaluation.experiment.experiment",
+    "settings": "plant.settings.settings", "Sweep": "evaluation.sweeps.Sweep", "sweep": "evaluation.sweeps.sweep"}
 
 
 def __getattr__(name: str):
     if name not in _PLACES:
         raise AttributeError(f"module 'cosim' has no attribute {name!r}")
-    module, attribute = _PLACES[name].split(".")
+    module, _, attribute = _PLACES[name].rpartition(".")
     return getattr(import_module(f"cosim.{module}"), attribute)
 
 

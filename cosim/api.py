@@ -4,12 +4,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from cosim.simulate import Result, drive
-from cosim.strategy import ALONE, configured, modelled, parse
-from cosim.sumo_output import check
+from cosim.evaluation.simulate import Result, drive
+from cosim.plant.strategy import ALONE, configured, modelled, parse
+from cosim.sumo.outputs import check
 from nmfd.api import named
 from nmfd.errors import InputError
-from nmfd.scenario import Scenario, load_scenario
+from nmfd.model.scenario import Scenario, load_scenario
 from nmfd.types import Controller
 
 
@@ -33,8 +33,8 @@ def run(
     sumo_output: files of SUMO's own outputs: {"tripinfo": "trips.xml"}, also summary, edgedata, emission
     progress: called as progress(done, steps) after every control interval
 
-    The result holds `trajectory` (nmfd.Trajectory), `record` (arrays, see cosim.record.Record) and `facts` (the row of
-    sumo.csv). The same seed gives the same result, but for wall times. Raises InputError, and RuntimeError while
+    The result holds `trajectory` (nmfd.Trajectory), `record` (arrays, see cosim.plant.record.Record) and `facts` (the
+    row of sumo.csv). The same seed gives the same result, but for wall times. Raises InputError, and RuntimeError while
     another simulation is open in this process.
     """
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from nmfd.api import benchmark, controller, run, train
-    from nmfd.benchmarks import table
     from nmfd.errors import InputError
     from nmfd.metrics import summary, total_time_spent
-    from nmfd.network import Network, load_network
-    from nmfd.plant import AcyclicPlant, NmfdPlant
-    from nmfd.runs import read_trajectory, write_trajectory
-    from nmfd.scenario import Scenario, load_scenario
+    from nmfd.model.plant import AcyclicPlant, NmfdPlant
+    from nmfd.model.regional_model import Network, load_network
+    from nmfd.model.scenario import Scenario, load_scenario
+    from nmfd.runs.run_folder import read_trajectory, write_trajectory
+    from nmfd.studies.benchmark import table
     from nmfd.types import Controller, Controls, Measurement, Plant, Trajectory
 
 __all__ = [
@@ -30,10 +30,10 @@ __all__ = [
     "Trajectory", "benchmark", "controller", "load_network", "load_scenario", "read_trajectory", "run", "summary",
     "table", "total_time_spent", "train", "write_trajectory"]
 _MODULES = {
-    "api": ("benchmark", "controller", "run", "train"), "benchmarks": ("table",), "errors": ("InputError",),
-    "metrics": ("summary", "total_time_spent"), "network": ("Network", "load_network"),
-    "plant": ("AcyclicPlant", "NmfdPlant"), "runs": ("read_trajectory", "write_trajectory"),
-    "scenario": ("Scenario", "load_scenario"),
+    "api": ("benchmark", "controller", "run", "train"), "studies.benchmark": ("table",), "errors": ("InputError",),
+    "metrics": ("summary", "total_time_spent"), "model.regional_model": ("Network", "load_network"),
+    "model.plant": ("AcyclicPlant", "NmfdPlant"), "runs.run_folder": ("read_trajectory", "write_trajectory"),
+    "model.scenario": ("Scenario", "load_scenario"),
     "types": ("Controller", "Controls", "Measurement", "Plant", "Trajectory")}
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

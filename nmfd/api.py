@@ -4,10 +4,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from nmfd import closed_loop, runs
+from nmfd import closed_loop
 from nmfd.controllers import registry
 from nmfd.errors import InputError
-from nmfd.scenario import Scenario, load_scenario
+from nmfd.model.scenario import Scenario, load_scenario
+from nmfd.runs import run_folder
 from nmfd.types import Controller, Plant, Trajectory
 
 
@@ -41,7 +42,7 @@ def run(
 
     The same seed gives the same trajectory (but for wall times). Raises InputError.
     """
-    from nmfd.benchmarks import PLANTS
+    from nmfd.studies.benchmark import PLANTS
 
     scenario = _loaded(scenario)
     if steps is not None:
@@ -54,7 +55,7 @@ def run(
     name, acting = named(controller, scenario, policy)
     driven = PLANTS[plant](scenario) if isinstance(plant, str) else plant
     trajectory = closed_loop.run(driven, acting, scenario, seed=seed, progress=progress)
-    return runs.labelled(
+    return run_folder.labelled(
         trajectory, controller=name, plant=plant if isinstance(plant, str) else type(plant).__name__)
 
 
@@ -69,14 +70,14 @@ def benchmark(
     out: the run folder, runs/<scenario>-<time> if None; finished runs in it are kept
     policies: controller -> file, if not SCENARIO/NAME.pt
 
-    `nmfd.table(rows)` gives the text that the command prints. Raises InputError and nmfd.workers.RunFailed.
+    `nmfd.table(rows)` gives the text that the command prints. Raises InputError and nmfd.runs.workers.RunFailed.
     """
-    from nmfd import benchmarks
+    from nmfd.studies import benchmark as benchmarks
 
     scenario = _loaded(scenario)
     return benchmarks.benchmark(
         scenario, list(controllers), range(seeds) if isinstance(seeds, int) else list(seeds), plant,
-        out=runs.default_folder(scenario) if out is None else Path(out),
+        out=run_folder.default_folder(scenario) if out is None else Path(out),
         policies={name: Path(file) for name, file in (policies or {}).items()}, workers=workers, progress=progress)
 
 
@@ -88,7 +89,7 @@ def train(
 
     steps: Adam steps; what scenario.toml says, else 400, if None. Raises InputError.
     """
-    from nmfd import training
+    from nmfd.controllers.dpc import training
 
     return training.train(
         _loaded(scenario), controller, seed=seed, out=Path(out), steps=steps, resume=resume, progress=progress)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from nmfd import faults
-from nmfd.scenario import Scenario
+from nmfd.model.scenario import Scenario
 from nmfd.types import Controller, Controls, Measurement, Plant, Trajectory
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nmfd.errors import InputError
-from nmfd.scenario import Scenario
+from nmfd.model.scenario import Scenario
 from nmfd.types import Controller, Controls, Measurement
 
 # Kind -> what its value is, or None. Of the measurements, of what computes the controls, and of the city.

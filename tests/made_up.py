@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim import evaluate, experiment
-from cosim.city import ensure_built
-from cosim.regions import load_city
-from cosim.simulate import FACTS, Result, scenario_of
-from nmfd.scenario import load_scenario
+from cosim.evaluation import evaluate, experiment
+from cosim.evaluation.simulate import FACTS, Result, scenario_of
+from cosim.sumo.build import ensure_built
+from cosim.sumo.net import load_city
+from nmfd.model.scenario import load_scenario
 from nmfd.types import Trajectory
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
@@ -57,7 +57,7 @@ def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(experiment, "outcomes", lambda function, todo, workers, *, fresh: (
             (task, result(task, city)) for task in todo))
-        patch.setattr(evaluate.report, "draw_all", lambda *_: None)
+        patch.setattr(evaluate.pictures, "draw_all", lambda *_: None)
         evaluate.evaluate(evaluate.Evaluation(
             scenario=SCENARIO, controllers=controllers, seeds=seeds, levels=levels, steps=STEPS, out=out))
     return out

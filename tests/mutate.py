@@ -1,7 +1,7 @@
 """Mutants of one module: it is changed in one place at a time, and its tests should notice. What they do not notice is
 in mutants.md beside this file, with the reason.
 
-    python tests/mutate.py nmfd.dynamics tests/test_dynamics.py tests/test_ledger.py --log dynamics.log
+    python tests/mutate.py nmfd.model.dynamics tests/test_dynamics.py tests/test_ledger.py --log dynamics.log
 
 Every mutant runs in a forked process, in which pytest stops at the first failure. The same command goes on where it was
 interrupted: what is in the log is not run again.
@@ -95,7 +95,7 @@ def noticed(name: str, tree: ast.Module, tests: list[str]) -> bool:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("module", help="such as nmfd.dynamics")
+    parser.add_argument("module", help="such as nmfd.model.dynamics")
     parser.add_argument("tests", nargs="+", help="what pytest is to run, the quickest first")
     parser.add_argument("--log", type=Path, required=True, help="a line per mutant; what is in it is not run again")
     order = parser.parse_args()

@@ -4,8 +4,10 @@ import pytest
 import tiny
 from click.testing import CliRunner
 
-from nmfd import ablation, disk, plots, plots_experiments, training
-from nmfd.cli import main
+from nmfd.cli.main import main
+from nmfd.controllers.dpc import training
+from nmfd.runs import files
+from nmfd.studies import ablation, plots, plots_studies
 
 
 @pytest.fixture
@@ -27,11 +29,11 @@ def test_training_compares_both_methods_on_the_plant(training_command, tmp_path)
     out = tmp_path / "out"
     result = nmfd(*training_command)
     assert result.exit_code == 0, result.stderr
-    curve = disk.read_rows(out / "validation.csv", ablation.VALIDATION_COLUMNS)
+    curve = files.read_rows(out / "validation.csv", ablation.VALIDATION_COLUMNS)
     assert [(row["method"], row["adam_step"]) for row in curve] == [
         ("alternating", 1), ("alternating", 2), ("joint", 1), ("joint", 2)]
     assert curve[1]["total_time_spent_veh_s"] != curve[3]["total_time_spent_veh_s"]
-    rows = disk.read_rows(out / "training.csv", ablation.TRAINING_COLUMNS)
+    rows = files.read_rows(out / "training.csv", ablation.TRAINING_COLUMNS)
     assert [(row["method"], row["seed"], row["adam_steps"]) for row in rows] == [("alternating", 0, 2), ("joint", 0, 2)]
     for row in rows:
         points = [point["total_time_spent_veh_s"] for point in curve if point["method"] == row["method"]]
@@ -54,7 +56,7 @@ def test_training_is_not_repeated_and_seeds_can_be_added(training_command, tmp_p
     assert nmfd(*training_command).stdout == result.stdout and not trained
     assert nmfd(*training_command, "--seeds", 2).exit_code == 0
     assert trained == [1, 1]
-    assert len(disk.read_rows(tmp_path / "out" / "validation.csv", ablation.VALIDATION_COLUMNS)) == 8
+    assert len(files.read_rows(tmp_path / "out" / "validation.csv", ablation.VALIDATION_COLUMNS)) == 8
     refused = nmfd(*training_command, "--steps", 3)
     assert refused.exit_code == 2 and "adam_steps: 2 there, 3 asked for" in refused.stderr
 
@@ -84,7 +86,7 @@ def test_horizon_runs_every_length_and_can_be_extended(folder, tmp_path):
     assert nmfd(*command, "2").exit_code == 0
     result = nmfd(*command, "2,4")
     assert result.exit_code == 0, result.stderr
-    rows = disk.read_rows(out / "horizon.csv", ablation.HORIZON_COLUMNS)
+    rows = files.read_rows(out / "horizon.csv", ablation.HORIZON_COLUMNS)
     assert [(row["controller"], row["horizon"]) for row in rows] == [("mpc-pc", 2), ("mpc-pc", 4)]
     assert "horizon  4" in result.stdout and (out / "horizon.png").stat().st_size > 1000
 
@@ -105,7 +107,7 @@ def test_curves_show_the_best_so_far_of_every_seed():
     rows = [
         dict(zip(ablation.VALIDATION_COLUMNS, ("joint", seed, step, total), strict=True))
         for seed, totals in enumerate(([4.0, 5.0, 2.0], [8.0, 1.0, 3.0])) for step, total in enumerate(totals)]
-    ax = plots_experiments.training_curves(plots.figure(4, 3).subplots(), rows)
+    ax = plots_studies.training_curves(plots.figure(4, 3).subplots(), rows)
     assert list(ax.lines[0].get_ydata()) == [6.0, 2.5, 1.5] and "2 seeds" in ax.lines[0].get_label()
     assert "veh s" in ax.get_ylabel()
 
@@ -113,7 +115,7 @@ def test_curves_show_the_best_so_far_of_every_seed():
 def test_every_trained_policy_has_its_point():
     rows = [{"method": method, "total_time_spent_veh_s": total} for method, total in (
         ("alternating", 3.0), ("alternating", 5.0), ("joint", 2.0))]
-    ax = plots_experiments.trained(plots.figure(4, 3).subplots(), rows)
+    ax = plots_studies.trained(plots.figure(4, 3).subplots(), rows)
     assert [list(line.get_ydata()) for line in ax.lines] == [[3.0, 5.0], [2.0]]
     assert [text.get_text() for text in ax.get_xticklabels()] == ["alternating", "joint"]
     assert ax.collections[0].get_segments()[0][0][1] == 4.0

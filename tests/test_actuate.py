@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from cosim.actuate import YELLOW, Actuator, GatewaySignal, _apportion, yellow_time
-from cosim.strategy import MODES
-from cosim.sumo import Phase, Programme
+from cosim.plant.perimeter import YELLOW, Actuator, GatewaySignal, _apportion, yellow_time
+from cosim.plant.strategy import MODES
+from cosim.sumo.session import Phase, Programme
 
 MIN_GREEN = 5.0
 

@@ -10,14 +10,14 @@ import torch
 from click.testing import CliRunner
 
 from nmfd import api
-from nmfd.adaptation import CASES, changed
-from nmfd.cli import main
+from nmfd.cli.main import main
 from nmfd.controllers import registry
-from nmfd.controllers.dpc import Architecture, Policy, checkpoint
-from nmfd.controllers.online import ModelEstimate, OnlineDpc
+from nmfd.controllers.dpc.online import ModelEstimate, OnlineDpc
+from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
 from nmfd.metrics import total_time_spent
-from nmfd.plant import NmfdPlant
-from nmfd.scenario import load_scenario
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import load_scenario
+from nmfd.studies.adaptation import CASES, changed
 
 BENCHMARK = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")
 QUICK = {"dpc-pc-online": {"look_ahead": 10, "iterations": 2, "learning_rate": 0.05, "rollouts": 2}}

@@ -15,8 +15,8 @@ from click.testing import CliRunner
 
 import cosim
 import nmfd
-from nmfd import runs
-from nmfd.cli import main
+from nmfd.cli.main import main
+from nmfd.runs import run_folder
 
 ROOT = Path(__file__).parents[1]
 # As they stand in the README; there, without `steps`.
@@ -75,7 +75,7 @@ def test_run_and_benchmark_agree_with_the_command_line(tmp_path):
     nmfd.write_trajectory(tmp_path / "same.npz", trajectory)
     assert (tmp_path / "same.npz").read_bytes() == (out / "pi-gating-1.npz").read_bytes()
     rows = nmfd.benchmark(folder, ["pi-gating"], seeds=2, out=out)
-    assert rows == runs.read_summary(out / "summary.csv") and nmfd.table(rows) in done.output
+    assert rows == run_folder.read_summary(out / "summary.csv") and nmfd.table(rows) in done.output
 
 
 class Half:

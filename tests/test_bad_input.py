@@ -20,15 +20,17 @@ import tiny_city
 import torch
 from click.testing import CliRunner
 
-import cosim.cli
-import nmfd.cli
-from nmfd import benchmarks, closed_loop, training
-from nmfd.controllers.dpc import Architecture, Policy, checkpoint
-from nmfd.network import load_network
-from nmfd.scenario import load_scenario
+import cosim.cli.main
+import nmfd.cli.main
+from nmfd import closed_loop
+from nmfd.controllers.dpc import training
+from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
+from nmfd.model.regional_model import load_network
+from nmfd.model.scenario import load_scenario
+from nmfd.studies import benchmark
 
 ROOT = Path(__file__).parents[1]
-MAINS = {"nmfd": nmfd.cli.main, "cosim": cosim.cli.main}
+MAINS = {"nmfd": nmfd.cli.main.main, "cosim": cosim.cli.main.main}
 HEXAGON, ECONOMIC = ROOT / "networks" / "hexagon7", ROOT / "scenarios" / "economic_mpc"
 GRID, PEAK = ROOT / "networks" / "grid7", ROOT / "scenarios" / "grid7_peak"
 
@@ -43,7 +45,7 @@ def nothing_runs(monkeypatch):
     def accepted(*_, **__):
         raise Accepted
 
-    for module, name in ((closed_loop, "run"), (training, "train"), (benchmarks, "draw_scenario")):
+    for module, name in ((closed_loop, "run"), (training, "train"), (benchmark, "draw_scenario")):
         monkeypatch.setattr(module, name, accepted)
 
 
@@ -429,7 +431,7 @@ def test_other_files_of_sumo(copied, name):
 
 def test_unsorted_routes_are_sorted(copied):
     """What SUMO would refuse is no mistake here: vehicles are sorted by departure."""
-    from cosim.originals import read_originals
+    from cosim.sumo.recorded_trips import read_originals
 
     file = copied / "scenarios" / "tiny" / "vehicles.rou.xml.gz"
     root = gzip.decompress(file.read_bytes()).decode()
@@ -598,7 +600,7 @@ def test_the_same_in_a_process_of_its_own(tmp_path, call):
     places = {"s": tiny.write(tmp_path), "none": tmp_path / "none"}
     program, *arguments = call
     done = subprocess.run(
-        [sys.executable, "-m", f"{program}.cli", *(a.format(**places) for a in arguments)], capture_output=True,
+        [sys.executable, "-m", program, *(a.format(**places) for a in arguments)], capture_output=True,
         text=True, cwd=tmp_path)
     assert done.returncode == 2 and done.stdout == ""
     assert re.fullmatch(f"{program}: error: [^\n]+\n", done.stderr), done.stderr

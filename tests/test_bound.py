@@ -8,15 +8,16 @@ import pytest
 import tiny
 from click.testing import CliRunner
 
-from nmfd import bound, closed_loop
-from nmfd.cli import main
+from nmfd import closed_loop
+from nmfd.cli.main import main
 from nmfd.controllers import registry
-from nmfd.controllers.fixed import NoControl
-from nmfd.controllers.gating import PiGating
+from nmfd.controllers.no_control import NoControl
+from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
 from nmfd.metrics import total_time_spent
-from nmfd.plant import NmfdPlant
-from nmfd.scenario import load_scenario
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import load_scenario
+from nmfd.studies import bound
 
 ECONOMIC = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
 

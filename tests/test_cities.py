@@ -12,10 +12,10 @@ import sumo
 from click.testing import CliRunner
 from tiny_city import driven
 
-from cosim.cli import main
+from cosim.cli.main import main
 from cosim.importing.quality import pieces
 from cosim.importing.streets import read_streets
-from nmfd.scenario import load_scenario
+from nmfd.model.scenario import load_scenario
 
 GAMES = Path(sumo.SUMO_HOME) / "tools" / "game"
 CITIES = Path(os.environ.get("CITIES", Path(__file__).parents[2] / "shared" / "cities"))

@@ -11,10 +11,10 @@ import pytest
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from cosim.city import build, ensure_built, read_recipe
-from cosim.regions import check_adjacency, load_city
+from cosim.sumo.build import build, ensure_built, read_recipe
+from cosim.sumo.net import check_adjacency, load_city
 from nmfd.errors import InputError
-from nmfd.network import load_network
+from nmfd.model.regional_model import load_network
 
 GRID7 = Path(__file__).parents[1] / "networks" / "grid7"
 

@@ -12,10 +12,13 @@ import tiny
 import torch
 from click.testing import CliRunner
 
-from nmfd import benchmarks, closed_loop, rollout, runs, training
-from nmfd.cli import main
+from nmfd import closed_loop
+from nmfd.cli.main import main
 from nmfd.controllers import registry
-from nmfd.controllers.gating import PiGating
+from nmfd.controllers.dpc import rollout, training
+from nmfd.controllers.pi_gating import PiGating
+from nmfd.runs import run_folder
+from nmfd.studies import benchmark
 
 HEAVY = ("torch", "casadi", "libsumo", "numpy", "pandas", "matplotlib")
 TIMES = ("evaluation_time_s", "control_step_ms_median", "control_step_ms_max")
@@ -40,21 +43,21 @@ def benchmark_command(scenario, tmp_path):
 
 def timeless(folder):
     """The rows of summary.csv without what differs from run to run, and the bytes of every trajectory."""
-    rows = [{key: value for key, value in row.items() if key not in TIMES} for row in runs.read_summary(
+    rows = [{key: value for key, value in row.items() if key not in TIMES} for row in run_folder.read_summary(
         folder / "summary.csv")]
     return rows, {path.name: path.read_bytes() for path in folder.glob("*.npz")}
 
 
 def commands(package):
     """The command line itself and every command of `package`."""
-    group = importlib.import_module(f"{package}.cli").main
+    group = importlib.import_module(f"{package}.cli.main").main
     return [[], *([command] for command in group.commands)]
 
 
 @pytest.mark.parametrize("package", ["nmfd", "cosim"])
 def test_help_is_quick_and_shows_an_example(package):
     for command in commands(package):
-        call = [sys.executable, "-c", f"from {package}.cli import main; main()", *command, "--help"]
+        call = [sys.executable, "-c", f"from {package}.cli.main import main; main()", *command, "--help"]
         durations = []
         for _ in range(4):  # the least of them, and processor time: the machine has other work
             begin = os.times()
@@ -69,7 +72,7 @@ def test_help_is_quick_and_shows_an_example(package):
 
 @pytest.mark.parametrize("package", ["nmfd", "cosim"])
 def test_importing_the_command_line_imports_nothing_heavy(package):
-    code = f"import sys, {package}.cli; print(*[name for name in {HEAVY} if name in sys.modules])"
+    code = f"import sys, {package}.cli.main; print(*[name for name in {HEAVY} if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "\n"
 
 
@@ -107,8 +110,8 @@ def test_benchmark_writes_a_run_folder(benchmark_command, tmp_path):
 
 def test_trajectories_of_the_folder_agree_with_the_summary(benchmark_command, tmp_path):
     nmfd(*benchmark_command, "--plant", "acyclic")
-    for row in runs.read_summary(tmp_path / "out" / "summary.csv"):
-        trajectory = runs.read_trajectory(tmp_path / "out" / f"{row['controller']}-{row['seed']}.npz")
+    for row in run_folder.read_summary(tmp_path / "out" / "summary.csv"):
+        trajectory = run_folder.read_trajectory(tmp_path / "out" / f"{row['controller']}-{row['seed']}.npz")
         assert trajectory.plant == row["plant"] == "acyclic"
         assert 30.0 * trajectory.accumulation[:-1].sum() == pytest.approx(row["total_time_spent_veh_s"], rel=1e-12)
         assert np.all(trajectory.accumulation >= 0)
@@ -136,7 +139,7 @@ def test_an_interrupted_benchmark_goes_on(benchmark_command, tmp_path, monkeypat
     result = nmfd(*benchmark_command)
     assert result.exit_code == 130
     assert result.stderr.count("\n") == 1 and f"--out {tmp_path / 'out'} goes on" in result.stderr
-    assert len(runs.read_summary(tmp_path / "out" / "summary.csv")) == 2
+    assert len(run_folder.read_summary(tmp_path / "out" / "summary.csv")) == 2
     assert nmfd(*benchmark_command).exit_code == 0
     assert len(calls) == 5  # two, the interrupted one, and the two that were left
     assert timeless(tmp_path / "out") == timeless(tmp_path / "whole")
@@ -260,5 +263,5 @@ def test_show_draws_the_scenario(scenario, tmp_path):
 
 
 def test_interval_is_students():
-    assert benchmarks.interval([1.0, 2.0, 3.0]) == pytest.approx(4.3027 / 3**0.5, rel=1e-4)
-    assert np.isnan(benchmarks.interval([1.0]))
+    assert benchmark.interval([1.0, 2.0, 3.0]) == pytest.approx(4.3027 / 3**0.5, rel=1e-4)
+    assert np.isnan(benchmark.interval([1.0]))

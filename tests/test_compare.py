@@ -8,8 +8,7 @@ import pytest
 import tiny
 import torch
 
-from cosim.compare import errors, held_up, outflow_samples, predict, predict_next
-from cosim.identify import (
+from cosim.evaluation.identify import (
     as_it_was,
     fit_table,
     nearly_empty,
@@ -19,11 +18,12 @@ from cosim.identify import (
     static_model,
     unreached,
 )
-from cosim.simulate import Result
-from cosim.strategy import modelled
-from nmfd import dynamics, mfd
-from nmfd.network import load_network
-from nmfd.scenario import load_scenario
+from cosim.evaluation.model_validation import errors, held_up, outflow_samples, predict, predict_next
+from cosim.evaluation.simulate import Result
+from cosim.plant.strategy import modelled
+from nmfd.model import dynamics, mfd
+from nmfd.model.regional_model import load_network
+from nmfd.model.scenario import load_scenario
 from nmfd.types import Trajectory
 
 ROOT = Path(__file__).parents[1]

@@ -11,11 +11,11 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from cosim.cli import main
-from nmfd.controllers.dpc import Architecture, Policy, checkpoint
-from nmfd.network import load_network
-from nmfd.runs import COLUMNS
-from nmfd.scenario import as_modelled, load_scenario
+from cosim.cli.main import main
+from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
+from nmfd.model.regional_model import load_network
+from nmfd.model.scenario import as_modelled, load_scenario
+from nmfd.runs.run_folder import COLUMNS
 
 ROOT = Path(__file__).parents[1]
 GRID = ROOT / "networks" / "grid7"

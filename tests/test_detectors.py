@@ -7,19 +7,21 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cosim import estimates
-from cosim.city import ensure_built
-from cosim.detectors import instruments, lay_out, probes
-from cosim.plant import SumoPlant
-from cosim.regions import load_city
-from cosim.simulate import Task, scenario_of, simulate
-from cosim.strategy import modelled
-from cosim.sumo_settings import Settings, settings
-from nmfd import closed_loop, plots, runs
+from cosim.evaluation import estimation_errors
+from cosim.evaluation.simulate import Task, scenario_of, simulate
+from cosim.plant.detectors import instruments, lay_out, probes
+from cosim.plant.plant import SumoPlant
+from cosim.plant.settings import Settings, settings
+from cosim.plant.strategy import modelled
+from cosim.sumo.build import ensure_built
+from cosim.sumo.net import load_city
+from nmfd import closed_loop
 from nmfd.controllers import registry
-from nmfd.controllers.gating import PiGating
+from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
-from nmfd.scenario import load_scenario
+from nmfd.model.scenario import load_scenario
+from nmfd.runs import run_folder
+from nmfd.studies import plots
 from nmfd.types import Measurement
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
@@ -109,7 +111,7 @@ def test_the_closed_loop_runs_on_estimates(scenario, run):
     assert run.estimate.min() >= 0.0 and (run.estimate[0] == 0.0).all()
     assert (run.accumulation == np.round(run.accumulation)).all()
     assert (run.estimate[1:] != np.round(run.estimate[1:])).any()
-    rows = estimates.errors(scenario.network, run)
+    rows = estimation_errors.errors(scenario.network, run)
     assert [row["region"] for row in rows] == [*range(7), "all"]
     assert 0.0 < rows[-1]["rmse_share"] < 0.15 and 0.0 < rows[-1]["cell_rmse_veh"] < 10.0
     vehicles = run.accumulation[-1].sum()
@@ -159,20 +161,20 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
 def test_same_seed_same_bytes(scenario, run, tmp_path):
     again = drive(scenario, measurement="estimate")
     for name, trajectory in (("a", run), ("b", again)):
-        runs.write_trajectory(tmp_path / f"{name}.npz", trajectory)
+        run_folder.write_trajectory(tmp_path / f"{name}.npz", trajectory)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    assert (runs.read_trajectory(tmp_path / "a.npz").estimate == run.estimate).all()
+    assert (run_folder.read_trajectory(tmp_path / "a.npz").estimate == run.estimate).all()
 
 
 def test_table_and_picture(scenario, run, tmp_path):
-    rows = estimates.write(tmp_path, scenario.network, [run, replace(run, seed=4, estimate=None)])
+    rows = estimation_errors.write(tmp_path, scenario.network, [run, replace(run, seed=4, estimate=None)])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate-pi-gating-3.png", "estimation.csv"]
     assert len(pd.read_csv(tmp_path / "estimation.csv")) == len(rows) == 8
-    assert "x_ij RMSE" in estimates.table(rows) and "mean of the regions" in estimates.table(rows)
+    assert "x_ij RMSE" in estimation_errors.table(rows) and "mean of the regions" in estimation_errors.table(rows)
     ax = plots.region_estimate(plots.figure(4.0, 3.0).subplots(), scenario.network, 3, run)
     lines = [line.get_ydata() for line in ax.get_lines()]
     np.testing.assert_allclose(lines, [run.accumulation[:, 3].sum(axis=1), run.estimate[:, 3].sum(axis=1)])
-    assert estimates.write(tmp_path / "none", scenario.network, [replace(run, estimate=None)]).empty
+    assert estimation_errors.write(tmp_path / "none", scenario.network, [replace(run, estimate=None)]).empty
 
 
 @pytest.mark.parametrize("lines, problem", [

@@ -8,13 +8,14 @@ import pytest
 import tiny
 import torch
 
-from nmfd import dynamics, training
-from nmfd.controllers import dpc
-from nmfd.controllers.dpc import Architecture, DpcController, Policy, SoftExponential
-from nmfd.controllers.gating import PiGating
+from nmfd.controllers.dpc import policy as dpc
+from nmfd.controllers.dpc import training
+from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy, SoftExponential
+from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
-from nmfd.network import load_network
-from nmfd.scenario import load_scenario
+from nmfd.model import dynamics
+from nmfd.model.regional_model import load_network
+from nmfd.model.scenario import load_scenario
 from nmfd.types import Measurement
 
 NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")

@@ -9,9 +9,9 @@ import pytest
 import tiny
 import torch
 
-from nmfd import dynamics, dynamics_casadi
-from nmfd.mfd import Mfd
-from nmfd.network import LEAST_ROOM, Network, load_network
+from nmfd.model import dynamics, dynamics_casadi
+from nmfd.model.mfd import Mfd
+from nmfd.model.regional_model import LEAST_ROOM, Network, load_network
 
 STEP = 30.0
 NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from nmfd.closed_loop import run
-from nmfd.controllers.fixed import NoControl
+from nmfd.controllers.no_control import NoControl
 from nmfd.metrics import summary
-from nmfd.plant import NmfdPlant
-from nmfd.scenario import load_scenario
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import load_scenario
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
 

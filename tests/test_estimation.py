@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from nmfd import dynamics, estimation
-from nmfd.estimation import Estimator, Instruments, Observation, bounded
-from nmfd.plant import NmfdPlant
-from nmfd.scenario import load_scenario
+from nmfd.model import dynamics, estimation
+from nmfd.model.estimation import Estimator, Instruments, Observation, bounded
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import load_scenario
 from nmfd.types import Controls
 
 # With one curve per region, as published: what is tested here is the filter, not how good a model a city has.

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim import facts
-from cosim.plant import SumoPlant
-from cosim.regions import edge_room
-from cosim.trip_facts import CLASS, read_trip_facts
-from nmfd.scenario import load_scenario
+from cosim.evaluation import run_metrics
+from cosim.plant.plant import SumoPlant
+from cosim.sumo.net import edge_room
+from cosim.sumo.tripinfo import CLASS, read_trip_facts
+from nmfd.model.scenario import load_scenario
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
@@ -26,7 +26,7 @@ def test_trips_under_way_and_not_departed_count_with_what_they_have_spent(tmp_pa
     read = read_trip_facts(path)
     assert (read.trips, read.completed, read.travel_time, read.departure_delay) == (3, 1, 170.0, 45.0)
     assert (read.co2, read.fuel) == (4.0, 2.0)
-    row = facts.trip_facts(read)
+    row = run_metrics.trip_facts(read)
     assert row["mean_trip_time_s"] == pytest.approx(170 / 3) and row["mean_departure_delay_s"] == 15.0
 
 
@@ -83,7 +83,7 @@ def test_full_edges_before_gateways(run):
     plant, record, _, _ = run
     city, room = plant.city, edge_room(plant.city)
     for share, expected in ((0.0, 0.0), (0.7, 0.0), (0.9, 1.0)):
-        row = facts.queue_facts(replace(record, edge_vehicles=np.tile(share * room, (3, 1))), city)
+        row = run_metrics.queue_facts(replace(record, edge_vehicles=np.tile(share * room, (3, 1))), city)
         assert row["gateway_full_share"] == expected
-    upstream = facts.upstream_gateways(city)
+    upstream = run_metrics.upstream_gateways(city)
     assert len({city.gateways[n].from_edge for n in upstream}) == len(upstream) < len(city.gateways)

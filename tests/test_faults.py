@@ -17,26 +17,27 @@ import tiny_city
 import torch
 from click.testing import CliRunner
 
-import cosim.cli
-import nmfd.cli
-from cosim.actuate import YELLOW
-from cosim.city import ensure_built
-from cosim.plant import SumoPlant
-from cosim.regions import load_city
-from cosim.sumo_settings import settings
-from nmfd import faults, runs
+import cosim.cli.main
+import nmfd.cli.main
+from cosim.plant.perimeter import YELLOW
+from cosim.plant.plant import SumoPlant
+from cosim.plant.settings import settings
+from cosim.sumo.build import ensure_built
+from cosim.sumo.net import load_city
+from nmfd import faults
 from nmfd.closed_loop import run
 from nmfd.controllers import registry
-from nmfd.controllers.dpc import Architecture, DpcController, Policy
-from nmfd.controllers.fixed import NoControl
-from nmfd.controllers.gating import PiGating
-from nmfd.controllers.mpc import EconomicMpc
+from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy
+from nmfd.controllers.mpc.controller import EconomicMpc
+from nmfd.controllers.no_control import NoControl
+from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
-from nmfd.plant import NmfdPlant
-from nmfd.scenario import load_scenario
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import load_scenario
+from nmfd.runs import run_folder
 from nmfd.types import Controls, Measurement
 
-MAINS = {"nmfd": nmfd.cli.main, "cosim": cosim.cli.main}
+MAINS = {"nmfd": nmfd.cli.main.main, "cosim": cosim.cli.main.main}
 
 
 def call(program, *arguments):
@@ -221,7 +222,8 @@ def test_ordered_in_the_scenario_or_on_the_command_line(tmp_path):
     (folder / "scenario.toml").write_text('faults = ["solver-fails@2-5"]\n' + tiny.SCENARIO)
     assert call(*command, tmp_path / "b").exit_code == 0
     for out in ("a", "b"):
-        rows = {row["controller"]: row["solver_failures"] for row in runs.read_summary(tmp_path / out / "summary.csv")}
+        summary = run_folder.read_summary(tmp_path / out / "summary.csv")
+        rows = {row["controller"]: row["solver_failures"] for row in summary}
         assert rows == {"mpc-pc": 3, "no-control": 0}
     assert (tmp_path / "a" / "mpc-pc-0.npz").read_bytes() == (tmp_path / "b" / "mpc-pc-0.npz").read_bytes()
     result = call(*command, tmp_path / "a")
@@ -386,7 +388,7 @@ def test_statuses_of_a_city_are_in_its_tables(city, tmp_path):
     facts = pd.read_csv(out / "sumo.csv").loc[0, "fallbacks"]
     assert "1 x edge B1C1 closed" in facts
     assert "solver failed (FloatingPointError): last plan used; edge B1C1 closed" in facts
-    assert runs.read_summary(out / "summary.csv")[0]["solver_failures"] == 2
+    assert run_folder.read_summary(out / "summary.csv")[0]["solver_failures"] == 2
 
 
 # A full disk, as far as one can be had without filling one: no file may grow beyond a limit.
@@ -421,7 +423,7 @@ def test_a_full_disk(tmp_path):
     assert {name: after[name] for name in before if name != "manifest.json"} == {
         name: content for name, content in before.items() if name != "manifest.json"}
     assert call(*command, 2).exit_code == 0
-    assert len(runs.read_summary(out / "summary.csv")) == 2
+    assert len(run_folder.read_summary(out / "summary.csv")) == 2
 
 
 IN_SUMO = ("cosim", "run", "--controller", "no-control", "--steps", 4, "--sumo-output")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from test_runs import trajectory
 
-from cosim import figures
-from nmfd import plots
+from cosim.report import figures
+from nmfd.studies import plots
 
 
 @pytest.fixture

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from nmfd.closed_loop import run
-from nmfd.controllers.gating import PiGating
+from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
 from nmfd.metrics import summary
-from nmfd.plant import NmfdPlant
-from nmfd.scenario import load_scenario
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import load_scenario
 from nmfd.types import Measurement
 
 SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")

@@ -9,10 +9,10 @@ import libsumo
 import numpy as np
 import pytest
 
-from cosim.guidance import Guide, shifted
-from cosim.measure import Event
-from cosim.regions import City, Gateway
-from cosim.ways import Home, Moves, Ways
+from cosim.plant.guidance import Guide, shifted
+from cosim.plant.meter import Event
+from cosim.plant.shortest_paths import Home, Moves, Ways
+from cosim.sumo.net import City, Gateway
 
 EDGES, REGION = 40, np.repeat([0, 1, 2, 3], 10)
 

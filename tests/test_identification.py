@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import tiny
 
-from nmfd import closed_loop, identification
-from nmfd.controllers.probing import Probing
-from nmfd.identification import Observed
-from nmfd.mfd import Mfd
-from nmfd.plant import NmfdPlant
-from nmfd.scenario import load_scenario
+from nmfd import closed_loop
+from nmfd.controllers.excitation import Probing
+from nmfd.model import identification
+from nmfd.model.identification import Observed
+from nmfd.model.mfd import Mfd
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import load_scenario
 
 ROOT = Path(__file__).parents[1]
 

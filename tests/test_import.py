@@ -13,18 +13,18 @@ import pytest
 import tiny_city
 from click.testing import CliRunner
 
-from cosim.cli import main
-from cosim.flows import own_flows
+from cosim.cli.main import main
 from cosim.importing import level
 from cosim.importing.case import read_case
 from cosim.importing.demand import read_traffic
 from cosim.importing.streets import graph, read_streets
-from cosim.originals import read_originals, read_routes
-from cosim.plant import SumoPlant
-from cosim.regions import load_city
-from cosim.sumo_settings import settings
+from cosim.plant.plant import SumoPlant
+from cosim.plant.settings import settings
+from cosim.sumo.net import load_city
+from cosim.sumo.recorded_trips import read_originals, read_routes
+from cosim.sumo.turning_flows import own_flows
 from nmfd.errors import InputError
-from nmfd.scenario import as_modelled, load_scenario
+from nmfd.model.scenario import as_modelled, load_scenario
 from nmfd.types import Controls
 
 

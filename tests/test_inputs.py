@@ -5,9 +5,9 @@ import tiny
 import torch
 from click.testing import CliRunner
 
-from nmfd.cli import main
-from nmfd.controllers.dpc import Architecture, Policy, checkpoint
-from nmfd.network import load_network
+from nmfd.cli.main import main
+from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
+from nmfd.model.regional_model import load_network
 
 TO_1 = "to = 1"
 BENCHMARK = ["benchmark", "{scenario}", "--out", "{out}", "--controllers"]

@@ -10,9 +10,9 @@ import pytest
 import tiny
 from click.testing import CliRunner
 
-import cosim.cli
-import nmfd.cli
-from nmfd import runs
+import cosim.cli.main
+import nmfd.cli.main
+from nmfd.runs import run_folder
 
 ROOT = Path(__file__).parents[1]
 
@@ -23,7 +23,7 @@ def peak(tmp_path_factory):
 
 
 def cosim_run(*arguments):
-    return CliRunner().invoke(cosim.cli.main, ["run", *(str(a) for a in arguments)])
+    return CliRunner().invoke(cosim.cli.main.main, ["run", *(str(a) for a in arguments)])
 
 
 def test_outputs_of_sumo_agree_with_ours_and_are_made_up_for(peak, tmp_path):
@@ -39,7 +39,7 @@ def test_outputs_of_sumo_agree_with_ours_and_are_made_up_for(peak, tmp_path):
     trips = ElementTree.parse(out / f"{name}tripinfo.xml").getroot()
     assert sum(float(trip.get("depart")) >= 0 for trip in trips) == facts["departed_veh"] > 0
     last = ElementTree.parse(out / f"{name}summary.xml").getroot()[-1]
-    row = runs.read_summary(out / "summary.csv")[0]
+    row = run_folder.read_summary(out / "summary.csv")[0]
     assert int(last.get("running")) == row["final_accumulation_veh"] and int(last.get("ended")) == row["completed_veh"]
     intervals = ElementTree.parse(out / f"{name}edgedata.xml").getroot()
     assert [float(interval.get("begin")) for interval in intervals] == [0.0, 90.0, 180.0, 270.0]
@@ -65,11 +65,11 @@ def test_outputs_from_python(peak, tmp_path):
 
 def test_parquet_of_a_benchmark(tmp_path):
     scenario, out = tiny.write(tmp_path), tmp_path / "out"
-    done = CliRunner().invoke(nmfd.cli.main, [
+    done = CliRunner().invoke(nmfd.cli.main.main, [
         "benchmark", str(scenario), "--controllers", "no-control,pi-gating", "--parquet", "--out", str(out)])
     assert done.exit_code == 0, done.output
     summary = pd.read_parquet(out / "summary.parquet")
-    assert summary.to_dict("records") == runs.read_summary(out / "summary.csv")
+    assert summary.to_dict("records") == run_folder.read_summary(out / "summary.csv")
     states, controls = pd.read_parquet(out / "states.parquet"), pd.read_parquet(out / "controls.parquet")
     assert len(states) == 2 * 21 * 4 and len(controls) == 2 * 20 * 4
     total = 30.0 * states[states["time_s"] < 600.0].groupby("controller")["accumulation_veh"].sum()

@@ -20,17 +20,18 @@ import tiny_city
 import torch
 from click.testing import CliRunner
 
-import cosim.cli
-import nmfd.cli
-from cosim.plant import SumoPlant
-from nmfd import disk, runs, training, workers
-from nmfd.disk import TEMPORARY
+import cosim.cli.main
+import nmfd.cli.main
+from cosim.plant.plant import SumoPlant
+from nmfd.controllers.dpc import training
 from nmfd.errors import InputError
-from nmfd.runs import LOCK
-from nmfd.scenario import load_scenario
-from nmfd.scratch import Scratch, sweep
+from nmfd.model.scenario import load_scenario
+from nmfd.runs import files, run_folder, workers
+from nmfd.runs.files import TEMPORARY
+from nmfd.runs.run_folder import LOCK
+from nmfd.runs.scratch import Scratch, sweep
 
-MAINS = {"nmfd": nmfd.cli.main, "cosim": cosim.cli.main}
+MAINS = {"nmfd": nmfd.cli.main.main, "cosim": cosim.cli.main.main}
 
 
 def call(program, *arguments):
@@ -83,8 +84,8 @@ def everything_readable(folder: Path) -> None:
     if (folder / "manifest.json").exists():
         json.loads((folder / "manifest.json").read_text())
     if (folder / "summary.csv").exists():
-        for row in runs.read_summary(folder / "summary.csv"):
-            trajectory = runs.read_trajectory(folder / f"{row['controller']}-{row['seed']}.npz")
+        for row in run_folder.read_summary(folder / "summary.csv"):
+            trajectory = run_folder.read_trajectory(folder / f"{row['controller']}-{row['seed']}.npz")
             assert trajectory.accumulation.sum() * trajectory.step > 0
 
 
@@ -164,7 +165,7 @@ def test_benchmark_killed_at_random_moments(tmp_path):
     good(call(*command, out))
     assert arrays(out) == arrays(tmp_path / "whole")
     rows = [[{**row, "evaluation_time_s": 0, "control_step_ms_median": 0, "control_step_ms_max": 0}
-             for row in runs.read_summary(folder / "summary.csv")] for folder in (out, tmp_path / "whole")]
+             for row in run_folder.read_summary(folder / "summary.csv")] for folder in (out, tmp_path / "whole")]
     assert rows[0] == rows[1]
 
 
@@ -256,7 +257,7 @@ def test_an_import_killed_is_no_network_or_a_whole_one(tmp_path):
 PARENT = """
 import os, sys, time
 from pathlib import Path
-from nmfd.workers import outcomes
+from nmfd.runs.workers import outcomes
 
 def sleep_and_tell(folder):
     (folder / str(os.getpid())).write_text("")
@@ -303,7 +304,7 @@ def wait_for(condition, seconds: float) -> bool:
 def test_the_second_of_two_runs_into_one_folder_is_told(tmp_path):
     scenario, out = tiny.write(tmp_path), tmp_path / "out"
     out.mkdir()
-    with disk.locked(out / LOCK, out):
+    with files.locked(out / LOCK, out):
         for program, command in (
                 ("nmfd", ("benchmark", scenario, "--controllers", "no-control", "--out", out)),
                 ("nmfd", ("robustness", scenario, "--controllers", "no-control", "--scenarios", 1, "--out", out))):
@@ -317,7 +318,7 @@ def test_the_second_of_two_runs_into_one_folder_is_told(tmp_path):
 
 def test_the_second_of_two_trainings_of_one_policy_is_told(tmp_path):
     scenario = tiny.write(tmp_path)
-    with disk.locked(scenario / ".dpc-pc.pt.lock", scenario / "dpc-pc.pt"):
+    with files.locked(scenario / ".dpc-pc.pt.lock", scenario / "dpc-pc.pt"):
         result = call("nmfd", "train", scenario, "--controller", "dpc-pc", "--steps", 1, "--device", "cpu")
     assert result.exit_code == 2 and "is writing to it" in result.stderr
     good(call("nmfd", "train", scenario, "--controller", "dpc-pc", "--steps", 1, "--device", "cpu"))
@@ -326,12 +327,12 @@ def test_the_second_of_two_trainings_of_one_policy_is_told(tmp_path):
 def test_the_lock_of_a_killed_process_is_no_lock(tmp_path):
     child = os.fork()
     if child == 0:
-        with disk.locked(tmp_path / LOCK, tmp_path):
+        with files.locked(tmp_path / LOCK, tmp_path):
             os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
     assert (tmp_path / LOCK).exists()
-    with disk.locked(tmp_path / LOCK, tmp_path):
-        with pytest.raises(InputError, match="is writing to it"), disk.locked(tmp_path / LOCK, tmp_path):
+    with files.locked(tmp_path / LOCK, tmp_path):
+        with pytest.raises(InputError, match="is writing to it"), files.locked(tmp_path / LOCK, tmp_path):
             pass
     assert not (tmp_path / LOCK).exists()
 
@@ -340,9 +341,9 @@ def test_temporary_files_of_others_are_left_alone(tmp_path):
     (tmp_path / ".dpc-pc-12.tmp.pt").write_text("")
     (tmp_path / ".dpc-pc-robust-12.tmp.pt").write_text("")
     (tmp_path / ".mine").write_text("")
-    disk.sweep(tmp_path, {"dpc-pc"})
+    files.sweep(tmp_path, {"dpc-pc"})
     assert {path.name for path in tmp_path.iterdir()} == {".dpc-pc-robust-12.tmp.pt", ".mine"}
-    disk.sweep(tmp_path)
+    files.sweep(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {".mine"}
 
 
@@ -358,7 +359,7 @@ def test_arrays_of_a_run_hold_no_times(tmp_path):
     for name in ("a", "b"):
         good(call("nmfd", "benchmark", scenario, "--controllers", "mpc-pc", "--out", tmp_path / name))
     assert arrays(tmp_path / "a") == arrays(tmp_path / "b")
-    assert np.isnan(runs.read_trajectory(tmp_path / "a" / "mpc-pc-0.npz").decision_time).all()
+    assert np.isnan(run_folder.read_trajectory(tmp_path / "a" / "mpc-pc-0.npz").decision_time).all()
 
 
 def test_scratch_folders_of_killed_processes_go_at_the_next_start(tmp_path, monkeypatch, city):

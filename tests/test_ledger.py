@@ -8,10 +8,12 @@ import tiny
 import torch
 from click.testing import CliRunner
 
-from nmfd import acyclic, dynamics, ledger, runs
-from nmfd.cli import main
-from nmfd.plant import AcyclicPlant, NmfdPlant
-from nmfd.scenario import load_scenario
+from nmfd import ledger
+from nmfd.cli.main import main
+from nmfd.model import acyclic, dynamics
+from nmfd.model.plant import AcyclicPlant, NmfdPlant
+from nmfd.model.scenario import load_scenario
+from nmfd.runs import run_folder
 from nmfd.types import Controls
 
 PLANTS = pytest.mark.parametrize("make", [NmfdPlant, AcyclicPlant])
@@ -101,4 +103,4 @@ def test_the_command_says_it_in_one_line_and_keeps_what_was_finished(tmp_path, m
     result = CliRunner().invoke(main, [str(a) for a in [*command, 2]])
     assert result.exit_code == 1 and result.stderr.count("\n") == 1
     assert "no-control, seed 1: LedgerError: vehicle ledger broken at control step" in result.stderr
-    assert [row["seed"] for row in runs.read_summary(out / "summary.csv")] == [0]
+    assert [row["seed"] for row in run_folder.read_summary(out / "summary.csv")] == [0]

@@ -12,15 +12,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cosim.importing.case import seconds
-from cosim.originals import read_originals
-from cosim.regions import load_city
-from cosim.strategy import parse
-from nmfd import bound, runs
-from nmfd.controllers.dpc import load_policy
+from cosim.plant.strategy import parse
+from cosim.sumo.net import load_city
+from cosim.sumo.recorded_trips import read_originals
+from nmfd.cli.options import policy_files, whole_numbers
+from nmfd.controllers.dpc.policy import load_policy
 from nmfd.errors import InputError
-from nmfd.network import load_network
-from nmfd.options import policy_files, whole_numbers
-from nmfd.scenario import load_scenario
+from nmfd.model.regional_model import load_network
+from nmfd.model.scenario import load_scenario
+from nmfd.runs import run_folder
+from nmfd.studies import bound
 
 SCENARIO_KEYS = {
     "name": "x", "network": "../network", "step": 30.0, "steps": 20, "integrator": "euler", "substeps": 1,
@@ -127,8 +128,8 @@ def test_any_bytes(tmp_path, network, content, kind):
         (tmp_path / "n").mkdir(exist_ok=True)
         (tmp_path / "n" / "network.toml").write_bytes(bytes_)
         loaders = {
-            "npz": [runs.read_trajectory], "pt": [lambda path: load_policy(path, network)],
-            "csv": [runs.read_summary, lambda path: load_city(tmp_path / "none.net.xml", path, 2)],
+            "npz": [run_folder.read_trajectory], "pt": [lambda path: load_policy(path, network)],
+            "csv": [run_folder.read_summary, lambda path: load_city(tmp_path / "none.net.xml", path, 2)],
             "xml": [read_originals_of, lambda path: load_city(path, tmp_path / "none.csv", 2)],
             "xml.gz": [read_originals_of, lambda path: load_city(path, tmp_path / "none.csv", 2)],
             "toml": [lambda path: load_network(tmp_path / "n")]}

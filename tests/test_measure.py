@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cosim.measure import Event, Meter
-from cosim.regions import City, Gateway
+from cosim.plant.meter import Event, Meter
+from cosim.sumo.net import City, Gateway
 from nmfd.ledger import LedgerError
 
 # a0 -> b0 -> b1 -> c0 in a row, regions 0, 1, 1, 2, and a way back c0 -> a0. Entries: b0, c0 and a0.

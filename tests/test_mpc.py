@@ -9,14 +9,14 @@ import tiny
 import torch
 from test_dynamics import random_controls
 
-from nmfd import dynamics
 from nmfd.closed_loop import run
-from nmfd.controllers.fixed import NoControl
-from nmfd.controllers.mpc import TOLERANCE, EconomicMpc
+from nmfd.controllers.mpc.controller import TOLERANCE, EconomicMpc
+from nmfd.controllers.no_control import NoControl
 from nmfd.errors import InputError
 from nmfd.metrics import summary
-from nmfd.plant import NmfdPlant
-from nmfd.scenario import load_scenario
+from nmfd.model import dynamics
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import load_scenario
 from nmfd.types import Measurement
 
 SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")

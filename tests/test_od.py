@@ -9,14 +9,14 @@ import pytest
 import tiny_city
 from click.testing import CliRunner
 
-from cosim.cli import main
+from cosim.cli.main import main
 from cosim.importing.case import read_case
 from cosim.importing.demand import read_traffic
 from cosim.importing.od import read_od, trips
 from cosim.importing.streets import read_streets
-from cosim.originals import read_originals
+from cosim.sumo.recorded_trips import read_originals
 from nmfd.errors import InputError
-from nmfd.scenario import load_scenario
+from nmfd.model.scenario import load_scenario
 
 RELATIONS = """<data><interval id="morning" begin="7:30:00" end="30600">
   <tazRelation from="west" to="east" count="90"/><tazRelation from="east" to="west" count="30.5"/>

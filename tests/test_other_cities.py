@@ -8,19 +8,19 @@ import tiny_city
 from click.testing import CliRunner
 from tiny_city import driven
 
-from cosim.cli import main
+from cosim.cli.main import main
 from cosim.importing.case import read_case
 from cosim.importing.demand import read_traffic
 from cosim.importing.importer import left_alone
 from cosim.importing.level import congesting
 from cosim.importing.streets import read_streets
-from cosim.measure import Meter
-from cosim.originals import draw, read_originals
-from cosim.plant import SumoPlant
-from cosim.sumo import REFUSALS
-from cosim.sumo_settings import settings
+from cosim.plant.meter import Meter
+from cosim.plant.plant import SumoPlant
+from cosim.plant.settings import settings
+from cosim.sumo.recorded_trips import draw, read_originals
+from cosim.sumo.session import REFUSALS
 from nmfd.errors import InputError
-from nmfd.scenario import load_scenario
+from nmfd.model.scenario import load_scenario
 
 FLOW = '<flow id="f" begin="0" end="600" number="60" from="A1B1" to="C1D1"/>'
 FAST = ("--method", "geometric", "--no-run")

@@ -10,14 +10,14 @@ import pytest
 import tiny
 from click.testing import CliRunner
 
-import cosim.cli
-from cosim.strategy import parse
-from nmfd import runs
-from nmfd.cli import main
-from nmfd.controllers import own, registry
+import cosim.cli.main
+from cosim.plant.strategy import parse
+from nmfd.cli.main import main
+from nmfd.controllers import custom, registry
 from nmfd.controllers.template import MyController
 from nmfd.errors import InputError
-from nmfd.scenario import load_scenario
+from nmfd.model.scenario import load_scenario
+from nmfd.runs import run_folder
 
 ROOT = Path(__file__).parents[1]
 GOOD = """
@@ -52,7 +52,7 @@ def test_the_template_runs_beside_the_others_and_a_changed_file_does_not_count(p
     done = nmfd(*command, "--controllers", f"no-control,{name}")
     assert done.exit_code == 0 and name in done.output, done.output
     assert f"--controllers no-control,pi-gating,{name}" in (place / "sub" / "mine.py").read_text()
-    rows = runs.read_summary(place / "out" / "summary.csv")
+    rows = run_folder.read_summary(place / "out" / "summary.csv")
     assert [(row["controller"], row["seed"]) for row in rows] == [
         ("no-control", 0), ("no-control", 1), (name, 0), (name, 1)]
     assert nmfd(*command, "--controllers", name, "--workers", "2").exit_code == 0  # all there, under its own name
@@ -65,10 +65,10 @@ def test_the_template_runs_beside_the_others_and_a_changed_file_does_not_count(p
 
 def test_the_template_holds_regions_at_their_set_points():
     scenario = load_scenario(ROOT / "scenarios" / "economic_mpc")
-    controller = own.make(f"{own.__file__.replace('own.py', 'template.py')}:MyController", scenario)
+    controller = custom.make(f"{custom.__file__.replace('custom.py', 'template.py')}:MyController", scenario)
     accumulation = np.zeros((7, 7))
     accumulation[3, 0] = 2 * scenario.network.mfds[3].critical
-    perimeter = controller.act(own.Measurement(
+    perimeter = controller.act(custom.Measurement(
         step=0, time=0.0, accumulation=accumulation, backlog=np.zeros((7, 7)))).perimeter
     entries = scenario.network.adjacency[:, 3]
     assert (perimeter[entries, 3] == scenario.network.u_min).all()
@@ -80,9 +80,9 @@ def test_it_has_a_table_of_its_own(place):
     with (place / "scenario" / "scenario.toml").open("a") as file:
         file.write("\n[controllers.own.my-controller]\ngain = 0.0\n")
     assert nmfd("new-controller", "mine.py").exit_code == 0
-    controller = own.make("mine.py:MyController", load_scenario(place / "scenario"))
+    controller = custom.make("mine.py:MyController", load_scenario(place / "scenario"))
     full = np.full((2, 2), 900.0)
-    perimeter = controller.act(own.Measurement(step=0, time=0.0, accumulation=full, backlog=0 * full)).perimeter
+    perimeter = controller.act(custom.Measurement(step=0, time=0.0, accumulation=full, backlog=0 * full)).perimeter
     assert perimeter[0, 1] == 0.9  # without gain nothing is held back
 
 
@@ -91,10 +91,11 @@ def test_processes_and_sumo_take_it(place):
     shutil.copytree(ROOT / "networks" / "grid7", place / "networks" / "grid7")
     shutil.copytree(ROOT / "scenarios" / "grid7_peak", place / "scenarios" / "peak",
                     ignore=shutil.ignore_patterns("reference"))
-    done = CliRunner().invoke(cosim.cli.main, [
+    done = CliRunner().invoke(cosim.cli.main.main, [
         "run", "scenarios/peak", "--controller", "mine.py:Mine+max-pressure", "--steps", "2", "--out", "out"])
     assert done.exit_code == 0 and "mine.py:Mine+max-pressure" in done.output, done.output
-    trajectory = runs.read_trajectory(place / "out" / f"{runs.run_name('mine.py:Mine+max-pressure', 0)}.npz")
+    name = run_folder.run_name("mine.py:Mine+max-pressure", 0)
+    trajectory = run_folder.read_trajectory(place / "out" / f"{name}.npz")
     assert (trajectory.perimeter[trajectory.perimeter > 0] == 0.5).all()
     benchmark = nmfd("benchmark", "scenario", "--controllers", "mine.py:Mine", "--seeds", 2, "--workers", 2)
     assert benchmark.exit_code == 0, benchmark.output
@@ -110,7 +111,7 @@ def test_in_strategies(place, name, controller, options):
     path.write_text(GOOD)
     strategy = parse(name)
     assert strategy.controller == controller and strategy.overrides == {"gateways_fixed": True, **options}
-    assert "/" not in runs.run_name(name, 0)
+    assert "/" not in run_folder.run_name(name, 0)
 
 
 @pytest.mark.parametrize("source, expected", [
@@ -147,7 +148,7 @@ def test_a_mistake_in_mid_run_is_a_failed_run_with_its_line(place):
     (place / "mine.py").write_text(failing)
     done = nmfd("benchmark", "scenario", "--controllers", "no-control,mine.py:Mine", "--out", "out")
     assert done.exit_code == 2 and "mine.py:10: mine.py:Mine: act: AssertionError" in done.stderr
-    assert [row["controller"] for row in runs.read_summary(place / "out" / "summary.csv")] == ["no-control"]
+    assert [row["controller"] for row in run_folder.read_summary(place / "out" / "summary.csv")] == ["no-control"]
 
 
 @pytest.mark.parametrize("name, expected", [
@@ -159,8 +160,8 @@ def test_names_that_mean_nothing(place, name, expected):
 
 
 def test_entry_points(place, monkeypatch):
-    point = metadata.EntryPoint("the-template", "nmfd.controllers.template:MyController", own.GROUP)
-    monkeypatch.setattr(own, "entry_points", lambda: {"the-template": point})
+    point = metadata.EntryPoint("the-template", "nmfd.controllers.template:MyController", custom.GROUP)
+    monkeypatch.setattr(custom, "entry_points", lambda: {"the-template": point})
     done = nmfd("benchmark", "scenario", "--controllers", "no-control,the-template", "--out", "out")
     assert done.exit_code == 0 and "the-template" in done.output
     assert parse("the-template+actuated").controller == "the-template"

@@ -13,8 +13,10 @@ import pytest
 from click.testing import CliRunner
 from test_tables import rows_of
 
-from cosim import finished, markup, page, story, tables
-from cosim.cli import main
+from cosim.cli.main import main
+from cosim.evaluation import results
+from cosim.evaluation import statistics as tables
+from cosim.report import html, markup, summary_text
 
 VOID = {"meta", "link", "img", "br"}
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -74,10 +76,10 @@ def evaluation(tmp_path_factory):
 @pytest.fixture(scope="module")
 def content(evaluation):
     """The page, with pictures at demand 1 only: they take most of the time."""
-    draw, more = page.report.draw, page.report.draw_more
+    draw, more = html.report.draw, html.report.draw_more
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(page.report, "draw", lambda *a: draw(*a) if a[3]["demand"].iloc[0] == 1 else None)
-        patch.setattr(page.report, "draw_more", lambda *a: more(*a) if a[3]["demand"].iloc[0] == 1 else None)
+        patch.setattr(html.report, "draw", lambda *a: draw(*a) if a[3]["demand"].iloc[0] == 1 else None)
+        patch.setattr(html.report, "draw_more", lambda *a: more(*a) if a[3]["demand"].iloc[0] == 1 else None)
         result = cosim("report", evaluation, "--reference", "pi-gating")
     assert result.exit_code == 0, result.output + str(result.exception)
     return (evaluation / "report.html").read_text()
@@ -147,7 +149,7 @@ def test_it_says_what_was_best_and_on_which_seeds(content):
 @pytest.fixture
 def blind(monkeypatch):
     for name in ("draw", "draw_more", "region_map"):
-        monkeypatch.setattr(page.report, name, lambda *_: None)
+        monkeypatch.setattr(html.report, name, lambda *_: None)
 
 
 def test_several_folders_and_one_level_on_a_page(evaluation, tmp_path, blind):
@@ -177,7 +179,7 @@ def test_a_failure_leaves_the_old_page(evaluation, tmp_path, monkeypatch):
     def fail(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(page.report, "draw", fail)
+    monkeypatch.setattr(html.report, "draw", fail)
     (tmp_path / "report.html").write_text("old")
     assert cosim("report", evaluation, "--out", tmp_path / "report.html").exit_code == 130
     assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
@@ -238,9 +240,9 @@ def test_a_run_whose_row_is_gone_is_not_shown(evaluation, tmp_path, monkeypatch)
     shutil.copytree(evaluation / "demand-1", tmp_path / "one")
     file, shown = tmp_path / "one" / "sumo.csv", []
     file.write_text("".join([line for line in file.open() if "pi-gating" not in line]))
-    monkeypatch.setattr(page.report, "draw_accumulations", lambda out, scenario, runs, **_: shown.extend(runs))
-    run = finished.read(tmp_path / "one")
-    page.report.draw(tmp_path / "one", run.scenario, None, run.rows)
+    monkeypatch.setattr(html.report, "draw_accumulations", lambda out, scenario, runs, **_: shown.extend(runs))
+    run = results.read(tmp_path / "one")
+    html.report.draw(tmp_path / "one", run.scenario, None, run.rows)
     assert {trajectory.controller for trajectory in shown} == {"no-control", "dpc-pcrg"}
 
 
@@ -251,27 +253,29 @@ def rows(**times):
 
 def test_the_words_of_worked_examples():
     three = rows(no_control={1: 100.0, 2: 200.0, 3: 300.0}, pi_gating={1: 90.0, 2: 160.0, 3: 210.0})
-    text = story.best(three)  # -20 ± 4.302653 * 10 / sqrt(3) %
+    text = summary_text.best(three)  # -20 ± 4.302653 * 10 / sqrt(3) %
     assert "best strategy was pi-gating" in text and "20.0 % less than without control" in text
     assert "paired over 3 seeds, is -44.8 to +4.8 % and includes zero" in text and "flattered" not in text
-    sure = story.best(rows(no_control={1: 100.0, 2: 200.0}, pi_gating={1: 50.0, 2: 101.0}, mpc_pc={1: 99.0, 2: 199.0}))
+    sure = summary_text.best(rows(
+        no_control={1: 100.0, 2: 200.0}, pi_gating={1: 50.0, 2: 101.0}, mpc_pc={1: 99.0, 2: 199.0}))
     assert "excludes zero: more than chance" in sure and "chosen among 2 on these very runs (seeds 1 to 2)" in sure
-    assert "there is no interval" in story.best(rows(no_control={1: 100.0}, pi_gating={1: 90.0}))
-    worse = story.best(rows(no_control={1: 100.0, 2: 100.0}, pi_gating={1: 110.0, 2: 112.0}))
+    assert "there is no interval" in summary_text.best(rows(no_control={1: 100.0}, pi_gating={1: 90.0}))
+    worse = summary_text.best(rows(no_control={1: 100.0, 2: 100.0}, pi_gating={1: 110.0, 2: 112.0}))
     assert "No strategy was better than no control" in worse and "11.0 % more" in worse
-    assert "no run of no-control with the same seed" in story.best(rows(pi_gating={1: 1.0}, no_control={2: 1.0}))
-    assert story.seeds([3, 1, 2, 7]) == "1 to 3, 7"
+    assert "no run of no-control with the same seed" in summary_text.best(rows(pi_gating={1: 1.0}, no_control={2: 1.0}))
+    assert summary_text.seeds([3, 1, 2, 7]) == "1 to 3, 7"
 
 
 def test_the_words_name_what_is_uneven_late_or_lost():
     table = rows(no_control={1: 100.0, 2: 200.0}, pi_gating={1: 50.0})
-    assert "Every trip was completed" in story.head(table) and "No vehicle was teleported" in story.head(table)
-    assert any("Not all strategies have all 2 seeds (pi-gating 1)" in text for text in story.details(table))
+    head = summary_text.head(table)
+    assert "Every trip was completed" in head and "No vehicle was teleported" in head
+    assert any("Not all strategies have all 2 seeds (pi-gating 1)" in text for text in summary_text.details(table))
     table.loc[0, ["teleports", "completed_veh"]] = 5, 40.0
     table["late_decisions"], table["solver_failures"] = [0, 0, 2], [0, 0, 1]
-    head = story.head(table)
+    head = summary_text.head(table)
     assert "no-control 30 of 100. The others completed all." in head and head.endswith("no-control 5.")
-    assert any("pi-gating 1 by a fallback, pi-gating 2 late" in text for text in story.details(table))
+    assert any("pi-gating 1 by a fallback, pi-gating 2 late" in text for text in summary_text.details(table))
 
 
 def test_minus_signs_and_units():
@@ -299,6 +303,6 @@ def test_nothing_is_wider_than_a_phone_or_a_desk(content, tmp_path):
 
 
 def test_finished_prefers_the_level_of_the_scenario(evaluation):
-    found = finished.read(evaluation)
+    found = results.read(evaluation)
     assert found.level(None).demand == 1.0 and found.level(0.8).folder == evaluation / "demand-0.8"
     assert len(found.rows) == 12 and found.evaluation and found.city is not None

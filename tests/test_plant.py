@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from test_actuate import MIN_GREEN, check
 
-from cosim.guidance import shifted
-from cosim.plant import SumoPlant
-from cosim.sumo import Session
-from cosim.sumo_settings import Settings
+from cosim.plant.guidance import shifted
+from cosim.plant.plant import SumoPlant
+from cosim.plant.settings import Settings
+from cosim.sumo.session import Session
 from nmfd.ledger import LedgerError
-from nmfd.scenario import load_scenario
+from nmfd.model.scenario import load_scenario
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"

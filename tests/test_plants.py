@@ -9,12 +9,12 @@ import pytest
 import tiny
 from test_dynamics import random_controls
 
-from nmfd import acyclic
 from nmfd.closed_loop import run
-from nmfd.controllers.fixed import NoControl
+from nmfd.controllers.no_control import NoControl
 from nmfd.metrics import total_time_spent
-from nmfd.plant import AcyclicPlant, NmfdPlant
-from nmfd.scenario import load_scenario
+from nmfd.model import acyclic
+from nmfd.model.plant import AcyclicPlant, NmfdPlant
+from nmfd.model.scenario import load_scenario
 from nmfd.types import Controls
 
 SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")

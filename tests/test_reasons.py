@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 import tiny
 
-from cosim import reasons
-from nmfd.network import load_network
+from cosim.evaluation import explain
+from nmfd.model.regional_model import load_network
 from nmfd.types import Trajectory
 
 
@@ -61,9 +61,9 @@ BETTER, WORSE, ALIKE = [80.0, 88.0, 84.1], [120.0, 132.0, 126.1], [101.0, 108.0,
 ])
 def test_known_reasons(network, values, most, leaking, u, started, full, expected):
     rows = table(values, full)
-    found = reasons.load(network, [run(network, most, 0.9)], [record(network, started, 100)])
-    done = reasons.deeds(network, [run(network, most, u)], [record(network, started, 100)])
-    line = reasons.verdict(rows, 1.0, "pi-gating", found, leaking, done, network)
+    found = explain.load(network, [run(network, most, 0.9)], [record(network, started, 100)])
+    done = explain.deeds(network, [run(network, most, u)], [record(network, started, 100)])
+    line = explain.verdict(rows, 1.0, "pi-gating", found, leaking, done, network)
     assert expected in line
     kind = {tuple(BETTER): "gains (", tuple(WORSE): "loses (", tuple(ALIKE): "gains nothing"}[tuple(values)]
     assert line.startswith(kind), line
@@ -72,18 +72,18 @@ def test_known_reasons(network, values, most, leaking, u, started, full, expecte
 
 
 def test_load_and_deeds_are_counted(network):
-    found = reasons.load(network, [run(network, 2.0, 0.9), run(network, 1.2, 0.9)], [record(network, 50, 150)])
+    found = explain.load(network, [run(network, 2.0, 0.9), run(network, 1.2, 0.9)], [record(network, 50, 150)])
     assert found.most == pytest.approx(1.6) and found.beyond == pytest.approx(5 / 11)
     entered = network.adjacency.any(axis=0)
     assert found.inside[entered] == pytest.approx(0.25) and list(found.critical) == list(range(network.regions))
     half = run(network, 1.0, 0.9)
     half = replace(half, perimeter=np.concatenate([half.perimeter[:5], run(network, 1.0, 0.2).perimeter[:5]]))
-    done = reasons.deeds(network, [half], [record(network, 50, 150, guided=100.0 * network.regions)])
+    done = explain.deeds(network, [half], [record(network, 50, 150, guided=100.0 * network.regions)])
     assert done.held == 0.5 and done.guided == pytest.approx(2.0)
 
 
 def test_nothing_to_compare_with(network):
     rows = table(ALIKE)[lambda frame: frame["controller"] != "no-control"]
-    found = reasons.load(network, [run(network, 2.0, 0.9)], [])
-    line = reasons.verdict(rows, 1.0, "pi-gating", found, 0.0, reasons.Deeds(held=0.1, guided=0.0), network)
+    found = explain.load(network, [run(network, 2.0, 0.9)], [])
+    line = explain.verdict(rows, 1.0, "pi-gating", found, 0.0, explain.Deeds(held=0.1, guided=0.0), network)
     assert "no common seed with no-control" in line and np.isnan(found.inside).all()

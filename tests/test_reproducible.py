@@ -10,11 +10,11 @@ import tiny
 import tiny_city
 from click.testing import CliRunner
 
-import cosim.cli
-import nmfd.cli
+import cosim.cli.main
+import nmfd.cli.main
 
 ROOT = Path(__file__).parents[1]
-MAINS = {"nmfd": nmfd.cli.main, "cosim": cosim.cli.main}
+MAINS = {"nmfd": nmfd.cli.main.main, "cosim": cosim.cli.main.main}
 
 
 def here(program, *arguments):
@@ -25,7 +25,7 @@ def here(program, *arguments):
 def elsewhere(program, *arguments):
     """In a process of its own, with another order of sets and dictionaries."""
     subprocess.run(
-        [sys.executable, "-m", f"{program}.cli", *map(str, arguments)], check=True, stdout=subprocess.DEVNULL,
+        [sys.executable, "-m", program, *map(str, arguments)], check=True, stdout=subprocess.DEVNULL,
         env={**os.environ, "PYTHONHASHSEED": "77", "PYTHONPATH": str(ROOT)})
 
 

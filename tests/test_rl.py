@@ -9,10 +9,10 @@ import pytest
 import tiny
 
 from nmfd import api
-from nmfd.controllers import own
+from nmfd.controllers import custom
 from nmfd.metrics import total_time_spent
-from nmfd.plant import AcyclicPlant
-from nmfd.scenario import load_scenario
+from nmfd.model.plant import AcyclicPlant
+from nmfd.model.scenario import load_scenario
 
 ROOT = Path(__file__).parents[1]
 gymnasium = pytest.importorskip("gymnasium", reason="the extra rl is not installed")
@@ -60,7 +60,7 @@ def test_gymnasium_and_pettingzoo_accept_the_regional_plants(scenario, hexagon, 
 
 
 def test_gymnasium_and_pettingzoo_accept_sumo(peak):
-    from cosim.rl import gymnasium_env, pettingzoo_env
+    from cosim.plant.env import gymnasium_env, pettingzoo_env
 
     gymnasium_check(gymnasium_env(peak, steps=2, guidance=True))
     pettingzoo_check(pettingzoo_env(peak, steps=2, city="actuated"), 3)
@@ -181,7 +181,7 @@ def test_the_ppo_example_is_a_controller_like_any_other_and_can_be_trained(hexag
     name = f"{ROOT}/scenarios/economic_mpc/ppo.py:Ppo"
     totals = {each: total_time_spent(api.run(hexagon, each, seed=7)) for each in (name, "no-control")}
     assert totals[name] < 0.9 * totals["no-control"]
-    example = own._module(Path(name.removesuffix(":Ppo")), name)
+    example = custom._module(Path(name.removesuffix(":Ppo")), name)
     monkeypatch.setattr(example, "ENVS", 2)
     with pytest.warns(UserWarning, match="mini-batch"):  # two scenarios at once are fewer than it is made for
         example.train(1, 0, tmp_path / "weights.pt")

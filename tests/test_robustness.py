@@ -10,15 +10,18 @@ import tiny
 import torch
 from click.testing import CliRunner
 
-from nmfd import closed_loop, robustness, training
-from nmfd.cli import main
-from nmfd.controllers import dpc, guarded, registry
-from nmfd.controllers.dpc import Architecture, Policy, checkpoint
-from nmfd.controllers.gating import PiGating
-from nmfd.demand_noise import WHERE, entries, perturbed
+from nmfd import closed_loop
+from nmfd.cli.main import main
+from nmfd.controllers import registry
+from nmfd.controllers.dpc import fallback, training
+from nmfd.controllers.dpc import policy as dpc
+from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
+from nmfd.controllers.pi_gating import PiGating
 from nmfd.metrics import total_time_spent
-from nmfd.plant import NmfdPlant
-from nmfd.scenario import load_scenario
+from nmfd.model.demand_noise import WHERE, entries, perturbed
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import load_scenario
+from nmfd.studies import robustness
 from nmfd.types import Measurement
 
 BENCHMARK = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
@@ -154,7 +157,7 @@ def constant_policy(scenario, logit):
 def guard(scenario, spread=0.1):
     policy = constant_policy(scenario, 20.0)
     states = 0.5 + spread * np.random.default_rng(0).standard_normal((5000, 4))
-    return guarded.Guarded(policy, guarded.statistics(states), scenario)
+    return fallback.Guarded(policy, fallback.statistics(states), scenario)
 
 
 def at(scenario, value, step=0):
@@ -164,7 +167,7 @@ def at(scenario, value, step=0):
 
 
 def test_the_guard_takes_over_outside_and_hands_back_inside(scenario, monkeypatch):
-    monkeypatch.setattr(guarded, "MOST_ERROR", np.inf)  # the states here jump
+    monkeypatch.setattr(fallback, "MOST_ERROR", np.inf)  # the states here jump
     watched, gating = guard(scenario), PiGating(scenario)
     assert watched.act(at(scenario, 0.5)).status == "ok"
     gating.reset()
@@ -172,7 +175,7 @@ def test_the_guard_takes_over_outside_and_hands_back_inside(scenario, monkeypatc
         controls = watched.act(at(scenario, 2.0, step))
         assert controls.status.startswith("guard: ")
         np.testing.assert_array_equal(controls.perimeter, gating.act(at(scenario, 2.0, step)).perimeter)
-    statuses = [watched.act(at(scenario, 0.5, step)).status for step in range(3, 3 + guarded.PATIENCE)]
+    statuses = [watched.act(at(scenario, 0.5, step)).status for step in range(3, 3 + fallback.PATIENCE)]
     assert all(status != "ok" for status in statuses[:-1]) and statuses[-1] == "ok"
 
 
@@ -188,7 +191,7 @@ def test_a_wrong_policy_does_not_make_it_worse_in_silence():
     made = wrong_policy(scenario)
     alone = closed_loop.run(NmfdPlant(scenario), dpc.DpcController(made), scenario, seed=0)
     states = (alone.accumulation[:-1] / made.scale.numpy()).reshape(-1, 49)
-    watched = guarded.Guarded(made, guarded.statistics(np.repeat(states, 4, axis=0)), scenario)
+    watched = fallback.Guarded(made, fallback.statistics(np.repeat(states, 4, axis=0)), scenario)
     kept = closed_loop.run(NmfdPlant(scenario), watched, scenario, seed=0)
     nobody = closed_loop.run(NmfdPlant(scenario), registry.make("no-control", scenario), scenario, seed=0)
     assert total_time_spent(alone) > 1.2 * total_time_spent(nobody)
@@ -211,7 +214,7 @@ def test_the_limit_lets_the_training_states_pass(scenario):
     watched, critical = guard(scenario), scenario.network.mfds[0].critical
     states = critical * (0.5 + 0.1 * np.random.default_rng(1).standard_normal((4000, 2, 2)))
     outside = np.mean([watched.distance(state) > 1.0 for state in states])
-    assert outside == pytest.approx(1.0 - guarded.QUANTILE, abs=2e-3)
+    assert outside == pytest.approx(1.0 - fallback.QUANTILE, abs=2e-3)
 
 
 def test_the_guard_reads_the_statistics_of_a_trained_policy(folder, scenario, tmp_path):

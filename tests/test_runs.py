@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nmfd import disk, runs, workers
+from nmfd.cli.progress import ProgressLine, progress_line
 from nmfd.errors import InputError
-from nmfd.progress import ProgressLine, progress_line
+from nmfd.runs import files, run_folder, workers
 from nmfd.types import Trajectory
 
 CONFIGURATION = {"scenario": "x", "step": 30.0, "protected": (1, 2)}
@@ -27,14 +27,14 @@ def trajectory(controller="no-control", seed=0, steps=4):
 
 def opened(path, *, controllers=("no-control",), seeds=(0,), settings=None):
     order = [(name, seed) for name in controllers for seed in seeds]
-    return runs.open_folder(path, configuration=CONFIGURATION, order=order, controllers=settings)
+    return run_folder.open_folder(path, configuration=CONFIGURATION, order=order, controllers=settings)
 
 
 def test_trajectory_round_trip_and_same_bytes(tmp_path):
     original = trajectory()
-    runs.write_trajectory(tmp_path / "a.npz", original)
-    runs.write_trajectory(tmp_path / "b.npz", replace(original, decision_time=2 * original.decision_time))
-    back = runs.read_trajectory(tmp_path / "a.npz")
+    run_folder.write_trajectory(tmp_path / "a.npz", original)
+    run_folder.write_trajectory(tmp_path / "b.npz", replace(original, decision_time=2 * original.decision_time))
+    back = run_folder.read_trajectory(tmp_path / "a.npz")
     for name in ("accumulation", "backlog", "completed", "perimeter", "splits"):
         np.testing.assert_array_equal(getattr(back, name), getattr(original, name))
     assert (back.controller, back.plant, back.seed, back.step) == ("no-control", "nmfd", 0, 30.0)
@@ -46,13 +46,13 @@ def test_trajectory_round_trip_and_same_bytes(tmp_path):
 def test_a_file_that_is_no_trajectory(tmp_path, content):
     (tmp_path / "a.npz").write_bytes(content)
     with pytest.raises(InputError, match="a.npz: is no trajectory"):
-        runs.read_trajectory(tmp_path / "a.npz")
+        run_folder.read_trajectory(tmp_path / "a.npz")
 
 
 def test_atomic_leaves_the_old_file_and_nothing_else_when_writing_fails(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(KeyboardInterrupt), disk.atomic(path) as temporary:
+    with pytest.raises(KeyboardInterrupt), files.atomic(path) as temporary:
         temporary.write_text("half")
         raise KeyboardInterrupt
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
@@ -65,9 +65,9 @@ def test_rows_come_in_the_order_asked_for_and_are_kept(tmp_path):
         assert folder.finished == [("a", 0), ("b", 1)]
     with opened(tmp_path / "r", controllers=("c",)) as folder:
         folder.add(trajectory("c"))
-    rows = runs.read_summary(tmp_path / "r" / "summary.csv")
+    rows = run_folder.read_summary(tmp_path / "r" / "summary.csv")
     assert [(row["controller"], row["seed"]) for row in rows] == [("a", 0), ("b", 1), ("c", 0)]
-    assert rows[0]["solver_failures"] == 1 and list(rows[0]) == list(runs.COLUMNS)
+    assert rows[0]["solver_failures"] == 1 and list(rows[0]) == list(run_folder.COLUMNS)
     sessions = json.loads((tmp_path / "r" / "manifest.json").read_text())["sessions"]
     assert [session["seeds"] for session in sessions] == [[0, 1], [0]]
 
@@ -87,14 +87,14 @@ def test_another_configuration_or_policy_is_refused(tmp_path):
         with opened(tmp_path / "r", settings={"no-control": {"policy_hash": "2"}}):
             pass
     with pytest.raises(InputError, match="step: 30.0 there, 60.0 asked for"):
-        with runs.open_folder(tmp_path / "r", configuration={**CONFIGURATION, "step": 60.0}, order=[]):
+        with run_folder.open_folder(tmp_path / "r", configuration={**CONFIGURATION, "step": 60.0}, order=[]):
             pass
     assert (tmp_path / "r" / "manifest.json").read_bytes() == before
 
 
 def test_a_folder_in_which_nothing_was_finished_goes_again(tmp_path):
     with pytest.raises(KeyboardInterrupt), opened(tmp_path / "a" / "b") as folder:
-        runs.write_trajectory(folder.trajectory_path("no-control", 0), trajectory())
+        run_folder.write_trajectory(folder.trajectory_path("no-control", 0), trajectory())
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(KeyboardInterrupt), opened(tmp_path) as folder:  # one that was there before stays, empty

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from nmfd import disk, scaling
-from nmfd.cli import main
-from nmfd.workers import Failure, outcomes
+from nmfd.cli.main import main
+from nmfd.runs import files
+from nmfd.runs.workers import Failure, outcomes
+from nmfd.studies import scaling
 
 
 def nmfd(*arguments):
@@ -57,10 +58,10 @@ def test_cases_are_kept_added_and_drawn(tmp_path):
     first = nmfd("--regions", 3, "--controllers", "mpc-pc", "--out", out)
     assert first.exit_code == 0, first.output
     assert "mpc-pc" in first.stdout and f"Written to {out}" in first.stdout
-    row = disk.read_rows(out / "scaling.csv", scaling.COLUMNS)[0]
+    row = files.read_rows(out / "scaling.csv", scaling.COLUMNS)[0]
     second = nmfd("--regions", "3,4", "--controllers", "mpc-pc", "--out", out, "--workers", 2, "--family", "hexagonal")
     assert second.exit_code == 0, second.output
-    rows = disk.read_rows(out / "scaling.csv", scaling.COLUMNS)
+    rows = files.read_rows(out / "scaling.csv", scaling.COLUMNS)
     assert [(r["family"], r["regions"]) for r in rows] == [("complete", 3), ("hexagonal", 3), ("hexagonal", 4)]
     assert rows[0] == row  # not measured again
     assert (out / "scaling.png").stat().st_size > 10_000
@@ -74,7 +75,7 @@ def test_what_takes_too_much_is_a_row_with_its_reason(tmp_path):
     big = scaling.scaling(["mpc-pcrg"], out=tmp_path / "big", regions=[150], memory_gib=0.3)
     assert "MemoryError" in big[0]["status"] or "died" in big[0]["status"]
     assert (tmp_path / "big" / "scaling.png").exists()
-    assert disk.read_rows(tmp_path / "big" / "scaling.csv", scaling.COLUMNS)[0]["status"] == big[0]["status"]
+    assert files.read_rows(tmp_path / "big" / "scaling.csv", scaling.COLUMNS)[0]["status"] == big[0]["status"]
 
 
 def whose(task):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import tiny
 
-from nmfd import training
 from nmfd.controllers import registry
+from nmfd.controllers.dpc import training
 from nmfd.errors import InputError
-from nmfd.scenario import as_modelled, load_scenario
+from nmfd.model.scenario import as_modelled, load_scenario
 
 OTHER = """
 name = "other"

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from test_actuate import MIN_GREEN, PHASES, SINGLE, check
 
-from cosim.city import ensure_built
-from cosim.flows import turning_flows
-from cosim.green_wave import offsets
-from cosim.max_pressure import Junction, Roads, transition
-from cosim.plant import SumoPlant
-from cosim.regions import gateway_room_taken, load_city
-from cosim.signals import Link, Signal, read_signals
-from cosim.sumo import Phase
-from cosim.sumo_settings import Settings
-from cosim.trips import make_trips
-from cosim.webster import LOST, SATURATION, optimised, plan
+from cosim.plant.max_pressure import Junction, Roads, transition
+from cosim.plant.offsets import offsets
+from cosim.plant.plant import SumoPlant
+from cosim.plant.settings import Settings
+from cosim.plant.webster import LOST, SATURATION, optimised, plan
+from cosim.sumo.build import ensure_built
+from cosim.sumo.net import gateway_room_taken, load_city
+from cosim.sumo.session import Phase
+from cosim.sumo.signals import Link, Signal, read_signals
+from cosim.sumo.trips import make_trips
+from cosim.sumo.turning_flows import turning_flows
 from nmfd.errors import InputError
-from nmfd.scenario import load_scenario
+from nmfd.model.scenario import load_scenario
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
@@ -352,6 +352,6 @@ def test_the_same_drivers_reroute(scenario, plant_of):
 
 
 def test_a_city_without_fixed_signals(scenario, monkeypatch):
-    monkeypatch.setattr("cosim.plant.read_signals", lambda *_: ([], ["c11"]))
+    monkeypatch.setattr("cosim.plant.plant.read_signals", lambda *_: ([], ["c11"]))
     with pytest.raises(InputError, match="sumo.signals: webster needs fixed-time signals"):
         SumoPlant(scenario, overrides=Settings(signals="webster"))

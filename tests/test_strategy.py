@@ -4,8 +4,8 @@ from dataclasses import fields
 
 import pytest
 
-from cosim.strategy import ALONE, OPTIONS, configured, model_free, parse
-from cosim.sumo_settings import Settings
+from cosim.plant.settings import Settings
+from cosim.plant.strategy import ALONE, OPTIONS, configured, model_free, parse
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 

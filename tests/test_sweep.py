@@ -15,13 +15,13 @@ import pytest
 from click.testing import CliRunner
 from test_interruption import killed
 
-from cosim import remote, sweeps
-from cosim.cli import main
-from cosim.simulate import FACTS, Result, Task
+from cosim.cli.main import main
+from cosim.evaluation import dask_worker, sweeps
+from cosim.evaluation.simulate import FACTS, Result, Task
 from nmfd.errors import InputError
-from nmfd.runs import read_summary
+from nmfd.runs.run_folder import read_summary
+from nmfd.runs.workers import Failure
 from nmfd.types import Trajectory
-from nmfd.workers import Failure
 
 ROOT = Path(__file__).parents[1]
 
@@ -167,20 +167,20 @@ def test_a_damaged_table_is_one_line(peak, tmp_path, content):
 
 
 def test_a_process_that_dies_is_a_failure(monkeypatch, tmp_path):
-    monkeypatch.setattr(remote.sys, "executable", shutil.which("false"))
+    monkeypatch.setattr(dask_worker.sys, "executable", shutil.which("false"))
     task = Task(scenario=tmp_path, controller="no-control", seed=0)
-    assert remote.run(task, str(tmp_path)) == Failure("its process died (status 1)")
+    assert dask_worker.run(task, str(tmp_path)) == Failure("its process died (status 1)")
 
 
 def test_remote_gives_the_reason(tmp_path):
     task = Task(scenario=Path("nowhere"), controller="no-control", seed=0)
-    outcome = remote.run(task, str(tmp_path))
+    outcome = dask_worker.run(task, str(tmp_path))
     assert "nowhere/scenario.toml: no such file" in outcome.reason and "\n" not in outcome.reason
 
 
 def test_no_scheduler_answers(peak, tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="the extra dask is not installed")
-    monkeypatch.setattr("cosim.cluster.PATIENCE", 0.5)
+    monkeypatch.setattr("cosim.evaluation.dask_cluster.PATIENCE", 0.5)
     for address in ("tcp://127.0.0.1:9", "nonsense://x"):
         done = sweep(peak, "--controllers", "no-control", "--scheduler", address, "--out", tmp_path / "out")
         assert done.exit_code == 2 and "no Dask scheduler answers at" in done.stderr, done.output + str(done.exception)

@@ -5,21 +5,21 @@ import math
 import pandas as pd
 import pytest
 
-from cosim import tables
-from cosim.simulate import FACTS
-from nmfd.runs import COLUMNS
+from cosim.evaluation import statistics
+from cosim.evaluation.simulate import FACTS
+from nmfd.runs.run_folder import COLUMNS
 
 
 def rows_of(values: dict[tuple[float, str], dict[int, float]]) -> pd.DataFrame:
     """(level, controller) -> seed -> TTS; everything else is 1 or empty."""
     blank = {name: 1.0 for name in (*COLUMNS, *FACTS)} | {"teleports": 0, "fallbacks": "", "solver_failures": 0}
     return pd.DataFrame([
-        blank | {"demand": level, "controller": name, "seed": seed, tables.TTS: tts}
+        blank | {"demand": level, "controller": name, "seed": seed, statistics.TTS: tts}
         for (level, name), seeds in values.items() for seed, tts in seeds.items()])
 
 
 def test_paired_interval_of_a_worked_example():
-    pair = tables.paired({1: 90.0, 2: 160.0, 3: 210.0}, {1: 100.0, 2: 200.0, 3: 300.0})
+    pair = statistics.paired({1: 90.0, 2: 160.0, 3: 210.0}, {1: 100.0, 2: 200.0, 3: 300.0})
     assert pair.percent == pytest.approx(-20.0)
     assert pair.percent_half == pytest.approx(4.302653 * 10.0 / math.sqrt(3))  # t quantile, 2 degrees of freedom
     assert pair.difference == pytest.approx((-10 - 40 - 90) / 3) and not pair.excludes_zero
@@ -28,14 +28,14 @@ def test_paired_interval_of_a_worked_example():
 def test_pairing_removes_what_a_seed_does_to_both():
     """Seeds differ by a factor of ten, the controllers by 10 to 11 %: the paired interval excludes zero."""
     reference = {seed: 10.0**seed for seed in range(4)}
-    pair = tables.paired({seed: (0.9 - 0.003 * seed) * value for seed, value in reference.items()}, reference)
+    pair = statistics.paired({seed: (0.9 - 0.003 * seed) * value for seed, value in reference.items()}, reference)
     assert pair.excludes_zero and pair.percent == pytest.approx(-10.45)
 
 
 def test_only_common_seeds_count_and_one_alone_proves_nothing():
-    pair = tables.paired({1: 50.0, 2: 1.0}, {1: 100.0, 3: 1.0})
+    pair = statistics.paired({1: 50.0, 2: 1.0}, {1: 100.0, 3: 1.0})
     assert (pair.seeds, pair.percent) == (1, -50.0) and math.isnan(pair.percent_half) and not pair.excludes_zero
-    assert tables.paired({1: 1.0}, {2: 1.0}).seeds == 0
+    assert statistics.paired({1: 1.0}, {2: 1.0}).seeds == 0
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def rows():
 
 
 def test_statistics_pair_within_a_demand_level(rows):
-    table = tables.statistics(rows, "pi-gating").set_index(["demand", "controller"])
+    table = statistics.statistics(rows, "pi-gating").set_index(["demand", "controller"])
     assert table.loc[(1.0, "dpc-pc"), "change_percent"] == pytest.approx(-50.0 + 50.0 / 110.0)
     assert table.loc[(1.0, "dpc-pc"), "change_excludes_zero"] and not table.loc[(1.3, "dpc-pc"), "change_excludes_zero"]
     assert table.loc[(1.0, "dpc-pc"), "change_to_reference_seeds"] == 1
@@ -57,7 +57,7 @@ def test_statistics_pair_within_a_demand_level(rows):
 
 
 def test_pairs_hold_every_pair_in_both_directions(rows):
-    pairs = tables.pairs(rows).set_index(["demand", "controller", "against"])
+    pairs = statistics.pairs(rows).set_index(["demand", "controller", "against"])
     assert len(pairs) == 3 * 2 + 2
     there, back = pairs.loc[(1.0, "dpc-pc", "no-control")], pairs.loc[(1.0, "no-control", "dpc-pc")]
     assert there["difference_veh_s"] == -back["difference_veh_s"] and there["seeds"] == 2
@@ -65,8 +65,8 @@ def test_pairs_hold_every_pair_in_both_directions(rows):
 
 
 def test_tables_show_a_line_per_controller_and_the_teleports(rows, tmp_path):
-    table = tables.write(tmp_path, rows, "pi-gating")
-    text, page = tables.text(table, "pi-gating"), (tmp_path / "evaluate.md").read_text()
+    table = statistics.write(tmp_path, rows, "pi-gating")
+    text, page = statistics.text(table, "pi-gating"), (tmp_path / "evaluate.md").read_text()
     assert "Demand times 1.3" in text and "against pi-gating" in text and "%*" in text
     first = next(line for line in page.splitlines() if line.startswith("| dpc-pc"))
     assert first.rstrip("| ").endswith("| 0") and "-49.5 ± " in first

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.city import ensure_built
-from cosim.regions import load_city
-from cosim.trips import make_trips, write_trips
+from cosim.sumo.build import ensure_built
+from cosim.sumo.net import load_city
+from cosim.sumo.trips import make_trips, write_trips
 from nmfd.errors import InputError
-from nmfd.scenario import load_scenario
+from nmfd.model.scenario import load_scenario
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
 

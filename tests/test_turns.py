@@ -1,4 +1,4 @@
-"""The regional model by its turns against nmfd.dynamics, its gradient against autograd; projected gradients."""
+"""The regional model by its turns against nmfd.model.dynamics, its gradient against autograd; projected gradients."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,10 +8,11 @@ import pytest
 import tiny
 import torch
 
-from nmfd import dynamics, turns
-from nmfd.controllers.mpc import Admissible
-from nmfd.descent import minimise
-from nmfd.network import load_network
+from nmfd.controllers.mpc import edge_model
+from nmfd.controllers.mpc.controller import Admissible
+from nmfd.controllers.mpc.projected_gradient import minimise
+from nmfd.model import dynamics
+from nmfd.model.regional_model import load_network
 
 NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
 LIMITED = tiny.limited(NETWORK)
@@ -29,7 +30,7 @@ def problem(model, *, moves=3, horizon=4, seed=0, guidance=True):
 
 
 def by_dynamics(network, model, start, demand, plan, *, step, substeps, integrator):
-    """The same sum by nmfd.dynamics, as a tensor that knows its gradient with respect to `plan`."""
+    """The same sum by nmfd.model.dynamics, as a tensor that knows its gradient with respect to `plan`."""
     def cells(vector):
         full = torch.zeros(7, 7, dtype=torch.float64)
         full[:, model.destinations] = torch.from_numpy(vector.reshape(7, -1))
@@ -54,46 +55,46 @@ def by_dynamics(network, model, start, demand, plan, *, step, substeps, integrat
     {"step": 30.0, "substeps": 1, "integrator": "euler"}, {"step": 90.0, "substeps": 3, "integrator": "euler"},
     {"step": 60.0, "substeps": 2, "integrator": "rk4"}])
 def test_the_twin_of_dynamics_and_its_gradient(scheme, used, network, guidance):
-    model = turns.build(network, used, guidance=guidance)
+    model = edge_model.build(network, used, guidance=guidance)
     start, demand, plan = problem(model, guidance=guidance)
     tensor = torch.tensor(plan, requires_grad=True)
     expected = by_dynamics(network, model, start, demand, tensor, **scheme)
     expected.backward()
-    value, gradient = turns.vehicle_steps(model, start, demand, plan, gradient=True, **scheme)
+    value, gradient = edge_model.vehicle_steps(model, start, demand, plan, gradient=True, **scheme)
     assert value == pytest.approx(expected.item(), rel=1e-12)
     np.testing.assert_allclose(gradient, tensor.grad.numpy(), rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
 
 
 def test_the_gradient_of_the_rounded_kink():
     """Central differences where a region crosses its jam accumulation."""
-    model = replace(turns.build(NETWORK, EVERY, guidance=True), rounding=50.0)
+    model = replace(edge_model.build(NETWORK, EVERY, guidance=True), rounding=50.0)
     start, demand, plan = problem(model)
     start *= 10_000.0 / start[:7].sum()
-    _, gradient = turns.vehicle_steps(model, start, demand, plan, 30.0, gradient=True)
+    _, gradient = edge_model.vehicle_steps(model, start, demand, plan, 30.0, gradient=True)
     random = np.random.default_rng(1)
     for _ in range(5):
         way = random.standard_normal(plan.shape)
         ahead, behind = (
-            turns.vehicle_steps(model, start, demand, plan + s * way, 30.0)[0] for s in (1e-5, -1e-5))
+            edge_model.vehicle_steps(model, start, demand, plan + s * way, 30.0)[0] for s in (1e-5, -1e-5))
         assert (ahead - behind) / 2e-5 == pytest.approx((gradient * way).sum(), rel=1e-5)
 
 
 def test_rounding_changes_the_rate_at_the_kink_only():
-    exact = replace(turns.build(NETWORK, EVERY, guidance=False), jam=np.full(7, 6000.0))
+    exact = replace(edge_model.build(NETWORK, EVERY, guidance=False), jam=np.full(7, 6000.0))
     rounded = replace(exact, rounding=50.0)
 
     def difference(n):
-        return np.abs(turns.rate(rounded, np.full(7, n))[0] / turns.rate(exact, np.full(7, n))[0] - 1.0).max()
+        return np.abs(edge_model.rate(rounded, np.full(7, n))[0] / edge_model.rate(exact, np.full(7, n))[0] - 1.0).max()
 
     assert 1e-4 < difference(6000.0) < 0.02
     assert max(difference(0.0), difference(4000.0), difference(9000.0)) < 2e-4
 
 
 def test_vehicles_at_stake():
-    model = turns.build(NETWORK, SOME, guidance=True)
+    model = edge_model.build(NETWORK, SOME, guidance=True)
     start, demand, plan = problem(model, moves=1, horizon=1)
-    stake = turns.vehicles_at_stake(model, start, demand, plan, 30.0)[0]
-    q = turns.rate(model, start.reshape(7, -1).sum(axis=1))[0]
+    stake = edge_model.vehicles_at_stake(model, start, demand, plan, 30.0)[0]
+    q = edge_model.rate(model, start.reshape(7, -1).sum(axis=1))[0]
     leaving = 30.0 * q[model.region] * start
     edges = len(model.edges)
     np.testing.assert_allclose(stake[edges:], leaving[model.source])
@@ -103,7 +104,7 @@ def test_vehicles_at_stake():
 
 @BOTH
 def test_projection_is_admissible_nearest_and_idempotent(guidance):
-    model = turns.build(NETWORK, EVERY, guidance=guidance)
+    model = edge_model.build(NETWORK, EVERY, guidance=guidance)
     admissible, random = Admissible(NETWORK, model, guidance=guidance), np.random.default_rng(0)
     edges = len(model.edges)
     for spread in (0.1, 3.0, 1e6):
@@ -124,7 +125,7 @@ def test_projection_is_admissible_nearest_and_idempotent(guidance):
 
 @BOTH
 def test_the_gap_is_what_the_best_plan_saves(guidance):
-    model = turns.build(NETWORK, EVERY, guidance=guidance)
+    model = edge_model.build(NETWORK, EVERY, guidance=guidance)
     admissible, random = Admissible(NETWORK, model, guidance=guidance), np.random.default_rng(0)
     plan = admissible.project(random.uniform(0.0, 1.0, (2, len(model.edges) + len(model.turns))))
     gradient = random.standard_normal(plan.shape)

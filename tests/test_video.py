@@ -7,8 +7,9 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 from test_page import cosim, error_line
 
-from cosim import figures, finished, video
-from cosim.experiment import read_run
+from cosim.evaluation import results as finished
+from cosim.evaluation.experiment import read_run
+from cosim.report import figures, video
 
 
 @pytest.fixture(scope="module")

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from test_page import cosim, error_line
 
-from cosim import sumo, watch
-from cosim.city import ensure_built
-from cosim.plant import SumoPlant
-from cosim.regions import edge_shapes, load_city
-from cosim.simulate import Task, simulate
-from nmfd.scenario import load_scenario
+from cosim.evaluation.simulate import Task, simulate
+from cosim.plant.plant import SumoPlant
+from cosim.report import watch
+from cosim.sumo import session
+from cosim.sumo.build import ensure_built
+from cosim.sumo.net import edge_shapes, load_city
+from nmfd.model.scenario import load_scenario
 
 ROOT = Path(__file__).parents[1]
 XVFB = shutil.which("Xvfb")
@@ -40,7 +41,7 @@ def task(tmp_path_factory):
 
 def test_a_watched_run_is_the_run(task, monkeypatch):
     painted = []
-    monkeypatch.setattr(sumo.Session, "paint", lambda self, colours: painted.append(colours))
+    monkeypatch.setattr(session.Session, "paint", lambda self, colours: painted.append(colours))
     there, here = watch.watch(task, delay=0, program="sumo"), simulate(task).trajectory
     for name in ("accumulation", "backlog", "completed", "perimeter"):
         np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
@@ -83,7 +84,7 @@ def test_a_closed_window_ends_the_run_and_another_can_begin(task, monkeypatch):
         started.append(popen(*arguments, **options))
         return started[-1]
 
-    monkeypatch.setattr(sumo.subprocess, "Popen", start)
+    monkeypatch.setattr(session.subprocess, "Popen", start)
     with pytest.raises(watch.WindowClosed):
         watch.watch(task, delay=0, program="sumo", progress=lambda k, steps: (started[-1].kill(), started[-1].wait()))
     plant = SumoPlant(load_scenario(task.scenario))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nmfd.network import Network
+from nmfd.model.regional_model import Network
 
 NETWORK = """
 name = "{name}"

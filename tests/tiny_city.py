@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import sumo
 
-from cosim.plant import SumoPlant
-from cosim.sumo_settings import settings
-from nmfd.scenario import Scenario
+from cosim.plant.plant import SumoPlant
+from cosim.plant.settings import settings
+from nmfd.model.scenario import Scenario
 from nmfd.types import Controls
 
 CONFIG = """<configuration>

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from cosim.importing.layers import colour
 from cosim.importing.quality import Tables
 from cosim.importing.streets import Streets
-from nmfd import plots
+from nmfd.studies import plots
 
 
 def draw_map(

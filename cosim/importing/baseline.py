@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from cosim.importing.streets import Streets
-from cosim.xml_files import file_list, read_xml
+from cosim.sumo.xml_files import file_list, read_xml
 from nmfd.errors import InputError
-from nmfd.scratch import Scratch
+from nmfd.runs.scratch import Scratch
 
 INTERVAL = 300.0  # s, of the densities
 PEAK = 3          # such intervals, one after the other: those with the most vehicles count for the partition

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from cosim.xml_files import BROKEN, opened, read_xml
+from cosim.sumo.xml_files import BROKEN, opened, read_xml
 from nmfd.errors import InputError
 
 # Names that SUMO gives the same option.

@@ -14,8 +14,8 @@ from cosim.importing.case import Case, seconds
 from cosim.importing.harmless import silent, softened
 from cosim.importing.od import Cell, read_od, relations, trips
 from cosim.importing.streets import Streets
-from cosim.originals import BOUND
-from cosim.xml_files import read_xml
+from cosim.sumo.recorded_trips import BOUND
+from cosim.sumo.xml_files import read_xml
 from nmfd.errors import InputError
 
 DRIVERS = ("vehicle", "trip", "flow")

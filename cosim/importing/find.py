@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from nmfd import toml
 from nmfd.errors import InputError
+from nmfd.runs import config
 
 
 def scenario_of(target: Path) -> Path:
@@ -22,7 +22,7 @@ def scenario_of(target: Path) -> Path:
 
 def _is_on(file: Path, network: Path) -> bool:
     try:
-        name = toml.read(file).text("network", None)
+        name = config.read(file).text("network", None)
     except InputError:
         return False
     return bool(name) and (file.parent / name).resolve() == network.resolve()

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from cosim.importing.demand import Traffic
 from cosim.importing.streets import Streets
-from cosim.trips import SHORT, TASTE_SPREAD, TASTES
+from cosim.sumo.trips import SHORT, TASTE_SPREAD, TASTES
 from nmfd.errors import InputError
 
 RAMP_UP, FLAT, RAMP_DOWN = 1800.0, 1800.0, 1800.0   # s

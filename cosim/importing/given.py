@@ -8,7 +8,7 @@ import numpy as np
 
 from cosim.importing.layers import area
 from cosim.importing.streets import Streets
-from cosim.xml_files import read_xml
+from cosim.sumo.xml_files import read_xml
 from nmfd.errors import InputError
 
 

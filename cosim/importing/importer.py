@@ -16,12 +16,12 @@ from cosim.importing.generated import morning_peak
 from cosim.importing.partition import partition
 from cosim.importing.regions import positions
 from cosim.importing.streets import Streets, read_streets
-from cosim.originals import MESOSCOPIC, read_originals, write_originals
-from cosim.regions import City, load_city
+from cosim.sumo.net import City, load_city
+from cosim.sumo.recorded_trips import MESOSCOPIC, read_originals, write_originals
 from nmfd.errors import InputError
-from nmfd.network import Network
-from nmfd.scenario import GUIDED
-from nmfd.scratch import LOCK, Scratch
+from nmfd.model.regional_model import Network
+from nmfd.model.scenario import GUIDED
+from nmfd.runs.scratch import LOCK, Scratch
 
 LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
 LITTLE = 0.3  # of the flow over the boundaries passes no signal under control: worth a word

@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cosim.identify import network_toml, own_splits
+from cosim.evaluation.identify import network_toml, own_splits
 from cosim.importing.baseline import Baseline
 from cosim.importing.case import Case
 from cosim.importing.demand import Traffic
 from cosim.importing.regions import digraph, names, positions
 from cosim.importing.streets import Streets
-from cosim.regions import JAM_SPACING
-from nmfd.mfd import Mfd
-from nmfd.network import Network
-from nmfd.toml import quoted
+from cosim.sumo.net import JAM_SPACING
+from nmfd.model.mfd import Mfd
+from nmfd.model.regional_model import Network
+from nmfd.runs.config import quoted
 
 # The shape of the published MFD, g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam, for want of anything measured.
 ALPHA, BETA = 0.98405, -1.97190

@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from cosim.importing.case import seconds
-from cosim.xml_files import opened, read_xml
+from cosim.sumo.xml_files import opened, read_xml
 from nmfd.errors import InputError
 
 COUNTS = ("count", "value")  # attributes of a relation that may hold the number of vehicles

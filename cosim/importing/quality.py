@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from cosim.importing.baseline import Baseline
 from cosim.importing.streets import Streets, graph
-from cosim.regions import City
+from cosim.sumo.net import City
 
 QUALITY = (
     "region", "name", "edges", "lane_km", "signals", "pieces", "mean_density_veh_km", "variance_before",

@@ -11,8 +11,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from cosim.importing.case import seconds
-from cosim.regions import for_cars, size
-from cosim.xml_files import BROKEN, opened, read_xml
+from cosim.sumo.net import for_cars, size
+from cosim.sumo.xml_files import BROKEN, opened, read_xml
 from nmfd.errors import InputError
 
 

@@ -13,7 +13,7 @@ from cosim.importing import atlas, layers, model, quality
 from cosim.importing.baseline import Baseline
 from cosim.importing.demand import Traffic, wrapped
 from cosim.importing.streets import Streets
-from nmfd.network import Network
+from nmfd.model.regional_model import Network
 
 NET = "city.net.xml.gz"
 FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz", "additional": "city.add.xml.gz"}

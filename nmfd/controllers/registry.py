@@ -1,6 +1,6 @@
 """Controllers by name. The module behind a name is imported only when that controller is made.
 
-Besides those here there are controllers of the user's own (nmfd.controllers.own), by entry point or file.
+Besides those here there are controllers of the user's own (nmfd.controllers.custom), by entry point or file.
 """
 
 from __future__ import annotations
@@ -13,48 +13,48 @@ from typing import TYPE_CHECKING
 from nmfd.errors import InputError
 
 if TYPE_CHECKING:  # `names` must answer without numpy, torch or casadi
-    from nmfd.scenario import Scenario
+    from nmfd.model.scenario import Scenario
     from nmfd.types import Controller
 
 
 def _no_control(scenario: Scenario) -> Controller:
-    from nmfd.controllers.fixed import NoControl
+    from nmfd.controllers.no_control import NoControl
 
     return NoControl(scenario)
 
 
 def _route_guidance(scenario: Scenario) -> Controller:
-    from nmfd.controllers.fixed import RouteGuidance
+    from nmfd.controllers.no_control import RouteGuidance
 
     return RouteGuidance(scenario)
 
 
 def _pi_gating(scenario: Scenario) -> Controller:
-    from nmfd.controllers.gating import PiGating
+    from nmfd.controllers.pi_gating import PiGating
 
     return PiGating(scenario)
 
 
 def _mpc_pc(scenario: Scenario) -> Controller:
-    from nmfd.controllers.mpc import EconomicMpc
+    from nmfd.controllers.mpc.controller import EconomicMpc
 
     return EconomicMpc(scenario, guidance=False)
 
 
 def _mpc_pcrg(scenario: Scenario) -> Controller:
-    from nmfd.controllers.mpc import EconomicMpc
+    from nmfd.controllers.mpc.controller import EconomicMpc
 
     return EconomicMpc(scenario, guidance=True)
 
 
 def _probing_pc(scenario: Scenario) -> Controller:
-    from nmfd.controllers.probing import Probing
+    from nmfd.controllers.excitation import Probing
 
     return Probing(scenario, guidance=False)
 
 
 def _probing_pcrg(scenario: Scenario) -> Controller:
-    from nmfd.controllers.probing import Probing
+    from nmfd.controllers.excitation import Probing
 
     return Probing(scenario, guidance=True)
 
@@ -98,8 +98,8 @@ def check(name: str) -> None:
 
 def split(name: str) -> tuple[str, list[str]]:
     """The controller of NAME+OPTION+..., and its options; the path of a controller in a file may hold a + too."""
-    own = _OWN.match(name)
-    first, *rest = [own[0], *name[own.end():].split("+")[1:]] if own else name.split("+")
+    custom = _OWN.match(name)
+    first, *rest = [custom[0], *name[custom.end():].split("+")[1:]] if custom else name.split("+")
     return first, rest
 
 
@@ -107,19 +107,19 @@ def known(name: str) -> bool:
     """Whether `name` is a controller. InputError for a file that is not there."""
     if name in names():
         return True
-    from nmfd.controllers import own
+    from nmfd.controllers import custom
 
-    if own.is_file(name):
-        own.check(name)
+    if custom.is_file(name):
+        custom.check(name)
         return True
-    return name in own.entry_points()
+    return name in custom.entry_points()
 
 
 def choice() -> tuple[str, ...]:
     """Every controller that has a name of its own, built in or installed."""
-    from nmfd.controllers import own
+    from nmfd.controllers import custom
 
-    return (*names(), *(name for name in own.entry_points() if name not in names()))
+    return (*names(), *(name for name in custom.entry_points() if name not in names()))
 
 
 def is_own(name: str) -> bool:
@@ -134,18 +134,18 @@ def guides(name: str) -> bool:
 
 def configured_own(name: str, scenario: Scenario) -> tuple[str, Scenario]:
     """Of a controller of the user's own: the name of its table, and `scenario` with the tables of all such."""
-    from nmfd.controllers import own
+    from nmfd.controllers import custom
 
-    return own.table_name(name), own.with_tables(scenario)
+    return custom.table_name(name), custom.with_tables(scenario)
 
 
 def fingerprint(name: str, policy: Path | None) -> dict[str, object]:
     """What the runs of `name` depend on in files: its own source, or its `policy_path`."""
     if is_own(name):
-        from nmfd.controllers import own
+        from nmfd.controllers import custom
 
-        return own.fingerprint(name)
-    from nmfd.disk import file_hash
+        return custom.fingerprint(name)
+    from nmfd.runs.files import file_hash
 
     return {} if policy is None else {"policy_hash": file_hash(policy)}
 
@@ -185,33 +185,33 @@ def _owner(name: str) -> str:
 def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Controller:
     """The controller `name` for `scenario`; `policy` is the file of a policy or plan instead of the scenario's own.
 
-    A name "NAME+..." stands for NAME with options and a policy of its own (nmfd.scenario.as_modelled). Raises
+    A name "NAME+..." stands for NAME with options and a policy of its own (nmfd.model.scenario.as_modelled). Raises
     InputError as `policy_path` does, and what the controller itself finds wrong with its options or policy.
     """
-    from nmfd.scenario import as_modelled
+    from nmfd.model.scenario import as_modelled
 
     path = policy_path(name, scenario, policy)
     variant, name = name, split(name)[0]
     if is_own(name):
-        from nmfd.controllers import own
+        from nmfd.controllers import custom
 
-        return own.make(name, scenario)
+        return custom.make(name, scenario)
     scenario = as_modelled(scenario, _owner(variant))
     if path is None:
         return _WITHOUT_POLICY[name](scenario)
     if name in _WITH_PLAN:
-        from nmfd import bound
+        from nmfd.studies import bound
 
         return bound.load(path, scenario, guidance=_WITH_PLAN[name])
     if name in _GUARDED:
-        from nmfd.controllers import guarded
+        from nmfd.controllers.dpc import fallback
 
-        return guarded.load(path, scenario, guidance=_WITH_POLICY[_GUARDED[name]])
+        return fallback.load(path, scenario, guidance=_WITH_POLICY[_GUARDED[name]])
     if name in _ONLINE:
-        from nmfd.controllers import online
+        from nmfd.controllers.dpc import online
 
         return online.load(path, scenario, guidance=_WITH_POLICY[_ONLINE[name]])
-    from nmfd.controllers import dpc
+    from nmfd.controllers.dpc import policy as dpc
 
     return dpc.load(path, scenario, guidance=_WITH_POLICY[name])
 
@@ -224,10 +224,10 @@ def check_options(scenario: Scenario) -> None:
     """
     from dataclasses import replace
 
-    from nmfd import toml
+    from nmfd.runs import config
 
     where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-    tables = toml.Table(scenario.controller_options, where, "controllers.")
+    tables = config.Table(scenario.controller_options, where, "controllers.")
     for variant in scenario.controller_options:
         if variant == OWN:  # checked by those controllers, if at all
             tables.table(OWN)
@@ -240,21 +240,21 @@ def check_options(scenario: Scenario) -> None:
         table.text("model", None)
         options = {**scenario.controller_options.get(name, {}), **table.raw()}
         options.pop("model", None)
-        own = replace(scenario, controller_options=dict.fromkeys((name, variant), options))
+        custom = replace(scenario, controller_options=dict.fromkeys((name, variant), options))
         if name.startswith("mpc-"):
-            from nmfd.controllers import mpc
+            from nmfd.controllers.mpc import controller
 
-            mpc.options(own, name)
+            controller.options(custom, name)
         elif name in _WITH_POLICY:
-            from nmfd import training
+            from nmfd.controllers.dpc import training
 
-            training.settings(own, variant)
+            training.settings(custom, variant)
         elif name in _ONLINE:
-            from nmfd.controllers import online
+            from nmfd.controllers.dpc import online
 
-            online.options(own, name)
+            online.options(custom, name)
         elif name in ("pi-gating", "probing-pc", "probing-pcrg"):
             if scenario.protected:  # without a protected region gating cannot be made, and is not made
-                _WITHOUT_POLICY[name](own)
+                _WITHOUT_POLICY[name](custom)
         else:
             table.close()

@@ -1,4 +1,4 @@
-"""Reinforcement learning on the regional model and, through cosim.rl, in SUMO. Needs the extra `rl`.
+"""Reinforcement learning on the regional model and, through cosim.plant.env, in SUMO. Needs the extra `rl`.
 
     RegionalEnv         gymnasium.Env: one agent for all regions, on any plant
     RegionsEnv          pettingzoo.ParallelEnv: one agent per region, on any plant

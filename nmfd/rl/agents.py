@@ -4,9 +4,9 @@ import gymnasium
 import numpy as np
 from pettingzoo import ParallelEnv
 
-from nmfd.plant import NmfdPlant
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import Scenario
 from nmfd.rl.interface import Episode, Interface, combined
-from nmfd.scenario import Scenario
 from nmfd.types import Plant
 
 

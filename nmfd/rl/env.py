@@ -3,9 +3,9 @@
 import gymnasium
 import numpy as np
 
-from nmfd.plant import NmfdPlant
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import Scenario
 from nmfd.rl.interface import Episode, Interface
-from nmfd.scenario import Scenario
 from nmfd.types import Plant
 
 

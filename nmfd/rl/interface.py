@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nmfd.network import Network
+from nmfd.model.regional_model import Network
 from nmfd.types import Controls, Measurement
 
 LOGITS = 5.0  # actions in [-1, 1] times this are the logits of the split ratios: up to e^10 between two ways

@@ -6,10 +6,10 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from nmfd import dynamics
+from nmfd.controllers.dpc.rollout import Rollout
+from nmfd.model import dynamics
+from nmfd.model.scenario import Scenario
 from nmfd.rl.interface import Interface
-from nmfd.rollout import Rollout
-from nmfd.scenario import Scenario
 
 
 class NmfdVectorEnv(VectorEnv):

@@ -6,10 +6,10 @@ import casadi as ca
 import numpy as np
 import torch
 
-from nmfd import dynamics_casadi as model
-from nmfd.controllers.dpc import Policy
-from nmfd.network import Network
-from nmfd.scenario import Scenario
+from nmfd.controllers.dpc.policy import Policy
+from nmfd.model import dynamics_casadi as model
+from nmfd.model.regional_model import Network
+from nmfd.model.scenario import Scenario
 
 
 def mpc(scenario: Scenario, *, guidance: bool, horizon: int = 8) -> Callable:

@@ -17,10 +17,10 @@ from xml.etree import ElementTree
 import numpy as np
 import sumo
 
-from cosim.city import ensure_built
-from cosim.regions import City, load_city
-from cosim.trips import write_trips
-from nmfd.scenario import load_scenario
+from cosim.sumo.build import ensure_built
+from cosim.sumo.net import City, load_city
+from cosim.sumo.trips import write_trips
+from nmfd.model.scenario import load_scenario
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "grid7_peak"
 AHEAD = (90, 900)  # s

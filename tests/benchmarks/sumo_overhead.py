@@ -20,11 +20,11 @@ from pathlib import Path
 import sumo
 import torch
 
-from cosim.plant import SumoPlant
-from cosim.sumo import Session
+from cosim.plant.plant import SumoPlant
+from cosim.sumo.session import Session
 from nmfd import closed_loop
 from nmfd.controllers import registry
-from nmfd.scenario import Scenario, load_scenario
+from nmfd.model.scenario import Scenario, load_scenario
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "grid7_peak"
 FIRST = 12  # control interval from which the demand is taken: it flows from the beginning

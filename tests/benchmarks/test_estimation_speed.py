@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from nmfd.estimation import Estimator, Instruments, Observation
-from nmfd.plant import NmfdPlant
-from nmfd.scenario import load_scenario
+from nmfd.model.estimation import Estimator, Instruments, Observation
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import load_scenario
 from nmfd.types import Controls
 
 SCENARIO = load_scenario(Path(__file__).parents[2] / "scenarios" / "grid7_peak")

@@ -11,14 +11,14 @@ import plain
 import pytest
 import torch
 
-from nmfd import scaling
 from nmfd.closed_loop import run
 from nmfd.controllers import registry
-from nmfd.controllers.dpc import load_policy
-from nmfd.controllers.fixed import NoControl
-from nmfd.controllers.mpc import EconomicMpc
-from nmfd.plant import NmfdPlant
-from nmfd.scenario import Scenario, load_scenario
+from nmfd.controllers.dpc.policy import load_policy
+from nmfd.controllers.mpc.controller import EconomicMpc
+from nmfd.controllers.no_control import NoControl
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import Scenario, load_scenario
+from nmfd.studies import scaling
 from nmfd.types import Measurement
 
 SCENARIO = load_scenario(Path(__file__).parents[2] / "scenarios" / "economic_mpc")
@@ -60,7 +60,7 @@ def random_city(family, regions):
 
 
 def compare(scenario, measured, guidance):
-    """Total time spent over the horizon [veh s] by nmfd.controllers.mpc, by plain IPOPT, and whether that converged."""
+    """Total time spent over the horizon [veh s] by our MPC, by plain IPOPT, and whether that converged."""
     controller, k = EconomicMpc(scenario, guidance=guidance), measured.step
     assert controller.act(measured).status == "ok"
     perimeter, splits, solved = plain.mpc(scenario, guidance=guidance)(

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from nmfd.controllers.dpc import Architecture, Policy
-from nmfd.rollout import Rollout, compiled_step
-from nmfd.scenario import load_scenario
+from nmfd.controllers.dpc.policy import Architecture, Policy
+from nmfd.controllers.dpc.rollout import Rollout, compiled_step
+from nmfd.model.scenario import load_scenario
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "economic_mpc"
 

@@ -1,0 +1,144 @@
+"""The commands identify and import of `cosim`. Heavy modules are imported inside them."""
+
+import os
+from pathlib import Path
+
+import click
+
+from cosim.cli.options import parsed_level, parsed_levels
+from nmfd.cli.errors import Interrupted
+from nmfd.cli.options import COUNT, FILE, FOLDER, SEED
+from nmfd.errors import InputError
+
+
+@click.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--levels", default="0.6,0.8,1.0", show_default=True, metavar="A,B,...",
+              help="The loading runs: multiples of the scenario's demand.")
+@click.option("--seeds", type=COUNT, default=2, show_default=True, metavar="N",
+              help="Loading runs per level, with seeds 1000 to 1000 + N - 1.")
+@click.option("--workers", type=COUNT, default=2, show_default=True, metavar="N")
+@click.option("--guided/--own", default=None,
+              help="Only the model of guided drivers, or only that of drivers who go their own ways. [default: both]")
+@click.option("--with", "options", metavar="OPTION[+...]",
+              help="Of a city with such signals or drivers: max-pressure, rerouting-30, ... as in a strategy's name.")
+@click.option("--network", "target", type=FOLDER, metavar="DIR",
+              help="The folder whose network.toml is written, for one model. [default: the scenario's network]")
+@click.option("--iterations", type=COUNT, default=600, show_default=True, metavar="N",
+              help="Of the fit.")
+@click.option("--out", type=FOLDER, metavar="DIR", help="Samples and pictures. [default: runs/<scenario>-identify]")
+def identify(
+    scenario: Path, levels: str, seeds: int, workers: int, guided: bool | None, options: str | None,
+    target: Path | None, iterations: int, out: Path | None,
+) -> None:
+    """Fit the regional model and the drivers' own split ratios of a SUMO city; writes a network.toml.
+
+    The city is loaded with multiples of the scenario's demand, first without perimeter control, then under a controller
+    that probes it. Policies that were trained on the network as it was before do not fit the new one: train them again.
+
+    Then the same with guided drivers, who make another model of the same city: it goes to the folder guided within the
+    network's, where the controllers that guide routes find it. Where the scenario tells them of another one, as with
+    [controllers.dpc-pcrg] and model = "../../networks/grid7_guided", and with --with or --network, there is one model
+    only. One for a strategy with options has a table of its own, such as [controllers."dpc-pcrg+max-pressure"].
+
+    Of an imported city the network's folder will do.
+
+    \b
+    Examples:
+      cosim identify networks/mycity
+      cosim identify networks/mycity --own --levels 0.6,0.8,1.0 --seeds 2
+      cosim identify scenarios/grid7_peak --guided --network networks/grid7_guided
+      cosim identify scenarios/grid7_peak --guided --with max-pressure --network networks/grid7_max_pressure
+    """
+    from cosim.evaluation import identify
+    from cosim.importing import find
+    from nmfd.cli.progress import progress_line
+    from nmfd.model.scenario import load_scenario
+    from nmfd.runs import files
+
+    factors = parsed_levels("--levels", levels)
+    scenario = find.scenario_of(scenario)
+    loaded = load_scenario(scenario)
+    both = guided is None and not options and target is None and identify.without_model(loaded)
+    for guide in (False, True) if both else (bool(guided),):
+        kind = f"{'-guided' if guide else ''}{f'-{options}' if options else ''}"
+        folder = out or Path("runs") / f"{files.file_name(loaded.name)}-identify{kind}"
+        if out and both and guide:
+            folder = out / "guided"
+        loading = identify.Loading(
+            levels=factors, seeds=range(1000, 1000 + seeds), guided=guide,
+            options=options.split("+") if options else (), network=target, iterations=iterations)
+        try:
+            with progress_line("identify") as progress:
+                text = identify.identify(scenario, loading, out=folder, workers=workers, progress=progress)
+        except KeyboardInterrupt:
+            raise Interrupted(
+                f"interrupted; finished loading runs are in {folder}: the same command goes on") from None
+        if both:
+            click.echo("Drivers who are guided:" if guide else "Drivers who go their own ways:")
+        click.echo(text)
+        written = os.path.normpath(loading.target(loaded) / "network.toml")
+        click.echo(f"Written to {written}; samples and pictures to {folder}")
+
+
+@click.command(name="import")
+@click.argument("source", type=FILE, metavar="SUMOCFG|NET")
+@click.option("--regions", type=click.IntRange(min=2), metavar="N", help="How many regions to cut the city into.")
+@click.option("--out", type=FOLDER, required=True, metavar="DIR", help="The network's folder, such as networks/mycity.")
+@click.option("--scenario", type=FOLDER, metavar="DIR", help="[default: scenarios/<name>, beside the networks]")
+@click.option("--method", type=click.Choice(["density", "geometric"]), default="density", show_default=True,
+              help="How: streets of similar density together, or k-means on the road graph.")
+@click.option("--edges", type=FILE, metavar="CSV", help="Or your own regions: a table with the columns edge,region,")
+@click.option("--taz", type=FILE, metavar="FILE", help="or a SUMO file with a TAZ per region,")
+@click.option("--polygons", type=FILE, metavar="FILE", help="or one with a polygon or more (id, id.1, ...) per region.")
+@click.option("--routes", type=FILE, multiple=True, metavar="FILE",
+              help="Vehicles, trips or flows, if not in the sumocfg. May be repeated.")
+@click.option("--od", type=FILE, multiple=True, metavar="FILE",
+              help="OD matrix between TAZ: tazRelation XML, or VISUM's O- or V-format. May be repeated.")
+@click.option("--zones", type=FILE, multiple=True, metavar="FILE", help="The TAZ of --od, if not in the sumocfg.")
+@click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak, for a city without demand.")
+@click.option("--level", default="1", show_default=True, metavar="X|auto",
+              help="Times the city's vehicles, or the usual peak; auto: the lowest that congests without control.")
+@click.option("--mesoscopic", is_flag=True,
+              help="With SUMO's queue model, now and later: ten times as fast, no lanes; for quick studies.")
+@click.option("--begin", metavar="TIME", help="Instead of the sumocfg's, in seconds or as hours:minutes:seconds.")
+@click.option("--end", metavar="TIME", help="Later departures are left out.")
+@click.option("--seed", type=SEED, default=0, show_default=True)
+@click.option("--no-run", is_flag=True, help="Do not simulate the city first: no densities and no flows.")
+@click.option("--force", is_flag=True, help="Replace a network and scenario that are there.")
+def import_(
+    source: Path, regions: int | None, out: Path, scenario: Path | None, method: str, edges: Path | None,
+    taz: Path | None, polygons: Path | None, routes: tuple[Path, ...], od: tuple[Path, ...], zones: tuple[Path, ...],
+    demand: str | None, level: str, mesoscopic: bool, begin: str | None, end: str | None, seed: int, no_run: bool,
+    force: bool,
+) -> None:
+    """Turn any SUMO city into a network and a scenario: regions, gateways, demand by pair of regions, map.
+
+    Its own vehicles stay as they are: routes, departures, types. The city is simulated without control first.
+
+    \b
+    Examples:
+      cosim import city.sumocfg --regions 5 --out networks/mycity
+      cosim import city.net.xml.gz --routes cars.rou.xml --regions 5 --out networks/mycity
+      cosim import city.net.xml.gz --regions 6 --demand peak --out networks/mycity
+      cosim import city.sumocfg --taz districts.taz.xml --out networks/mycity --begin 7:00:00 --end 9:00:00
+    """
+    from cosim.importing.importer import Order, import_city, parse_time
+    from nmfd.cli.progress import progress_line
+
+    own = {key: file for key, file in (("edges", edges), ("taz", taz), ("polygons", polygons)) if file}
+    if len(own) + (regions is not None) != 1:
+        raise InputError("--regions: give a number of regions, or else one of --edges, --taz and --polygons")
+    if no_run and method == "density" and not own:
+        raise InputError("--no-run: the densities come from that run; add --method geometric")
+    method, given = next(iter(own.items()), (method, None))
+    order = Order(
+        source=source, regions=regions, out=out, method=method, given=given, seed=seed, run=not no_run, force=force,
+        peak=demand is not None, level=parsed_level(level, no_run), mesoscopic=mesoscopic,
+        scenario=scenario or out.parent.parent / "scenarios" / out.name,
+        begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"), routes=routes, od=od,
+        zones=zones)
+    with progress_line("import") as progress:
+        report = import_city(order, (lambda stage: progress(0, 1, stage)) if progress else lambda stage: None)
+    click.echo(report)
+    click.echo(f"Written to {order.out} (see map.png, quality.csv, gateways.csv) and {order.scenario}")

@@ -1,0 +1,167 @@
+"""The command line `cosim`. Heavy modules are imported inside the commands, so that the help answers at once."""
+
+from pathlib import Path
+
+import click
+
+from cosim.cli.city import identify, import_
+from cosim.cli.options import CONTROLLER_HELP, parsed_compliance, parsed_levels, tell
+from cosim.cli.report import report, video, watch
+from cosim.cli.run import compare, run
+from nmfd.cli.errors import Commands, Interrupted
+from nmfd.cli.options import COUNT, FOLDER, SEED
+from nmfd.errors import InputError
+from nmfd.runs.workers import RunFailed
+
+
+@click.group(name="cosim", cls=Commands)
+@click.version_option(package_name="perimeter-cosim", prog_name="cosim")
+def main() -> None:
+    """Regional controllers in a SUMO city: run, evaluate, compare with the regional model, identify it.
+
+    \b
+    Example:
+      cosim run scenarios/grid7_peak --controller dpc-pcrg --against no-control
+    """
+
+
+@main.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--controllers", required=True, metavar="A,B,...", help="Separated by commas. " + CONTROLLER_HELP)
+@click.option("--seeds", type=COUNT, default=10, show_default=True, metavar="N",
+              help="Runs per controller and demand level, on the same trips for all controllers.")
+@click.option("--first-seed", type=SEED, default=2000, show_default=True, metavar="S",
+              help="The seeds are S to S + N - 1. From 2000 on they were never used in development.")
+@click.option("--demand", default="1.0", show_default=True, metavar="A,B,...",
+              help="Demand levels: multiples of the scenario's demand.")
+@click.option("--reference", metavar="NAME", help="Pair all controllers with this one too, besides no-control.")
+@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
+              help="Policy of a DPC controller, if not SCENARIO/NAME.pt. May be repeated.")
+@click.option("--workers", type=COUNT, metavar="N",
+              help="Runs at a time, each in a process of its own. [default: one per core]")
+@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
+@click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-evaluate]")
+def evaluate(
+    scenario: Path, controllers: str, seeds: int, first_seed: int, demand: str, reference: str | None,
+    policies: tuple[str, ...], workers: int | None, steps: int | None, out: Path | None,
+) -> None:
+    """Compare controllers in the microsimulation over seeds and demand levels; print and write tables, draw figures.
+
+    Every run is kept as soon as it is finished. The same command goes on where it was interrupted, and more seeds,
+    controllers or demand levels are added to what is there; only the runs of a controller whose own options, policy
+    or model changed are done again.
+
+    \b
+    Examples:
+      cosim evaluate scenarios/grid7_peak --controllers no-control,pi-gating,dpc-pc --seeds 10
+      cosim evaluate scenarios/grid7_peak --controllers no-control,dpc-pc --demand 0.8,1.0,1.3 --out runs/levels
+    """
+    from cosim.plant.strategy import parse
+    from nmfd.cli.options import policy_files
+
+    names = [name.strip() for name in controllers.split(",")]
+    for name in names:
+        parse(name)
+    if repeated := [name for n, name in enumerate(names) if name in names[:n]]:
+        raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
+    files = policy_files(policies, names)
+
+    import os
+
+    from cosim.evaluation import evaluate, statistics
+    from nmfd.cli.progress import progress_line
+    from nmfd.model.scenario import load_scenario
+    from nmfd.runs import files as disk
+
+    loaded = load_scenario(scenario)
+    chosen = evaluate.Evaluation(
+        scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
+        levels=tuple(parsed_levels("--demand", demand)), steps=steps, policies=files, reference=reference,
+        out=Path("runs") / f"{disk.file_name(loaded.name)}-evaluate" if out is None else out)
+    workers = len(os.sched_getaffinity(0)) if workers is None else workers
+    try:
+        with progress_line("evaluate") as progress:
+            table, failures = evaluate.evaluate(chosen, workers=workers, progress=progress, tell=tell)
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; finished runs are in {chosen.out}: the same command goes on") from None
+    if len(table):
+        click.echo(statistics.text(table, reference))
+        click.echo(f"Written to {chosen.out}: see evaluate.md, pairs.csv and the pictures")
+    if failures:
+        raise RunFailed(f"{len(failures)} runs failed, and the same command tries them again: {'; '.join(failures)}")
+
+
+@main.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--controllers", required=True, metavar="A,B,...", help="Separated by commas. " + CONTROLLER_HELP)
+@click.option("--seeds", type=COUNT, default=1, show_default=True, metavar="N",
+              help="Runs per controller, demand level and compliance.")
+@click.option("--first-seed", type=SEED, default=0, show_default=True, metavar="S",
+              help="The seeds are S to S + N - 1.")
+@click.option("--demand", default="1.0", show_default=True, metavar="A,B,...",
+              help="Demand levels: multiples of the scenario's demand.")
+@click.option("--compliance", metavar="A,B,...",
+              help="Drivers who follow route guidance [%], such as 0,50,100; of controllers that guide nobody there is "
+                   "one run all the same. [default: the scenario's]")
+@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
+              help="Policy of a DPC controller, if not SCENARIO/NAME.pt. May be repeated.")
+@click.option("--workers", type=COUNT, metavar="N",
+              help="Runs at a time, each in a process of its own. [default: one per core]")
+@click.option("--scheduler", metavar="ADDRESS",
+              help="Of a Dask cluster that does the runs, such as tcp://host:8786 (extra dask). Its workers need this "
+                   "package, and the same files under the same paths.")
+@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
+@click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-sweep]")
+def sweep(
+    scenario: Path, controllers: str, seeds: int, first_seed: int, demand: str, compliance: str | None,
+    policies: tuple[str, ...], workers: int | None, scheduler: str | None, steps: int | None, out: Path | None,
+) -> None:
+    """Run controllers x seeds x demand levels x compliance; write one table, sweep.parquet.
+
+    A run that fails is a row with its reason, and the others go on. Every run is kept as soon as it is finished: the
+    same command goes on where it was interrupted, tries failed runs again, and adds what is asked for besides.
+
+    \b
+    Examples:
+      cosim sweep scenarios/grid7_peak --controllers dpc-pcrg,rerouting-30 --compliance 0,50,100 --seeds 3
+      cosim sweep scenarios/grid7_peak --controllers no-control,pi-gating --demand 0.8,1.0,1.2 \\
+          --scheduler tcp://localhost:8786 --out runs/cluster
+    """
+    from cosim.plant.strategy import parse
+    from nmfd.cli.options import policy_files
+
+    names = [name.strip() for name in controllers.split(",")]
+    for name in names:
+        parse(name)
+    if repeated := [name for n, name in enumerate(names) if name in names[:n]]:
+        raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
+    if scheduler is not None and workers is not None:
+        raise InputError("--workers: is for processes here, and --scheduler has workers of its own; leave one away")
+    files = policy_files(policies, names)
+
+    import os
+
+    from cosim.evaluation import sweeps
+    from nmfd.cli.progress import progress_line
+    from nmfd.model.scenario import load_scenario
+    from nmfd.runs import files as disk
+
+    order = sweeps.Sweep(
+        scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
+        levels=tuple(parsed_levels("--demand", demand)), compliance=parsed_compliance(compliance), steps=steps,
+        policies=files,
+        out=Path("runs") / f"{disk.file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
+    workers = len(os.sched_getaffinity(0)) if workers is None else workers
+    try:
+        with progress_line("sweep") as progress:
+            rows = sweeps.sweep(order, workers=workers, scheduler=scheduler, progress=progress, tell=tell)
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; finished runs are in {order.out}: the same command goes on") from None
+    click.echo(sweeps.text(rows))
+    click.echo(f"Written to {order.out / 'sweep.parquet'}")
+    if failed := int((rows["status"] == sweeps.FAILED).sum()):
+        tell(f"{failed} of {len(rows)} runs failed, see the column reason; the same command tries them again")
+
+
+for command in (run, compare, report, video, watch, identify, import_):
+    main.add_command(command)

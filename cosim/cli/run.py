@@ -1,0 +1,168 @@
+"""The commands run and compare of `cosim`. Heavy modules are imported inside them."""
+
+from pathlib import Path
+
+import click
+
+from cosim.cli.options import CONTROLLER_HELP, tell
+from nmfd.cli.errors import Interrupted
+from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, fault_option
+from nmfd.errors import InputError
+
+
+@click.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--controller", required=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
+@click.option("--against", metavar="NAME", help="Run this controller too, on the same trips, in a second process.")
+@click.option("--seed", type=SEED, default=0, show_default=True,
+              help="Of the trips, the drivers and the guidance.")
+@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
+@click.option("--policy", type=FILE, metavar="FILE", help="Policy of a DPC controller, if not SCENARIO/NAME.pt.")
+@click.option("--sumo-output", metavar="A,B,...",
+              help="SUMO's own outputs in the run folder too: tripinfo, summary, edgedata (per control interval), "
+                   "emission (of every vehicle in every step, large).")
+@click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.runs.frames).")
+@fault_option("closed:EDGE, signal:NAME, sumo-exits")
+@click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
+def run(
+    scenario: Path, controller: str, against: str | None, seed: int, steps: int | None, policy: Path | None,
+    sumo_output: str | None, parquet: bool, faults: tuple[str, ...], out: Path | None,
+) -> None:
+    """Run a controller in the microsimulation; print a table and write a run folder.
+
+    SCENARIO is a folder with a scenario.toml on a network that SUMO can simulate. The run folder holds summary.csv,
+    sumo.csv, trajectories and records, manifest.json and pictures. The same --out goes on where it was interrupted,
+    even by kill -9: finished runs are kept, and the one that was under way starts again from its beginning.
+
+    \b
+    Examples:
+      cosim run scenarios/grid7_peak --controller dpc-pcrg --against no-control
+      cosim run scenarios/grid7_peak --controller pi-gating --seed 3 --out runs/gating
+      cosim run scenarios/grid7_peak --controller dpc-pc+rerouting-30 --against rerouting-30
+      cosim run scenarios/grid7_peak --controller pi-gating --sumo-output tripinfo,edgedata --parquet
+      cosim run scenarios/grid7_peak --controller dpc-pc --fault missing:3@20-30 --fault closed:c33-c34@10-40
+    """
+    from cosim.plant import strategy
+    from cosim.sumo import outputs as outputs
+
+    kinds = outputs.parse(sumo_output) if sumo_output is not None else ()
+    names = [controller] + ([against] if against and against != controller else [])
+    for name in names:
+        strategy.parse(name)
+
+    from cosim.evaluation import estimation_errors, experiment
+    from cosim.evaluation.simulate import Task
+
+    tasks = [
+        Task(scenario=scenario, controller=name, seed=seed, policy=policy if name == controller else None, steps=steps,
+             faults=faults)
+        for name in names]
+    out, rows = _experiment(tasks, out, kinds)
+    click.echo(experiment.table(rows))
+    if parquet:
+        from nmfd.runs import frames
+
+        frames.write(out, experiment.trajectories(out), {"summary": rows})
+    if (out / "estimation.csv").is_file():
+        import pandas as pd
+
+        click.echo(estimation_errors.table(pd.read_csv(out / "estimation.csv")))
+    click.echo(f"Written to {out}: see total_accumulation.png and region_accumulation.png")
+
+
+@click.command()
+@click.argument("target", type=FOLDER, metavar="SCENARIO|RUN")
+@click.option("--controller", metavar="NAME[+...]",
+              help=CONTROLLER_HELP + " [default: no-control; all runs of a RUN folder]")
+@click.option("--seed", type=SEED, help="[default: 0]")
+@click.option("--model", type=FOLDER, metavar="DIR",
+              help="A network of the same city, whose regional model predicts. [default: that with which the "
+                   "controller plans]")
+@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
+@click.option("--out", type=FOLDER, metavar="DIR", help="Run folder of a SCENARIO. [default: runs/<scenario>-<time>]")
+def compare(
+    target: Path, controller: str | None, seed: int | None, model: Path | None, steps: int | None, out: Path | None,
+) -> None:
+    """Compare microsimulated accumulations with what the regional model predicts.
+
+    For a scenario, the microsimulation is run first; for the run folder of `cosim run`, its record is used. Then the
+    regional model is driven with the recorded departures and controls. Writes compare-NAME-SEED.csv and pictures
+    beside the run. For a RUN folder without --controller, `cosim evaluate`'s too: how far ahead the models foresee all
+    of its runs, as a table and foresight.csv.
+
+    \b
+    Examples:
+      cosim compare scenarios/grid7_peak --controller no-control
+      cosim compare runs/gating --controller pi-gating --seed 3
+      cosim compare runs/grid7_peak-evaluate
+    """
+    from cosim.evaluation import experiment, model_validation
+    from cosim.evaluation.simulate import Task, scenario_of
+    from cosim.plant import strategy
+    from nmfd.runs import run_folder
+
+    manifest = run_folder.read_manifest(target / "manifest.json") if (target / "manifest.json").is_file() else None
+    results = manifest is not None or any(target.glob("demand-*/manifest.json"))
+    if results and out is not None:
+        raise InputError(f"--out: {out}: a comparison is written into its run folder {target}; leave --out away")
+    if results and controller is None:
+        if seed is not None or steps is not None:
+            raise InputError(
+                f"--{'seed' if steps is None else 'steps'}: without --controller all runs of {target} are compared, "
+                "whole; name a controller, or leave it away")
+        _foresight(target, model)
+        return
+    controller, seed = controller or "no-control", seed or 0
+    if manifest is not None:
+        try:
+            task = Task(
+                scenario=Path(manifest["sessions"][-1]["scenario_folder"]), controller=controller, seed=seed,
+                steps=manifest["configuration"]["steps"], demand_factor=manifest["configuration"]["demand_factor"])
+        except (LookupError, TypeError):
+            raise InputError(
+                f"{target / 'manifest.json'}: is not that of a run in SUMO; choose another folder") from None
+        out = target
+    elif results:
+        raise InputError(
+            f"{target}: holds runs of several demand levels; give one of its folders {target}/demand-..., or leave "
+            "--controller away")
+    else:
+        task = Task(scenario=target, controller=controller, seed=seed, steps=steps)
+        out, _ = _experiment([task], out)
+    result = experiment.read_run(out, controller, seed)
+    scenario = strategy.modelled(scenario_of(task), controller, model)
+    rows = model_validation.write(out, scenario, result)
+    click.echo(model_validation.table(rows))
+    name = run_folder.run_name(controller, seed)
+    click.echo(f"Written to {out}: see compare-{name}-accumulation.png and ...-mfd.png")
+
+
+def _foresight(target: Path, model: Path | None) -> None:
+    """All runs of a folder against the regional models."""
+    from cosim.evaluation import prediction_error, results
+
+    found = prediction_error.foresee(results.read(target), model)
+    prediction_error.write(target / "foresight.csv", found)
+    click.echo(prediction_error.table(found))
+    click.echo(f"Written to {target / 'foresight.csv'}")
+
+
+def _experiment(tasks: list, out: Path | None, sumo_output: tuple[str, ...] = ()) -> tuple:
+    """The run folder of the tasks, and its overview; SUMO's own outputs of these kinds are in it."""
+    from dataclasses import replace
+
+    from cosim.evaluation import experiment
+    from cosim.sumo.outputs import paths
+    from nmfd.cli.progress import progress_line
+    from nmfd.model.scenario import load_scenario
+    from nmfd.runs import run_folder
+
+    out = run_folder.default_folder(load_scenario(tasks[0].scenario)) if out is None else out
+    tasks = [replace(task, sumo_output=paths(sumo_output, out, task.controller, task.seed)) for task in tasks]
+    try:
+        with progress_line("cosim") as progress:
+            return out, experiment.experiment(tasks, out=out, workers=2, progress=progress, tell=tell)
+    except KeyboardInterrupt:
+        if not (out / "summary.csv").exists():
+            raise Interrupted("interrupted before a run was finished; nothing is kept") from None
+        raise Interrupted(f"interrupted; finished runs are in {out}: the same command with --out goes on") from None

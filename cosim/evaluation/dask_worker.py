@@ -1,0 +1,62 @@
+"""One run in a process of its own, on whatever machine this is called: what a worker of a cluster does.
+
+A Dask worker may neither start processes by multiprocessing (it is daemonic) nor hold two simulations at once (SUMO
+has one per process). So the run goes to `python -m cosim.evaluation.dask_worker`, which ends when the worker
+that waits for it dies.
+"""
+
+import os
+import pickle
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+
+from cosim.evaluation.simulate import Result, Task, simulate
+from nmfd.runs.workers import Failure, attempt
+
+HEADER = 8  # bytes, the length of the pickle that follows
+
+
+def run(task: Task, folder: str) -> Result | Failure:
+    """`simulate(task)` in a new process in `folder`, to which the relative paths in `task` refer."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cosim.evaluation.dask_worker"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        cwd=folder, env=environment)
+    with process:
+        message = pickle.dumps(task)
+        try:
+            process.stdin.write(len(message).to_bytes(HEADER) + message)
+            process.stdin.flush()
+        except BrokenPipeError:  # of a process that has just died; its status says why
+            with suppress(BrokenPipeError):
+                process.stdin.close()
+        outcome = process.stdout.read()  # stdin stays open as long as this process lives
+    if process.returncode:
+        return Failure(f"its process died (status {process.returncode})")
+    return pickle.loads(outcome)
+
+
+def _serve() -> None:
+    """The other side: one task from stdin, its outcome to stdout."""
+    answer = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what libraries print must not get between
+    task = pickle.loads(sys.stdin.buffer.read(int.from_bytes(sys.stdin.buffer.read(HEADER))))
+    answered = threading.Event()
+    threading.Thread(target=_end_with_the_caller, args=[answered], daemon=True).start()
+    outcome = pickle.dumps(attempt(simulate, task))
+    answer.write(outcome)
+    answer.flush()
+    answered.set()
+    answer.close()  # with which the caller goes on
+    os._exit(0)  # not by way of the interpreter's end, where the reading thread holds stdin
+
+
+def _end_with_the_caller(answered: threading.Event) -> None:
+    os.read(0, 1)  # nothing comes but the end
+    os._exit(0 if answered.is_set() else 1)
+
+
+if __name__ == "__main__":
+    _serve()

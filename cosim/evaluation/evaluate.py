@@ -1,0 +1,103 @@
+"""The evaluation: controllers x seeds x demand levels in SUMO, paired by seed, with tables and figures.
+
+    <folder>/demand-<level>/    the run folder of a demand level (cosim.evaluation.experiment)
+    <folder>/evaluate.md, evaluate.csv, pairs.csv, runs.csv    the tables (statistics), new after every run; in the
+        first,  at the end, why (explain)
+    pictures of a level in its folder, those across levels here (cosim.report.pictures)
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pandas as pd
+
+from cosim.evaluation import experiment, explain, statistics
+from cosim.evaluation.simulate import Task
+from cosim.report import pictures
+from nmfd.errors import InputError
+from nmfd.model.scenario import load_scenario
+from nmfd.runs import files
+from nmfd.runs.workers import ended
+
+FIRST_SEED = 2000  # these seeds are kept for evaluations: nothing was chosen, trained or identified on them
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """scenario: its folder; controllers: strategies; levels: multiples of the scenario's demand; steps: control
+    intervals, all if None; policies: controller -> file instead of the scenario's own; reference: a controller to
+    pair with, besides no control; out: the folder of the evaluation."""
+
+    scenario: Path
+    controllers: tuple[str, ...]
+    seeds: Sequence[int]
+    out: Path
+    levels: tuple[float, ...] = (1.0,)
+    steps: int | None = None
+    policies: Mapping[str, Path] = field(default_factory=dict)
+    reference: str | None = None
+
+    def plan(self) -> list[tuple[Path, Task]]:
+        """Every run with its run folder, seed by seed, so that whatever is finished compares like with like."""
+        return [
+            (self.out / f"demand-{level:g}", Task(
+                scenario=self.scenario, controller=name, seed=seed, policy=self.policies.get(name), steps=self.steps,
+                demand_factor=level))
+            for seed in self.seeds for level in self.levels for name in self.controllers]
+
+
+def evaluate(
+    evaluation: Evaluation, *, workers: int = 1, progress: Callable[[int, int, str], None] | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> tuple[pd.DataFrame, list[str]]:
+    """Run what is not there yet and write tables; returns `tables.statistics` and a line per failed run.
+
+    The tables are of all runs in the folder. progress, tell: as in `experiment.perform`. Raises InputError.
+    """
+    out = evaluation.out
+    if (out / "manifest.json").is_file():
+        raise InputError(f"{out}: is the folder of another command; choose another folder with --out")
+    known = {*evaluation.controllers, *all_runs(evaluation)["controller"]}
+    if evaluation.reference is not None and evaluation.reference not in known:
+        raise InputError(
+            f"--reference: {evaluation.reference!r} is neither among --controllers nor in {out}; add it to them")
+    failures = experiment.perform(
+        evaluation.plan(), workers=workers, fresh=True, progress=progress, tell=tell,
+        kept=lambda: statistics.write(out, all_runs(evaluation), None))
+    rows, table = all_runs(evaluation), pd.DataFrame()
+    if len(rows):
+        table = statistics.write(out, rows, evaluation.reference)
+        scenario = load_scenario(evaluation.scenario)
+        why = explain.text(level_folders(out), scenario.network, rows)
+        files.write_text(out / "evaluate.md", statistics.markdown(table, evaluation.reference) + "\n" + why)
+        pictures.draw_all(out, level_folders(out), scenario, rows)
+    if failures and table.empty and all(failure.mistake for _, failure in failures):
+        raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])
+    return table, [f"{experiment.label(task)}: {failure.reason}" for task, failure in failures]
+
+
+def level_folders(out: Path) -> dict[float, Path]:
+    """Demand level -> its run folder, those in `out` that hold finished runs."""
+    found = {}
+    for path in out.glob("demand-*/summary.csv"):
+        if re.fullmatch(r"demand-[\d.e+-]+", path.parent.name) and (path.parent / "sumo.csv").is_file():
+            found[float(path.parent.name.removeprefix("demand-"))] = path.parent
+    return dict(sorted(found.items()))
+
+
+def all_runs(evaluation: Evaluation) -> pd.DataFrame:
+    """`experiment.overview` of every demand level, with a column demand; controllers in the order asked for."""
+    parts = []
+    for level, folder in level_folders(evaluation.out).items():
+        rows = experiment.overview(folder)
+        rows.insert(0, "demand", level)
+        parts.append(rows)
+    if not parts:
+        return pd.DataFrame(columns=["demand", "controller", "seed"])
+    rows = pd.concat(parts, ignore_index=True)
+    names = list(dict.fromkeys([*evaluation.controllers, *rows["controller"]]))
+    return rows.sort_values(
+        ["demand", "controller", "seed"], ignore_index=True,
+        key=lambda column: column.map(names.index) if column.name == "controller" else column)

@@ -1,0 +1,292 @@
+"""Closed-loop runs in SUMO, side by side: a run folder with table, records and pictures."""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from cosim.evaluation import estimation_errors
+from cosim.evaluation.simulate import FACTS, Result, Task, scenario_of, simulate
+from cosim.plant import incidents
+from cosim.plant.plant import own_vehicles
+from cosim.plant.settings import Settings, settings
+from cosim.plant.strategy import MAX_PRESSURE, configured, parse
+from cosim.sumo import outputs
+from cosim.sumo.build import ensure_built
+from cosim.sumo.net import check_adjacency, load_city
+from cosim.sumo.signals import read_signals
+from cosim.sumo.xml_files import read_xml
+from nmfd import faults
+from nmfd.controllers import registry
+from nmfd.errors import InputError
+from nmfd.model.scenario import Scenario, as_modelled
+from nmfd.runs import files as disk
+from nmfd.runs import run_folder
+from nmfd.runs.workers import Failure, attempt, ended, outcomes
+from nmfd.studies.benchmark import REFERENCE, draw_accumulations, interval
+from nmfd.types import Trajectory
+
+# Of loading runs: whether they guide routes, and so depend on the drivers' own split ratios.
+LOADING = {"probing-pc": False, "probing-pcrg": True, "route-guidance": True}
+CAPTION = (
+    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; backlog: not\n"
+    "inserted at the end; step: median / longest decision; outside SUMO: share of the wall time not in its own step")
+
+
+def experiment(
+    tasks: Sequence[Task], *, out: Path, workers: int = 1, progress: Callable[[int, int, str], None] | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> pd.DataFrame:
+    """Run the tasks that are not yet in the run folder `out`; returns `overview` of all that is there.
+
+    As `perform` does it; RunFailed at the end if runs failed.
+    """
+    zipped = any(kind == outputs.ZIPPED for task in tasks for kind, _ in task.sumo_output)
+    failures = perform([(out, task) for task in tasks], workers=workers, fresh=zipped, progress=progress, tell=tell)
+    if (out / "summary.csv").is_file() and (kept := trajectories(out)):
+        scenario = scenario_of(tasks[0])
+        draw_accumulations(out, scenario, kept)
+        estimation_errors.write(out, scenario.network, kept)
+    if failures:
+        raise ended([(label(task), failure) for task, failure in failures])
+    return overview(out)
+
+
+def perform(
+    plan: Sequence[tuple[Path, Task]], *, workers: int = 1, fresh: bool = False,
+    progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
+    kept: Callable[[], object] | None = None, failed: Callable[[Task, str], None] | None = None,
+    source: Callable[[Sequence[Task]], Iterator[tuple[Task, Result | Failure]]] | None = None,
+) -> list[tuple[Task, Failure]]:
+    """Run every task, in this order, that is not yet in its run folder; returns those that failed, and why.
+
+    The tasks of one folder share scenario, steps and demand. Every finished run is kept at once, whatever happens to
+    the others. A kept run stays valid as long as the city, its demand and what its own controller depends on
+    (`dependencies`) stay as they are.
+
+    A run that was interrupted starts again from its beginning. SUMO's saved states are no way round that: they hold
+    neither the vehicles that are not loaded yet, nor what perimeter control shows at the signals, nor what is known
+    here of every vehicle (ledger, guidance, detectors) and in the controller; a run that was put together from all
+    these would have to be proven the same to the byte, to save the minute or two that it takes.
+
+    fresh: every run in a process of its own
+    progress: called with what is done and to do, and what is running
+    tell: takes one line where the runs of a controller do not count any more because it changed; None: an InputError
+    kept: called after every run that was kept; failed: with every one that failed, and why
+    source: runs the tasks elsewhere and gives their outcomes as they finish, instead of `workers` processes here
+
+    Raises InputError, before anything is written, for a city or controller that cannot be made, and for a folder that
+    holds runs of another city or demand.
+    """
+    where = {task: path for path, task in plan}
+    settings_of = {path: _settings([t for t in where if where[t] == path]) for path in dict.fromkeys(where.values())}
+    failures = []
+    with ExitStack() as stack:
+        folders = {}
+        for path, (configuration, controllers) in settings_of.items():
+            tasks = [task for task in where if where[task] == path]
+            folders[path] = stack.enter_context(run_folder.open_folder(
+                path, configuration=configuration, controllers=controllers,
+                order=[(task.controller, task.seed) for task in tasks], renew=tell,
+                session={"scenario_folder": str(tasks[0].scenario), "workers": workers}))
+        there = {path: _finished(folder) for path, folder in folders.items()}
+        todo = [task for task in where if (task.controller, task.seed) not in there[where[task]] or not all(
+            file.is_file() for _, file in task.sumo_output)]
+        found = _outcomes(todo, workers, fresh, progress) if source is None else _reported(source, todo, progress)
+        for task, outcome in found:
+            if isinstance(outcome, Failure):
+                failures.append((task, outcome))
+                if failed:
+                    failed(task, outcome.reason)
+                continue
+            folder = folders[where[task]]
+            write_record(record_path(folder.path, task.controller, task.seed), outcome)
+            _write_facts(folder, outcome)
+            folder.add(outcome.trajectory)
+            if kept:
+                kept()
+    return failures
+
+
+def label(task: Task) -> str:
+    demand = "" if task.demand_factor == 1.0 else f", demand times {task.demand_factor:g}"
+    return f"controller {task.controller}, seed {task.seed}{demand}"
+
+
+def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> dict:
+    """What the runs of a controller depend on, besides the city and its demand, which all runs share.
+
+    Its own options, its policy or plan, the regional model and the library that computes with it. No control depends
+    on none of these, and loading runs only on their options and the split ratios that they start from. Raises
+    InputError for a controller that cannot be made.
+    """
+    controller, variant = parse(name).controller, configured(name, scenario.controller_options)
+    registry.make(variant, scenario, policy=policy)
+    if controller == REFERENCE:
+        return {}
+    tables = scenario.controller_options
+    options = {**tables.get(controller, {}), **tables.get(variant, {})}
+    if controller in LOADING:  # its model only says what `cosim compare` predicts with
+        options = {key: value for key, value in options.items() if key != "model"}
+        splits = scenario.network.nominal_splits if LOADING[controller] else np.empty(0)
+        return {"options": options, "splits_hash": hashlib.sha256(splits.round(9).tobytes()).hexdigest()[:16]}
+    path = registry.policy_path(variant, scenario, policy)
+    if registry.is_own(controller):
+        variant, scenario = registry.configured_own(controller, scenario)
+        options = scenario.controller_options.get(variant, {})
+    network = as_modelled(scenario, variant).network
+    model = json.dumps([network.hash, scenario.integrator, scenario.substeps, scenario.protected])
+    return {
+        "options": options,
+        "policy_hash": None, **registry.fingerprint(controller, path),
+        "model_hash": hashlib.sha256(model.encode()).hexdigest()[:16], "torch": metadata.version("torch")}
+
+
+def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
+    """The configuration that the tasks of one folder share, and what each of their controllers depends on."""
+    first = tasks[0]
+    scenario = scenario_of(first)
+    controllers = {task.controller: dependencies(task.controller, scenario_of(task), task.policy)
+                   for task in {task.controller: task for task in tasks}.values()}
+    chosen = settings(scenario)
+    files = ensure_built(scenario.network)
+    city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
+    check_adjacency(city, scenario.network)
+    simple, _ = read_signals(city)
+    own_vehicles(scenario, chosen, city)
+    everywhere = MAX_PRESSURE in {parse(name).overrides.get("signals", chosen.signals) for name in controllers}
+    incidents.check(faults.of(scenario), city, "faults", [signal.id for signal in simple] if everywhere else ())
+    for name in (*chosen.background, *chosen.additional):
+        read_xml(scenario.folder / name)
+    configuration = {
+        "scenario": scenario.name, "network": scenario.network.name, "plant": "sumo", "step_s": scenario.step,
+        "steps": scenario.steps, "demand_factor": first.demand_factor,
+        "demand_hash": hashlib.sha256(np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16],
+        "net_file_hash": disk.file_hash(files.net_file), "regions_hash": disk.file_hash(files.regions_csv),
+        "measurement_std_veh": scenario.measurement_std, "sumo": _plain(chosen, scenario.folder),
+        "libsumo": metadata.version("libsumo"), **({"faults": list(scenario.faults)} if scenario.faults else {})}
+    return configuration, controllers
+
+
+def _plain(chosen: Settings, folder: Path | None) -> dict:
+    """The settings that are not the default ones; of the files that they name, fingerprints.
+
+    Only these, so that a new kind of setting does not make old runs another city's.
+    """
+    usual, found = vars(Settings()), {}
+    for key, value in vars(chosen).items():
+        if value != usual[key]:
+            found[key] = list(value) if isinstance(value, tuple) else value
+            if key in ("routes", "background", "additional"):
+                found[key] = [disk.file_hash(folder / name) for name in value]
+    return found
+
+
+def _finished(folder: run_folder.RunFolder) -> set[tuple[str, int]]:
+    return {run for run in folder.finished if record_path(folder.path, *run).is_file()}
+
+
+def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress) -> Iterator[tuple]:
+    """(task, Result or Failure); in this process, which reports every control interval, if one run is all there is."""
+    report = progress or (lambda done, total, note: None)
+    if len(todo) == 1 and not fresh:
+        def tick(k, steps):
+            report(k, steps, f"{todo[0].controller}, seed {todo[0].seed}")
+
+        yield todo[0], attempt(lambda task: simulate(task, tick), todo[0])
+        return
+    report(0, len(todo), "")
+    for done, (task, outcome) in enumerate(outcomes(simulate, todo, workers, fresh=fresh), start=1):
+        report(done, len(todo), f"last {label(task)}")
+        yield task, outcome
+
+
+def _reported(source, todo: Sequence[Task], progress) -> Iterator[tuple]:
+    """What comes from `source`, with a word to `progress` of each."""
+    report = progress or (lambda done, total, note: None)
+    report(0, len(todo), "")
+    for done, (task, outcome) in enumerate(source(todo) if todo else (), start=1):
+        report(done, len(todo), f"{'failed' if isinstance(outcome, Failure) else 'last'} {label(task)}")
+        yield task, outcome
+
+
+def record_path(folder: Path, controller: str, seed: int) -> Path:
+    return folder / f"{run_folder.run_name(controller, seed)}.record.npz"
+
+
+def write_record(path: Path, result: Result) -> None:
+    """The fields of cosim.plant.record.Record, atomically."""
+    with disk.atomic(path) as temporary:
+        np.savez_compressed(temporary, **result.record)
+
+
+def read_run(folder: Path, controller: str, seed: int) -> Result:
+    """A finished run of the run folder. Raises InputError."""
+    path = record_path(folder, controller, seed)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            record = {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such run; choose a controller and seed of {folder / 'sumo.csv'}") from None
+    except run_folder.DAMAGED as error:
+        raise InputError(f"{path}: is no record of a run ({error}); delete it and run again") from None
+    trajectory = run_folder.read_trajectory(folder / f"{run_folder.run_name(controller, seed)}.npz")
+    return Result(trajectory=trajectory, record=record, facts={})
+
+
+def trajectories(folder: Path) -> list[Trajectory]:
+    """The finished runs of the run folder. Raises InputError."""
+    return [
+        run_folder.read_trajectory(folder / f"{run_folder.run_name(row['controller'], row['seed'])}.npz")
+        for row in run_folder.read_summary(folder / "summary.csv")]
+
+
+def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
+    path = folder.path / "sumo.csv"
+    rows = read_facts(path) if path.is_file() else pd.DataFrame(columns=FACTS)
+    same = (rows["controller"] == result.facts["controller"]) & (rows["seed"] == result.facts["seed"])
+    rows = pd.DataFrame([*rows[~same].to_dict("records"), result.facts], columns=FACTS)
+    with disk.atomic(path) as temporary:
+        rows.to_csv(temporary, index=False)
+
+
+def overview(folder: Path) -> pd.DataFrame:
+    """summary.csv and sumo.csv joined, one row per finished run. Raises InputError."""
+    return pd.DataFrame(run_folder.read_summary(folder / "summary.csv")).merge(
+        read_facts(folder / "sumo.csv"), on=["controller", "seed"])
+
+
+def read_facts(path: Path) -> pd.DataFrame:
+    """The rows of sumo.csv. Raises InputError."""
+    try:
+        rows = pd.read_csv(path)
+        return rows.astype({"controller": str, "seed": int})
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; delete the folder and run again") from None
+    except (OSError, ValueError, KeyError) as error:  # pandas' own errors are ValueErrors
+        raise InputError(f"{path}: is no table of runs ({error}); delete the folder and run again") from None
+
+
+def table(rows: pd.DataFrame) -> str:
+    """The overview as text: one line per controller, means over seeds, TTS with its 95 % interval."""
+    reference = rows.loc[rows["controller"] == REFERENCE, "total_time_spent_veh_s"]
+    lines = []
+    for name, group in rows.groupby("controller", sort=False):
+        tts = group["total_time_spent_veh_s"]
+        spread = f" ± {interval(list(tts)):.1e}" if len(tts) > 1 else ""
+        change = f"{100 * (tts.mean() / reference.mean() - 1):+.1f} %" if len(reference) and name != REFERENCE else ""
+        lines.append({
+            "controller": name, "seeds": len(group), "TTS [veh s]": f"{tts.mean():.4g}{spread}", "change": change,
+            "completed": f"{group['completed_veh'].mean():,.0f} of {group['trips'].mean():,.0f}",
+            "left inside": f"{group['final_accumulation_veh'].mean():,.0f}",
+            "backlog": f"{group['final_backlog_veh'].mean():,.0f}", "teleports": int(group["teleports"].sum()),
+            "step [ms]": f"{group['control_step_ms_median'].mean():.3g} / {group['control_step_ms_max'].max():.3g}",
+            "failures": int(group["solver_failures"].sum()),
+            "wall [s]": f"{group['wall_time_s'].mean():.0f}",
+            "outside SUMO": f"{100 * group['overhead_share'].mean():.1f} %"})
+    return pd.DataFrame(lines).to_string(index=False) + "\n" + CAPTION

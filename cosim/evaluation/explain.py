@@ -1,0 +1,175 @@
+"""Why a controller gained something against no control, or nothing: what the runs of an evaluation say about it.
+
+Perimeter control can only gain where it controls the boundaries, where a region would go beyond its critical
+accumulation without it, and if it holds vehicles back at all; even then it may cost more than it saves.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from cosim.evaluation import experiment, statistics
+from cosim.plant.strategy import model_free
+from nmfd.model.regional_model import Network
+from nmfd.runs import run_folder
+from nmfd.studies.benchmark import REFERENCE
+from nmfd.types import Trajectory
+
+NO_AUTHORITY = 0.5   # of the flow over the boundaries passes without a signal under control
+HARDLY = 0.01        # of the commands, or of the time
+NEARLY_OPEN = 0.1    # of the range of u, below its upper bound: a learned policy never quite reaches that
+MOSTLY_INSIDE = 0.5  # of what came into a region started there
+MORE_FULL = 0.02     # of the edges before gateways and intervals
+
+
+@dataclass(frozen=True, kw_only=True)
+class Load:
+    """Of R regions: most (R,), the highest accumulation over the critical one, mean over the runs; beyond (R,), the
+    share of the time beyond it; inside (R,), the share of the vehicles there that had started there, NaN if unknown."""
+
+    most: np.ndarray
+    beyond: np.ndarray
+    inside: np.ndarray
+
+    @property
+    def critical(self) -> np.ndarray:
+        """The regions that were beyond their critical accumulation for more than a moment."""
+        return np.flatnonzero(self.beyond > HARDLY)
+
+
+def load(network: Network, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> Load:
+    """What some runs were like."""
+    critical = np.array([mfd.critical for mfd in network.mfds])
+    states = [trajectory.accumulation.sum(axis=2) / critical for trajectory in trajectories]
+    started, came = np.zeros(network.regions), np.zeros(network.regions)
+    for record in records:
+        if {"departures", "crossings"} <= record.keys() and record["crossings"].ndim == 4:
+            started += record["departures"].sum(axis=(0, 2))
+            came += record["crossings"].sum(axis=(0, 1, 3))
+    with np.errstate(invalid="ignore"):
+        inside = started / (started + came)
+    return Load(
+        most=np.mean([state.max(axis=0) for state in states], axis=0),
+        beyond=np.mean([(state > 1.0).mean(axis=0) for state in states], axis=0), inside=inside)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deeds:
+    """What a controller did. held: share of its perimeter commands, one per boundary, direction and interval, that were
+    below the upper bound by more than NEARLY_OPEN of the range; guided: vehicles per trip that it gave a next region.
+    """
+
+    held: float
+    guided: float
+
+    def __str__(self) -> str:
+        parts = [f"it held back in {_share(self.held)} of its commands"] if self.held >= HARDLY else []
+        if self.guided > 0:
+            parts.append(f"it guided {self.guided:.1f} times per trip")
+        return " and ".join(parts) or "it never held back and never guided"
+
+
+def deeds(network: Network, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> Deeds:
+    """What a controller did in some runs."""
+    limit = network.u_max - NEARLY_OPEN * (network.u_max - network.u_min)
+    held = [(t.perimeter[:, network.adjacency] < limit).mean() for t in trajectories]
+    guided, trips = 0.0, 0.0
+    for record in records:
+        if {"guided", "departures"} <= record.keys():
+            guided, trips = guided + record["guided"].sum(), trips + record["departures"].sum()
+    return Deeds(held=float(np.mean(held)), guided=float(guided / max(trips, 1.0)))
+
+
+def text(folders: Mapping[float, Path], network: Network, rows: pd.DataFrame) -> str:
+    """Markdown, a section per demand level: what the city was like without control, and a line per controller.
+
+    folders: demand level -> its run folder; rows: as in cosim.evaluation.statistics.
+    """
+    parts = []
+    for level, folder in folders.items():
+        city, lines = at(level, folder, network, rows[rows["demand"] == level])
+        parts.append("\n".join([f"## Why, at demand times {level:g}", "", city, "", *(f"- {line}" for line in lines)]))
+    return "\n\n".join(parts) + "\n"
+
+
+def at(level: float, folder: Path, network: Network, rows: pd.DataFrame) -> tuple[str, list[str]]:
+    """What the city was like without control at one demand level, and a line per controller; rows: of this level."""
+    kept = {name: [int(seed) for seed in group["seed"]] for name, group in rows.groupby("controller", sort=False)}
+    shown = REFERENCE if REFERENCE in kept else next(iter(kept))
+    found = load(network, *_runs(folder, shown, kept[shown]))
+    leaking = float(rows.loc[rows["controller"] == shown, "leaking_share"].mean())
+    lines = []
+    for name, seeds in kept.items():
+        if name != REFERENCE:
+            done = deeds(network, *_runs(folder, name, seeds))
+            lines.append(f"{name} {verdict(rows, level, name, found, leaking, done, network)}")
+    return _city(network, found, leaking, shown), lines
+
+
+def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Trajectory], Iterable[Mapping]]:
+    """Trajectories and records of one controller."""
+    return ([run_folder.read_trajectory(folder / f"{run_folder.run_name(name, seed)}.npz") for seed in seeds],
+            (experiment.read_run(folder, name, seed).record for seed in seeds))
+
+
+def verdict(
+    rows: pd.DataFrame, level: float, name: str, found: Load, leaking: float, done: Deeds, network: Network,
+) -> str:
+    """What a controller came to against no control, and why, in one line that begins behind its name. rows: of this
+    demand level; leaking: share of the flow over the boundaries that passes no signal under control."""
+    pair = statistics.paired(statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, REFERENCE))
+    if not pair.seeds:
+        return f"has no common seed with {REFERENCE}, so that nothing can be said: add it to --controllers"
+    spread = f"± {pair.percent_half:.1f} over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed, no proof"
+    size = f"{pair.percent:+.1f} % in total time spent {spread}"
+    unmodelled = model_free(name)
+    if pair.percent < 0 and (pair.excludes_zero or pair.seeds == 1):
+        return f"gains ({size})" + ("" if unmodelled else f"; {done}")
+    kind = "loses" if pair.excludes_zero or pair.seeds == 1 else "gains nothing that stands out from the seeds"
+    if pair.percent == 0.0:
+        kind = "changes nothing"
+    reasons = [] if unmodelled else _reasons(rows, name, found, leaking, done, network)
+    return f"{kind} ({size})" + (f": {'; '.join(reasons)}" if reasons else "")
+
+
+def _reasons(
+    rows: pd.DataFrame, name: str, found: Load, leaking: float, done: Deeds, network: Network,
+) -> list[str]:
+    """Why perimeter control, or guidance, gains nothing."""
+    reasons = []
+    if leaking > NO_AUTHORITY:
+        reasons.append(f"no control authority at the boundaries, {_share(leaking)} of the flow over them passes no "
+                       "signal under control")
+    if not len(found.critical):
+        reasons.append("no region is ever critical, so that there is nothing to protect")
+    elif done.held >= HARDLY and all(found.inside[r] > MOSTLY_INSIDE for r in found.critical):
+        reasons.append(f"most of what fills {_list(network, found.critical)} starts there, where no gateway holds it "
+                       "back")
+    full = rows.groupby("controller")["gateway_full_share"].mean()
+    if done.held >= HARDLY and full.get(name, 0.0) - full.get(REFERENCE, 0.0) > MORE_FULL:
+        reasons.append(f"its queues fill the streets before the gateways ({_share(full[name])} of the time, "
+                       f"{_share(full[REFERENCE])} without control) and block others")
+    return [*reasons, str(done)]
+
+
+def _city(network: Network, found: Load, leaking: float, shown: str) -> str:
+    """The city without control, in two sentences."""
+    when = "Without control" if shown == REFERENCE else f"Under {shown}"
+    hot = [f"{_list(network, [r])} ({_share(found.beyond[r])} of the time, most {found.most[r]:.1f} times it)"
+           for r in found.critical]
+    highest = int(np.argmax(found.most))
+    state = f"beyond their critical accumulation were {', '.join(hot)}" if hot else (
+        f"no region went beyond its critical accumulation; {_list(network, [highest])} came nearest, with "
+        f"{found.most[highest]:.1f} times it")
+    return f"Signals under control see {_share(1.0 - leaking)} of the flow over the boundaries. {when} {state}."
+
+
+def _list(network: Network, regions: Sequence[int]) -> str:
+    return ", ".join(f"{r} {network.region_names[r]}" for r in regions)
+
+
+def _share(value: float) -> str:
+    return "an unknown share" if np.isnan(value) else f"{100.0 * value:.0f} %"

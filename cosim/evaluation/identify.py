@@ -1,0 +1,319 @@
+"""Loading runs -> the regional model of a SUMO city and its drivers' own split ratios -> network.toml.
+
+First the city is loaded without perimeter control, and every region's MFD is fitted to its outflow samples. Then it is
+loaded again under a probing controller, whose set points come from these MFDs, and the whole model is fitted to all
+runs by prediction error (nmfd.model.identification).
+"""
+
+import csv
+import io
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from cosim.evaluation import experiment, mfd_bands
+from cosim.evaluation.model_validation import HELD_UP, draw_mfds, outflow_samples
+from cosim.evaluation.simulate import Result, Task
+from nmfd.errors import InputError
+from nmfd.model import identification, mfd
+from nmfd.model.identification import Observed
+from nmfd.model.regional_model import Network
+from nmfd.model.scenario import GUIDED, GUIDING, Scenario, load_scenario
+from nmfd.runs import config, files
+from nmfd.runs.config import quoted
+from nmfd.runs.workers import ended
+
+FEWEST = 30.0   # vehicles that must have crossed before their split ratios count
+SAMPLES = 10    # of a region: with fewer it is as good as empty, and keeps the MFD that it has
+AHEAD = 900.0   # s, of the longer prediction that is judged
+BINS = 12       # of accumulation, for the hysteresis
+PATHS = ("recipe", "net", "regions")  # keys of [sumo] in network.toml
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loading:
+    """levels: multiples of the scenario's demand; seeds: of the runs at every level
+    guided: with route guidance, first towards the drivers' own split ratios, then probing; else without
+    options: of the strategies (cosim.plant.strategy.OPTIONS), of a city that has, say, max-pressure signals
+    network: the folder whose network.toml is written; None for the scenario's own or, if guided, the one where
+        controllers that guide look for their model (nmfd.model.scenario.guided_model)
+    iterations: of the fit
+    """
+
+    levels: Sequence[float]
+    seeds: Sequence[int]
+    guided: bool = False
+    options: Sequence[str] = ()
+    network: Path | None = None
+    iterations: int = identification.ITERATIONS
+
+    @property
+    def stages(self) -> tuple[str, str]:
+        """The strategies of the two stages."""
+        first, second = ("route-guidance", "probing-pcrg") if self.guided else ("no-control", "probing-pc")
+        return "+".join([first, *self.options]), "+".join([second, *self.options])
+
+    def target(self, scenario: Scenario) -> Path:
+        """The folder whose network.toml is written."""
+        own = scenario.network.folder
+        alone = self.guided and not self.options and without_model(scenario)
+        return self.network or (own / GUIDED if alone else own)
+
+
+def without_model(scenario: Scenario) -> bool:
+    """Whether controllers that guide routes are told of no model of their own: they need that of guided drivers."""
+    return not any(name.startswith(GUIDING) and "model" in options
+                   for name, options in scenario.controller_options.items())
+
+
+def identify(
+    scenario: Path, loading: Loading, *, out: Path, workers: int = 1,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> str:
+    """Load the city of `scenario`, fit its regional model, and write the network.toml of `loading`.
+
+    Samples, pictures and the loading runs go to `out`, one run folder per level. Returns the fit as a table. Raises
+    InputError for a network that does not come from a folder, RunFailed if a loading run failed. Loading runs are kept:
+    the same call goes on where it was interrupted, and gives the same model.
+    """
+    loaded = load_scenario(scenario)
+    target = loading.target(loaded)
+    if (loading.guided or loading.options) and target.resolve() == loaded.network.folder.resolve():
+        raise InputError(
+            f"{'--guided' if loading.guided else '--with'}: {loaded.name} runs on {target}, whose model must stay that "
+            "of its own drivers and signals; name another folder with --network")
+    there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):  # rather than after hours of loading
+        raise InputError(f"--network: {there} is no folder that can be written to; choose another")
+    first, second = loading.stages
+    found = _load(scenario, loading, first, {}, out, workers, progress)
+    network = static_model(loaded, found, guided=loading.guided)
+    set_point = tuple(network.mfds[region].critical for region in loaded.protected)
+    found += _load(scenario, loading, second, {"set_point": set_point}, out, workers, progress)
+    held_out = [result for result in found if len(loading.seeds) > 1 and result.trajectory.seed == loading.seeds[-1]]
+    scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
+
+    def fitted(results: Sequence[Result], samples: Sequence[dict], what: str) -> Network:
+        def tell(done, total, note):
+            progress(done, total, f"{what}, {note}")
+
+        return as_it_was(network, identification.fit(
+            network, [observed(result) for result in results], iterations=loading.iterations,
+            progress=tell if progress else None, **scheme), nearly_empty(samples))
+
+    samples = samples_of(network, found)
+    model = fitted(found, samples, "fitting")
+    text = fit_table(model, samples) + unreached(model, [result.trajectory.accumulation for result in found])
+    if held_out:
+        kept = [result for result in found if not any(result is other for other in held_out)]
+        without = fitted(kept, samples_of(network, kept), "fitting without the last seed")
+        text += "\n" + prediction_table(without, [observed(result) for result in held_out], scheme)
+    _write_samples(out / "samples.csv", samples)
+    by_run = [[own_points(cloud) for cloud in samples_of(network, [result])] for result in found]
+    draw_mfds(out / "mfd.png", model, samples, [mfd_bands.band(runs) for runs in zip(*by_run, strict=True)])
+    mfd_bands.draw_production(out / "production.png", model, [result.record for result in found])
+    levels, seeds = ", ".join(f"{level:g}" for level in loading.levels), f"{min(loading.seeds)} to {max(loading.seeds)}"
+    target.mkdir(parents=True, exist_ok=True)
+    files.write_text(target / "network.toml", network_toml(
+        model, _sumo_table(loaded.network.folder, target),
+        f"Regional model: written by cosim identify from {len(found)} loading runs of {loaded.name} under {first} and\n"
+        f"# {second}, demand times {levels}, seeds {seeds}."))
+    return text
+
+
+def _load(
+    scenario: Path, loading: Loading, controller: str, options: dict, out: Path, workers: int, progress,
+) -> list[Result]:
+    """The loading runs of one controller at all levels, those that are kept or new ones."""
+    plan = [
+        (out / f"level-{level:g}", Task(
+            scenario=scenario, controller=controller, seed=seed, demand_factor=level, options=tuple(options.items())))
+        for level in loading.levels for seed in loading.seeds]
+    failures = experiment.perform(plan, workers=workers, progress=progress, tell=lambda line: None)
+    if failures:
+        raise ended([(experiment.label(task), failure) for task, failure in failures])
+    return [experiment.read_run(folder, controller, task.seed) for folder, task in plan]
+
+
+def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> Network:
+    """The scenario's network with the published model: an MFD per region, fitted to outflow samples, and own splits,
+    if drivers were not guided."""
+    network = replace(scenario.network, exit_rates=None, capacity=None, storage=None)
+    samples = samples_of(network, results)
+    empty = nearly_empty(samples)
+    if len(empty) == network.regions:
+        raise InputError(
+            "--levels: every region was nearly empty in all loading runs; give higher levels, or a scenario with more "
+            "vehicles")
+    network = replace(network, mfds=tuple(
+        network.mfds[region] if region in empty else
+        mfd.fit(*own_points(cloud).T, max_rate=scenario.substeps / scenario.step)
+        for region, cloud in enumerate(samples)))
+    if guided:  # what theta is compared with stays what it is for the plant (cosim.plant.guidance)
+        return network
+    return replace(network, own_splits=own_splits(network, [result.record for result in results]))
+
+
+def samples_of(network: Network, results: Sequence[Result]) -> list[dict[str, np.ndarray]]:
+    """Outflow samples of every region (cosim.evaluation.model_validation.outflow_samples)."""
+    return [
+        outflow_samples(
+            [r.trajectory for r in results], [r.record for r in results], network.u_max, region, network.adjacency)
+        for region in range(network.regions)]
+
+
+def observed(result: Result) -> Observed:
+    """A run as identification sees it; the demand is what entered the streets."""
+    trajectory, record = result.trajectory, result.record
+    return Observed(
+        accumulation=trajectory.accumulation, demand=record["departures"] / trajectory.step,
+        perimeter=trajectory.perimeter, splits=trajectory.splits, crossings=record["crossings"].sum(axis=3))
+
+
+def nearly_empty(samples: Sequence[dict[str, np.ndarray]]) -> list[int]:
+    """The regions with too few samples to fit anything to."""
+    return [region for region, cloud in enumerate(samples) if len(own_points(cloud)) < SAMPLES]
+
+
+def as_it_was(network: Network, model: Network, regions: Sequence[int]) -> Network:
+    """`model` with these regions as they are in `network`, and room for as many vehicles as their MFDs are meant for:
+    what was fitted to hardly any vehicles knows nothing of more."""
+    alone = np.isin(np.arange(model.regions), regions)
+    mfds = tuple((network if alone[n] else model).mfds[n] for n in range(model.regions))
+    return replace(
+        model, mfds=mfds, exit_rates=np.where(alone[:, None], 1.0, model.exit_rates),
+        storage=np.where(alone, np.maximum(model.storage, [mfd.jam for mfd in mfds]), model.storage))
+
+
+def own_points(cloud: dict[str, np.ndarray]) -> np.ndarray:
+    """(n, 2): the samples that the region's own MFD explains."""
+    return np.concatenate([points for label, points in cloud.items() if label != HELD_UP])
+
+
+def own_splits(network: Network, records: Sequence[dict]) -> dict[tuple[int, int], dict[int, float]]:
+    """(i, j) -> {h: share}: by which neighbour h the vehicles in i bound for j went on in fact."""
+    crossings = sum(record["crossings"].sum(axis=0) for record in records) * network.split_mask
+    found = {}
+    for i, j in np.argwhere(crossings.sum(axis=1) >= FEWEST):
+        shares = crossings[i, :, j] / crossings[i, :, j].sum()
+        kept = {int(h): round(float(shares[h]), 4) for h in np.flatnonzero(shares >= 0.005)}
+        found[int(i), int(j)] = {h: share / sum(kept.values()) for h, share in kept.items()}
+    return found
+
+
+def hysteresis(cloud: dict[str, np.ndarray]) -> float:
+    """How much larger the outflow is while loading than while unloading at the same accumulation, as a share of it [-].
+
+    The mean over bins of accumulation with both, weighted by the outflow; NaN where there is none.
+    """
+    loading, unloading = (cloud.get(label, np.empty((0, 2))) for label in ("loading", "unloading"))
+    most = max((part[:, 0].max() for part in (loading, unloading) if len(part)), default=0.0)
+    means = np.full((2, BINS), np.nan)
+    for row, part in zip(means, (loading, unloading), strict=True):
+        number = np.minimum((BINS * part[:, 0] / max(most, 1e-9)).astype(int), BINS - 1)
+        for n in range(BINS):
+            if (number == n).sum() >= 3:
+                row[n] = part[number == n, 1].mean()
+    both = means[:, ~np.isnan(means).any(axis=0)]
+    return float((both[0] - both[1]).sum() / both.mean(axis=0).sum()) if both.size else float("nan")
+
+
+def fit_table(network: Network, samples: Sequence[dict]) -> str:
+    """Per region: the curve of the MFD, how well it explains the samples, and their hysteresis."""
+    lines = [f"{'region':<16}{'critical':>10}{'jam':>8}{'storage':>9}{'max outflow':>13}{'samples':>9}{'R2':>7}"
+             f"{'hysteresis':>12}   [veh, veh/s]"]
+    for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
+        points = own_points(cloud)
+        explained = float("nan")
+        if len(points) >= SAMPLES and points[:, 1].var() > 0:
+            explained = 1.0 - ((points[:, 1] - curve.outflow(points[:, 0])) ** 2).mean() / points[:, 1].var()
+        storage = float("inf") if network.storage is None else network.storage[region]
+        lines.append(
+            f"{f'{region} {network.region_names[region]}':<16}{curve.critical:>10.0f}{curve.jam:>8.0f}{storage:>9.0f}"
+            f"{curve.capacity:>13.3f}{len(points):>9}{explained:>7.2f}{100 * hysteresis(cloud):>10.0f} %")
+    if empty := nearly_empty(samples):
+        left = ", ".join(f"{region} {network.region_names[region]}" for region in empty)
+        lines.append(f"nearly empty in all loading runs: {left}; the MFD stays as it was there")
+    return "\n".join(lines)
+
+
+def unreached(network: Network, accumulations: Sequence[np.ndarray]) -> str:
+    """A line on the regions whose critical accumulation no loading run reached, each run (T+1, R, R) [veh]; or none."""
+    most = np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
+    short = [f"{region} {network.region_names[region]} ({100 * most[region] / curve.critical:.0f} % of it)"
+             for region, curve in enumerate(network.mfds) if most[region] < curve.critical]
+    if not short:
+        return ""
+    return (f"\nnever beyond the critical accumulation: {', '.join(short)}; what lies beyond is a guess there.\n"
+            "Give higher --levels, or take it that perimeter control has nothing to protect there")
+
+
+def prediction_table(network: Network, held_out: Sequence[Observed], scheme: dict) -> str:
+    """RMSE of the accumulation one control interval and AHEAD seconds ahead, in runs that the fit did not see."""
+    intervals = identification.intervals_within(AHEAD, scheme["step"], held_out)
+    share = identification.prediction_shares(network, held_out, (1, intervals), **scheme)
+    heads = [f"{n * scheme['step']:g} s ahead" for n in (1, intervals)]
+    lines = [f"{'region':<16}{heads[0]:>14}{heads[1]:>14}   RMSE of critical, runs of the last seed, fit without them"]
+    for region, (one, many) in enumerate(zip(*share, strict=True)):
+        lines.append(f"{f'{region} {network.region_names[region]}':<16}{100 * one:>12.1f} %{100 * many:>12.1f} %")
+    lines.append(f"{'mean':<16}{100 * share[0].mean():>12.1f} %{100 * share[1].mean():>12.1f} %")
+    return "\n".join(lines)
+
+
+def _sumo_table(folder: Path, target: Path) -> dict[str, str]:
+    """The table [sumo] of the network in `folder`, its paths seen from `target`."""
+    table = config.read(folder / "network.toml").raw_table("sumo")
+    return {
+        key: os.path.relpath(folder / value, target) if key in PATHS and isinstance(value, str) else value
+        for key, value in table.items()}
+
+
+def network_toml(network: Network, sumo: Mapping[str, str], comment: str) -> str:
+    """network.toml of `network` with this table [sumo]."""
+    out = io.StringIO()
+    out.write(f"# {comment}\nname = {quoted(network.name)}\n\n")
+    out.write(f"[perimeter]\nmin = {network.u_min:g}\nmax = {network.u_max:g}\n")
+    if sumo:
+        out.write("\n[sumo]\n" + "".join(f"{key} = {quoted(value)}\n" for key, value in sumo.items()))
+    for region in range(network.regions):
+        x, y = network.positions[region]
+        adjacent = np.flatnonzero((network.adjacency | network.adjacency.T)[region])
+        one_way = ", ".join(str(h) for h in adjacent if not network.adjacency[region, h])
+        barred = f"no_way_to = [{one_way}]\n" if one_way else ""
+        neighbours = ", ".join(str(h) for h in adjacent)
+        curve = network.mfds[region]
+        out.write(
+            f'\n[[regions]]\nname = {quoted(network.region_names[region])}\nposition = [{x:.6g}, {y:.6g}]\n'
+            f"adjacent = [{neighbours}]\n{barred}{_options(network, region)}\n"
+            f"[regions.mfd]\na = {curve.a:.6g}\nb = {curve.b:.6g}\nc = {curve.c:.6g}\n"
+            f"jam = {curve.jam:.6g}\n")
+    for (i, j), shares in sorted(network.own_splits.items()):
+        via = ", ".join(str(h) for h in shares)
+        share = ", ".join(f"{value:.4f}" for value in shares.values())
+        out.write(f"\n[[own_splits]]\nregion = {i}\ndestination = {j}\nnext = [{via}]\nshare = [{share}]\n")
+    return out.getvalue()
+
+
+def _options(network: Network, region: int) -> str:
+    """exit_rates, capacity and storage of one region, as far as the network has them."""
+    lines = ""
+    if network.exit_rates is not None:
+        lines += f"exit_rates = [{', '.join(f'{value:.4g}' for value in network.exit_rates[region])}]\n"
+    if network.capacity is not None:
+        passing = network.capacity[region, network.adjacency[region]]
+        lines += (
+            f"capacity = [{', '.join(f'{value:.4g}' for value in passing)}]\n"
+            f"storage = {network.storage[region]:.6g}\n")
+    return lines
+
+
+def _write_samples(path: Path, samples: Sequence[dict]) -> None:
+    with files.atomic(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["region", "branch", "accumulation_veh", "outflow_veh_s"])
+        for region, cloud in enumerate(samples):
+            for branch, points in cloud.items():
+                writer.writerows([region, branch, f"{x:.1f}", f"{g:.5f}"] for x, g in points)

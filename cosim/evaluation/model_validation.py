@@ -1,0 +1,193 @@
+"""The microsimulation against what the regional model predicts, for the same demand and the recorded controls."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from cosim.evaluation import mfd_bands
+from cosim.evaluation.simulate import Result
+from nmfd import closed_loop
+from nmfd.model.dynamics import advance, parameters
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.regional_model import Network
+from nmfd.model.scenario import Scenario
+from nmfd.runs import files, run_folder
+from nmfd.studies import plots
+from nmfd.types import Controls, Measurement, Trajectory
+
+COLUMNS = (
+    "region", "name", "critical_veh", "mean_veh", "rmse_veh", "rmse_share", "bias_veh", "next_interval_rmse_veh",
+    "next_interval_rmse_share")
+COLLAPSED = 0.7  # of the largest outflow so far
+HELD_UP = "held up by a neighbour"
+CAPTION = (
+    "RMSE, bias: of the accumulation that the regional model predicts for the whole run from its start [veh]; next\n"
+    "interval: predicted one control interval ahead from every recorded state; bias > 0: the model holds too many")
+
+
+class Replay:
+    """The recorded controls of a trajectory, as a controller."""
+
+    def __init__(self, trajectory: Trajectory):
+        self.name, self._trajectory = trajectory.controller, trajectory
+
+    def reset(self, seed: int = 0) -> None:
+        pass
+
+    def act(self, measurement: Measurement) -> Controls:
+        k = measurement.step
+        return Controls(perimeter=self._trajectory.perimeter[k], splits=self._trajectory.splits[k])
+
+
+def predict(scenario: Scenario, result: Result) -> Trajectory:
+    """The regional model from the same start, under the departures and controls that the microsimulation recorded.
+
+    Demand is what entered the streets, not what wished to: the backlog is none of the model's business here.
+    """
+    same = replace(
+        scenario, steps=len(result.trajectory.perimeter), demand=result.record["departures"] / scenario.step,
+        measurement_std=0.0, faults=())
+    trajectory = closed_loop.run(NmfdPlant(same), Replay(result.trajectory), same, seed=result.trajectory.seed)
+    return replace(trajectory, plant="nmfd")
+
+
+def predict_next(scenario: Scenario, result: Result, intervals: int = 1) -> np.ndarray:
+    """(T + 1 - intervals, R) [veh]: accumulations `intervals` ahead of every recorded state, by the regional model."""
+    import torch
+
+    trajectory, steps = result.trajectory, len(result.trajectory.perimeter)
+    x = torch.from_numpy(trajectory.accumulation[: steps + 1 - intervals])
+    demand = torch.from_numpy(result.record["departures"] / scenario.step)
+    perimeter, splits = torch.from_numpy(trajectory.perimeter), torch.from_numpy(trajectory.splits)
+    p = parameters(scenario.network)
+    for n in range(intervals):
+        part = slice(n, n + len(x))
+        x = advance(
+            p, x, demand[part], perimeter[part], splits[part], scenario.step, integrator=scenario.integrator,
+            substeps=scenario.substeps)
+    return x.sum(-1).numpy()
+
+
+def errors(scenario: Scenario, result: Result, predicted: Trajectory) -> list[dict]:
+    """One row of COLUMNS per region, and one for all of them (region "all").
+
+    rmse, bias: of the predicted accumulation over the whole run, model minus simulation; share: of the critical
+    accumulation; next_interval: predicted from the recorded state one control interval before.
+    """
+    simulated = result.trajectory.accumulation.sum(-1)
+    whole = predicted.accumulation.sum(-1) - simulated
+    ahead = predict_next(scenario, result) - simulated[1:]
+    critical = np.array([m.critical for m in scenario.network.mfds])
+    rows = [
+        _row(i, scenario.network.region_names[i], critical[i], simulated[:, i], whole[:, i], ahead[:, i])
+        for i in range(scenario.network.regions)]
+    return [*rows, _row("all", "all regions", critical.sum(), simulated.sum(1), whole.sum(1), ahead.sum(1))]
+
+
+def _row(region, name, critical, simulated, whole, ahead) -> dict:
+    rmse, next_rmse = float(np.sqrt((whole**2).mean())), float(np.sqrt((ahead**2).mean()))
+    return dict(zip(COLUMNS, (
+        region, name, float(critical), float(simulated.mean()), rmse, rmse / critical, float(whole.mean()), next_rmse,
+        next_rmse / critical), strict=True))
+
+
+def outflow_samples(
+    trajectories: Sequence[Trajectory], records: Sequence[dict], u_max: float, region: int, adjacency: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """MFD samples of one region: label -> (n, 2) of accumulation [veh] and outflow [veh/s].
+
+    Labels: "loading" and "unloading", and HELD_UP for intervals in which a neighbour's congestion, not the region's
+    own, limited what could leave (`held_up`).
+
+    Per control interval, the outflow that the model's g has to give: trips ended in the region and transfers out of
+    it as counted, the transfers divided by the u of the interval where it was below the bound that is meant by the
+    original programme. In the model x_ii leaves at q x_ii and x_ij at u q x_ij, so q = outflow / (x_ii + u x_i,other).
+    """
+    samples: dict[str, list[np.ndarray]] = {"loading": [], "unloading": [], HELD_UP: []}
+    for trajectory, record in zip(trajectories, records, strict=True):
+        x = 0.5 * (trajectory.accumulation[1:] + trajectory.accumulation[:-1])
+        total, own = x.sum(2), x[:, range(x.shape[1]), range(x.shape[1])]
+        outflow = (record["arrivals"] + record["crossings"].sum(axis=(2, 3))) / trajectory.step
+        share = np.minimum(trajectory.perimeter[:, region].max(axis=1), u_max)
+        weight = own[:, region] + share * (total - own)[:, region]
+        points = np.stack(
+            [total[:, region], outflow[:, region] * total[:, region] / np.maximum(weight, 1e-9)], axis=1)
+        rising = np.diff(trajectory.accumulation[:, region].sum(1)) >= 0
+        seen, blocked = total[:, region] >= 5.0, held_up(total, outflow, adjacency)[:, region]
+        samples["loading"].append(points[seen & ~blocked & rising])
+        samples["unloading"].append(points[seen & ~blocked & ~rising])
+        samples[HELD_UP].append(points[seen & blocked])
+    return {label: np.concatenate(clouds) for label, clouds in samples.items()}
+
+
+def held_up(accumulation: np.ndarray, outflow: np.ndarray, adjacency: np.ndarray) -> np.ndarray:
+    """(T, R) bool: a neighbour that collapsed before the region did is collapsed in this interval.
+
+    Collapsed: holding more vehicles (T, R) than when its outflow (T, R) was largest so far, and letting out less than
+    COLLAPSED of that. Queues that spill back over a boundary lower the outflow of the region behind it; its own MFD
+    is not to blame.
+    """
+    steps, regions = outflow.shape
+    collapsed = np.zeros((steps, regions), dtype=bool)
+    for i in range(regions):
+        best = 0
+        for k in range(steps):
+            if outflow[k, i] >= outflow[best, i]:
+                best = k
+            collapsed[k, i] = (
+                accumulation[k, i] > accumulation[best, i] and outflow[k, i] < COLLAPSED * outflow[best, i])
+    onset = np.where(collapsed.any(axis=0), collapsed.argmax(axis=0), steps)
+    earlier = adjacency & (onset[None, :] < onset[:, None])
+    return (collapsed[:, None, :] & earlier[None]).any(axis=2)
+
+
+def table(rows: pd.DataFrame) -> str:
+    """The errors as text."""
+    shown = rows.copy()
+    for column in ("critical_veh", "mean_veh", "rmse_veh", "bias_veh", "next_interval_rmse_veh"):
+        shown[column] = [f"{value:.1f}" for value in rows[column]]
+    for column in ("rmse_share", "next_interval_rmse_share"):
+        shown[column] = [f"{100 * value:.1f} %" for value in rows[column]]
+    shown.columns = [
+        "region", "name", "critical", "mean", "RMSE", "of critical", "bias", "next interval RMSE", "of critical"]
+    return shown.to_string(index=False) + "\n" + CAPTION
+
+
+def write(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
+    """Compare, and add compare-<run>.csv and two pictures to the run folder; returns the rows of `errors`."""
+    predicted = predict(scenario, result)
+    rows = pd.DataFrame(errors(scenario, result, predicted), columns=COLUMNS)
+    name = run_folder.run_name(result.trajectory.controller, result.trajectory.seed)
+    with files.atomic(folder / f"compare-{name}.csv") as temporary:
+        rows.to_csv(temporary, index=False)
+    drawing, axes = plots.panels(scenario.network.regions + 1)
+    for region, ax in enumerate(axes[:-1]):
+        plots.region_accumulation(ax, scenario.network, region, [result.trajectory, predicted])
+    plots.total_accumulation(axes[-1], [replace(
+        result.trajectory, backlog=np.zeros_like(result.trajectory.backlog)), predicted])
+    axes[-1].set_title("all regions", fontsize="medium")
+    plots.legend_below(drawing, axes, columns=4)
+    plots.save(drawing, folder / f"compare-{name}-accumulation.png")
+    samples = [
+        outflow_samples(
+            [result.trajectory], [result.record], scenario.network.u_max, region, scenario.network.adjacency)
+        for region in range(scenario.network.regions)]
+    draw_mfds(folder / f"compare-{name}-mfd.png", scenario.network, samples)
+    return rows
+
+
+def draw_mfds(
+    path: Path, network: Network, samples: Sequence[Mapping[str, np.ndarray]], found: Sequence[np.ndarray] = (),
+) -> None:
+    """The MFD of every region over its outflow samples, as one picture. found: by region, a `bands.band` to draw."""
+    drawing, axes = plots.panels(network.regions)
+    for region, ax in enumerate(axes):
+        plots.mfd(ax, network.mfds[region], samples[region])
+        if len(found):
+            mfd_bands.draw_band(ax, found[region])
+        ax.set_title(f"{region} {network.region_names[region]}", fontsize="medium")
+    plots.legend_below(drawing, axes)
+    plots.save(drawing, path)

@@ -1,0 +1,91 @@
+"""How far ahead the regional models foresee the accumulations of finished runs, over all runs of a folder."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from cosim.evaluation import experiment
+from cosim.evaluation.identify import AHEAD, observed
+from cosim.evaluation.results import Finished
+from cosim.plant.strategy import modelled
+from nmfd.errors import InputError
+from nmfd.model import identification
+from nmfd.model.scenario import Scenario
+from nmfd.runs import files
+
+COLUMNS = (
+    "demand", "controller", "runs", "model", "region", "critical_veh", "most_share", "next_interval_rmse_share",
+    "ahead_s", "ahead_rmse_share")
+CAPTION = (
+    "RMSE of the predicted accumulation, predicted from every recorded state under the recorded departures and\n"
+    "controls, as a share of the region's critical accumulation, mean of the regions; most: the largest accumulation\n"
+    "of any region in any of the runs, as a share of its critical one")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Foresight:
+    """How well one model foresees the runs of one strategy at one demand level.
+
+    model: the folder of its network; critical: (R,) [veh]; most: (R,) [-], the largest accumulation in the runs, as a
+    share of the critical one; errors: (2, R) [-], RMSE one control interval and `ahead` [s] ahead, as such a share
+    """
+
+    demand: float
+    controller: str
+    runs: int
+    model: Path | None
+    critical: np.ndarray
+    most: np.ndarray
+    ahead: float
+    errors: np.ndarray
+
+
+def foresee(found: Finished, model: Path | None = None) -> list[Foresight]:
+    """Of every strategy at every demand level of the folder.
+
+    model: the folder of a network, instead of that with which each controller plans. Raises InputError.
+    """
+    if found.changed:
+        raise InputError(f"{found.path}: {found.changed}; run them again to compare them")
+    return [
+        _of(level.demand, controller, modelled(found.scenario, controller, model),
+            [experiment.read_run(level.folder, controller, seed) for seed in rows["seed"]])
+        for level in found.levels for controller, rows in level.rows.groupby("controller", sort=False)]
+
+
+def _of(demand: float, controller: str, scenario: Scenario, results: Sequence[experiment.Result]) -> Foresight:
+    seen, network = [observed(result) for result in results], scenario.network
+    intervals = identification.intervals_within(AHEAD, scenario.step, seen)
+    critical = np.array([curve.critical for curve in network.mfds])
+    return Foresight(
+        demand=demand, controller=controller, runs=len(results), critical=critical,
+        model=network.folder and Path(os.path.normpath(network.folder)),
+        most=np.max([run.accumulation.sum(axis=2).max(axis=0) for run in seen], axis=0) / critical,
+        ahead=intervals * scenario.step,
+        errors=identification.prediction_shares(
+            network, seen, (1, intervals), step=scenario.step, substeps=scenario.substeps,
+            integrator=scenario.integrator))
+
+
+def table(foresights: Sequence[Foresight]) -> str:
+    """As text, one line per strategy and demand level."""
+    rows = [{
+        "demand": f"{one.demand:g}", "controller": one.controller, "runs": one.runs,
+        "model": one.model.name if one.model else "", "most": f"{one.most.max():.1f}",
+        "next interval": f"{100 * one.errors[0].mean():.1f} %",
+        "later": f"{100 * one.errors[1].mean():.1f} % ({one.ahead:g} s)"} for one in foresights]
+    return pd.DataFrame(rows).to_string(index=False) + "\n" + CAPTION
+
+
+def write(path: Path, foresights: Sequence[Foresight]) -> None:
+    """COLUMNS as a table, one row per strategy, demand level and region."""
+    rows = [
+        (one.demand, one.controller, one.runs, one.model, region, one.critical[region], one.most[region],
+         one.errors[0, region], one.ahead, one.errors[1, region])
+        for one in foresights for region in range(len(one.critical))]
+    with files.atomic(path) as temporary:
+        pd.DataFrame(rows, columns=COLUMNS).to_csv(temporary, index=False, float_format="%.6g")

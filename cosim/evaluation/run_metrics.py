@@ -1,0 +1,63 @@
+"""One row of sumo.csv: what a run in SUMO came to, beside the figures that every plant has (nmfd.metrics)."""
+
+from collections import Counter
+from collections.abc import Collection
+
+import numpy as np
+
+from cosim.plant.record import Record
+from cosim.sumo.net import City, Gateway, gateway_room_taken
+from cosim.sumo.tripinfo import TripFacts
+from nmfd.types import Trajectory
+
+FULL = 0.8         # share of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards
+
+
+def trip_facts(facts: TripFacts) -> dict:
+    """Means over all trips that were due, finished or not [s], and emissions of the whole run [kg]."""
+    trips = max(facts.trips, 1)
+    return {
+        "mean_trip_time_s": facts.travel_time / trips, "mean_departure_delay_s": facts.departure_delay / trips,
+        "co2_kg": facts.co2, "fuel_kg": facts.fuel}
+
+
+def queue_facts(record: Record, city: City) -> dict:
+    """Queues on the edges before gateways, every edge once.
+
+    gateway_queue_mean_veh: over edges and time; gateway_queue_max_veh: the longest at any time; gateway_full_share:
+    of edges and intervals, those in which the edge was full (FULL)
+    """
+    upstream = upstream_gateways(city)
+    queue, longest = record.gateway_queue[:, upstream], record.gateway_queue_max[:, upstream]
+    full = gateway_full(record.edge_vehicles, city)[:, upstream]
+    return {
+        "gateway_queue_mean_veh": float(queue.mean()), "gateway_queue_max_veh": float(longest.max()),
+        "gateway_full_share": float(full.mean())}
+
+
+def upstream_gateways(city: City) -> list[int]:
+    """Indices of gateways, one for every edge before a boundary."""
+    first: dict[str, int] = {}
+    for n, gateway in enumerate(city.gateways):
+        first.setdefault(gateway.from_edge, n)
+    return list(first.values())
+
+
+def gateway_full(edge_vehicles: np.ndarray, city: City) -> np.ndarray:
+    """(T, G) bool: the edge before the gateway holds at least FULL of its room, by edge_vehicles (T, E) [veh]."""
+    return gateway_room_taken(edge_vehicles.astype(float), city) >= FULL
+
+
+def decision_facts(trajectory: Trajectory) -> dict:
+    """late_decisions: those that took longer than the control interval; fallbacks: the statuses that were not ok."""
+    reasons = Counter(status for status in trajectory.status if status != "ok")
+    return {
+        "late_decisions": int((trajectory.decision_time > trajectory.step).sum()),
+        "fallbacks": "; ".join(f"{count} x {reason}" for reason, count in reasons.most_common(3))}
+
+
+def leaking_share(record: Record, city: City, leaks: Collection[Gateway]) -> float:
+    """Share of the flow over the boundaries that passes gateways without a signal under control."""
+    flow = record.gateway_flow.sum(axis=0)
+    leaking = sum(passed for gateway, passed in zip(city.gateways, flow, strict=True) if gateway in leaks)
+    return float(leaking / max(flow.sum(), 1))

@@ -1,0 +1,184 @@
+"""Tables of an evaluation: means over seeds with intervals, and differences paired by seed.
+
+A change is the mean over the seeds that both have of 100 (a / b - 1), with its 95 % interval by Student's t: the same
+trips on both sides, so that what one seed's demand does to both is not taken for an effect.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from nmfd.runs import files
+from nmfd.studies.benchmark import REFERENCE, interval
+
+TTS = "total_time_spent_veh_s"
+MEANS = (  # columns of summary.csv and sumo.csv of which an evaluation shows the mean over seeds
+    "completed_veh", "trips", "final_backlog_veh", "total_backlog_veh_s", "mean_trip_time_s", "mean_departure_delay_s",
+    "co2_kg", "fuel_kg", "gateway_queue_mean_veh", "gateway_full_share", "control_step_ms_median", "overhead_share",
+    "wall_time_s")
+CAPTION = (
+    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; change: of TTS,\n"
+    "paired by seed, mean of the percentages ± 95 % interval, * if that excludes zero; backlog: not inserted at the\n"
+    "end, and its time integral; teleports: all seeds; trip, delay: mean time on the road, and between the wanted and\n"
+    "the real departure, of all trips, unfinished ones with what they had spent at the end; queue: halting on the\n"
+    "edges before gateways, mean / longest; full: share of these edges and intervals that were full; decision: median\n"
+    "/ longest; late: decisions longer than the control interval; fallbacks: decisions that were one")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Paired:
+    """How a differs from b on the n seeds that both have: mean and half of the 95 % interval (NaN of a single seed)."""
+
+    seeds: int
+    percent: float
+    percent_half: float
+    difference: float
+    difference_half: float
+
+    @property
+    def excludes_zero(self) -> bool:
+        return abs(self.percent) > self.percent_half  # never of a single seed
+
+
+def paired(a: Mapping[int, float], b: Mapping[int, float]) -> Paired:
+    """a, b: seed -> value; NaN everywhere without a common seed."""
+    seeds = sorted(set(a) & set(b))
+    percent = [100.0 * (a[seed] / b[seed] - 1.0) for seed in seeds]
+    difference = [a[seed] - b[seed] for seed in seeds]
+    return Paired(
+        seeds=len(seeds), percent=_mean(percent), percent_half=interval(percent), difference=_mean(difference),
+        difference_half=interval(difference))
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if len(values) else math.nan
+
+
+def by_seed(rows: pd.DataFrame, level: float, controller: str, column: str = TTS) -> dict[int, float]:
+    """Seed -> value."""
+    chosen = rows[(rows["demand"] == level) & (rows["controller"] == controller)]
+    return dict(zip(chosen["seed"], chosen[column], strict=True))
+
+
+def groups(rows: pd.DataFrame) -> dict[float, list[str]]:
+    """Demand level -> controllers, as they come."""
+    return {level: list(dict.fromkeys(part["controller"])) for level, part in rows.groupby("demand", sort=True)}
+
+
+def statistics(rows: pd.DataFrame, reference: str | None = None) -> pd.DataFrame:
+    """One row per demand level and controller of `rows`, which are those of experiment.overview with a column
+    demand. `reference`: a controller to pair with, besides no control."""
+    out = []
+    for level, names in groups(rows).items():
+        for name in names:
+            part = rows[(rows["demand"] == level) & (rows["controller"] == name)]
+            row = {
+                "demand": level, "controller": name, "seeds": len(part), f"mean_{TTS}": part[TTS].mean(),
+                f"half_interval_{TTS}": interval(list(part[TTS]))}
+            for label, other in (("change", REFERENCE), ("change_to_reference", reference)):
+                pair = paired(by_seed(rows, level, name), by_seed(rows, level, other)) if other else None
+                shown = pair is not None and pair.seeds > 0 and name != other
+                row |= {
+                    f"{label}_percent": pair.percent if shown else math.nan,
+                    f"{label}_half_interval_percent": pair.percent_half if shown else math.nan,
+                    f"{label}_excludes_zero": pair.excludes_zero if shown else None,
+                    f"{label}_seeds": pair.seeds if shown else 0}
+            row |= {column: part[column].mean() for column in MEANS}
+            row |= {
+                "teleports": int(part["teleports"].sum()),
+                "gateway_queue_max_veh": part["gateway_queue_max_veh"].max(),
+                "control_step_ms_max": part["control_step_ms_max"].max(),
+                "late_decisions": part["late_decisions"].sum(min_count=1),  # unknown in runs of an older version
+                "fallbacks": int(part["solver_failures"].sum())}
+            out.append(row)
+    return pd.DataFrame(out)
+
+
+def pairs(rows: pd.DataFrame) -> pd.DataFrame:
+    """TTS of every controller against every other at every demand level, paired by seed."""
+    out = []
+    for level, names in groups(rows).items():
+        for name in names:
+            for other in names:
+                if other == name:
+                    continue
+                pair = paired(by_seed(rows, level, name), by_seed(rows, level, other))
+                out.append({
+                    "demand": level, "controller": name, "against": other, "seeds": pair.seeds,
+                    "change_percent": pair.percent, "half_interval_percent": pair.percent_half,
+                    "difference_veh_s": pair.difference, "half_interval_veh_s": pair.difference_half,
+                    "excludes_zero": pair.excludes_zero})
+    columns = ["demand", "controller", "against", "seeds", "change_percent", "half_interval_percent",
+               "difference_veh_s", "half_interval_veh_s", "excludes_zero"]
+    return pd.DataFrame(out, columns=columns)
+
+
+def shown(table: pd.DataFrame, reference: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """`statistics` of one demand level as two tables of text: what came of it, and how."""
+    first, second = [], []
+    for row in table.to_dict("records"):
+        teleports = f"{row['teleports']:.0f}"
+        against = {f"against {reference}": _change(row, "change_to_reference")} if reference else {}
+        first.append({
+            "controller": row["controller"], "seeds": row["seeds"], "TTS [veh s]": _spread(row),
+            "change": _change(row, "change"), **against,
+            "completed": f"{row['completed_veh']:,.0f} of {row['trips']:,.0f}",
+            "backlog [veh]": f"{row['final_backlog_veh']:,.0f}",
+            "backlog [veh s]": f"{row['total_backlog_veh_s']:.2e}", "teleports": teleports})
+        second.append({
+            "controller": row["controller"], "trip [s]": f"{row['mean_trip_time_s']:,.0f}",
+            "delay [s]": f"{row['mean_departure_delay_s']:,.0f}", "CO2 [kg]": f"{row['co2_kg']:,.0f}",
+            "queue [veh]": f"{row['gateway_queue_mean_veh']:.1f} / {row['gateway_queue_max_veh']:.0f}",
+            "full": f"{100 * row['gateway_full_share']:.1f} %",
+            "decision [ms]": f"{row['control_step_ms_median']:.3g} / {row['control_step_ms_max']:.3g}",
+            "late": row["late_decisions"], "fallbacks": row["fallbacks"],
+            "outside SUMO": f"{100 * row['overhead_share']:.1f} %", "teleports": teleports})
+    return pd.DataFrame(first), pd.DataFrame(second)
+
+
+def _spread(row: Mapping) -> str:
+    half = row[f"half_interval_{TTS}"]
+    return f"{row[f'mean_{TTS}']:.3e}" + ("" if math.isnan(half) else f" ± {half:.1e}")
+
+
+def _change(row: Mapping, label: str) -> str:
+    percent, half = row[f"{label}_percent"], row[f"{label}_half_interval_percent"]
+    if math.isnan(percent):
+        return ""
+    return f"{percent:+.1f}" + (" %" if math.isnan(half) else f" ± {half:.1f} %{'*' * row[f'{label}_excludes_zero']}")
+
+
+def text(table: pd.DataFrame, reference: str | None = None) -> str:
+    """`statistics` for the terminal."""
+    parts = []
+    for level, part in table.groupby("demand", sort=True):
+        first, second = shown(part, reference)
+        parts += [f"Demand times {level:g}", first.to_string(index=False), "", second.to_string(index=False), ""]
+    return "\n".join([*parts, CAPTION])
+
+
+def markdown(table: pd.DataFrame, reference: str | None = None) -> str:
+    """`statistics` as markdown."""
+    parts = []
+    for level, part in table.groupby("demand", sort=True):
+        parts += [f"## Demand times {level:g}", *(_markdown(t) for t in shown(part, reference))]
+    return "\n\n".join([*parts, " ".join(CAPTION.split())]) + "\n"
+
+
+def _markdown(table: pd.DataFrame) -> str:
+    lines = [list(table.columns), ["---"] * len(table.columns), *table.astype(str).values.tolist()]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def write(folder: Path, rows: pd.DataFrame, reference: str | None = None) -> pd.DataFrame:
+    """evaluate.csv, evaluate.md, pairs.csv and runs.csv in `folder`; returns `statistics`."""
+    table = statistics(rows, reference)
+    for name, content in (("runs.csv", rows), ("evaluate.csv", table), ("pairs.csv", pairs(rows))):
+        with files.atomic(folder / name) as temporary:
+            content.to_csv(temporary, index=False)
+    files.write_text(folder / "evaluate.md", markdown(table, reference))
+    return table

@@ -1,0 +1,156 @@
+"""The sweep: controllers x seeds x demand levels x compliance rates in SUMO, on processes or a cluster, as one table.
+
+    <folder>/sweep.parquet      one row per run, new after every run: what was asked for, how it ended, all its figures
+    <folder>/demand-<level>/    the run folder of a demand level (cosim.evaluation.experiment), as of an evaluation
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import pandas as pd
+
+from cosim.evaluation import dask_cluster, experiment
+from cosim.evaluation.evaluate import level_folders
+from cosim.evaluation.simulate import Result, Task
+from cosim.plant.settings import settings
+from cosim.plant.strategy import parse
+from nmfd.controllers import registry
+from nmfd.errors import InputError
+from nmfd.model.scenario import load_scenario
+from nmfd.runs.frames import write_parquet
+from nmfd.runs.workers import Failure, ended, outcomes
+
+OK, FAILED = "ok", "failed"
+KEYS = ["strategy", "seed", "demand"]
+FIRST = ["strategy", "controller", "seed", "demand", "compliance", "status", "reason"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """scenario: its folder; controllers: strategies; levels: multiples of the scenario's demand; compliance: shares of
+    the drivers' decisions that follow route guidance, the scenario's own where there is none or nobody guides;
+    steps: control intervals, all if None; policies: controller -> file instead of the scenario's own; out: the folder.
+    """
+
+    scenario: Path
+    controllers: tuple[str, ...]
+    seeds: Sequence[int]
+    out: Path
+    levels: tuple[float, ...] = (1.0,)
+    compliance: tuple[float, ...] = ()
+    steps: int | None = None
+    policies: Mapping[str, Path] = field(default_factory=dict)
+
+    def strategies(self) -> dict[str, str]:
+        """Strategy with its compliance -> strategy as asked for; those that guide nobody once only. InputError."""
+        ways = [f"+compliance-{100 * share:g}" for share in self.compliance] or [""]
+        found = {name + way: name for name in self.controllers for way in ways}
+        guiding = {name: registry.guides(parse(name).controller) for name in found}
+        return {strategy if guiding[strategy] else name: name for strategy, name in found.items()}
+
+    def plan(self) -> list[tuple[Path, Task]]:
+        """Every run with its run folder, seed by seed, so that whatever is finished compares like with like."""
+        return [
+            (self.out / f"demand-{level:g}", Task(
+                scenario=self.scenario, controller=strategy, seed=seed, policy=self.policies.get(name),
+                steps=self.steps, demand_factor=level))
+            for seed in self.seeds for level in self.levels for strategy, name in self.strategies().items()]
+
+
+def sweep(
+    order: Sweep, *, workers: int = 1, scheduler: str | None = None,
+    progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
+) -> pd.DataFrame:
+    """Run what is not there yet; returns the table, which is in sweep.parquet, of all runs in the folder.
+
+    Columns: strategy, controller (without its compliance), seed, demand, compliance, status ("ok" or "failed"),
+    reason, and those of summary.csv and sumo.csv, which are empty where a run failed. Failed runs are tried again at
+    the next call. `scheduler`: the address of a Dask scheduler, whose workers run all of it instead of `workers`
+    processes here. progress, tell: as in `experiment.perform`. Raises InputError, and
+    RunFailed if no run at all went well.
+    """
+    if (order.out / "manifest.json").is_file():
+        raise InputError(f"{order.out}: is the folder of another command; choose another folder with --out")
+    plan, file = order.plan(), order.out / "sweep.parquet"
+    failures = _failures(file)
+    own = settings(load_scenario(order.scenario)).compliance
+
+    def write() -> pd.DataFrame:
+        done = _finished(order.out)
+        for key in done[KEYS].itertuples(index=False, name=None):
+            failures.pop(key, None)
+        failed = [{**dict(zip(KEYS, key, strict=True)), "status": FAILED, "reason": reason}
+                  for key, reason in failures.items()]
+        rows = _named(pd.concat([done, pd.DataFrame(failed)], ignore_index=True) if failed else done, own)
+        order.out.mkdir(parents=True, exist_ok=True)
+        write_parquet(file, rows)
+        return rows
+
+    def failed(task: Task, reason: str) -> None:
+        failures[task.controller, task.seed, task.demand_factor] = reason
+        write()
+
+    if scheduler is not None:
+        dask_cluster.connect(scheduler).close()  # before anything is written
+    failed_now = experiment.perform(
+        plan, workers=workers, progress=progress, tell=tell, kept=write, failed=failed,
+        source=partial(_local, workers=workers) if scheduler is None else partial(dask_cluster.outcomes, scheduler))
+    rows = write()
+    if failed_now and (rows["status"] == FAILED).all():
+        raise ended([(experiment.label(task), failure) for task, failure in failed_now[:1]])
+    return rows
+
+
+def _local(tasks: Sequence[Task], *, workers: int) -> Iterator[tuple[Task, Result | Failure]]:
+    return outcomes(experiment.simulate, tasks, workers, fresh=True)
+
+
+def _finished(out: Path) -> pd.DataFrame:
+    """A row per finished run."""
+    parts = []
+    for level, folder in level_folders(out).items():
+        rows = experiment.overview(folder).rename(columns={"controller": "strategy"})
+        parts.append(rows.assign(demand=level, status=OK, reason=""))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=[*KEYS, "status", "reason"])
+
+
+def _failures(file: Path) -> dict[tuple[str, int, float], str]:
+    """Strategy, seed and demand level -> reason, of the runs that failed so far. Raises InputError."""
+    if not file.is_file():
+        return {}
+    try:
+        rows = pd.read_parquet(file)
+        rows = rows[rows["status"] == FAILED]
+        return {tuple(key): reason for *key, reason in rows[[*KEYS, "reason"]].itertuples(index=False, name=None)}
+    except (OSError, ValueError, KeyError) as error:  # pyarrow's own errors are among them
+        raise InputError(
+            f"{file}: is no table of a sweep ({' '.join(str(error).split())[:200]}); delete it, the runs are kept in "
+            "the folders beside it") from None
+
+
+def _named(rows: pd.DataFrame, own: float) -> pd.DataFrame:
+    """`rows` with what was asked for as the first columns, sorted by it; `own`: the compliance of the scenario."""
+    strategies = {name: parse(name) for name in dict.fromkeys(rows["strategy"])}
+    controllers = {name: "+".join(part for part in (registry.split(name)[0], *registry.split(name)[1])
+                                  if not part.startswith("compliance-")) for name in strategies}
+    compliance = {name: float(strategy.overrides.get("compliance", own)) for name, strategy in strategies.items()}
+    named = rows.assign(
+        controller=rows["strategy"].map(controllers), compliance=rows["strategy"].map(compliance).astype(float))
+    return named[[*FIRST, *(column for column in named if column not in FIRST)]].sort_values(
+        ["demand", "controller", "compliance", "seed"], ignore_index=True)
+
+
+def text(rows: pd.DataFrame) -> str:
+    """Means over the seeds, one line per demand level, controller and compliance."""
+    groups = rows.groupby(["demand", "controller", "compliance"], sort=True)
+    good = rows[rows["status"] == OK].groupby(["demand", "controller", "compliance"], sort=True)
+    failed = groups["status"].agg(lambda status: (status == FAILED).sum())
+    table = pd.DataFrame({"runs": groups.size(), "failed": failed})
+    if len(good):
+        table["TTS [veh s]"] = good["total_time_spent_veh_s"].mean().map("{:.4g}".format)
+        table["completed [veh]"] = good["completed_veh"].mean().map("{:,.0f}".format)
+        table["trip [s]"] = good["mean_trip_time_s"].mean().map("{:,.0f}".format)
+        table["CO2 [kg]"] = good["co2_kg"].mean().map("{:,.0f}".format)
+    return table.fillna("").reset_index().to_string(index=False)

@@ -1,0 +1,1 @@
+"""The city as a plant, and what acts in it."""

@@ -1,0 +1,51 @@
+"""The SUMO city as an environment for reinforcement learning (nmfd.rl; needs the extra `rl`).
+
+One simulation per process: close an environment before the next is reset, and use processes for several
+(gymnasium.vector.AsyncVectorEnv, Stable-Baselines3's SubprocVecEnv).
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cosim.plant.strategy import parse
+from nmfd.model.scenario import Scenario, load_scenario
+
+if TYPE_CHECKING:
+    from cosim.plant.plant import SumoPlant
+    from nmfd.rl import RegionalEnv, RegionsEnv
+
+
+def gymnasium_env(
+    scenario: Scenario | Path | str, *, guidance: bool = False, metering: bool = False, steps: int | None = None,
+    city: str = "",
+) -> "RegionalEnv":
+    """One agent for all regions (nmfd.rl.RegionalEnv) in SUMO.
+
+    guidance, metering: as of nmfd.rl.Interface; steps: control intervals of an episode, the scenario's if None
+    city: what else the city does, such as "max-pressure+rerouting-30". Raises InputError.
+    """
+    from nmfd.rl import RegionalEnv
+
+    return RegionalEnv(*_city(scenario, steps, city), guidance=guidance, metering=metering)
+
+
+def pettingzoo_env(
+    scenario: Scenario | Path | str, *, guidance: bool = False, cooperative: bool = True, steps: int | None = None,
+    city: str = "",
+) -> "RegionsEnv":
+    """One agent per region (nmfd.rl.RegionsEnv) in SUMO; the other arguments as of `gymnasium_env`."""
+    from nmfd.rl import RegionsEnv
+
+    return RegionsEnv(*_city(scenario, steps, city), guidance=guidance, cooperative=cooperative)
+
+
+def _city(scenario: Scenario | Path | str, steps: int | None, city: str) -> tuple[Scenario, "SumoPlant"]:
+    from cosim.plant.plant import SumoPlant
+    from cosim.plant.settings import settings
+
+    loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    if steps is not None:
+        loaded = replace(loaded, steps=min(steps, loaded.steps), demand=loaded.demand[:steps])
+    overrides = {**(parse(city).overrides if city else {}), "gateways_fixed": True}
+    return loaded, SumoPlant(loaded, overrides=replace(settings(loaded), **overrides))

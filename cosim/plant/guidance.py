@@ -1,0 +1,298 @@
+"""Route guidance to reroutes: every vehicle is given its next region when it enters a region, in shares theta.
+
+Drivers who are told travel times do not keep to the split ratios that they had without: what they would choose now is
+followed up, and theta shifts it as it shifts the drivers' own split ratios in the regional model (`shifted`). A
+controller that asks for these gets guidance by travel times alone; one that asks for everybody gets everybody.
+
+Who is sent where is not drawn by lot: a driver at the western edge of a region would be sent round its eastern end as
+often as the others, and trips get so much longer that guidance with the drivers' own split ratios jams a city that
+flows without it (measured on grid7). Instead everybody takes the next region that costs least, with a bonus for the
+regions that are behind their share; the bonus grows until the shares are met, by those who lose least.
+
+A guided vehicle in region i bound for edge d takes the fastest way inside i to a gateway i -> h, and from there to d
+without coming back to i, at the travel times of the last control interval (smoothed), as its group of drivers sees
+them. In h it is guided again, and in the region of d it is sent there on the fastest way. With a period it is asked
+again where it is, every so often as long as it stays in i: in a city that congests, the fastest way when it came may
+be a standing one soon. Nobody is sent on a detour that takes much longer, whatever theta says, and nobody leaves the
+way that he is on for a small gain: everybody who changes his way makes the travel times that the others were told
+wrong.
+
+Where the boundaries of the regions are ragged, a main road may leave i and come back. With `ways_return` the fastest
+way of all is open to everybody, wherever it leads, and counts for the region that it enters when it leaves i for good;
+other ways into h still never come back. Without it such a road is closed to guided drivers, however much it costs them.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+
+import numpy as np
+
+from cosim.plant.meter import Event
+from cosim.plant.shortest_paths import Home, Moves, Ways
+from cosim.sumo.net import City
+from cosim.sumo.session import REFUSALS, Session
+
+SMOOTHING = 0.5  # weight of the newest travel times
+TASTES = 4       # groups of drivers who see different travel times: were they all sent one way, it would jam
+SPREAD = 0.15    # standard deviation of the logarithm of their travel times
+SLOWEST = 0.1    # m/s; slower is as good as standing
+BONUS = 30.0     # s per vehicle that a region is behind its share
+LOYALTY = 0.3    # a driver keeps his way if the best one does not save more than this share of its own time
+MEMORY = 0.9     # of the vehicles assigned before and of their wishes, per control interval
+
+
+def shifted(wish: Sequence[float], own: Sequence[float], theta: Sequence[float]) -> list[float]:
+    """Shares (n,) [-] that differ from `wish` as `theta` does from `own`.
+
+    A next region that theta lowers loses the same part of those who wish to go there, and what is freed goes to the
+    regions that theta raises, in proportion to by how much.
+    """
+    kept = [w * (t / o) if t < o else w for w, o, t in zip(wish, own, theta, strict=True)]
+    raised = [max(t - o, 0.0) for o, t in zip(own, theta, strict=True)]
+    freed, total = sum(wish) - sum(kept), max(sum(raised), 1e-12)
+    return [k + freed * r / total for k, r in zip(kept, raised, strict=True)]
+
+
+@dataclass(eq=False)
+class _Visit:
+    """A driver who follows, in one region: how he came, and how he sees travel times; following: where he was sent
+    last, and in which control interval."""
+
+    event: Event
+    taste: int
+    following: int | None = None
+    interval: int = 0
+
+
+class Guide:
+    """Reroutes vehicles; `compliance` is the probability that a driver follows, drawn anew in every region,
+    `most_detour` [s] the most that a commanded next region may cost him, and `period` [s] the time after which he is
+    asked again; 0: never in the same region.
+
+    realised: (R, R, R) [veh], [i, h, j] = vehicles sent from i to h on their way to j since the start, those who were
+    asked several times as they were sent last
+    """
+
+    def __init__(
+        self, session: Session, city: City, own: np.ndarray, *, compliance: float, most_detour: float,
+        random: np.random.Generator, ways_return: bool = False, period: float = 0.0,
+    ):
+        """own: (R, R, R) [-], the drivers' own split ratios, which controllers mean as well"""
+        self._own = own
+        self._period = math.ceil(period / session.step_length - 1e-6) if period else 0  # simulation steps
+        self._steps = self._interval = 0
+        self._visits: dict[str, _Visit] = {}
+        self._due: dict[int, list[_Visit]] = {}  # simulation step -> whom to ask again then
+        self._most_detour = most_detour
+        self._session, self._city, self._compliance, self._random = session, city, compliance, random
+        self._index = {edge: n for n, edge in enumerate(city.edges)}
+        self._region = [city.region_of[edge] for edge in city.edges]
+        moves = [(e, f) for e, after in city.successors.items() for f in after]
+        first, second = np.array([(self._index[e], self._index[f]) for e, f in moves]).T
+        turn = np.array([city.turn_time[move] for move in moves])
+        self._turn_time = dict(zip(zip(first.tolist(), second.tolist(), strict=True), turn.tolist(), strict=True))
+        here = [np.array(self._region) == region for region in range(city.regions)]
+        self._within, within_back, self._without_back = (
+            [Moves(first, second, turn, allowed=allowed ^ outside, reverse=reverse) for allowed in here]
+            for outside, reverse in ((False, False), (False, True), (True, True)))
+        self._ways_return = ways_return
+        if ways_return:
+            within_back = [Moves(first, second, turn, allowed=np.full(len(city.edges), True), reverse=True)]
+        self._homeward = within_back  # by region, or one for all
+        self._gateways = [
+            np.array([(self._index[g.from_edge], self._index[g.to_edge], g.target)
+                      for g in city.gateways if g.source == region], dtype=int).reshape(-1, 3).T
+            for region in range(city.regions)]
+        self._taste = np.exp(SPREAD * random.standard_normal((TASTES, len(city.edges))))
+        self._length = np.array([city.length[edge] for edge in city.edges])
+        self._free = self._length / np.array([city.speed[edge] for edge in city.edges])
+        self._time = self._free.copy()
+        self._reached: dict[int, np.ndarray] = {}
+        self._ahead: dict[tuple[int, int], np.ndarray] = {}
+        self._ways: dict[tuple[int, int], Ways] = {}
+        self._homes: dict[tuple[int, int], Home] = {}
+        self._splits: np.ndarray | None = None
+        self._assigned, self._wished = np.zeros((2, *(city.regions,) * 3))
+        self.realised = np.zeros((city.regions,) * 3, dtype=int)
+        self.refused = 0
+
+    def command(self, splits: np.ndarray | None, speed: np.ndarray | None) -> None:
+        """Take over theta (R, R, R) [-] for the next control interval; None: no guidance.
+
+        speed: (E,) [m/s] of the city's edges, the mean over the last interval and NaN on empty ones; None: as before.
+        A mean, because the speed at one instant is that of a red or a green signal, every time the same one.
+        """
+        self._splits = splits
+        if splits is not None:
+            self._interval += 1
+            if speed is not None:
+                now = np.where(np.isnan(speed), self._free, self._length / np.maximum(speed, SLOWEST))
+                self._time += SMOOTHING * (np.maximum(now, self._free) - self._time)
+            self._ways, self._homes = {}, {}
+            self._assigned *= MEMORY
+            self._wished *= MEMORY
+
+    def apply(self, events: list[Event]) -> None:
+        """Guide the vehicles that departed or entered a region in the last step, and those whose time has come."""
+        if self._splits is None:
+            return
+        self._steps += 1
+        for event in events:
+            self._visits.pop(event.vehicle, None)
+            if event.free and self._random.random() < self._compliance:
+                visit = _Visit(event, int(self._random.integers(TASTES)))
+                if event.edge in self._index:  # or it may use roads that are closed to cars, as taxis do
+                    self._ask(visit)
+        for visit in self._due.pop(self._steps, ()):
+            if self._visits.get(visit.event.vehicle) is visit:
+                self._ask(visit)
+
+    def _ask(self, visit: _Visit) -> None:
+        """Guide a driver, unless he is on a junction or in the next region already: too late to turn."""
+        event, target, after = visit.event, self._index[visit.event.edge], self._period
+        try:
+            here = self._index.get(self._session.road(event.vehicle))
+        except REFUSALS:  # he has arrived
+            self._visits.pop(event.vehicle, None)
+            return
+        if here is None or self._region[here] != event.region:
+            after = min(self._period, 1)
+        elif event.region == event.destination:
+            self._guide_home(visit, here, target)
+        else:
+            self._guide_on(visit, here, target)
+        if after:
+            self._visits[event.vehicle] = visit
+            self._due.setdefault(self._steps + after, []).append(visit)
+
+    def _guide_home(self, visit: _Visit, here: int, target: int) -> None:
+        """The fastest way inside the region of destination; if ways may return, the fastest of all."""
+        event, home = visit.event, self._home(visit.event.region, visit.taste)
+        present = self._present(event.vehicle)
+        takes, bound = self._takes(present, here, home.time)
+        cost = home.cost(here, target, takes + 1.0 if bound else np.inf)
+        if here == target or not np.isfinite(cost) or self._keeps(present, here, takes, cost):
+            return
+        self._send(event.vehicle, home.route(here, target))
+
+    def _guide_on(self, visit: _Visit, here: int, target: int) -> None:
+        """The next region, and the fastest way through it."""
+        event, ways = visit.event, self._ways_from(visit.event.region, visit.taste)
+        present = self._present(event.vehicle)
+        takes, bound = self._takes(present, here, ways.time)
+        cost, reached = ways.cost(here, target, self._most_detour + takes + 1.0 if bound else np.inf)
+        # Plain numbers from here on: there are a handful of next regions, too few for arrays to pay.
+        least, open_ways = (
+            best.reduceat(values, ways.begins).tolist()
+            for best, values in ((np.minimum, cost), (np.logical_or, reached)))
+        fastest = min(least, default=np.inf)
+        returning = None  # the next region of the fastest way of all, where that is one that comes back
+        if self._ways_return:
+            home = self._home(event.region, visit.taste)
+            of_all = home.cost(here, target, takes + 1.0 if bound else np.inf)
+            if of_all < fastest:
+                way, fastest = home.route(here, target), of_all
+                returning = int(np.searchsorted(ways.neighbours, self._next_region(way)))
+                least[returning], open_ways[returning] = fastest, True
+        if fastest == np.inf:
+            return
+        self._wished[event.region, ways.neighbours[least.index(fastest)], event.destination] += 1.0
+        wish, own, theta, assigned = (
+            values[event.region, ways.neighbours, event.destination].tolist()
+            for values in (self._wished, self._own, self._splits, self._assigned))
+        wishes = sum(wish)
+        shares = [
+            share * is_open
+            for share, is_open in zip(shifted([w / wishes for w in wish], own, theta), open_ways, strict=True)]
+        if (total := sum(shares)) <= 0:
+            return
+        shares, everybody = [share / total for share in shares], sum(assigned) + 1.0
+        allowed = [share > 1e-3 and c <= fastest + self._most_detour for share, c in zip(shares, least, strict=True)]
+        if not any(allowed):  # every region with a share is too far out of the way
+            allowed = [c <= fastest for c in least]
+        price = [
+            c - BONUS * (share * everybody - sent) if good else np.inf
+            for c, share, sent, good in zip(least, shares, assigned, allowed, strict=True)]
+        n = price.index(min(price))
+        following = int(ways.neighbours[n])
+        if not self._keeps(present, here, takes, least[n], following):
+            if n != returning:
+                way = ways.route(here, int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]])), target)
+            if not self._send(event.vehicle, way):
+                return
+        if visit.following is not None:  # what he was told before does not count any more
+            before = event.region, visit.following, event.destination
+            self.realised[before] -= 1
+            self._assigned[before] -= MEMORY ** (self._interval - visit.interval)
+        self.realised[event.region, following, event.destination] += 1
+        self._assigned[event.region, following, event.destination] += 1.0
+        visit.following, visit.interval = following, self._interval
+
+    def _present(self, vehicle: str) -> list[int] | None:
+        """The edges of the driver's present way from where he is; None where it uses roads that are closed to cars."""
+        route = self._session.route(vehicle)[self._session.route_index(vehicle):]
+        way = list(map(self._index.get, route))
+        return None if None in way else way
+
+    def _takes(self, present: list[int] | None, here: int, time: np.ndarray) -> tuple[float, bool]:
+        """[s] from the end of edge `here` to the end of the present way, if it begins there, at `time` (E,) [s]; and
+        whether it is a way that a search would find: by known moves and, unless ways may return, out of the region of
+        `here` and never back."""
+        if present is None or present[0] != here:
+            return np.inf, False
+        turns = list(map(self._turn_time.get, pairwise(present)))
+        known, regions = None not in turns, self._regions(present)
+        back = not self._ways_return and regions.count(regions[0]) > 1
+        return time[present[1:]].sum() + sum(turns if known else filter(None, turns)), known and not back
+
+    def _regions(self, way: list[int]) -> list[int]:
+        """The regions that a way leads through, one after the other."""
+        return [region for region, _ in groupby(map(self._region.__getitem__, way))]
+
+    def _keeps(self, present: list[int] | None, here: int, takes: float, cost: float,
+               following: int | None = None) -> bool:
+        """Whether the driver's present way, which takes `takes` [s], is about as good as one of `cost` [s], and leads
+        into the region `following` next, if that is given; so it is where the way uses roads that are closed to
+        cars."""
+        if present is None:
+            return True
+        if present[0] != here:
+            return False
+        if following is not None and self._next_region(present) != following:
+            return False
+        return takes <= (1.0 + LOYALTY) * cost
+
+    def _next_region(self, way: list[int]) -> int:
+        """The region that a way enters first, or, if ways may return, when it leaves its own for good; its own if it
+        stays there."""
+        regions = self._regions(way)
+        left = max(n for n, region in enumerate(regions) if region == regions[0]) if self._ways_return else 0
+        return regions[min(left + 1, len(regions) - 1)]
+
+    def _send(self, vehicle: str, way: list[int]) -> bool:
+        """Give a vehicle this way; counts the refusals."""
+        taken = self._session.set_route(vehicle, [self._city.edges[n] for n in way])
+        self.refused += not taken
+        return taken
+
+    def _home(self, region: int, taste: int) -> "Home":
+        region = 0 if self._ways_return else region
+        if (region, taste) not in self._homes:
+            self._homes[region, taste] = Home(self._homeward[region], self._time * self._taste[taste])
+        return self._homes[region, taste]
+
+    def _ways_from(self, region: int, taste: int) -> "Ways":
+        if (region, taste) not in self._ways:
+            outside = self._without_back[region]
+            entries = outside.number[self._gateways[region][1]]
+            if region not in self._reached:
+                self._reached[region] = outside.leading_to(entries)
+            if (region, taste) not in self._ahead:
+                self._ahead[region, taste] = outside.ahead(entries, self._free * self._taste[taste])
+            self._ways[region, taste] = Ways(
+                *self._gateways[region], inside=self._within[region], outside=outside,
+                reached=self._reached[region], ahead=self._ahead[region, taste],
+                time=self._time * self._taste[taste])
+        return self._ways[region, taste]

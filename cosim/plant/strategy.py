@@ -1,0 +1,117 @@
+"""Strategies by name: CONTROLLER[+OPTION...], a regional controller and what else the city does.
+
+    dpc-pc+max-pressure      max-pressure at all signals, DPC limits the green of the gateways
+    no-control+rerouting-30  nobody controls, 30 % of the drivers reroute; `rerouting-30` for short
+    mine.py:Gate+actuated    a controller of one's own (nmfd.controllers.custom), actuated signals elsewhere
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from nmfd.controllers import registry
+from nmfd.errors import InputError
+from nmfd.model.scenario import Scenario, as_modelled, guided_model, with_model
+
+ALONE = "no-control"  # the controller of a name that is only options
+FIXED, WEBSTER, ACTUATED, MAX_PRESSURE = "fixed", "webster", "actuated", "max-pressure"
+SIGNALS = (FIXED, WEBSTER, ACTUATED, MAX_PRESSURE)
+HOLD_BACK, REDISTRIBUTE = "hold-back", "redistribute"
+MODES = (HOLD_BACK, REDISTRIBUTE)
+
+# Option -> (field of cosim.plant.settings.Settings, its value).
+_WORDS = {
+    **{name: ("signals", name) for name in SIGNALS[1:]}, **{name: ("actuation", name) for name in MODES},
+    "estimate": ("measurement", "estimate")}
+PERCENT, SECONDS = "percent", "seconds"
+# Option with a whole number -> (field of cosim.plant.settings.Settings, least, most, its unit).
+_NUMBERS = {
+    "rerouting": ("rerouting", 1, 100, PERCENT), "compliance": ("compliance", 0, 100, PERCENT),
+    "queue-override": ("queue_override", 1, 100, PERCENT),
+    "guidance-period": ("guidance_period", 1, 3600, SECONDS)}
+OPTIONS = (*_WORDS, *(f"{name}-N" for name in _NUMBERS))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Strategy:
+    """name: as the user wrote it; controller: of nmfd.controllers.registry; overrides: field of
+    cosim.plant.settings.Settings -> value, instead of that of the scenario."""
+
+    name: str
+    controller: str
+    overrides: dict[str, Any] = field(default_factory=dict)
+
+
+def parse(name: str) -> Strategy:
+    """The strategy `name`. InputError for a controller or option that there is not, and for contradictory ones."""
+    first, words = registry.split(name)
+    controller = first
+    if _option(first) is not None:
+        controller, words = ALONE, [first, *words]
+    elif not registry.known(first):
+        raise _unknown(name, first, controllers=True)
+    overrides: dict[str, Any] = {"gateways_fixed": controller != ALONE}
+    chosen: dict[str, str] = {}
+    for word in words:
+        option = _option(word)
+        if option is None:
+            raise _unknown(name, word, controllers=False)
+        key, value = option
+        if key in chosen:
+            raise InputError(f"strategy {name!r}: {chosen[key]} and {word} exclude each other; leave one of them out")
+        chosen[key], overrides[key] = word, value
+    return Strategy(name=name, controller=controller, overrides=overrides)
+
+
+def model_free(name: str) -> bool:
+    """Whether runs of a strategy do not depend on the regional model; its controller need not be there any more."""
+    first, _ = registry.split(name)
+    return first == ALONE or _option(first) is not None
+
+
+def configured(name: str, tables: Iterable[str]) -> str:
+    """The controller of the strategy `name`, with as many of its options as one of the `tables` has in its name.
+
+    tables: names CONTROLLER+OPTION... of tables in [controllers], each with a regional model or a policy for that city
+    """
+    controller = parse(name).controller
+    words = {controller, *name.split("+")}
+    fitting = [table for table in tables if table.startswith(f"{controller}+") and set(table.split("+")) <= words]
+    return max(fitting, key=lambda table: table.count("+"), default=controller)
+
+
+def modelled(scenario: Scenario, strategy: str, model: Path | None = None) -> Scenario:
+    """`scenario` with the regional model to predict the runs of `strategy` with: that with which its controller plans,
+    or, of one that guides routes and plans with none, that of guided drivers, if the network has one beside it.
+
+    model: the folder of a network, instead. Raises InputError.
+    """
+    if model is not None:
+        return with_model(scenario, model)
+    controller, variant = parse(strategy).controller, configured(strategy, scenario.controller_options)
+    if registry.is_own(controller):
+        variant, scenario = registry.configured_own(controller, scenario)
+    planned = as_modelled(scenario, variant)
+    if planned.network is scenario.network and registry.guides(controller) and (
+            folder := guided_model(scenario.network)) is not None:
+        return with_model(scenario, folder)
+    return planned
+
+
+def _option(word: str) -> tuple[str, object] | None:
+    if word in _WORDS:
+        return _WORDS[word]
+    stem, _, digits = word.rpartition("-")
+    if stem in _NUMBERS and digits.isascii() and digits.isdigit():
+        key, least, most, unit = _NUMBERS[stem]
+        if least <= int(digits) <= most and digits == str(int(digits)):
+            return key, int(digits) / 100 if unit == PERCENT else float(digits)
+    return None
+
+
+def _unknown(name: str, word: str, *, controllers: bool) -> InputError:
+    where = f"controller {name!r}" if word == name else f"strategy {name!r}: {word!r}"
+    ranges = ", ".join(f"{stem}-N from {least} to {most} {unit}" for stem, (_, least, most, unit) in _NUMBERS.items())
+    first = f"{', '.join(registry.choice())} or file.py:Class, with options joined by +: " if controllers else ""
+    return InputError(f"{where} is unknown; choose from {first}{', '.join(OPTIONS)} (whole numbers, {ranges})")

@@ -1,0 +1,1 @@
+"""Pictures, pages and films of finished and running simulations."""

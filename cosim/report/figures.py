@@ -1,0 +1,175 @@
+"""Figures of an evaluation in SUMO; the manners of nmfd.studies.plots: draw into `ax`, return it, simulate nothing."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+from nmfd.studies import plots
+
+JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
+DENSITIES = ScalarMappable(Normalize(0.0, JAM_DENSITY), LinearSegmentedColormap.from_list(
+    "density", ["#d9d9d9", "#fecc5c", "#e31a1c", "#4d0010"]))
+ASIDE = 0.007  # of the map's width: how far the lines of the two directions of a street are drawn apart
+QUEUES = colormaps["YlOrRd"]
+SATURATION = 0.5  # veh/s and lane
+COMMANDED, GREEN_SHOWN, FLOWED = "#333333", "#009e73", "#0059a8"
+
+
+def link_densities(
+    ax: Axes, shapes: Sequence[np.ndarray], density: np.ndarray, lanes: np.ndarray, region: np.ndarray,
+) -> Axes:
+    """A map of the edges in the colours of DENSITIES.
+
+    shapes: E lines (n, 2) [m]; density: (E,) [veh/km and lane]; lanes, region: (E,)
+    """
+    points = np.concatenate(shapes)
+    apart = ASIDE * np.ptp(points[:, 0])
+    order = np.argsort(density, kind="stable")  # the full ones on top
+    ax.add_collection(LineCollection(
+        [_to_the_right(shapes[n], apart) for n in order], colors=DENSITIES.to_rgba(density[order]),
+        linewidths=0.5 + 0.4 * lanes[order], capstyle="butt"))
+    for r in np.unique(region):
+        middle = np.mean([shapes[n].mean(axis=0) for n in np.flatnonzero(region == r)], axis=0)
+        ax.text(*middle, str(r), fontsize=8, fontweight="bold", ha="center", va="center",
+                bbox={"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": "#30506f", "linewidth": 0.8})
+    ax.autoscale_view()
+    ax.set_aspect("equal")
+    ax.set_axis_off()
+    return ax
+
+
+def _to_the_right(shape: np.ndarray, distance: float) -> np.ndarray:
+    """The line moved sideways, as seen in its direction."""
+    along = shape[-1] - shape[0]
+    return shape + distance * np.array([along[1], -along[0]]) / max(np.hypot(*along), 1e-9)
+
+
+def perimeter(ax: Axes, step: float, commanded: np.ndarray, green: np.ndarray, flow: np.ndarray) -> Axes:
+    """One boundary over time: u (T,) as commanded, green as a share of the original programme's, and flow as a share
+    of what passes in that at saturation."""
+    time = plots.time_axis(ax, step * np.arange(len(commanded) + 1))
+    for values, tone, label, width in (
+            (flow, FLOWED, "flow / saturation flow of the original green", 1.2),
+            (green, GREEN_SHOWN, "green shown / original green", 1.6),
+            (commanded, COMMANDED, "commanded u", 1.6)):
+        ax.stairs(values, time, color=tone, linewidth=width, label=label, baseline=None)
+    ax.set_ylim(0.0, 1.08)
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
+def green_against_command(ax: Axes, commanded: np.ndarray, green: np.ndarray) -> Axes:
+    """Every boundary and interval: share of the original green that was shown against the commanded u, both (n,)."""
+    ax.scatter(commanded, green, s=5, color=GREEN_SHOWN, alpha=0.35, linewidths=0)
+    ax.set_xlabel("commanded u")
+    ax.set_ylabel("green shown / original")
+    ax.set_xlim(0.0, 1.0)
+    ax.set_ylim(0.0, 1.08)
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
+def splits(ax: Axes, step: float, commanded: np.ndarray, realised: np.ndarray, neighbours: Sequence[int]) -> Axes:
+    """The vehicles of one region for one destination over time: theta (T, H) as commanded (lines) and the shares that
+    left by each of the H neighbours (dots; NaN where nobody left)."""
+    time = plots.time_axis(ax, step * np.arange(len(commanded) + 1))
+    for n, h in enumerate(neighbours):
+        tone = colormaps["tab10"](h % 10)
+        ax.stairs(commanded[:, n], time, color=tone, linewidth=1.5, label=f"by {h}", baseline=None)
+        ax.plot(time[:-1] + np.diff(time) / 2, realised[:, n], "o", color=tone, markersize=3)
+    ax.set_ylim(-0.04, 1.04)
+    ax.set_ylabel("share [-]")
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
+def split_totals(ax: Axes, commanded: np.ndarray, realised: np.ndarray, vehicles: np.ndarray) -> Axes:
+    """theta as commanded against as realised, (n,) each, over the whole run; area by `vehicles` (n,)."""
+    ax.plot([0, 1], [0, 1], color="#bbbbbb", linewidth=1.0, zorder=1)
+    ax.scatter(commanded, realised, s=90.0 * vehicles / max(vehicles.max(initial=0.0), 1.0) + 3.0, color=FLOWED,
+               alpha=0.45, linewidths=0, zorder=2)
+    ax.set_xlabel("commanded θ, mean of the run")
+    ax.set_ylabel("share that went there")
+    ax.set_xlim(-0.04, 1.04)
+    ax.set_ylim(-0.04, 1.04)
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
+def gateway_queues(
+    ax: Axes, step: float, queue: np.ndarray, labels: Sequence[str], *, most: float,
+) -> Axes:
+    """Vehicles halting before gateways over time: queue (T, N) [veh], one row per edge, white where there is none.
+
+    labels: N, such as "2 > 3"; neighbours with the same label are one group. most: [veh], end of the scale.
+    """
+    time = plots.time_axis(ax, step * np.arange(len(queue) + 1))
+    rows = np.arange(queue.shape[1] + 1)
+    mesh = ax.pcolormesh(time, rows, np.where(queue.T > 0, queue.T, np.nan), cmap=QUEUES, vmin=0.0, vmax=most)
+    mesh.set_rasterized(True)
+    begins = [n for n, label in enumerate(labels) if n == 0 or labels[n - 1] != label]
+    for begin, end in zip(begins, [*begins[1:], len(labels)], strict=True):
+        ax.axhline(begin, color="#dddddd", linewidth=0.5)
+        ax.text(-0.01, (begin + end) / 2, labels[begin], transform=ax.get_yaxis_transform(), fontsize=6, ha="right",
+                va="center")
+    ax.set_yticks([])
+    ax.set_ylim(len(labels), 0)
+    return ax
+
+
+def time_full(ax: Axes, hours: Mapping[str, np.ndarray]) -> Axes:
+    """How long the edges before each gateway row were full [min]: controller -> (N,), rows as in gateway_queues."""
+    tones = plots.colours(list(hours))
+    for n, (controller, values) in enumerate(hours.items()):
+        rows = np.arange(len(values)) + (n + 0.5) / len(hours)
+        ax.barh(rows, values, height=1.0 / len(hours), color=tones[controller], label=controller)
+    ax.set_yticks([])
+    ax.set_ylim(max(map(len, hours.values())), 0)
+    ax.set_xlim(0.0, max(1.0, 1.05 * max(values.max() for values in hours.values())))
+    ax.set_xlabel("time full [min]")
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
+def over_demand(ax: Axes, ratios: Mapping[str, Mapping[float, tuple[float, float]]]) -> Axes:
+    """Total time spent as a share of no control's against the demand level: controller -> level -> mean over seeds and
+    half of its 95 % interval (NaN of a single seed)."""
+    ax.axhline(1.0, color=plots.CONTROLLER_COLOURS["no-control"], linewidth=1.0)
+    tones = plots.colours(list(ratios))
+    levels = sorted({level for points in ratios.values() for level in points})
+    aside = 0.012 * max(levels[-1] - levels[0], 0.1)  # so that intervals do not hide each other
+    for number, (controller, points) in enumerate(ratios.items()):
+        mean, half = np.array(list(points.values())).reshape(-1, 2).T
+        ax.errorbar(np.array(list(points)) + aside * (number - (len(ratios) - 1) / 2), mean, np.nan_to_num(half),
+                    color=tones[controller], linewidth=1.6, capsize=3, marker="o^sDv"[number % 5], markersize=4,
+                    label=controller)
+    ax.set_xticks(levels, [f"{level:g}" for level in levels])
+    ax.set_xlabel("demand, multiple of the scenario's")
+    ax.set_ylabel("total time spent / that of no control")
+    ax.set_ylim(bottom=0.0)
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
+def decision_times(ax: Axes, median: Mapping[str, float], longest: Mapping[str, float], step: float) -> Axes:
+    """Wall time per decision [ms], controller -> median and longest, on a scale that ends at the control interval
+    `step` [s]."""
+    tones = plots.colours(list(median))
+    for row, name in enumerate(median):
+        ax.plot([median[name], longest[name]], [row, row], color=tones[name], linewidth=2.0)
+        ax.plot(median[name], row, "o", color=tones[name], markersize=7)
+        ax.plot(longest[name], row, "|", color=tones[name], markersize=13, markeredgewidth=2.0)
+    ax.axvline(1000.0 * step, color=plots.RED, linestyle="--", linewidth=1.2)
+    ax.text(1000.0 * step, -0.75, "control interval ", color=plots.RED, ha="right", va="center", fontsize="small")
+    ax.set_xscale("log")
+    ax.set_xlim(right=1500.0 * step)
+    ax.set_yticks(range(len(median)), list(median))
+    ax.set_ylim(len(median) - 0.5, -1.2)
+    ax.set_xlabel("time per decision [ms]: median (dot) and longest (bar)")
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax

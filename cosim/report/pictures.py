@@ -1,0 +1,282 @@
+"""The pictures of an evaluation: which runs are shown, and the files they go to."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from cosim.evaluation import experiment, model_validation, run_metrics, statistics
+from cosim.evaluation.simulate import Result
+from cosim.importing import atlas
+from cosim.importing.quality import Tables
+from cosim.importing.streets import read_streets
+from cosim.plant.settings import settings
+from cosim.report import figures
+from cosim.sumo.build import ensure_built
+from cosim.sumo.net import City, edge_shapes, load_city
+from nmfd.model.regional_model import Network
+from nmfd.model.scenario import Scenario
+from nmfd.studies import plots
+from nmfd.studies.benchmark import REFERENCE, draw_accumulations
+
+MAPS = 4       # times of the maps
+PANELS = 11    # boundaries, or pairs of region and destination, that are shown one by one
+NAMED = 2      # controllers with the most teleports in a title
+WINDOW = 3     # control intervals over which realised shares are taken
+DRAWN = (      # what pictures of streets and gateways need of a record
+    "edge_vehicles", "gateway_queue", "gateway_flow", "gateway_green", "gateway_original_green", "crossings", "guided")
+
+
+def draw(
+    folder: Path, scenario: Scenario, city: City | None, rows: pd.DataFrame, out: Path | None = None,
+) -> None:
+    """All pictures of one demand level into `out`, or into its run folder; `rows` of this level, as in statistics.
+
+    Those of streets and gateways need the `city`, and records that hold DRAWN.
+    """
+    out = folder if out is None else out
+    names = ranked(rows)
+    seed = shown_seed(rows)
+    order = list(dict.fromkeys(rows["controller"]))
+    runs = sorted((t for t in experiment.trajectories(folder) if t.controller in order),
+                  key=lambda t: (order.index(t.controller), t.seed))
+    note = teleports(rows)
+    draw_accumulations(out, scenario, runs, seed=seed, title=f"seed {seed}, shaded: all seeds; {note}")
+    results = {} if city is None else {
+        name: result for name, result in recorded(folder, rows, seed).items() if set(DRAWN) <= set(result.record)}
+    best = next((name for name in names if name != REFERENCE and name in results), None)
+    pair = {name: results[name] for name in (REFERENCE, best) if name in results}
+    if pair:
+        link_maps(out / "link_densities.png", city, pair, f"seed {seed}; {note}")
+        gateway_queues(out / "gateway_queues.png", city, pair, f"seed {seed}; {note}")
+    gating = next((name for name in names if name in results and acts(results[name], scenario.network)), None)
+    if gating:
+        perimeter(out / "perimeter.png", city, scenario.network, results[gating], note)
+    guiding = next((name for name in names if name in results and results[name].record["guided"].sum() > 0), None)
+    if guiding:
+        splits(out / "splits.png", scenario.network, results[guiding], note)
+
+
+def recorded(folder: Path, rows: pd.DataFrame, seed: int) -> dict[str, Result]:
+    """The runs of this seed, the best controller first."""
+    there = set(rows.loc[rows["seed"] == seed, "controller"])
+    return {name: experiment.read_run(folder, name, seed) for name in ranked(rows) if name in there}
+
+
+def acts(result: Result, network: Network) -> bool:
+    """Whether a gateway was ever commanded to less than its original programme."""
+    return bool((result.trajectory.perimeter[:, network.adjacency] < network.u_max - 1e-9).any())
+
+
+def ranked(rows: pd.DataFrame) -> list[str]:
+    """Controllers of one demand level, the best first: by mean change against no control, else by mean TTS."""
+    level = rows["demand"].iloc[0]
+    reference = statistics.by_seed(rows, level, REFERENCE)
+    score = {}
+    for name in dict.fromkeys(rows["controller"]):
+        values = statistics.by_seed(rows, level, name)
+        pair = statistics.paired(values, reference)
+        score[name] = pair.percent if pair.seeds else float(np.mean(list(values.values())))
+    return sorted(score, key=score.get)
+
+
+def shown_seed(rows: pd.DataFrame) -> int:
+    """The first seed that most controllers have."""
+    counts = rows["seed"].value_counts().sort_index()
+    return int(counts.idxmax())
+
+
+def teleports(rows: pd.DataFrame) -> str:
+    """How many vehicles were teleported in the runs behind a picture; the controllers with the most by name, so that
+    it fits into a title."""
+    counts = rows.groupby("controller", sort=False)["teleports"].sum()
+    counts = counts[counts > 0].sort_values(ascending=False, kind="stable")
+    if counts.empty:
+        return "no teleport in any run"
+    named = [f"{name} {count:.0f}" for name, count in counts.iloc[:NAMED].items()]
+    return "teleports: " + ", ".join(named + ["others fewer"] * (len(counts) > NAMED))
+
+
+def link_maps(path: Path, city: City, results: dict[str, Result], note: str) -> None:
+    """Maps of the link densities at MAPS times, one row per controller."""
+    shapes, lanes = edge_shapes(city), np.array([city.lanes[edge] for edge in city.edges])
+    km = np.array([city.length[edge] for edge in city.edges]) / 1000.0
+    region = np.array([city.region_of[edge] for edge in city.edges])
+    width, height = np.ptp(np.concatenate(shapes), axis=0)
+    drawing = plots.figure(3.6 * MAPS + 1.0, 0.6 + (0.3 + 3.6 * height / width) * len(results))
+    grid = drawing.subplots(len(results), MAPS, squeeze=False)
+    for line, (name, result) in zip(grid, results.items(), strict=True):
+        loads = result.record["edge_vehicles"].astype(float)
+        for ax, k in zip(line, np.linspace(0, len(loads) - 1, MAPS + 1).round().astype(int)[1:], strict=True):
+            figures.link_densities(ax, shapes, loads[k] / km / lanes, lanes, region)
+            ax.set_title(f"{name}, {(k + 1) * result.trajectory.step / 60:.0f} min", fontsize="medium")
+    drawing.suptitle(note, fontsize="medium")
+    bar = drawing.colorbar(figures.DENSITIES, ax=grid, shrink=0.8, aspect=30)
+    bar.set_label("vehicles per km and lane,\nmean of the control interval")
+    plots.save(drawing, path)
+
+
+def gateway_queues(path: Path, city: City, results: dict[str, Result], note: str) -> None:
+    """Queues before gateways over time for each of `results`, and how long the edges were full."""
+    upstream = run_metrics.upstream_gateways(city)
+    labels = [f"{city.gateways[n].source} > {city.gateways[n].target}" for n in upstream]
+    queues = {name: result.record["gateway_queue"][:, upstream] for name, result in results.items()}
+    most = max(max(queue.max() for queue in queues.values()), 1.0)
+    drawing = plots.figure(4.2 * len(results) + 3.6, 8.4)
+    axes = drawing.subplots(1, len(results) + 1, width_ratios=[*[1.0] * len(results), 0.6])
+    full = {}
+    for ax, (name, queue) in zip(axes, queues.items(), strict=False):
+        step = results[name].trajectory.step
+        figures.gateway_queues(ax, step, queue, labels, most=most)
+        ax.set_title(name, fontsize="medium")
+        full[name] = step / 60 * run_metrics.gateway_full(
+            results[name].record["edge_vehicles"], city)[:, upstream].sum(axis=0)
+        mesh = ax.collections[0]
+    figures.time_full(axes[-1], full)
+    axes[-1].set_title("edge full", fontsize="medium")
+    drawing.suptitle(note, fontsize="medium")
+    bar = drawing.colorbar(mesh, ax=axes[:-1], location="bottom", shrink=0.5, aspect=40)
+    bar.set_label("vehicles halting on the edge before the boundary (from > to) [veh]")
+    plots.legend_below(drawing, [axes[-1]])
+    plots.save(drawing, path)
+
+
+def perimeter(path: Path, city: City, network: Network, result: Result, note: str) -> None:
+    """Commanded u against green and flow: the boundaries that were closed most over time, and all in one cloud; no
+    picture of a city without a signal under control."""
+    trajectory, record = result.trajectory, result.record
+    pairs = {}
+    for pair in map(tuple, np.argwhere(network.adjacency)):
+        members = [n for n, g in enumerate(city.gateways)
+                   if (g.source, g.target) == pair and not np.isnan(record["gateway_original_green"][0, n])]
+        original = record["gateway_original_green"][:, members] * [len(city.gateways[n].links) for n in members]
+        shown = record["gateway_green"][:, members] * [len(city.gateways[n].links) for n in members]
+        if members and original.sum() > 0:
+            flow = record["gateway_flow"][:, members].sum(axis=1) / (figures.SATURATION * original.sum(axis=1))
+            pairs[pair] = trajectory.perimeter[:, *pair], shown.sum(axis=1) / original.sum(axis=1), flow
+    if not pairs:
+        return
+    closed = [pair for pair in pairs if pairs[pair][0].min() < network.u_max - 1e-9]
+    chosen = sorted(sorted(closed, key=lambda pair: pairs[pair][0].mean())[:PANELS])
+    drawing, axes = plots.panels(len(chosen) + 1)
+    for ax, pair in zip(axes, chosen, strict=False):
+        figures.perimeter(ax, trajectory.step, *pairs[pair])
+        ax.set_title(f"{pair[0]} > {pair[1]}", fontsize="medium")
+    figures.green_against_command(
+        axes[-1], np.concatenate([u for u, _, _ in pairs.values()]),
+        np.concatenate([green for _, green, _ in pairs.values()]))
+    axes[-1].set_title("all boundaries", fontsize="medium")
+    drawing.suptitle(f"{trajectory.controller}, seed {trajectory.seed}; {note}", fontsize="medium")
+    plots.legend_below(drawing, axes)
+    plots.save(drawing, path)
+
+
+def splits(path: Path, network: Network, result: Result, note: str) -> None:
+    """Commanded theta against the shares that went there: the busiest choices over time, and all in one cloud; no
+    picture where there is nothing to choose, as with two regions."""
+    trajectory, crossings = result.trajectory, result.record["crossings"].astype(float)
+    leaving = crossings.sum(axis=2)  # (T, R, R), from i bound for j
+    choices = [
+        (i, j) for i, j in np.ndindex(network.adjacency.shape)
+        if i != j and network.split_mask[i, :, j].sum() > 1 and leaving[:, i, j].sum() > 0]
+    if not choices:
+        return
+    totals = []
+    for i, j in choices:
+        neighbours = np.flatnonzero(network.split_mask[i, :, j])
+        weight = leaving[:, i, j][:, None]
+        commanded = (trajectory.splits[:, i, neighbours, j] * weight).sum(axis=0) / weight.sum()
+        realised = crossings[:, i, neighbours, j].sum(axis=0) / weight.sum()
+        totals.append(np.stack([commanded, realised, np.full(len(neighbours), weight.sum())]))
+    shown = sorted(sorted(choices, key=lambda pair: -leaving[:, *pair].sum())[:PANELS])
+    drawing, axes = plots.panels(len(shown) + 1)
+    for ax, (i, j) in zip(axes, shown, strict=False):
+        neighbours = np.flatnonzero(network.split_mask[i, :, j])
+        moved = _moving_sum(crossings[:, i, neighbours, j])
+        every = moved.sum(axis=1, keepdims=True)
+        figures.splits(ax, trajectory.step, trajectory.splits[:, i, neighbours, j],
+                       np.where(every > 0, moved / np.maximum(every, 1.0), np.nan), neighbours)
+        ax.set_title(f"in {i}, bound for {j}", fontsize="medium")
+    figures.split_totals(axes[-1], *np.concatenate(totals, axis=1))
+    axes[-1].set_title("all", fontsize="medium")
+    drawing.suptitle(
+        f"{trajectory.controller}, seed {trajectory.seed}: commanded θ (lines), shares that went there (dots, over "
+        f"{WINDOW} intervals); {note}", fontsize="medium")
+    plots.legend_below(drawing, axes, columns=8)
+    plots.save(drawing, path)
+
+
+def _moving_sum(values: np.ndarray) -> np.ndarray:
+    """(T, H): sums over WINDOW rows around each."""
+    kernel = np.ones(WINDOW)
+    return np.stack([np.convolve(column, kernel, mode="same") for column in values.T], axis=1)
+
+
+def demand_levels(path: Path, rows: pd.DataFrame) -> None:
+    """TTS against that of no control over the demand levels."""
+    ratios: dict[str, dict[float, tuple[float, float]]] = {}
+    for level, names in statistics.groups(rows).items():
+        for name in names:
+            pair = statistics.paired(statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, REFERENCE))
+            if name != REFERENCE and pair.seeds:
+                ratios.setdefault(name, {})[level] = 1.0 + pair.percent / 100.0, pair.percent_half / 100.0
+    if not ratios:
+        return
+    drawing = plots.figure(7.5, 4.8)
+    ax = figures.over_demand(drawing.subplots(), ratios)
+    drawing.suptitle(f"paired by seed, 95 % intervals; {teleports(rows)}", fontsize="medium")
+    plots.legend_below(drawing, [ax])
+    plots.save(drawing, path)
+
+
+def draw_all(out: Path, folders: Mapping[float, Path], scenario: Scenario, rows: pd.DataFrame) -> None:
+    """The pictures of every demand level in its folder, and those across levels in `out`."""
+    files = ensure_built(scenario.network)
+    city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
+    for level, folder in folders.items():
+        draw(folder, scenario, city, rows[rows["demand"] == level])
+    if len(folders) > 1:
+        demand_levels(out / "demand.png", rows)
+
+
+def draw_more(out: Path, scenario: Scenario, folder: Path, rows: pd.DataFrame) -> None:
+    """Beside `draw`, for a page, of one demand level: MFDs and decision times; arguments as there."""
+    results = recorded(folder, rows, shown_seed(rows))
+    best = next((name for name in results if name != REFERENCE), None)
+    outflows(out / "mfd.png", scenario.network, {
+        name: results[name] for name in (REFERENCE, best) if name in results})
+    decision_times(out / "decision_times.png", rows, scenario.step)
+
+
+def region_map(path: Path, scenario: Scenario, city: City) -> None:
+    """The regions and gateways of the city."""
+    streets = read_streets(city.net_file)
+    regions = np.array([city.region_of.get(edge, -1) for edge in streets.edges])
+    places = np.stack([streets.centre[streets.drivable & (regions == r)].mean(axis=0) for r in range(city.regions)])
+    left_alone = settings(scenario).leave_signals
+    static = {signal for signal, logics in streets.logics.items() if logics[-1].kind == "static"} - set(left_alone)
+    gateways = [{"from_edge": g.from_edge, "control": "controlled" if g.signal in static else "left alone"}
+                for g in city.gateways]
+    atlas.draw_map(path, streets, regions, scenario.network.region_names, places,
+                   Tables(quality=(), gateways=gateways), None)
+
+
+def outflows(path: Path, network: Network, results: dict[str, Result]) -> None:
+    """The MFD of every region: of the regional model as a curve, in these runs as dots."""
+    samples = []
+    for region in range(network.regions):
+        clouds = {name: model_validation.outflow_samples(
+            [result.trajectory], [result.record], network.u_max, region, network.adjacency)
+            for name, result in results.items()}
+        samples.append({name: np.concatenate(list(parts.values())) for name, parts in clouds.items()})
+    model_validation.draw_mfds(path, network, samples)
+
+
+def decision_times(path: Path, rows: pd.DataFrame, step: float) -> None:
+    """Wall time per decision of every controller, all seeds."""
+    groups = rows.groupby("controller", sort=False)
+    median, longest = groups["control_step_ms_median"].median(), groups["control_step_ms_max"].max()
+    drawing = plots.figure(8.0, 1.4 + 0.32 * len(median))
+    figures.decision_times(drawing.subplots(), median.to_dict(), longest.to_dict(), step)
+    plots.save(drawing, path)

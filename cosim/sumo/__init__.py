@@ -1,0 +1,1 @@
+"""What SUMO reads and writes; no control."""

@@ -1,0 +1,299 @@
+"""Building a SUMO city: city.toml -> plain XML -> netconvert -> <network>/build/<name>.net.xml and regions.csv."""
+
+import csv
+import hashlib
+import io
+import os
+import re
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+from nmfd.errors import InputError
+from nmfd.model.regional_model import Network
+from nmfd.runs import config
+from nmfd.runs.scratch import Scratch
+
+# (lanes, movements, every movement has lanes of its own) -> lanes of each movement, numbered from the right
+LANES = {
+    (4, "rsl", True): {"r": [0], "s": [1, 2], "l": [3]},
+    (3, "rsl", True): {"r": [0], "s": [1], "l": [2]},
+    (3, "rsl", False): {"r": [0], "s": [0, 1], "l": [2]},
+    (3, "rs", False): {"r": [0], "s": [1, 2]},
+    (3, "sl", False): {"s": [0, 1], "l": [2]},
+    (3, "rl", False): {"r": [0], "l": [1, 2]},
+    (3, "r", False): {"r": [0, 1, 2]},
+    (3, "l", False): {"l": [0, 1, 2]},
+    (2, "rsl", False): {"r": [0], "s": [0], "l": [1]},
+    (2, "rs", False): {"r": [0], "s": [1]},
+    (2, "sl", False): {"s": [0], "l": [1]},
+    (2, "rl", False): {"r": [0], "l": [1]},
+    (1, "r", False): {"r": [0]},
+    (1, "l", False): {"l": [0]},
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SumoFiles:
+    """What a simulation needs of a city: the network and the region of every edge."""
+
+    net_file: Path
+    regions_csv: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class Node:
+    """A junction at (x, y) [m]; `centre` tells the fine grid from the lattice around it."""
+
+    id: str
+    x: float
+    y: float
+    region: int
+    centre: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """A city.toml that was read and checked: junctions, streets between neighbours, speeds and signals."""
+
+    nodes: dict[str, Node]
+    streets: list[tuple[str, str]]
+    centre_speed: float
+    outer_speed: float
+    pocket: float
+    cycle: int
+    yellow: int
+    all_red: int
+    left_green: int
+
+
+def ensure_built(network: Network) -> SumoFiles:
+    """The SUMO files of `network`, built first if they are missing or the recipe has changed.
+
+    Raises InputError if network.toml has no [sumo] table, a key of it or a file it names is wrong, or netconvert fails.
+    """
+    if network.folder is None:
+        raise InputError(f"network {network.name}: was not loaded from a folder; load it with load_network")
+    path = network.folder / "network.toml"
+    root = config.read(path)
+    if not root.has("sumo"):
+        raise InputError(
+            f'{path}: sumo: missing; this network has no city to simulate: add [sumo] with recipe = "city.toml"')
+    table = config.Table(root.raw_table("sumo"), path, "sumo.")
+    if table.has("recipe"):
+        recipe = network.folder / table.text("recipe")
+        table.close()
+        return _built(recipe, network)
+    files = SumoFiles(
+        net_file=network.folder / table.text("net"), regions_csv=network.folder / table.text("regions"))
+    table.close()
+    for key, file in (("net", files.net_file), ("regions", files.regions_csv)):
+        if not file.is_file():
+            raise table.error(key, f"no such file: {file}; give the path of an existing one")
+    return files
+
+
+def _built(recipe_file: Path, network: Network) -> SumoFiles:
+    folder = recipe_file.parent / "build"
+    files = SumoFiles(net_file=folder / f"{network.name}.net.xml", regions_csv=folder / "regions.csv")
+    stamp_file = folder / f"{network.name}.stamp"
+    recipe = read_recipe(recipe_file, network.regions)
+    stamp = _stamp(recipe_file)
+    if stamp_file.is_file() and stamp_file.read_text() == stamp and files.net_file.is_file() and (
+            files.regions_csv.is_file()):
+        return files
+    folder.mkdir(exist_ok=True)
+    stamp_file.unlink(missing_ok=True)  # nothing here counts until it is written again
+    net, regions = build(recipe, str(recipe_file))
+    # the stamp comes last: whoever sees it finds the files that belong to it
+    for file, content in ((files.net_file, net), (files.regions_csv, regions), (stamp_file, stamp.encode())):
+        handle, temporary = tempfile.mkstemp(dir=folder, prefix=f".{file.name}.")
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+        os.replace(temporary, file)
+    return files
+
+
+def _stamp(recipe_file: Path) -> str:
+    """Changes with the recipe, this file and SUMO's version."""
+    content = recipe_file.read_bytes() + Path(__file__).read_bytes() + metadata.version("eclipse-sumo").encode()
+    return hashlib.sha256(content).hexdigest()
+
+
+def read_recipe(path: Path, regions: int) -> Recipe:
+    """Read and check a city.toml. Raises InputError."""
+    root = config.read(path)
+    centre, outer, signals = (root.table(key) for key in ("centre", "outer", "signals"))
+    region = centre.integer("region", high=regions - 1)
+    centre_x, centre_y = _lines(centre, "x"), _lines(centre, "y")
+    outer_x, outer_y = _lines(outer, "x"), _lines(outer, "y")
+    picture = [line.split() for line in outer.lines("regions")][::-1]
+    if [len(row) for row in picture] != [len(outer_x)] * len(outer_y):
+        raise outer.error("regions", f"expected {len(outer_y)} rows of {len(outer_x)} regions or dots; correct it")
+    nodes = {}
+    for i, x in enumerate(centre_x):
+        for j, y in enumerate(centre_y):
+            nodes[f"c{i}{j}"] = Node(id=f"c{i}{j}", x=x, y=y, region=region, centre=True)
+    for j, y in enumerate(outer_y):
+        for i, x in enumerate(outer_x):
+            inside = centre_x[0] <= x <= centre_x[-1] and centre_y[0] <= y <= centre_y[-1]
+            word = picture[j][i]
+            if inside and word == ".":
+                continue
+            if inside or word not in map(str, range(regions)):
+                allowed = "a dot (it lies in the centre)" if inside else f"a region from 0 to {regions - 1}"
+                raise outer.error("regions", f"expected {allowed} at x = {x:g}, y = {y:g}, got {word!r} instead")
+            nodes[f"o{i}{j}"] = Node(id=f"o{i}{j}", x=x, y=y, region=int(word), centre=False)
+    recipe = Recipe(
+        nodes=nodes, streets=_streets(nodes), centre_speed=centre.number("speed", above=0.0),
+        outer_speed=outer.number("speed", above=0.0), pocket=centre.number("pocket", low=10.0),
+        cycle=signals.integer("cycle", low=30), yellow=signals.integer("yellow", low=1),
+        all_red=signals.integer("all_red"), left_green=signals.integer("left_green", low=1))
+    for table in (centre, outer, signals, root):
+        table.close()
+    return recipe
+
+
+def _lines(table: config.Table, key: str) -> tuple[float, ...]:
+    lines = table.numbers(key)
+    if not 3 <= len(lines) <= 10 or any(b - a < 60 for a, b in zip(lines, lines[1:], strict=False)):
+        raise table.error(key, f"expected 3 to 10 rising numbers at least 60 m apart, got {list(lines)} instead")
+    return lines
+
+
+def _streets(nodes: dict[str, Node]) -> list[tuple[str, str]]:
+    """Both directions between neighbours on a line; lattice lines end or pass over into the centre's streets."""
+    streets = []
+    for along, across in (("x", "y"), ("y", "x")):
+        lines: dict[float, list[Node]] = {}
+        for node in nodes.values():
+            lines.setdefault(getattr(node, across), []).append(node)
+        for line in lines.values():
+            line.sort(key=lambda node: getattr(node, along))
+            for a, b in zip(line, line[1:], strict=False):
+                streets += [(a.id, b.id), (b.id, a.id)]
+    return streets
+
+
+def _movements(recipe: Recipe, start: str, end: str) -> dict[str, str]:
+    """{"r", "s" or "l": next node} at the end of a street, without turning back.
+
+    A radial into the centre is entered straight ahead only: no queue before the centre stands on the ring around it.
+    """
+    nodes = recipe.nodes
+    heading = _heading(nodes[start], nodes[end])
+    turns = {}
+    for a, b in recipe.streets:
+        if a == end and b != start:
+            onward = _heading(nodes[a], nodes[b])
+            cross = heading[0] * onward[1] - heading[1] * onward[0]
+            turn = "s" if cross == 0 else "l" if cross > 0 else "r"
+            if turn == "s" or nodes[a].centre or not nodes[b].centre:
+                turns[turn] = b
+    return {turn: turns[turn] for turn in "rsl" if turn in turns}
+
+
+def _heading(a: Node, b: Node) -> tuple[int, int]:
+    return (b.x > a.x) - (b.x < a.x), (b.y > a.y) - (b.y < a.y)
+
+
+def _plain_xml(recipe: Recipe) -> tuple[str, str, str, dict[str, int]]:
+    """nodes, edges and connections for netconvert, and the region of every edge."""
+    nodes = recipe.nodes
+    legs = {name: sum(a == name for a, _ in recipe.streets) for name in nodes}
+    node_rows = [_row("node", id=n.id, x=n.x, y=n.y, type="traffic_light" if legs[n.id] > 2 else "priority")
+                 for n in nodes.values()]
+    edge_rows, connection_rows, region_of, first, last, lanes = [], [], {}, {}, {}, {}
+    for a, b in recipe.streets:
+        start, end, name = nodes[a], nodes[b], f"{a}-{b}"
+        speed = recipe.centre_speed if start.centre or end.centre else recipe.outer_speed
+        if start.centre and end.centre:
+            pieces = [(name, a, b, 1)]
+            if legs[b] > 2:
+                joint = f"{name}.j"
+                length = abs(end.x - start.x) + abs(end.y - start.y)
+                # netconvert cuts about 10 m off for the junction itself
+                share = 1.0 - (recipe.pocket + 10.0) / length
+                node_rows.append(_row(
+                    "node", id=joint, x=start.x + share * (end.x - start.x), y=start.y + share * (end.y - start.y),
+                    type="priority"))
+                pieces = [(name, a, joint, 1), (f"{name}.p", joint, b, 2)]
+                connection_rows += [_link(name, f"{name}.p", 0, lane) for lane in (0, 1)]
+        else:
+            pieces = [(name, a, b, 4 if _leads_in(recipe, a, b) else 3)]
+        for piece, begin, finish, count in pieces:
+            edge_rows.append(_row("edge", id=piece, **{"from": begin}, to=finish, numLanes=count, speed=speed))
+            region_of[piece] = end.region if start.centre and not end.centre else start.region
+            lanes[piece] = count
+        first[a, b], last[a, b] = pieces[0][0], pieces[-1][0]
+    for a, b in recipe.streets:
+        turns, source = _movements(recipe, a, b), last[a, b]
+        own = _leads_in(recipe, a, b) or (nodes[b].centre and not nodes[a].centre)
+        for turn, lanes_of_turn in LANES[lanes[source], "".join(turns), own].items():
+            target = first[b, turns[turn]]
+            for lane, into in zip(lanes_of_turn, _into(turn, len(lanes_of_turn), lanes[target]), strict=True):
+                connection_rows += [_link(source, target, lane, number) for number in into]
+    return _file("nodes", node_rows), _file("edges", edge_rows), _file("connections", connection_rows), region_of
+
+
+def _file(tag: str, rows: list[str]) -> str:
+    return f"<{tag}>\n{''.join(rows)}</{tag}>\n"
+
+
+def _leads_in(recipe: Recipe, a: str, b: str) -> bool:
+    """A street of the lattice from whose end a radial leads into the centre."""
+    outside = not recipe.nodes[a].centre and not recipe.nodes[b].centre
+    return outside and any(recipe.nodes[to].centre for to in _movements(recipe, a, b).values())
+
+
+def _into(turn: str, lanes: int, target_lanes: int) -> list[range]:
+    """For each lane of a movement the lanes that it leads into.
+
+    A vehicle chooses the lane it needs next while it turns: in a queue it could not change lanes any more, and two
+    vehicles that each want the lane of the other would wait for ever.
+    """
+    if turn == "s" or lanes > 1:
+        cuts = [target_lanes * n // lanes for n in range(lanes + 1)]
+        return [range(a, b) for a, b in zip(cuts, cuts[1:], strict=False)]
+    return [range(target_lanes)]
+
+
+def _row(tag: str, **attributes) -> str:
+    return f"  <{tag} {' '.join(f'{key}={quoteattr(str(value))}' for key, value in attributes.items())}/>\n"
+
+
+def _link(source: str, target: str, lane: int, into: int) -> str:
+    return _row("connection", **{"from": source}, to=target, fromLane=lane, toLane=into)
+
+
+def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
+    """The bytes of net.xml and regions.csv; the same recipe gives the same bytes. InputError if netconvert fails."""
+    import sumo
+
+    *plain, region_of = _plain_xml(recipe)
+    with Scratch("cosim-") as folder:
+        options = []
+        for kind, content in zip(("node", "edge", "connection"), plain, strict=True):
+            (folder / f"{kind}.xml").write_text(content)
+            options += [f"--{kind}-files", f"{kind}.xml"]
+        command = [
+            str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"), *options, "--output-file", "net.xml",
+            "--no-turnarounds", "true", "--tls.cycle.time", str(recipe.cycle),
+            "--tls.yellow.time", str(recipe.yellow),
+            "--tls.allred.time", str(recipe.all_red), "--tls.left-green.time", str(recipe.left_green)]
+        result = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, check=False,
+            env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME})
+        if result.returncode:
+            lines = [line for line in result.stderr.splitlines() if line.startswith("Error")] or ["unknown error"]
+            raise InputError(f"{where}: netconvert cannot build it: {lines[0]}; correct the recipe")
+        net = (folder / "net.xml").read_bytes()
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(["edge", "region"])
+    writer.writerows(sorted(region_of.items()))
+    # the comment holds the date and the scratch folder
+    return re.sub(rb"<!--.*?-->\s*", b"", net, count=1, flags=re.DOTALL), table.getvalue().encode()

@@ -1,0 +1,286 @@
+"""Partition of a SUMO network: edge -> region, and the gateways between regions."""
+
+import csv
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cosim.sumo.xml_files import BROKEN, opened
+from nmfd.errors import InputError
+from nmfd.model.regional_model import Network
+
+JAM_SPACING = 7.5  # m of lane per standing vehicle
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gateway:
+    """A boundary movement: from an edge in region `source` over a junction to an edge in region `target`.
+
+    signal: the traffic light that controls it, or None where it leaks
+    links: its indices in the light's state string
+    lanes: of the edge it comes from, numbered as SUMO does
+    shared: those of them on which other vehicles go elsewhere, which a red of this movement holds too
+    """
+
+    source: int
+    target: int
+    from_edge: str
+    to_edge: str
+    signal: str | None
+    links: tuple[int, ...]
+    lanes: tuple[int, ...] = ()
+    shared: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class City:
+    """A SUMO network cut into regions 0 .. regions - 1; only what cars may use, but for region_of.
+
+    edges: the normal edges, sorted
+    region_of: normal and junction-internal edge -> region; an internal edge has that of the edge it leads to, since
+        a vehicle on it has left the edge before. Edges closed to cars are there as far as their region was given
+    length [m], lanes, speed [m/s]: by normal edge
+    lane_ids: normal edge -> its lanes for cars
+    successors: normal edge -> the edges that follow, sorted
+    turn_time: (from_edge, to_edge) -> free-flow time on the junction between them [s]
+    gateways: sorted by source, target, from_edge, to_edge
+    signals: edge -> the signal at its end, as far as it has links for cars
+    """
+
+    net_file: Path
+    regions: int
+    region_of: Mapping[str, int]
+    edges: tuple[str, ...]
+    length: Mapping[str, float]
+    lanes: Mapping[str, int]
+    lane_ids: Mapping[str, tuple[str, ...]]
+    speed: Mapping[str, float]
+    successors: Mapping[str, tuple[str, ...]]
+    turn_time: Mapping[tuple[str, str], float]
+    gateways: tuple[Gateway, ...]
+    signals: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class _Connection:
+    source: str
+    target: str
+    via: str | None
+    signal: str | None
+    link: int
+    lane: int
+    to_lane: int
+
+
+def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
+    """Read a net.xml (or net.xml.gz) and the region of each of its edges.
+
+    Raises InputError for a missing or broken file, an edge that the network does not have, an edge without a region,
+    a region that is not in 0 .. regions - 1 and a region without edges.
+    """
+    lanes_of, cars, internal, connections = _read_net(Path(net_file))
+    given = _read_regions(Path(regions_csv), regions)
+    edges = tuple(sorted(lanes_of))
+    for edge in given:
+        if edge not in lanes_of and edge not in internal:
+            raise InputError(f"{regions_csv}: edge {edge} is not in {net_file}; remove it or give the network it is of")
+    missing = [edge for edge in edges if lanes_of[edge] and edge not in given]
+    if missing:
+        raise InputError(
+            f"{regions_csv}: edge {missing[0]} has no region ({len(missing)} such edges); add a line for every edge")
+    edges = tuple(edge for edge in edges if lanes_of[edge])
+    empty = set(range(regions)) - {given[edge] for edge in edges}
+    if empty:
+        raise InputError(
+            f"{regions_csv}: region {min(empty)} has no edges; every region from 0 to {regions - 1} needs one")
+    links = [c for c in connections if (c.source, c.lane) in cars and (c.target, c.to_lane) in cars]
+    turns = sorted({(c.source, c.target) for c in links})
+    times = {(c.source, c.target): internal[c.via.rpartition("_")[0]] if c.via else 0.0 for c in links}
+    successors: dict[str, list[str]] = {edge: [] for edge in edges}
+    for source, target in turns:
+        successors[source].append(target)
+    region_of = {edge: given[edge] for edge in edges}
+    gateways = _gateways(links, region_of)
+    region_of |= {edge: region for edge, region in given.items() if not edge.startswith(":")}
+    return City(
+        net_file=Path(net_file), regions=regions,
+        region_of=region_of | _internal_regions(connections, region_of, internal), edges=edges,
+        length={e: lanes_of[e][0][0] for e in edges}, lanes={e: len(lanes_of[e]) for e in edges},
+        lane_ids={e: tuple(lane for _, _, lane in lanes_of[e]) for e in edges},
+        speed={e: max(speed for _, speed, _ in lanes_of[e]) for e in edges},
+        successors={edge: tuple(after) for edge, after in successors.items()}, turn_time=times, gateways=gateways,
+        signals={c.source: c.signal for c in links if c.signal})
+
+
+def check_adjacency(city: City, network: Network) -> None:
+    """InputError unless the gateways join exactly the regions that network.toml calls adjacent, both ways."""
+    where = f"{network.folder}/network.toml: regions"
+    joined = np.zeros((city.regions, city.regions), dtype=bool)
+    for gateway in city.gateways:
+        if not (network.adjacency | network.adjacency.T)[gateway.source, gateway.target]:
+            raise InputError(
+                f"{where}[{gateway.source}].adjacent: region {gateway.target} is missing, although edge "
+                f"{gateway.from_edge} leads to {gateway.to_edge}; add it, or move the edges to other regions")
+        if not network.adjacency[gateway.source, gateway.target]:
+            raise InputError(
+                f"{where}[{gateway.source}].no_way_to: lists {gateway.target}, but edge {gateway.from_edge} leads to "
+                f"{gateway.to_edge} there; remove it, or move the edges to other regions")
+        joined[gateway.source, gateway.target] = True
+    for i, h in np.argwhere(network.adjacency & ~joined):
+        raise InputError(
+            f"{where}[{i}].adjacent: lists {h}, but no edge leads from region {i} to region {h} in {city.net_file}; "
+            f"remove it, add no_way_to = [{h}], or change the regions of edges")
+
+
+def edge_shapes(city: City) -> list[np.ndarray]:
+    """(n, 2) [m] for every edge of the city: its line on the map, midway between its outermost lanes."""
+    shapes: dict[str, np.ndarray] = {}
+    with opened(city.net_file) as stream:
+        for _, element in ElementTree.iterparse(stream):
+            if element.tag == "edge":
+                lanes = [
+                    np.array([point.split(",")[:2] for point in lane.get("shape").split()], dtype=float)
+                    for lane in element.iter("lane") if for_cars(lane)]
+                if lanes:
+                    same = len(lanes[0]) == len(lanes[-1])
+                    shapes[element.get("id")] = (lanes[0] + lanes[-1]) / 2 if same else lanes[0]
+                element.clear()
+    return [shapes[edge] for edge in city.edges]
+
+
+def _read_net(path: Path):
+    """(edge -> [(length, speed, id) of each car lane], the car lanes, internal edge -> free-flow time [s], links)."""
+    cars: set[tuple[str, int]] = set()
+    lanes_of: dict[str, list[tuple[float, float, str]]] = {}
+    internal: dict[str, float] = {}
+    connections: list[_Connection] = []
+    try:
+        with opened(path) as stream:
+            for _, element in ElementTree.iterparse(stream):
+                if element.tag == "edge":
+                    lanes = [(size(lane, "length"), size(lane, "speed"), lane.attrib["id"])
+                             for lane in element.iter("lane") if for_cars(lane)]
+                    if element.get("function", "normal") in ("normal", "connector"):
+                        lanes_of[element.attrib["id"]] = lanes
+                        cars |= {(element.get("id"), int(lane.get("index")))
+                                 for lane in element.iter("lane") if for_cars(lane)}
+                    else:
+                        internal[element.attrib["id"]] = max(
+                            (length / speed for length, speed, _ in lanes), default=0.0)
+                    element.clear()
+                elif element.tag == "connection":
+                    connections.append(_Connection(
+                        element.attrib["from"], element.attrib["to"], element.get("via"), element.get("tl"),
+                        int(element.get("linkIndex", -1)), int(element.get("fromLane")),
+                        int(element.get("toLane"))))
+                    element.clear()
+                elif element.tag in ("junction", "tlLogic"):
+                    element.clear()
+        for connection in connections:
+            if connection.via and connection.via.rpartition("_")[0] not in internal:
+                raise LookupError(f"connection from {connection.source} by way of {connection.via}: no such edge")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give the path of an existing SUMO network") from None
+    except BROKEN as error:
+        raise InputError(f"{path}: is not a SUMO network ({error}); build it with netconvert") from None
+    if not lanes_of:
+        raise InputError(f"{path}: has no edges; build it with netconvert")
+    return lanes_of, cars, internal, connections
+
+
+def size(lane: ElementTree.Element, name: str) -> float:
+    """The length [m] or speed [m/s] of a <lane>; ValueError unless it is above 0 and finite."""
+    value = float(lane.attrib[name])
+    if not 0.0 < value < math.inf:
+        raise ValueError(f"lane {lane.get('id')}: {name}: expected a number above 0, got {value:g} instead")
+    return value
+
+
+def for_cars(lane: ElementTree.Element) -> bool:
+    """Whether cars may use a <lane>."""
+    if lane.get("allow") is not None:
+        return bool({"all", "passenger"} & set(lane.get("allow").split()))
+    return not {"all", "passenger"} & set(lane.get("disallow", "").split())
+
+
+def _read_regions(path: Path, regions: int) -> dict[str, int]:
+    try:
+        with path.open(newline="") as stream:
+            rows = list(csv.reader(stream))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give a table with the columns edge,region") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read ({error}); give a table with the columns edge,region") from None
+    if not rows or rows[0] != ["edge", "region"]:
+        found = ",".join(rows[0]) if rows else "nothing"
+        raise InputError(f"{path}: line 1: expected edge,region, got {found} instead")
+    region_of: dict[str, int] = {}
+    for number, row in enumerate(rows[1:], start=2):
+        if len(row) != 2 or not row[1].isdecimal() or len(row[1]) > 9 or int(row[1]) >= regions:
+            raise InputError(
+                f"{path}: line {number}: expected an edge and a region from 0 to {regions - 1}, got {','.join(row)} "
+                "instead")
+        if row[0] in region_of:
+            raise InputError(f"{path}: line {number}: edge {row[0]} appears twice; remove one of the lines")
+        region_of[row[0]] = int(row[1])
+    return region_of
+
+
+def _internal_regions(connections, region_of: dict[str, int], internal: dict[str, float]) -> dict[str, int]:
+    """Internal edge -> region of the edge it leads to; crossings and walking areas, without cars, that of any edge of
+    their junction."""
+    regions: dict[str, int] = {}
+    of_junction: dict[str, int] = {}
+    for connection in connections:
+        target = region_of.get(connection.target)
+        if target is None:
+            continue
+        if connection.via:
+            regions[connection.via.rpartition("_")[0]] = target
+        if connection.source.startswith(":"):
+            regions[connection.source] = target
+    for edge, region in regions.items():
+        of_junction.setdefault(edge.rpartition("_")[0], region)
+    return {edge: regions.get(edge, of_junction.get(edge.rpartition("_")[0], 0)) for edge in internal}
+
+
+def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gateway, ...]:
+    movements: dict[tuple, list[_Connection]] = {}
+    onward: dict[tuple[str, int], set[str]] = {}
+    for link in links:
+        onward.setdefault((link.source, link.lane), set()).add(link.target)
+        source, target = region_of[link.source], region_of[link.target]
+        if source != target:
+            movements.setdefault((source, target, link.source, link.target), []).append(link)
+    return tuple(
+        Gateway(source=key[0], target=key[1], from_edge=key[2], to_edge=key[3], signal=members[0].signal,
+                links=tuple(sorted(link.link for link in members if link.signal)),
+                lanes=tuple(sorted({link.lane for link in members})),
+                shared=tuple(sorted({link.lane for link in members if len(onward[key[2], link.lane]) > 1})))
+        for key, members in sorted(movements.items()))
+
+
+def gateway_movements(city: City) -> dict[str, dict[int, tuple[int, int]]]:
+    """Signal -> link index -> (i, h), of the links that lead over a boundary."""
+    movements: dict[str, dict[int, tuple[int, int]]] = {}
+    for gateway in city.gateways:
+        if gateway.signal is not None:
+            movements.setdefault(gateway.signal, {}).update(
+                dict.fromkeys(gateway.links, (gateway.source, gateway.target)))
+    return movements
+
+
+def edge_room(city: City) -> np.ndarray:
+    """(E,) [veh]: how many stand on each edge at JAM_SPACING."""
+    return np.array([max(city.lanes[edge] * city.length[edge] / JAM_SPACING, 1.0) for edge in city.edges])
+
+
+def gateway_room_taken(edge_vehicles: np.ndarray, city: City) -> np.ndarray:
+    """(..., G) [-]: the share of the room on the edge before each gateway that edge_vehicles (..., E) [veh] take."""
+    index = {edge: n for n, edge in enumerate(city.edges)}
+    before = [index[gateway.from_edge] for gateway in city.gateways]
+    return edge_vehicles[..., before] / edge_room(city)[before]

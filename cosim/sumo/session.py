@@ -1,0 +1,299 @@
+"""The SUMO session: the only file that imports libsumo. At most one simulation per process.
+
+libsumo has no window: where one is asked for, sumo-gui runs beside this process and traci, which has libsumo's
+functions, talks to it.
+"""
+
+import io
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import libsumo
+import traci
+
+from cosim.sumo.recorded_trips import BOUND
+from cosim.sumo.xml_files import file_list
+from nmfd.errors import InputError
+from nmfd.runs.workers import RunFailed
+
+REFUSALS = (libsumo.TraCIException, traci.TraCIException)  # of one order: the simulation goes on
+FATAL = (libsumo.FatalTraCIError, traci.FatalTraCIError)
+LOST = (traci.FatalTraCIError, ConnectionError)  # what every order raises once the window was closed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """Run in sumo-gui: its command line options, and additional files to draw. program: of eclipse-sumo."""
+
+    options: tuple[str, ...] = ()
+    additional: tuple[Path, ...] = ()
+    program: str = "sumo-gui"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """One phase of a signal programme: duration [s] and one character per link (SUMO's G g y r u o O s)."""
+
+    duration: float
+    state: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Programme:
+    """A signal programme. position [s]: where in its cycle it was when it was read; static: fixed-time,
+    one phase after the other."""
+
+    signal: str
+    phases: tuple[Phase, ...]
+    position: float
+    static: bool
+
+    @property
+    def cycle(self) -> float:
+        """[s]"""
+        return sum(phase.duration for phase in self.phases)
+
+
+class Session:
+    """One running simulation.
+
+    libsumo holds a single simulation per process and a second start would silently replace the first: here it is an
+    error. `sumo_time` [s] is the wall time spent inside SUMO's own step; `command` is the command line of the same run.
+    """
+
+    _open = False
+
+    def __init__(
+        self, net_file: Path, route_file: Path | Sequence[Path], *, seed: int, step_length: float = 1.0,
+        time_to_teleport: float = -1.0, collision_action: str = "warn", options: tuple[str, ...] = (),
+        window: Window | None = None,
+    ):
+        """Raises RuntimeError if another session is open in this process, InputError if SUMO refuses to start."""
+        if Session._open:
+            raise RuntimeError("a SUMO session is already open in this process; close it first")
+        self.sumo_time, self.step_length, self._exits = 0.0, step_length, False
+        routes = file_list([route_file] if isinstance(route_file, Path) else route_file)
+        self.command = [
+            "sumo", "--net-file", str(net_file), "--route-files", routes, "--seed", str(seed),
+            "--step-length", str(step_length), "--time-to-teleport", str(time_to_teleport), "--collision.action",
+            collision_action, "--no-step-log", "true", "--no-warnings", "true", "--duration-log.disable", "true",
+            *options]
+        self._sumo = sumo = libsumo if window is None else traci
+        try:
+            if window is None:
+                _start_quietly(self.command)
+            else:
+                _start(window, self.command)
+        except (*REFUSALS, *FATAL) as error:
+            if window is not None:
+                raise InputError(
+                    f"{window.program} cannot show {net_file}: {_one_line(error)}; check DISPLAY, or use `cosim run` "
+                    "and `cosim video`") from None
+            raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {_one_line(error)}") from None
+        Session._open = True
+        self.time = sumo.simulation.getTime()
+        # Asked so often that a Python call around them would cost as much as SUMO's answer:
+        # road(vehicle), the edge it is on, normal or internal; route(vehicle), its edges.
+        self.road, self.route = sumo.vehicle.getRoadID, sumo.vehicle.getRoute
+        # Edges: the vehicles on one and their number, mean speed [m/s] (the limit if empty), vehicles under 0.1 m/s.
+        self.vehicles_on, self.vehicle_count = sumo.edge.getLastStepVehicleIDs, sumo.edge.getLastStepVehicleNumber
+        self.mean_speed, self.halting = sumo.edge.getLastStepMeanSpeed, sumo.edge.getLastStepHaltingNumber
+        # Lanes: the same, for max-pressure control, which asks for a thousand of them every few seconds.
+        self.lane_vehicles = sumo.lane.getLastStepVehicleNumber
+        self.lane_halting = sumo.lane.getLastStepHaltingNumber
+        # Loop detectors: the share of the last step in which a vehicle was on one [%].
+        self.loop_occupancy = sumo.inductionloop.getLastStepOccupancy
+
+    def close(self) -> None:
+        if Session._open:
+            Session._open = False
+            with suppress(*LOST):  # the window may be gone
+                self._sumo.close()
+
+    def step(self) -> None:
+        """Advance by one simulation step. RunFailed, with its own words, if SUMO gives up."""
+        before = time.perf_counter()
+        try:
+            if self._exits:
+                raise libsumo.FatalTraCIError("ordered by the fault sumo-exits")
+            self._sumo.simulationStep()
+        except (libsumo.FatalTraCIError, *REFUSALS) as error:
+            raise RunFailed(f"SUMO stopped at {self.time:g} s: {_one_line(error)}") from None
+        self.sumo_time += time.perf_counter() - before
+        self.time = self._sumo.simulation.getTime()
+
+    # Vehicles: what happened in the last step.
+
+    def loaded(self) -> tuple[str, ...]:
+        return self._sumo.simulation.getLoadedIDList()
+
+    def departed(self) -> tuple[str, ...]:
+        return self._sumo.simulation.getDepartedIDList()
+
+    def arrived(self) -> tuple[str, ...]:
+        return self._sumo.simulation.getArrivedIDList()
+
+    def started_teleport(self) -> tuple[str, ...]:
+        return self._sumo.simulation.getStartingTeleportIDList()
+
+    def ended_teleport(self) -> tuple[str, ...]:
+        return self._sumo.simulation.getEndingTeleportIDList()
+
+    # Vehicles: the present state.
+
+    def running(self) -> tuple[str, ...]:
+        """On the road; teleporting ones are not."""
+        return self._sumo.vehicle.getIDList()
+
+    def teleports(self) -> int:
+        """How many there were so far, by SUMO's own count: the mesoscopic model has no events for them."""
+        return int(self._sumo.simulation.getParameter("", "stats.teleports.total"))
+
+    def known(self) -> tuple[str, ...]:
+        """All that were loaded and have not arrived, wherever they are."""
+        return self._sumo.vehicle.getLoadedIDList()
+
+    def pending(self) -> tuple[str, ...]:
+        """Due to depart, but not yet inserted: the backlog."""
+        return self._sumo.simulation.getPendingVehicles()
+
+    def is_free(self, vehicle: str) -> bool:
+        """Whether its driver may choose another way: no public transport, and nothing to do on the way."""
+        return (
+            self._sumo.vehicle.getVehicleClass(vehicle) not in BOUND and not self._sumo.vehicle.getLine(vehicle)
+            and not self._sumo.vehicle.getStops(vehicle, 1))
+
+    def route_index(self, vehicle: str) -> int:
+        """Where on its route a vehicle is."""
+        return self._sumo.vehicle.getRouteIndex(vehicle)
+
+    def emission_class(self, vehicle_type: str) -> str:
+        return self._sumo.vehicletype.getEmissionClass(vehicle_type)
+
+    def set_route(self, vehicle: str, edges: list[str]) -> bool:
+        """Give a vehicle on edges[0] a new route; False where SUMO refuses it (the old route then stays)."""
+        try:
+            self._sumo.vehicle.setRoute(vehicle, edges)
+        except REFUSALS:
+            return False
+        return True
+
+    def reroutes(self, vehicle: str) -> bool:
+        """Whether it has SUMO's rerouting device."""
+        return self._sumo.vehicle.getParameter(vehicle, "has.rerouting.device") == "true"
+
+    # Signals.
+
+    def programme(self, signal: str) -> Programme:
+        """The programme that runs on `signal` now."""
+        active = self._sumo.trafficlight.getProgram(signal)
+        for logic in self._sumo.trafficlight.getAllProgramLogics(signal):
+            if logic.programID == active:
+                elapsed = sum(p.duration for p in logic.phases[:self._sumo.trafficlight.getPhase(signal) + 1])
+                left = self._sumo.trafficlight.getNextSwitch(signal) - self._sumo.simulation.getTime()
+                return Programme(
+                    signal=signal, phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
+                    position=elapsed - left,
+                    static=logic.type == self._sumo.constants.TRAFFICLIGHT_TYPE_STATIC
+                    and not any(phase.next for phase in logic.phases))
+        raise RuntimeError(f"signal {signal} has no programme {active}")
+
+    def signals(self) -> tuple[str, ...]:
+        return self._sumo.trafficlight.getIDList()
+
+    def signal_state(self, signal: str) -> str:
+        return self._sumo.trafficlight.getRedYellowGreenState(signal)
+
+    def set_signal_state(self, signal: str, state: str) -> bool:
+        """False where SUMO does not take it."""
+        try:
+            self._sumo.trafficlight.setRedYellowGreenState(signal, state)
+        except REFUSALS:
+            return False
+        return True
+
+    # Incidents.
+
+    def programme_id(self, signal: str) -> str:
+        """Of the programme that runs on `signal` now."""
+        return self._sumo.trafficlight.getProgram(signal)
+
+    def restart_programme(self, signal: str, programme: str) -> None:
+        """Let a signal run one of its own programmes again."""
+        self._sumo.trafficlight.setProgram(signal, programme)
+
+    def limit_speed(self, edge: str, limits: list[float]) -> list[float]:
+        """Set the speed limits [m/s] of the lanes of an edge, one for each or one for all; those before."""
+        lanes = [f"{edge}_{n}" for n in range(self._sumo.edge.getLaneNumber(edge))]
+        before = [self._sumo.lane.getMaxSpeed(lane) for lane in lanes]
+        for lane, limit in zip(lanes, limits * len(lanes) if len(limits) == 1 else limits, strict=True):
+            self._sumo.lane.setMaxSpeed(lane, limit)
+        return before
+
+    def exit_at_next_step(self) -> None:
+        """As if SUMO gave up by itself."""
+        self._exits = True
+
+    # What is drawn in the window.
+
+    def paint(self, colours: Mapping[str, tuple[int, int, int]]) -> None:
+        """Give points of interest, by id, a colour (red, green, blue)."""
+        for mark, colour in colours.items():
+            self._sumo.poi.setColor(mark, (*colour, 255))
+
+
+def _start_quietly(command: list[str]) -> None:
+    """libsumo.start. Raises FatalTraCIError with what SUMO says: it tells stderr what is wrong, not the caller."""
+    with tempfile.TemporaryFile() as said:
+        sys.stderr.flush()
+        stderr = os.dup(2)
+        os.dup2(said.fileno(), 2)
+        try:
+            libsumo.start(command)
+            failure = None
+        except (*REFUSALS, *FATAL) as error:
+            failure = error
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+        said.seek(0)
+        words = said.read().decode(errors="replace")
+    if failure is None:
+        sys.stderr.write(words)
+        return
+    lines = [line.removeprefix("Error: ") for line in words.splitlines() if line.startswith("Error: ")]
+    raise libsumo.FatalTraCIError(lines[0] if lines else _one_line(failure))
+
+
+def _start(window: Window, command: list[str]) -> None:
+    """As libsumo.start, with `window`. Raises FatalTraCIError with what the program has said."""
+    import sumo
+    from sumolib.miscutils import getFreeSocketPort
+
+    program = str(Path(sumo.SUMO_HOME) / "bin" / window.program)
+    with tempfile.TemporaryFile("w+") as said:
+        port = getFreeSocketPort()
+        process = subprocess.Popen(
+            [program, *command[1:], *window.options, "--remote-port", str(port)], stdout=said, stderr=said)
+        try:
+            with redirect_stdout(io.StringIO()):  # traci prints every attempt to connect
+                traci.init(port, numRetries=600, proc=process)  # one a second, while it reads its files
+        except BaseException as error:
+            process.kill()
+            process.wait()
+            if not isinstance(error, (*REFUSALS, *FATAL)):
+                raise
+            said.seek(0)
+            words = [line for line in said.read().splitlines() if line.strip()]
+            raise traci.FatalTraCIError(words[-1] if words else _one_line(error)) from None
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,200 @@
+"""Demand between regions -> individual trips with static routes."""
+
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from cosim.sumo.net import City
+from nmfd.errors import InputError
+
+STREAM = 7101       # keeps the random numbers of trips apart from others of the same seed
+TASTES = 8          # groups of drivers who see different travel times
+TASTE_SPREAD = 0.15  # standard deviation of the logarithm of their travel times
+SHORT = 30.0        # m; no trip starts or ends on a shorter edge where its region has longer ones
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trips:
+    """N trips, sorted by departure.
+
+    depart: (N,) [s]
+    origin, destination: (N,) regions
+    routes: N tuples of edges, from an edge of the origin to an edge of the destination
+    arrival: (N,) [m], position on the last edge at which the trip ends
+    """
+
+    depart: np.ndarray
+    origin: np.ndarray
+    destination: np.ndarray
+    routes: tuple[tuple[str, ...], ...]
+    arrival: np.ndarray
+
+
+def write_trips(city: City, demand: np.ndarray, step: float, seed: int, path: Path) -> int:
+    """Write the trips of `demand` (T, R, R) [veh/s], intervals of `step` [s], to a SUMO route file; returns how many.
+
+    The vehicles are v0, v1, ... by departure; the same seed gives the same bytes.
+    """
+    trips = make_trips(city, demand, step, seed)
+    lines = ['<routes>\n  <vType id="car" sigma="0.2"/>\n']
+    for n, route in enumerate(trips.routes):
+        lines.append(
+            f'  <vehicle id="v{n}" type="car" depart="{trips.depart[n]:.2f}" departLane="best" departSpeed="max" '
+            f'departPos="random_free" arrivalPos="{trips.arrival[n]:.1f}">'
+            f"<route edges={quoteattr(' '.join(route))}/></vehicle>\n")
+    lines.append("</routes>\n")
+    path = Path(path)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    with os.fdopen(handle, "w") as stream:
+        stream.writelines(lines)
+    os.replace(temporary, path)
+    return len(trips.routes)
+
+
+def make_trips(city: City, demand: np.ndarray, step: float, seed: int) -> Trips:
+    """Individual trips of `demand` (T, R, R) [veh/s], intervals of `step` [s].
+
+    Every pair of regions gets its number of vehicles to within one, at the times at which its cumulated demand passes
+    whole numbers, shifted by a random phase. Edges are drawn by length times lanes. Each route is a shortest one in
+    free-flow time as one of `TASTES` groups of drivers sees it. InputError where no way leads from i to j.
+    """
+    if demand.shape[1:] != (city.regions, city.regions):
+        raise InputError(f"{city.net_file}: demand for {demand.shape[1]} regions, but the city has {city.regions}")
+    rng = np.random.default_rng([seed, STREAM])
+    depart, origin, destination = _departures(demand, step, rng)
+    starts = [_ends(city, region, departing=True) for region in range(city.regions)]
+    goals = [_ends(city, region, departing=False) for region in range(city.regions)]
+    draws = rng.random((len(depart), 2))
+    tastes = rng.integers(TASTES, size=len(depart))
+    positions = rng.random(len(depart))
+    trees = Ways(city, rng)
+    number = {edge: n for n, edge in enumerate(city.edges)}
+    first, last = np.empty(len(depart), dtype=int), np.empty(len(depart), dtype=int)
+    for n, (i, j) in enumerate(zip(origin, destination, strict=True)):
+        first[n] = number[_draw(starts[i], draws[n, 0])]
+        last[n] = number[_draw(goals[j], draws[n, 1])]
+    for n in np.flatnonzero(first == last):
+        edges, _ = goals[destination[n]]
+        other = (edges.index(city.edges[first[n]]) + 1) % len(edges)
+        last[n] = number[edges[other]]
+    routes = trees.routes(first, last, tastes)
+    for n, route in enumerate(routes):
+        if len(route) < 2:
+            raise InputError(
+                f"{city.net_file}: no way leads from edge {city.edges[first[n]]} (region {origin[n]}) to "
+                f"{city.edges[last[n]]} (region {destination[n]}); leave out edges that are not connected")
+    lengths = np.array([city.length[route[-1]] for route in routes])
+    return Trips(depart=depart, origin=origin, destination=destination, routes=tuple(routes),
+                 arrival=lengths * (0.1 + 0.8 * positions))
+
+
+def _departures(demand: np.ndarray, step: float, rng) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(times, origins, destinations), sorted by time, rounded to 0.01 s."""
+    clock = step * np.arange(len(demand) + 1)
+    times, origins, destinations = [], [], []
+    for i in range(demand.shape[1]):
+        for j in range(demand.shape[2]):
+            cumulated = np.concatenate([[0.0], np.cumsum(demand[:, i, j]) * step])
+            phase = rng.random()
+            count = int(np.floor(cumulated[-1] + phase))
+            marks = np.arange(1, count + 1) - phase
+            rising = np.concatenate([[True], np.diff(cumulated) > 0])
+            keep = rising | np.concatenate([rising[1:], [False]])   # the end of a pause begins the next rise
+            times.append(np.interp(marks, cumulated[keep], clock[keep]))
+            origins.append(np.full(count, i))
+            destinations.append(np.full(count, j))
+    times, origins, destinations = (np.concatenate(parts) for parts in (times, origins, destinations))
+    times = np.floor(times * 100) / 100
+    order = np.lexsort((destinations, origins, times))
+    return times[order], origins[order], destinations[order]
+
+
+def _ends(city: City, region: int, *, departing: bool) -> tuple[list[str], np.ndarray]:
+    """The edges of a region where trips start (or end), and their cumulated weights.
+
+    Not where a trip would have to leave the region at once (or could only have come from outside), not on turn
+    pockets and short pieces: unless there is nothing else.
+    """
+    edges = [edge for edge in city.edges if city.region_of[edge] == region]
+    before = _predecessors(city)
+    onward = city.successors if departing else before
+    good = [edge for edge in edges if _stays(city, edge, onward) and city.length[edge] >= SHORT
+            and not _is_pocket(city, edge, before[edge])]
+    chosen = good if len(good) >= 2 else edges
+    weights = np.cumsum([city.length[edge] * city.lanes[edge] for edge in chosen])
+    return chosen, weights / weights[-1]
+
+
+def _predecessors(city: City) -> dict[str, list[str]]:
+    before: dict[str, list[str]] = {edge: [] for edge in city.edges}
+    for edge, after in city.successors.items():
+        for other in after:
+            before[other].append(edge)
+    return before
+
+
+def _stays(city: City, edge: str, onward) -> bool:
+    """Whether some way on from the edge stays in its region; a dead end does not."""
+    seen = {edge}
+    here = edge
+    while len(onward[here]) == 1 and onward[here][0] not in seen:
+        here = onward[here][0]
+        if city.region_of[here] != city.region_of[edge]:
+            return False
+        seen.add(here)
+    return any(city.region_of[other] == city.region_of[edge] for other in onward[here])
+
+
+def _is_pocket(city: City, edge: str, before: list[str]) -> bool:
+    """A short piece with more lanes at the end of a road."""
+    return len(before) == 1 and city.length[edge] < 80.0 and city.lanes[edge] > city.lanes[before[0]] and (
+        city.successors[before[0]] == (edge,))
+
+
+def _draw(ends: tuple[list[str], np.ndarray], uniform: float) -> str:
+    edges, weights = ends
+    return edges[min(int(np.searchsorted(weights, uniform, side="right")), len(edges) - 1)]
+
+
+class Ways:
+    """Shortest paths over the edges as nodes: an arc costs the junction and the edge after it."""
+
+    def __init__(self, city: City, rng):
+        self.city = city
+        number = {edge: n for n, edge in enumerate(city.edges)}
+        arcs = [(number[a], number[b], city.turn_time[a, b]) for a, after in city.successors.items() for b in after]
+        self._from, self._to = (np.array([arc[n] for arc in arcs], dtype=int) for n in (0, 1))
+        self._turn = np.array([arc[2] for arc in arcs])
+        self._time = np.array([city.length[edge] / city.speed[edge] for edge in city.edges])
+        self._noise = np.exp(TASTE_SPREAD * rng.standard_normal((TASTES, len(city.edges))))
+
+    def routes(self, first: np.ndarray, last: np.ndarray, tastes: np.ndarray) -> list[tuple[str, ...]]:
+        """The route of every trip; empty where there is none."""
+        found: list[tuple[str, ...]] = [()] * len(first)
+        count = len(self.city.edges)
+        for taste in range(TASTES):
+            cost = self._turn + (self._time * self._noise[taste])[self._to]
+            graph = csr_matrix((np.maximum(cost, 1e-6), (self._from, self._to)), shape=(count, count))
+            members = np.flatnonzero(tastes == taste)
+            origins = np.unique(first[members])
+            for chunk in np.array_split(origins, max(1, len(origins) // 256)):
+                if not len(chunk):
+                    continue
+                _, before = dijkstra(graph, indices=chunk, return_predecessors=True)
+                for n in members[np.isin(first[members], chunk)]:
+                    found[n] = self._walk(before[np.searchsorted(chunk, first[n])], first[n], last[n])
+        return found
+
+    def _walk(self, before: np.ndarray, first: int, last: int) -> tuple[str, ...]:
+        way = [last]
+        while way[-1] != first:
+            way.append(before[way[-1]])
+            if way[-1] < 0:
+                return ()
+        return tuple(self.city.edges[n] for n in reversed(way))

@@ -1,0 +1,6 @@
+"""`python -m nmfd` is the command `nmfd`."""
+
+from nmfd.cli.main import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,200 @@
+"""The command line `nmfd`. Heavy modules are imported inside the commands, so that the help answers at once."""
+
+from pathlib import Path
+
+import click
+
+from nmfd.cli.errors import Commands, Interrupted
+from nmfd.cli.exchange import export, new_controller
+from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, controller_names, fault_option, policy_files, quoted
+from nmfd.cli.studies import ablation, adaptation, bound, robustness, scaling
+from nmfd.errors import InputError
+
+
+@click.group(name="nmfd", cls=Commands)
+@click.version_option(package_name="perimeter-cosim", prog_name="nmfd")
+def main() -> None:
+    """Perimeter control and route guidance on the regional traffic model (NMFD).
+
+    \b
+    Example:
+      nmfd benchmark scenarios/economic_mpc --controllers no-control,pi-gating
+    """
+
+
+@main.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--controllers", required=True, metavar="A,B,...",
+              help="Which to run: no-control, route-guidance, pi-gating, mpc-pc, mpc-pcrg, probing-pc, "
+                   "probing-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, dpc-pcrg-robust, dpc-pc-guarded, "
+                   "dpc-pcrg-guarded, dpc-pc-online, dpc-pcrg-online, bound-pc, bound-pcrg, or file.py:Class "
+                   "(see nmfd new-controller).")
+@click.option("--seeds", type=COUNT, default=1, show_default=True, metavar="N",
+              help="Run seeds 0 to N-1 of the measurement noise.")
+@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", show_default=True,
+              help="The model that the controllers act on.")
+@click.option("--workers", type=COUNT, default=1, show_default=True, metavar="N",
+              help="Runs at a time, each on one core. Timings are cleanest with 1.")
+@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
+              help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.")
+@click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.runs.frames).")
+@fault_option()
+@click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
+def benchmark(
+    scenario: Path, controllers: str, seeds: int, plant: str, workers: int, policies: tuple[str, ...],
+    parquet: bool, faults: tuple[str, ...], out: Path | None,
+) -> None:
+    """Run controllers on a regional model; print a table and write a run folder.
+
+    SCENARIO is a folder with a scenario.toml. The run folder holds summary.csv, the trajectories, manifest.json and
+    figures. Every finished run is kept: the same command with the same --out goes on where it was interrupted, and
+    other controllers or more seeds are added to what is there.
+
+    \b
+    Examples:
+      nmfd benchmark scenarios/economic_mpc --controllers no-control,pi-gating
+      nmfd benchmark scenarios/economic_mpc --controllers no-control,dpc-pc \\
+          --seeds 5 --plant acyclic --workers 2 --policy dpc-pc=mine.pt --out runs/mine
+    """
+    names = controller_names(controllers)
+    files = policy_files(policies, names)
+
+    from nmfd.cli.progress import progress_line
+    from nmfd.faults import with_faults
+    from nmfd.model.scenario import load_scenario
+    from nmfd.runs import run_folder
+    from nmfd.studies import benchmark as benchmarks
+
+    loaded = with_faults(load_scenario(scenario), faults)
+    out = run_folder.default_folder(loaded) if out is None else out
+    try:
+        with progress_line("benchmark") as progress:
+            rows = benchmarks.benchmark(
+                loaded, names, range(seeds), plant, out=out, policies=files, workers=workers, progress=progress)
+    except KeyboardInterrupt:
+        if not (out / "summary.csv").exists():
+            raise Interrupted("interrupted before a run was finished; nothing is kept") from None
+        raise Interrupted(
+            f"interrupted; finished runs are in {out}: the same command with --out {quoted(out)} goes on") from None
+    if parquet:
+        import pandas as pd
+
+        from nmfd.runs import frames
+
+        names = [run_folder.run_name(row["controller"], row["seed"]) for row in rows]
+        frames.write(
+            out, [run_folder.read_trajectory(out / f"{name}.npz") for name in names], {"summary": pd.DataFrame(rows)})
+    click.echo(f"{loaded.name}, {plant} plant, {loaded.steps} control intervals of {loaded.step:g} s")
+    click.echo(benchmarks.table(rows))
+    click.echo(f"Written to {out}")
+
+
+@main.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--controller", required=True, metavar="NAME",
+              help="dpc-pc, dpc-pcrg, dpc-pc-robust or dpc-pcrg-robust.")
+@click.option("--seed", type=SEED, default=0, show_default=True,
+              help="Of the initial weights and the training scenarios.")
+@click.option("--steps", type=COUNT, metavar="N",
+              help="Adam steps. [default: what scenario.toml says, else 400]")
+@click.option("--out", type=FILE, metavar="FILE", help="The policy file. [default: SCENARIO/NAME.pt]")
+@click.option("--resume", is_flag=True, help="Go on with an interrupted training.")
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True,
+              help="auto: a GPU where there is one. The CPU gives the same weights every time.")
+@click.option("--compile/--no-compile", "compiled", default=None,
+              help="Compile the rollout: a minute or two first, then about twice as fast. [default: from 200 Adam "
+                   "steps up, where there is a C++ compiler]")
+def train(
+    scenario: Path, controller: str, seed: int, steps: int | None, out: Path | None, resume: bool, device: str,
+    compiled: bool | None,
+) -> None:
+    """Train a DPC policy on a scenario. The -robust ones are trained with noise on the demand.
+
+    The policy that does best in validation is in the policy file at any time; Ctrl-C keeps it, and --resume goes on.
+
+    \b
+    Examples:
+      nmfd train scenarios/economic_mpc --controller dpc-pcrg
+      nmfd train scenarios/economic_mpc --controller dpc-pc --steps 200 --out mine.pt
+    """
+    from nmfd.cli.progress import progress_line
+    from nmfd.controllers.dpc import rollout, training
+    from nmfd.model.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    device = training.available(device)
+    chosen = training.settings(loaded, controller, steps)  # complains of the name before a file is named after it
+    file = scenario / f"{controller}.pt" if out is None else out
+    if not file.parent.is_dir():
+        raise InputError(f"{file.parent}: no such folder for the policy; make it or choose another --out")
+    default = compiled is None
+    if default:
+        compiled = chosen.steps >= training.WORTH_COMPILING
+    if compiled and not rollout.can_compile(device):
+        if not default:
+            raise InputError("--compile: does not work here, most likely for want of a C++ compiler; install g++ or "
+                             "leave it out")
+        compiled = False
+        click.echo("nmfd: cannot compile here, most likely for want of a C++ compiler; training goes on uncompiled, "
+                   "about half as fast", err=True)
+    state = file.with_name(file.name + ".resume")
+    before = _stamp(state)
+    notes = ["no validation yet"]
+    try:
+        with progress_line(controller) as line:
+            def progress(done: int, total: int, note: str) -> None:
+                notes.append(note)
+                if line:
+                    line(done, total, note)
+
+            training.train(
+                loaded, controller, seed=seed, out=file, steps=steps, resume=resume, device=device, compiled=compiled,
+                progress=progress)
+    except KeyboardInterrupt:
+        if not resume and _stamp(state) == before:
+            raise Interrupted("interrupted before the first validation; nothing is kept") from None
+        again = f"nmfd train {quoted(scenario)} --controller {controller}"
+        again += f" --seed {seed}" if seed else ""
+        again += f" --steps {steps}" if steps else ""
+        again += f" --out {quoted(out)}" if out else ""
+        again += f" --device {device}" if device != "cpu" else ""
+        again += "" if default else f" --{'' if compiled else 'no-'}compile"
+        raise Interrupted(f"interrupted; the best policy so far is {file}; go on with: {again} --resume") from None
+    click.echo(f"{controller}: {notes[-1]} in validation")
+    click.echo(f"Written to {file}")
+
+
+@main.command()
+@click.argument("scenario", type=FOLDER)
+@click.option("--out", type=FOLDER, metavar="DIR", help="Where the figures go. [default: runs/<scenario>-show]")
+def show(scenario: Path, out: Path | None) -> None:
+    """Draw a scenario: its demand, region map and MFDs.
+
+    \b
+    Example:
+      nmfd show scenarios/economic_mpc --out figures
+    """
+    from nmfd.model.scenario import load_scenario
+    from nmfd.runs import files as disk
+    from nmfd.studies import benchmark as benchmarks
+
+    loaded = load_scenario(scenario)
+    out = Path("runs") / f"{disk.file_name(loaded.name)}-show" if out is None else out
+    out.mkdir(parents=True, exist_ok=True)
+    files = benchmarks.draw_scenario(out, loaded)
+    total = loaded.step * loaded.demand.sum()
+    click.echo(
+        f"{loaded.name}: {loaded.network.regions} regions, {total:,.0f} trips between "
+        f"{int((loaded.demand.sum(axis=0) > 0).sum())} pairs, peak {loaded.demand.sum(axis=(1, 2)).max():.3g} veh/s, "
+        f"{loaded.steps} control intervals of {loaded.step:g} s")
+    for file in files:
+        click.echo(f"Written to {file}")
+
+
+def _stamp(path: Path) -> int | None:
+    """When `path` was written last [ns]; None without it."""
+    return path.stat().st_mtime_ns if path.exists() else None
+
+
+for command in (bound, robustness, adaptation, ablation, scaling, new_controller, export):
+    main.add_command(command)

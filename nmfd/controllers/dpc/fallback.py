@@ -1,0 +1,158 @@
+"""A policy that is watched: where it cannot be trusted, PI gating takes over.
+
+It is not trusted where the state has left what it was trained on, where the regional model that it was trained on no
+longer predicts the city, and where that model expects it to do worse than no control.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nmfd.controllers.dpc.policy import DpcController, Policy, check_guidance, load_policy
+from nmfd.controllers.pi_gating import PiGating
+from nmfd.errors import InputError
+from nmfd.model import dynamics
+from nmfd.model.scenario import Scenario
+from nmfd.types import Controls, Measurement
+
+# Added to the variance of every normalised state: 2 % of the critical accumulation is no departure, even in an entry
+# that was always empty in training.
+TOLERANCE = 0.02
+QUANTILE = 0.999    # of the training states that count as inside
+PATIENCE = 4        # control intervals in a row inside before the policy is trusted again
+MOST_ERROR = 0.25   # of the critical accumulations: of predictions for the next interval, root mean square of regions
+MEMORY = 0.5        # of the squared errors before
+LOOK_AHEAD = 40     # control intervals; gating costs something at first, and pays later
+MOST_LOSS = 0.05    # of the total time spent without control, in that time
+
+
+def statistics(states: np.ndarray) -> dict[str, torch.Tensor]:
+    """What a checkpoint keeps of the training states (N, R*R) [-], each divided by the policy's scale.
+
+    mean (R*R,), precision (R*R, R*R): of the Mahalanobis distance; limit: the QUANTILE of it in training.
+    """
+    mean = states.mean(axis=0)
+    precision = np.linalg.inv(np.cov(states, rowvar=False) + TOLERANCE**2 * np.eye(states.shape[1]))
+    far = states - mean
+    squares = ((far @ precision) * far).sum(axis=1)
+    return {"mean": torch.from_numpy(mean), "precision": torch.from_numpy(precision),
+            "limit": torch.tensor(float(np.sqrt(np.quantile(squares, QUANTILE))), dtype=torch.float64)}
+
+
+class Guarded:
+    """A policy with PI gating behind it (nmfd.types.Controller).
+
+    Outside: the Mahalanobis distance of the measured state from the training states is beyond its limit, the last
+    predictions missed by more than MOST_ERROR, or the total time spent over the next LOOK_AHEAD intervals of the
+    regional model, from the measured state under the scenario's demand, is more than MOST_LOSS above that without
+    control. PI gating starts anew with an open perimeter when it takes over, and hands back after PATIENCE intervals
+    inside.
+    """
+
+    def __init__(self, policy: Policy, states: dict[str, torch.Tensor], scenario: Scenario):
+        self._policy, self._fallback, self._network = DpcController(policy), PiGating(scenario), policy
+        self.name = f"{self._policy.name}-guarded"
+        self._scale = policy.scale.numpy().astype(float)
+        self._mean, self._precision = states["mean"].numpy(), states["precision"].numpy()
+        self._limit = float(states["limit"])
+        self._scenario, network = scenario, scenario.network
+        self._model = dynamics.parameters(network, dtype=torch.float32)
+        self._demand = torch.tensor(scenario.demand, dtype=torch.float32)
+        self._open = torch.tensor(np.where(network.adjacency, network.u_max, 0.0), dtype=torch.float32)
+        self._own = torch.tensor(network.nominal_splits, dtype=torch.float32)
+        self.reset()
+
+    @property
+    def fault(self) -> str | None:
+        """Of the policy, injected (nmfd.faults)."""
+        return self._policy.fault
+
+    @fault.setter
+    def fault(self, kind: str | None) -> None:
+        self._policy.fault = kind
+
+    def reset(self, seed: int = 0) -> None:
+        self._policy.reset(seed)
+        self._left = 0          # intervals that PI gating keeps the control for
+        self._error = 0.0       # squared, of the predictions so far
+        self._predicted: np.ndarray | None = None  # accumulations (R,) at the end of this interval
+
+    def distance(self, accumulation: np.ndarray) -> float:
+        """Mahalanobis distance of accumulation (R, R) [veh] from the training states, as a share of its limit."""
+        far = (accumulation / self._scale).ravel() - self._mean
+        return float(np.sqrt(far @ self._precision @ far)) / self._limit
+
+    def act(self, measurement: Measurement) -> Controls:
+        problem = self._problem(measurement)
+        if problem:
+            if self._left == 0:
+                self._fallback.reset()
+            self._left = PATIENCE
+        elif self._left > 0:
+            self._left -= 1
+        if self._left == 0:
+            controls = self._policy.act(measurement)
+        else:
+            reason = problem or f"inside again for {PATIENCE - self._left} of {PATIENCE} intervals"
+            controls = replace(
+                self._fallback.act(measurement), status=f"guard: {reason}, pi-gating in control")
+        self._predict(measurement, controls)
+        return controls
+
+    def _problem(self, measurement: Measurement) -> str | None:
+        """Why the policy is not to be trusted now."""
+        if self._predicted is not None:
+            missed = (measurement.accumulation.sum(axis=1) - self._predicted) / self._scale[:, 0]
+            self._error = MEMORY * self._error + (1.0 - MEMORY) * float((missed**2).mean())
+        if (distance := self.distance(measurement.accumulation)) > 1.0:
+            return f"state at {distance:.2f} of the limit"
+        if (error := self._error**0.5) > MOST_ERROR:
+            return f"predictions miss by {100 * error:.0f} % of the critical accumulation"
+        if (loss := self.foreseen_loss(measurement)) > MOST_LOSS:
+            return f"expected to take {100 * loss:.0f} % more time than no control"
+        return None
+
+    def foreseen_loss(self, measurement: Measurement) -> float:
+        """By how much the policy is expected to exceed the total time spent without control, as a share of it [-]."""
+        start = torch.from_numpy(np.maximum(measurement.accumulation, 0.0)).float()
+        x, total = start.expand(2, -1, -1), torch.zeros(2)
+        first = min(measurement.step, len(self._demand) - 1)
+        with torch.inference_mode():
+            for demand in self._demand[first : first + LOOK_AHEAD]:
+                perimeter, splits = self._network(x[0])
+                x = self._advance(
+                    x, demand, torch.stack([perimeter, self._open]),
+                    self._own if splits is None else torch.stack([splits, self._own]))
+                total += x.sum((1, 2))
+        policy, none = total.tolist()
+        return policy / max(none, 1.0) - 1.0
+
+    def _predict(self, measurement: Measurement, controls: Controls) -> None:
+        splits = self._own if controls.splits is None else torch.from_numpy(controls.splits).float()
+        demand = self._demand[min(measurement.step, len(self._demand) - 1)]
+        with torch.inference_mode():
+            x = self._advance(
+                torch.from_numpy(measurement.accumulation).float(), demand,
+                torch.from_numpy(controls.perimeter).float(), splits)
+        self._predicted = x.sum(-1).numpy().astype(float)
+
+    def _advance(self, x, demand, perimeter, splits) -> torch.Tensor:
+        scenario = self._scenario
+        return dynamics.advance(
+            self._model, x, demand, perimeter, splits, scenario.step, integrator=scenario.integrator,
+            substeps=scenario.substeps)
+
+
+def load(path: Path, scenario: Scenario, *, guidance: bool) -> Guarded:
+    """The policy in `path`, guarded. InputError as dpc.load, and if the file holds no statistics of its training."""
+    policy, content = load_policy(path, scenario.network)
+    check_guidance(policy, path, guidance)
+    if "states" not in content:
+        raise InputError(f"{path}: holds no statistics of its training states; train it again with 'nmfd train'")
+    try:
+        return Guarded(policy, content["states"], scenario)
+    except (KeyError, TypeError, AttributeError, RuntimeError):
+        raise InputError(
+            f"{path}: states: are damaged or of another version; train it again with 'nmfd train'") from None

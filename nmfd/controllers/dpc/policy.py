@@ -1,0 +1,227 @@
+"""Differentiable predictive control: a neural policy from the measured state to admissible controls.
+
+As in Tumu et al.: an MLP backbone with one decoder for the perimeter (scaled sigmoid) and one for the split ratios
+(masked softmax), so that every output satisfies the constraints by construction. Trained by `training`.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from nmfd.errors import InputError
+from nmfd.model.regional_model import Network
+from nmfd.model.scenario import Scenario
+from nmfd.types import Controls, Measurement
+
+FORMAT = 1
+WIDEST, DEEPEST = 10_000, 100  # units per layer, layers: of a policy that fits into memory
+
+
+class SoftExponential(nn.Module):
+    """Trainable activation between logarithm, identity and exponential (Godfrey and Gashler, 2015), per unit.
+
+    f(a, x) = -ln(1 - a (x + a)) / a for a < 0, x at a = 0, (exp(a x) - 1) / a + a for a > 0. Near its pole and below
+    the logarithm goes on along its tangent, and the exponential stops growing at e^20, so that f and its gradients
+    are finite for every x.
+    """
+
+    POLE = 1e-3  # the argument of the logarithm from which on its tangent is taken
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.alpha = nn.Parameter(torch.zeros(width))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        small = self.alpha.abs() < 1e-4
+        safe = torch.where(small, torch.full_like(self.alpha, 1e-4), self.alpha)
+        rising = torch.expm1((safe * x).clamp(max=20.0)) / safe + safe
+        argument = 1.0 - safe * (x + safe)
+        logarithm = torch.log(argument.clamp(min=self.POLE)) + (argument - self.POLE).clamp(max=0.0) / self.POLE
+        # Near a = 0 the first-order expansion in a: with x alone, a would have no gradient and stay 0 for ever.
+        identity = x + self.alpha * (1.0 + 0.5 * x * x)
+        return torch.where(small, identity, torch.where(safe > 0, rising, -logarithm / safe))
+
+
+ACTIVATIONS = {
+    "gelu": lambda width: nn.GELU(), "relu": lambda width: nn.ReLU(), "tanh": lambda width: nn.Tanh(),
+    "soft-exponential": SoftExponential}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Architecture:
+    """width: units per hidden layer; layers: hidden layers of the backbone; activation: a key of ACTIVATIONS;
+    guidance: with a decoder for the split ratios; sparse: decoders with outputs for adjacent regions only, which a
+    city of many regions needs (their number grows with R^2 instead of R^3)."""
+
+    width: int = 128
+    layers: int = 2
+    activation: str = "gelu"
+    guidance: bool = False
+    sparse: bool = False
+
+
+class Policy(nn.Module):
+    """State x (..., R, R) [veh] -> perimeter (..., R, R) [-] and splits (..., R, R, R) [-], or None without guidance.
+
+    scale: (R, 1) [veh], the normalisation of the state: the critical accumulation of each region.
+    """
+
+    def __init__(self, network: Network, architecture: Architecture):
+        super().__init__()
+        regions, width = network.regions, architecture.width
+        self.architecture, self.regions = architecture, regions
+        self.u_min, self.u_max = network.u_min, network.u_max
+        self.register_buffer("scale", torch.tensor([[m.critical] for m in network.mfds], dtype=torch.float32))
+        onward = _neighbours(network.adjacency) if architecture.sparse else np.tile(np.arange(regions), (regions, 1))
+        here = np.arange(regions)[:, None]
+        allowed = torch.tensor(network.adjacency[here, onward] & (np.diff(onward, prepend=-1) != 0))
+        self.register_buffer("adjacency", allowed.float(), persistent=False)
+        self.register_buffer("onward", torch.tensor(onward), persistent=False)
+        layers: list[nn.Module] = []
+        for layer in range(architecture.layers):
+            layers += [nn.Linear(regions**2 if layer == 0 else width, width),
+                       ACTIVATIONS[architecture.activation](width)]
+        self.backbone = nn.Sequential(*layers)
+        self.perimeter_decoder = nn.Linear(width, onward.size)
+        if architecture.guidance:
+            self.splits_decoder = nn.Linear(width, onward.size * regions)
+            mask = torch.tensor(network.split_mask[here, onward]) & allowed.unsqueeze(-1)
+            # A softmax over nothing but -inf is NaN: rows with no way out (j = i) get finite logits and are zeroed.
+            blocked = ~mask & mask.any(dim=1, keepdim=True)
+            bias = torch.zeros(mask.shape).masked_fill(blocked, -torch.inf)
+            self.register_buffer("split_mask", mask.float(), persistent=False)
+            self.register_buffer("split_bias", bias, persistent=False)
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        perimeter, splits = self.listed(x)
+        if not self.architecture.sparse:
+            return perimeter, splits
+        onward, shape = self.onward, (self.regions,) * 2
+        perimeter = perimeter.new_zeros(*x.shape[:-2], *shape).scatter_add(-1, onward.expand_as(perimeter), perimeter)
+        if splits is not None:
+            splits = splits.new_zeros(*x.shape[:-2], self.regions, *shape).scatter_add(
+                -2, onward.unsqueeze(-1).expand_as(splits), splits)
+        return perimeter, splits
+
+    def listed(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Perimeter (..., R, D) and splits (..., R, D, R) towards the regions `onward` (R, D); all D = R if dense."""
+        hidden = self.backbone((x / self.scale).flatten(-2))
+        shape = self.onward.shape
+        open_share = torch.sigmoid(self.perimeter_decoder(hidden)).unflatten(-1, shape)
+        perimeter = (self.u_min + (self.u_max - self.u_min) * open_share) * self.adjacency
+        if not self.architecture.guidance:
+            return perimeter, None
+        logits = self.splits_decoder(hidden).unflatten(-1, (*shape, self.regions)) + self.split_bias
+        return perimeter, torch.softmax(logits, dim=-2) * self.split_mask
+
+
+def _neighbours(adjacency: np.ndarray) -> np.ndarray:
+    """(R, D) int: the regions adjacent to each, D the most that any has; shorter rows repeat their last."""
+    rows = [np.flatnonzero(row) for row in adjacency]
+    most = max(map(len, rows))
+    return np.stack([np.pad(row, (0, most - len(row)), "edge") for row in rows])
+
+
+class DpcController:
+    """A trained policy as a controller (nmfd.types.Controller), "dpc-pc" or "dpc-pcrg"."""
+
+    def __init__(self, policy: Policy):
+        self._policy = policy.eval()
+        self.name = "dpc-pcrg" if policy.architecture.guidance else "dpc-pc"
+        self.fault: str | None = None  # injected (nmfd.faults)
+        self._onward = policy.onward.numpy() if policy.architecture.sparse else None
+        self._u_max = self._full(policy.u_max * policy.adjacency.numpy())
+
+    def reset(self, seed: int = 0) -> None:
+        pass
+
+    def act(self, measurement: Measurement) -> Controls:
+        with torch.inference_mode():
+            x = torch.from_numpy(measurement.accumulation.astype(np.float32))
+            perimeter, splits = self._policy.listed(x)
+        perimeter = perimeter.numpy()
+        if self.fault == "policy-nan":
+            perimeter = np.full_like(perimeter, np.nan)
+        if splits is not None:
+            splits = splits.numpy().astype(float)
+            sums = splits.sum(axis=1, keepdims=True)
+        # The sum is finite if every number is: they are bounded unless they are NaN.
+        if not math.isfinite(perimeter.sum()) or (splits is not None and not math.isfinite(sums.sum())):
+            return Controls(perimeter=self._u_max, splits=None, status="dpc: policy returned NaN, perimeter opened")
+        if splits is not None:
+            splits /= np.maximum(sums, 1e-9)  # float32 sums miss 1 by 1e-7; those of j = i are 0
+        return Controls(perimeter=self._full(perimeter), splits=None if splits is None else self._full(splits))
+
+    def _full(self, listed: np.ndarray) -> np.ndarray:
+        """(R, R) or (R, R, R) of (R, D) or (R, D, R): the second axis, over the policy's neighbours, over all regions.
+
+        The zeros are never written, so that many regions cost no time.
+        """
+        if self._onward is None:
+            return listed.astype(float, copy=False)
+        full = np.zeros((len(listed), len(listed), *listed.shape[2:]))
+        here, way = np.nonzero(np.diff(self._onward, prepend=-1))
+        full[here, self._onward[here, way]] = listed[here, way]
+        return full
+
+
+def checkpoint(policy: Policy, network: Network, configuration: Mapping, states: Mapping | None = None) -> dict:
+    """What a policy file holds: weights with the normalisation, architecture, network hash, configuration.
+
+    states: of nmfd.controllers.dpc.fallback.statistics, where the policy is to be guarded
+    """
+    return {
+        **({} if states is None else {"states": dict(states)}),
+        "format": FORMAT, "architecture": asdict(policy.architecture), "network": network.name,
+        "network_hash": network.hash, "configuration": dict(configuration),
+        "weights": {key: value.detach().cpu().clone() for key, value in policy.state_dict().items()}}
+
+
+def load_policy(path: Path, network: Network) -> tuple[Policy, dict]:
+    """The policy in `path` and its whole checkpoint. InputError if it is none, or was trained for another network.
+
+    No code of the file is executed (weights_only).
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such policy; train one with 'nmfd train'") from None
+    except Exception:
+        raise InputError(f"{path}: is not a policy file; train one with 'nmfd train'") from None
+    try:
+        if content["format"] != FORMAT:
+            raise InputError(f"{path}: format: expected {FORMAT}, got {content['format']!r} instead; train it again")
+        if content["network_hash"] != network.hash:
+            raise InputError(
+                f"{path}: network_hash: the policy was trained for network {content['network']!r} "
+                f"({content['network_hash']}), not for {network.name!r} ({network.hash}); train one with 'nmfd train'")
+        architecture = Architecture(**content["architecture"])
+        flags = {type(architecture.guidance), type(architecture.sparse)}
+        if not (0 < architecture.width <= WIDEST and 0 < architecture.layers <= DEEPEST and flags == {bool}):
+            raise KeyError("architecture")
+        policy = Policy(network, architecture)
+        policy.load_state_dict(content["weights"])
+    except (LookupError, TypeError, RuntimeError, AttributeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: is damaged or of another version; train it again with 'nmfd train'") from None
+    return policy, content
+
+
+def check_guidance(policy: Policy, path: Path, guidance: bool) -> None:
+    """InputError if the policy in `path` is of the other kind."""
+    if policy.architecture.guidance != guidance:
+        has, wanted = ("dpc-pc", "dpc-pcrg") if guidance else ("dpc-pcrg", "dpc-pc")
+        raise InputError(f"{path}: is a {has} policy, not {wanted}; choose --controller {has} or another file")
+
+
+def load(path: Path, scenario: Scenario, *, guidance: bool) -> DpcController:
+    """The controller in the policy file `path`; InputError if it does not fit the scenario's network or the name."""
+    policy, _ = load_policy(path, scenario.network)
+    check_guidance(policy, path, guidance)
+    return DpcController(policy)

@@ -1,0 +1,165 @@
+"""Rollouts of the regional model under a policy, as tensors and many at once: what training descends."""
+
+import os
+import shutil
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+
+from nmfd.controllers.dpc.policy import Policy
+from nmfd.model import dynamics
+from nmfd.model.demand_noise import entries
+from nmfd.model.scenario import Scenario
+
+
+class Rollout:
+    """The scenario's regional model as tensors on `device`, for many rollouts at once.
+
+    Random numbers are drawn on the CPU, so that they are the same on every device.
+    """
+
+    def __init__(self, scenario: Scenario, dtype=torch.float32, device="cpu", detour_cost: float = 0.0):
+        """detour_cost: what a vehicle loses that is guided off the drivers' own split ratios [s]"""
+        def tensor(values):
+            return torch.tensor(values, dtype=dtype, device=device)
+
+        network = scenario.network
+        self.detour_cost = detour_cost
+        self.scenario, self.dtype, self.device = scenario, dtype, torch.device(device)
+        self.parameters = self._nominal = dynamics.parameters(network, dtype=dtype, device=device)
+        self.demand = tensor(scenario.demand)
+        self.nominal_splits = tensor(network.nominal_splits)
+        self.jam = tensor([m.jam for m in network.mfds])
+        self.bound = (self.demand.sum((0, 1)) > 0).to(dtype)
+
+    def random_start(
+        self, batch: int, spread: float, share: float, generator, levels: tuple[float, float] = (1.0, 1.0),
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Initial states (B, R, R) [veh] and demands (T, B, R, R) [veh/s].
+
+        levels: the demand of a whole rollout is multiplied by a number between these
+        A share of the rollouts starts at a random time of the scenario from a random state, which fills the regions
+        up to between nothing and 80 % of their jam accumulation with vehicles for the destinations in use.
+        """
+        def uniform(*shape):
+            return torch.rand(*shape, generator=generator, dtype=self.dtype).to(self.device)
+
+        steps, regions = self.demand.shape[:2]
+        rollout = torch.arange(batch, device=self.device)
+        factor = 1.0 + spread * (2.0 * uniform(batch, regions, regions) - 1.0)
+        shift = (uniform(batch) * steps * 0.5).long() * (rollout < share * batch)
+        index = torch.arange(steps, device=self.device)[:, None] + shift
+        padded = torch.cat([self.demand, torch.zeros_like(self.demand)])
+        demand = padded[index] * factor
+        weight = uniform(batch, regions, regions) ** 2 * self.bound
+        total = uniform(batch, regions) * uniform(batch, 1) * 0.8 * self.jam
+        x = total.unsqueeze(-1) * weight / weight.sum(-1, keepdim=True).clamp(min=1e-6)
+        if levels[0] < levels[1]:
+            demand = demand * (levels[0] + (levels[1] - levels[0]) * uniform(batch, 1, 1))
+        return x * (rollout < share * batch)[:, None, None], demand
+
+    def draw_model(self, batch: int, spread: float, generator, scale: float = 1.0) -> None:
+        """From now on every one of `batch` rollouts has a regional model of its own, around the nominal one.
+
+        spread: standard deviation of the logarithm of every region's accumulation axis (jam and critical accumulation,
+        storage), and half of it of its outflow and of the capacities [-]
+        scale: of all accumulation axes besides [-]; spread 0 and scale 1 give the nominal model
+        """
+        p, regions = self._nominal, len(self.jam)
+        if spread or scale != 1.0:
+            def factor(*shape, share=1.0):
+                normal = torch.randn(batch, *shape, generator=generator, dtype=self.dtype).to(self.device)
+                return torch.exp(share * spread * normal.clamp(-2.0, 2.0))
+
+            wide, high = scale * factor(regions), factor(regions, share=0.5)
+            # The integration step stays short enough: no rate rises above the largest that the network was checked for.
+            high = high.clamp(max=1.0 / (self._fastest() * self.scenario.step / self.scenario.substeps))
+            p = replace(
+                p, a=high * p.a / wide**2, b=high * p.b / wide, c=high * p.c, jam=wide * p.jam,
+                capacity=None if p.capacity is None else p.capacity * factor(regions, regions, share=0.5),
+                storage=None if p.storage is None else p.storage * wide)
+        self.parameters = p
+
+    def _fastest(self) -> torch.Tensor:
+        """The largest rate at which vehicles leave each region (R,) [1/s]."""
+        p = self._nominal
+        return p.c if p.exit_rates is None else p.c * p.exit_rates.amax(-1)
+
+    def perturb(self, demand: torch.Tensor, level, noise: float, noise_all: float, generator) -> torch.Tensor:
+        """`demand` (T, B, R, R) [veh/s] with Gaussian noise, clipped at zero.
+
+        sigma is `level` (B,) times `noise`, on the pairs with demand (demand_noise.WHERE, "pairs"); in every other
+        rollout times `noise_all` and on every pair ("all"), unless `noise_all` is 0.
+        """
+        if not noise and not noise_all:
+            return demand
+        everywhere = (torch.arange(demand.shape[1]) % 2 == 1) & (noise_all > 0)
+        sigma = level * torch.where(everywhere, noise_all, noise)
+        pairs, every = (torch.tensor(entries(self.scenario.demand, where)[0]) for where in ("pairs", "all"))
+        sigma = sigma[:, None, None] * torch.where(everywhere[:, None, None], every, pairs)
+        normal = torch.randn(demand.shape, generator=generator, dtype=self.dtype)
+        return (demand + (normal * sigma).to(self.device)).clamp(min=0.0)
+
+    def step(self, policy: Policy, x, demand, noise) -> torch.Tensor:
+        """The state (B, R, R) [veh] one control interval after x, which `policy` saw with `noise` (B, R, R) [veh]."""
+        perimeter, splits = policy(x + noise)
+        return dynamics.advance(
+            self.parameters, x, demand, perimeter, self.nominal_splits if splits is None else splits,
+            self.scenario.step, integrator=self.scenario.integrator, substeps=self.scenario.substeps)
+
+    def states(self, policy: Policy, x, demand, generator, step=None) -> tuple[torch.Tensor, torch.Tensor]:
+        """The states (T, B, R, R) [veh] under `policy` from x (B, R, R), and what it saw of them through the noise.
+
+        step: what to use instead of `self.step`, such as its compiled form
+        """
+        noise = torch.randn(demand.shape, generator=generator, dtype=self.dtype).to(self.device)
+        noise *= self.scenario.measurement_std
+        states = [x]
+        for k in range(demand.shape[0] - 1):
+            states.append((step or self.step)(policy, states[-1], demand[k], noise[k]))
+        exact = torch.stack(states)
+        return exact, exact + noise
+
+    def total_time_spent(self, policy: Policy, x, demand, generator, step=None) -> torch.Tensor:
+        """TTS (B,) [veh s] of rollouts from x (B, R, R) under `policy`, with detours; arguments as `states`."""
+        exact, seen = self.states(policy, x, demand, generator, step)
+        vehicles = exact.sum((0, -2, -1))
+        if self.detour_cost and policy.architecture.guidance:
+            vehicles = vehicles + self.detour_cost * self._diverted(exact, policy(seen)[1]).sum((0, -2, -1))
+        return self.scenario.step * vehicles
+
+    def _diverted(self, x: torch.Tensor, splits: torch.Tensor) -> torch.Tensor:
+        """Vehicles (..., R, R) [veh/s] that leave a region another way than by the drivers' own split ratios."""
+        p = self.parameters
+        leaving = dynamics.rate(p, x.sum(-1)).unsqueeze(-1) * x
+        if p.exit_rates is not None:
+            leaving = leaving * p.exit_rates
+        return 0.5 * (splits - self.nominal_splits).abs().sum(-2) * leaving
+
+
+def can_compile(device: str = "cpu") -> bool:
+    """Whether torch.compile works on `device`, found out with one small function.
+
+    It needs a C++ compiler, but also Python's headers and OpenMP, and on a GPU Triton.
+    """
+    if shutil.which(os.environ.get("CXX", "g++")) is None:
+        return False
+    try:
+        with warnings.catch_warnings():
+            compiled_step(torch.neg)(torch.ones(1, device=device))
+    except Exception:  # of the compiler, its tools, or a cache that cannot be written: all the same here
+        return False
+    return True
+
+
+def compiled_step(step: Callable) -> Callable:
+    """`step`, to be compiled in this process when it is called first."""
+    import torch._dynamo
+    import torch._inductor.config
+
+    warnings.filterwarnings("ignore", category=FutureWarning, module="torch._inductor")  # PyTorch's own business
+    torch._inductor.config.compile_threads = 1  # no pool of processes beside one training
+    torch._dynamo.reset()  # what an earlier training compiled counts towards a limit, beyond which nothing is compiled
+    return torch.compile(step, dynamic=False)

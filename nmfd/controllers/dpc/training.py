@@ -1,0 +1,314 @@
+"""Training of DPC policies: roll the regional model out under the policy and descend the total time spent.
+
+Random initial states and demand keep gradients alive (a rollout that gridlocks has none) and the best policy by
+validation on the scenario itself is kept. The same seed gives the same weights.
+"""
+
+import io
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nmfd.controllers.dpc import fallback
+from nmfd.controllers.dpc.policy import ACTIVATIONS, DEEPEST, WIDEST, Architecture, Policy, checkpoint
+from nmfd.controllers.dpc.rollout import Rollout, compiled_step
+from nmfd.controllers.pi_gating import PiGating
+from nmfd.errors import InputError
+from nmfd.model.regional_model import Network
+from nmfd.model.scenario import Scenario, as_modelled
+from nmfd.runs import config
+from nmfd.runs.files import atomic, locked, sweep
+from nmfd.runs.workers import RunFailed
+
+VALIDATE_EVERY = 20  # Adam steps
+MOST_STEPS = 10**7
+ROBUST_NOISE = 3.0     # veh/s, of the policies whose name ends in -robust
+WORTH_COMPILING = 200  # Adam steps
+# Of the first policy from a gate: Adam steps, states in each, learning rate; width of the gate and the fullest region,
+# as a share of the set point; share of u where there is no gate.
+GATE_STEPS, GATE_BATCH, GATE_RATE, GATE_WIDTH, GATE_FULLEST, OPENED = 1000, 256, 2e-3, 0.05, 2.5, 0.95
+WEAK, OPEN, RARE = 0.1, 3.0, 1e-3  # of the first policy from no control: factor of weights, logit of u, least theta
+VALIDATIONS = 16       # perturbed scenarios in a validation, if training perturbs the demand
+NAMES = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """Settings of one training, from the table [controllers.<name>] of scenario.toml, name one of NAMES.
+
+    width, layers, activation: of the policy
+    steps: Adam steps
+    batch: rollouts per step
+    learning_rate: of Adam at the start; falls to a tenth along a cosine
+    alternating: with route guidance, train the two decoders in turn (the backbone always)
+    demand_spread: every flow is scaled by a factor drawn from 1 +- demand_spread, per rollout
+    demand_low, demand_high: every flow is scaled, besides, by one factor drawn from between these, per rollout
+    initial_share: share of the rollouts that start from a random state, at a random time of the scenario
+    noise: largest sigma [veh/s] of the Gaussian noise on the demand of the pairs that have any, at every step; every
+        rollout has its own sigma, evenly between 0 and `noise` (demand_noise.WHERE, "pairs")
+    detour_cost: what a vehicle loses that is guided off the drivers' own split ratios, in the objective [s]
+    mfd_spread: of the regional model that every rollout has for itself (Rollout.draw_model) [-]
+    mfd_scale: of the accumulation axes of these models besides [-]; below 1 for a city that may lock, by chance, before
+        its mean outflow falls
+    from_no_control: the first policy is nearly no control, so that what training finds no reason to change stays open
+    from_gating: the first policy is nearly a gate on the protected regions, which holds them at the set point of
+        pi-gating: where the regional model locks whatever small changes do, descent finds no way to a gate by itself
+    noise_all: the same of the noise on every pair of regions ("all"), in every other rollout, instead of `noise`
+    """
+
+    width: int = 128
+    layers: int = 2
+    activation: str = "gelu"
+    steps: int = 400
+    batch: int = 16
+    learning_rate: float = 1e-3
+    alternating: bool = True
+    demand_spread: float = 0.2
+    demand_low: float = 1.0
+    demand_high: float = 1.0
+    initial_share: float = 0.5
+    noise: float = 0.0
+    noise_all: float = 0.0
+    mfd_spread: float = 0.0
+    mfd_scale: float = 1.0
+    detour_cost: float = 0.0
+    from_no_control: bool = False
+    from_gating: bool = False
+
+    @property
+    def levels(self) -> tuple[float, float]:
+        return self.demand_low, self.demand_high
+
+
+def settings(scenario: Scenario, controller: str, steps: int | None = None) -> Training:
+    """The training settings of `controller` in `scenario`, checked; `steps` overrides.
+
+    controller: one of NAMES, or "NAME+..." if the scenario has a table of that name (nmfd.model.scenario.as_modelled)
+    """
+    name, variant, _ = controller.partition("+")
+    if name not in NAMES:
+        raise InputError(f"--controller: {controller!r} cannot be trained; choose one of {', '.join(NAMES)}")
+    if variant and controller not in scenario.controller_options:
+        raise InputError(
+            f"--controller: {controller!r} needs a table [controllers.\"{controller}\"] in {scenario.folder}/"
+            f"scenario.toml that says what is different from {name}; add one, or train {name}")
+    scenario = as_modelled(scenario, controller)
+    default = Training(noise=ROBUST_NOISE if name.endswith("-robust") else 0.0)
+    table = config.Table(
+        scenario.controller_options.get(name, {}), scenario.folder / "scenario.toml" if scenario.folder else
+        Path("scenario"), f"controllers.{controller}.")
+    chosen = Training(
+        width=table.integer("width", default.width, low=1, high=WIDEST),
+        layers=table.integer("layers", default.layers, low=1, high=DEEPEST),
+        activation=table.text("activation", default.activation, tuple(ACTIVATIONS)),
+        steps=table.integer("steps", default.steps, low=1, high=MOST_STEPS),
+        batch=table.integer("batch", default.batch, low=1, high=100_000),
+        learning_rate=table.number("learning_rate", default.learning_rate, above=0.0, high=1.0),
+        alternating=table.flag("alternating", default.alternating),
+        demand_spread=table.number("demand_spread", default.demand_spread, low=0.0, high=1.0),
+        demand_low=table.number("demand_low", default.demand_low, above=0.0, high=1.0),
+        demand_high=table.number("demand_high", default.demand_high, low=1.0, high=100.0),
+        initial_share=table.number("initial_share", default.initial_share, low=0.0, high=1.0),
+        noise=table.number("noise", default.noise, low=0.0, high=1e6),
+        noise_all=table.number("noise_all", default.noise_all, low=0.0, high=1e6),
+        mfd_spread=table.number("mfd_spread", default.mfd_spread, low=0.0, high=1.0),
+        mfd_scale=table.number("mfd_scale", default.mfd_scale, low=0.1, high=1.0),
+        detour_cost=table.number("detour_cost", default.detour_cost, low=0.0, high=1e6),
+        from_no_control=table.flag("from_no_control", default.from_no_control),
+        from_gating=table.flag("from_gating", default.from_gating))
+    table.close()
+    if chosen.from_gating and not scenario.protected:
+        raise table.error("from_gating", "expected a scenario with protected regions; name them, or leave it out")
+    if chosen.from_gating and chosen.from_no_control:
+        raise table.error("from_gating", "a policy cannot begin as both, a gate and no control; leave one out")
+    return chosen if steps is None else Training(**{**asdict(chosen), "steps": steps})
+
+
+def available(device: str) -> str:
+    """"cpu" or "cuda", with "auto" the GPU where there is one. InputError for a GPU that is not there."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device: cuda asked for, but PyTorch finds no GPU here; choose cpu or auto")
+    return "cuda" if device == "auto" and torch.cuda.is_available() else device.replace("auto", "cpu")
+
+
+def train(
+    scenario: Scenario, controller: str, *, seed: int, out: Path, steps: int | None = None, resume: bool = False,
+    device: str = "cpu", compiled: bool = False, progress: Callable[[int, int, str], None] | None = None,
+    log: Callable[[int, float], None] | None = None,
+) -> Path:
+    """Train `controller`, one that `settings` knows, on the regional model and write the policy to `out`.
+
+    `out` holds the best policy so far after every validation; `out`.resume beside it holds what `resume` needs and
+    goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done, TTS)` after
+    every validation. `compiled` makes a step about twice as fast, after up to a minute or two of compilation; the
+    weights differ by rounding.
+    """
+    chosen = settings(scenario, controller, steps)
+    scenario = as_modelled(scenario, controller)
+    configuration = {
+        "controller": controller, "scenario": scenario.name, "seed": seed, "compiled": compiled, **asdict(chosen)}
+    torch.set_num_threads(1)  # the matrices are small: more threads only wait for one another
+    torch.manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
+    guidance = NAMES[controller.partition("+")[0]]
+    architecture = Architecture(
+        width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=guidance)
+    policy = Policy(scenario.network, architecture)
+    if chosen.from_no_control:
+        begin_as_no_control(policy, scenario.network)
+    policy = policy.to(device)
+    rollout = Rollout(scenario, device=device, detour_cost=chosen.detour_cost)
+    if chosen.from_gating and not resume:
+        begin_as_gate(policy, rollout, generator)
+    advance = compiled_step(rollout.step) if compiled else rollout.step
+    optimizer = torch.optim.Adam(policy.parameters(), lr=chosen.learning_rate)
+    first, best, history = 0, float("inf"), []
+    state_file = out.with_name(out.name + ".resume")
+    with locked(out.with_name(f".{out.name}.lock"), out):
+        sweep(out.parent, {out.stem, state_file.stem})
+        if resume:
+            first, best, history = _restore(state_file, configuration, policy, optimizer, generator)
+        for step in range(first, chosen.steps):
+            for group in optimizer.param_groups:
+                cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
+                group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
+            rollout.draw_model(chosen.batch, chosen.mfd_spread, generator, chosen.mfd_scale)
+            x, demand = rollout.random_start(
+                chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
+            demand = rollout.perturb(
+                demand, torch.rand(chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
+            # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
+            loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            if architecture.guidance and chosen.alternating:
+                # Not by requires_grad, which would compile the step once for each decoder.
+                for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
+                    weights.grad = None
+            torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+            optimizer.step()
+            last = step + 1 == chosen.steps
+            if (step + 1) % VALIDATE_EVERY == 0 or last:
+                score = validate(policy, rollout, seed, chosen)
+                history.append([step + 1, math.exp(loss.item()), score])
+                if log:
+                    log(step + 1, score)
+                if score < best:
+                    best = score
+                    states = fallback.statistics(visited(policy, rollout, chosen, seed))
+                    _write(checkpoint(
+                        policy, scenario.network, {**configuration, "validation_veh_s": best}, states), out)
+                if not last:
+                    _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
+            if progress:
+                progress(step + 1, chosen.steps, f"best {best:.4g} veh s")
+        if not math.isfinite(best):
+            raise RunFailed(
+                f"{controller}: every validation of {chosen.steps} steps diverged; lower the learning rate")
+        state_file.unlink(missing_ok=True)
+    return out
+
+
+def begin_as_no_control(policy: Policy, network: Network) -> None:
+    """Let `policy` hardly depend on the state, with nearly open gateways and nearly the drivers' own split ratios."""
+    with torch.no_grad():
+        policy.perimeter_decoder.weight.mul_(WEAK)
+        policy.perimeter_decoder.bias.fill_(OPEN)
+        if policy.architecture.guidance:
+            own = torch.tensor(network.nominal_splits[np.arange(network.regions)[:, None], policy.onward.numpy()])
+            policy.splits_decoder.weight.mul_(WEAK)
+            policy.splits_decoder.bias.copy_(own.clamp(min=RARE).log().flatten())
+
+
+def begin_as_gate(policy: Policy, rollout: Rollout, generator: torch.Generator) -> None:
+    """Let `policy` close the entries of every protected region as this fills, half at the set point of pi-gating."""
+    network, protected = rollout.scenario.network, list(rollout.scenario.protected)
+    set_point = torch.tensor(PiGating(rollout.scenario).set_point, dtype=rollout.dtype, device=rollout.device)
+    counts = rollout.parameters.adjacency.expand(GATE_BATCH, -1, -1)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=GATE_RATE)
+    for _ in range(GATE_STEPS):
+        x, _ = rollout.random_start(GATE_BATCH, 0.0, 1.0, generator)
+        full = torch.rand(GATE_BATCH, len(protected), generator=generator).to(x) * GATE_FULLEST * set_point
+        x[:, protected] *= (full / x[:, protected].sum(-1).clamp(min=1.0)).unsqueeze(-1)
+        wanted = torch.full_like(x, OPENED)
+        wanted[:, :, protected] = torch.sigmoid((set_point - full) / (GATE_WIDTH * set_point)).unsqueeze(1)
+        share = (policy(x)[0] - network.u_min) / (network.u_max - network.u_min)
+        loss = torch.nn.functional.binary_cross_entropy(share.clamp(0.0, 1.0), wanted, weight=counts)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+
+def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> float:
+    """TTS of the scenario itself from its own start, the geometric mean of two noise draws [veh s].
+
+    If training perturbs demand or model: also of VALIDATIONS perturbed ones, whose sigma rises to that of `chosen`.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    perturbed = chosen.noise or chosen.noise_all or chosen.mfd_spread or chosen.demand_low < chosen.demand_high
+    count = 2 + (VALIDATIONS if perturbed else 0)
+    rollout.draw_model(count, chosen.mfd_spread, generator, chosen.mfd_scale)
+    level = torch.linspace(0.0, 1.0, count // 2).repeat_interleave(2)  # in twos: one of each kind of noise
+    nominal = rollout.demand.unsqueeze(1).expand(-1, count, -1, -1)
+    demand = rollout.perturb(nominal, level, chosen.noise, chosen.noise_all, generator)
+    if chosen.demand_low < chosen.demand_high:
+        low, high = chosen.levels
+        demand = demand * (low + (high - low) * level[torch.randperm(count, generator=generator)]).to(
+            demand)[:, None, None]
+    with torch.no_grad():
+        total = rollout.total_time_spent(policy, torch.zeros_like(demand[0]), demand, generator)
+    return torch.log(total).mean().exp().item()
+
+
+def visited(policy: Policy, rollout: Rollout, chosen: Training, seed: int) -> np.ndarray:
+    """States (N, R*R) [-], as a share of the policy's scale, that `policy` sees in rollouts like those in training."""
+    generator = torch.Generator().manual_seed(seed)
+    rollout.draw_model(4 * chosen.batch, chosen.mfd_spread, generator, chosen.mfd_scale)
+    x, demand = rollout.random_start(
+        4 * chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
+    demand = rollout.perturb(
+        demand, torch.rand(4 * chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
+    with torch.no_grad():
+        _, seen = rollout.states(policy, x, demand, generator)
+        return (seen / policy.scale).flatten(0, 1).flatten(-2).double().cpu().numpy()
+
+
+def _state(configuration, step, best, history, policy, optimizer, generator) -> dict:
+    return {
+        "configuration": configuration, "step": step, "best": best, "history": history,
+        "policy": policy.state_dict(), "optimizer": optimizer.state_dict(), "generator": generator.get_state()}
+
+
+def _restore(state_file: Path, configuration, policy, optimizer, generator) -> tuple[int, float, list]:
+    try:
+        state = torch.load(state_file, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise InputError(f"{state_file}: nothing to resume; train without --resume") from None
+    except Exception:
+        raise InputError(f"{state_file}: is damaged; remove it and train without --resume") from None
+    try:
+        there = dict(state["configuration"])
+        for key, value in configuration.items():
+            if there.get(key) != value:
+                raise InputError(
+                    f"{state_file}: {key}: was {there.get(key)!r}, now {value!r}; resume with the same settings or "
+                    "train without --resume")
+        policy.load_state_dict(state["policy"])
+        optimizer.load_state_dict(state["optimizer"])
+        generator.set_state(state["generator"])
+        return int(state["step"]), float(state["best"]), list(state["history"])
+    except InputError:
+        raise
+    except Exception:
+        raise InputError(f"{state_file}: is damaged; remove it and train without --resume") from None
+
+
+def _write(content: dict, path: Path) -> None:
+    buffer = io.BytesIO()  # given a path, torch would write its name into the file: never the same bytes twice
+    torch.save(content, buffer)
+    with atomic(path) as temporary:
+        temporary.write_bytes(buffer.getvalue())

@@ -1,0 +1,1 @@
+"""Economic model predictive control."""

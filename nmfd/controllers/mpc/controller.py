@@ -1,0 +1,229 @@
+"""Economic model predictive control: the least total time spent over a horizon of the regional model.
+
+As in Tumu et al.: perimeter control alone ("mpc-pc") or with route guidance ("mpc-pcrg"), the demand known ahead,
+nothing assumed beyond the horizon. Not as there: single shooting, so that only the controls are unknown, with exact
+gradients by the adjoint method (edge_model), and projected gradients (projected_gradient). Every control is bounded or
+in a simplex and acts linearly on the model, so that nearly all of them end at a bound; finding out which takes a few
+gradients, while an interior-point method factorises the whole horizon some twenty times.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from nmfd.controllers.mpc.edge_model import Turns, build, vehicle_steps, vehicles_at_stake
+from nmfd.controllers.mpc.projected_gradient import AT_REST, Minimum, minimise
+from nmfd.controllers.pi_gating import PiGating
+from nmfd.model.regional_model import Network
+from nmfd.model.scenario import Scenario
+from nmfd.runs import config
+from nmfd.types import Controls, Measurement
+
+ROUNDING = 0.005    # of the smallest jam accumulation: over which the solver sees the kink of the MFD there rounded off
+# The solver stops when, to first order, no admissible plan can save more than this share of the total time spent. A
+# tenth changes the benchmark's total time spent by less than 1 %, either way. At its limits it may stop at ACCEPTABLE.
+TOLERANCE = 1e-6
+ACCEPTABLE = 1e-5
+FEW = 5.0           # veh: added to the vehicles that a control decides on, where these scale the solver's steps
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """The table [controllers.mpc-pc] or [controllers.mpc-pcrg] of scenario.toml.
+
+    horizon: control intervals that the plan looks ahead
+    max_iterations: of the solver, per decision
+    time_limit: deadline of the solver, per decision [s]; default the control interval, as a later answer would be of
+        no use
+    """
+
+    horizon: int
+    max_iterations: int
+    time_limit: float
+
+
+def options(scenario: Scenario, name: str) -> Options:
+    """The options of controller `name`, checked; InputError for an unknown key or a wrong value."""
+    where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
+    table = config.Table(scenario.controller_options.get(name, {}), where, f"controllers.{name}.")
+    chosen = Options(
+        horizon=table.integer("horizon", 8, low=2, high=1000),
+        max_iterations=table.integer("max_iterations", 1000),
+        time_limit=table.number("time_limit", scenario.step, above=0.0))
+    table.close()
+    return chosen
+
+
+class Admissible:
+    """The plans (K, E + V) of edge_model that a controller may choose: u in its bounds, theta in simplices.
+
+    Without guidance theta is the nominal one.
+    """
+
+    def __init__(self, network: Network, model: Turns, *, guidance: bool):
+        self._network, self._model, self._guidance = network, model, guidance
+        self._edges = len(model.edges)
+        unused = np.setdiff1d(np.arange(network.regions), model.destinations)
+        self._unused = (slice(None), slice(None), unused)
+
+    def open(self, moves: int) -> np.ndarray:
+        """The plan without control: perimeters open, nominal splits."""
+        return np.tile(np.concatenate([np.full(self._edges, self._network.u_max), self._model.own]), (moves, 1))
+
+    def project(self, plan: np.ndarray) -> np.ndarray:
+        """The nearest admissible plan."""
+        perimeter = np.clip(plan[:, :self._edges], self._network.u_min, self._network.u_max)
+        if not self._guidance:
+            return np.concatenate([perimeter, np.broadcast_to(self._model.own, plan[:, self._edges:].shape)], axis=1)
+        return np.concatenate([perimeter, self._simplices(plan[:, self._edges:])], axis=1)
+
+    def _simplices(self, splits: np.ndarray) -> np.ndarray:
+        """The nearest shares (K, V) >= 0 whose sum is 1 over the turns of every cell (Michelot, 1986)."""
+        groups, value = self._groups(len(splits)), splits.ravel()
+        count = groups.max(initial=-1) + 1
+        positive = np.ones(len(value), dtype=bool)
+        while True:
+            surplus = np.bincount(groups, np.where(positive, value, 0.0), count) - 1.0
+            level = (surplus / np.maximum(np.bincount(groups, positive, count), 1.0))[groups]
+            still = positive & (value > level)
+            if still.sum() == positive.sum():
+                return np.where(positive, value - level, 0.0).reshape(splits.shape)
+            positive = still
+
+    def gap(self, plan: np.ndarray, gradient: np.ndarray) -> float:
+        """What the best admissible plan would save if the objective were linear [its unit]."""
+        u, of_u = plan[:, :self._edges], gradient[:, :self._edges]
+        saved = float((of_u * (u - np.where(of_u > 0, self._network.u_min, self._network.u_max))).sum())
+        if not self._guidance or not len(self._model.turns):
+            return saved
+        splits, of_splits = plan[:, self._edges:], gradient[:, self._edges:]
+        groups = self._groups(len(plan))
+        least = np.full(groups.max() + 1, np.inf)
+        np.minimum.at(least, groups, of_splits.ravel())
+        return saved + float((splits.ravel() * (of_splits.ravel() - least[groups])).sum())
+
+    def _groups(self, moves: int) -> np.ndarray:
+        """(K * V,) int: the simplex, one per interval and cell, of every share."""
+        cells = len(self._model.region)
+        return (cells * np.arange(moves)[:, None] + self._model.source).ravel()
+
+    def controls(self, decision: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """Perimeter (R, R) and splits (R, R, R), or None without guidance, of one interval (E + V,) of a plan."""
+        perimeter = np.where(self._network.adjacency, self._network.u_max, 0.0)
+        perimeter[tuple(self._model.edges.T)] = decision[:self._edges]
+        if not self._guidance:
+            return perimeter, None
+        splits = np.zeros((self._network.regions,) * 3)
+        splits[self._unused] = self._network.nominal_splits[self._unused]
+        splits[tuple(self._model.turns.T)] = decision[self._edges:]
+        return perimeter, splits
+
+    def decision(self, perimeter: np.ndarray, splits: np.ndarray) -> np.ndarray:
+        """One interval (E + V,) of a plan, of perimeter (R, R) and splits (R, R, R)."""
+        return np.concatenate([perimeter[tuple(self._model.edges.T)], splits[tuple(self._model.turns.T)]])
+
+
+class EconomicMpc:
+    """Economic MPC on the scenario's own regional model and demand (nmfd.types.Controller).
+
+    The solver starts from its last plan, moved on by one interval, or from no control where that is better. Where it
+    stops short of its tolerance, the status says why; the best plan that it has found, which is never worse than the
+    one that it started from, is used. Where it finds none (it fails, diverges, or meets its deadline first), the last
+    plan is used, moved on, for as long as it reaches, and then PI gating takes over, or without a protected region the
+    open perimeter, until the solver is back. The backlog counts as demand of the first interval; negative measurements
+    count as 0.
+    """
+
+    def __init__(self, scenario: Scenario, *, guidance: bool):
+        """InputError for a wrong option."""
+        self.name = "mpc-pcrg" if guidance else "mpc-pc"
+        self.options = options(scenario, self.name)
+        network, horizon = scenario.network, self.options.horizon
+        used = np.flatnonzero(scenario.forecast.sum(axis=(0, 1)) > 0)
+        self._used = used if len(used) else np.arange(network.regions)
+        self._demand, self._step, self._steps = scenario.forecast, scenario.step, scenario.steps
+        # With one Euler step per interval, the last controls move vehicles that the horizon does not see arrive.
+        blind = scenario.integrator == "euler" and scenario.substeps == 1
+        self._moves = horizon - 1 if blind else horizon
+        self._model = build(network, self._used, guidance=guidance)
+        rounded = replace(self._model, rounding=ROUNDING * min(mfd.jam for mfd in network.mfds))
+        scheme: dict = {"step": scenario.step, "substeps": scenario.substeps, "integrator": scenario.integrator}
+        self._exact: Callable = partial(vehicle_steps, self._model, **scheme)
+        self._rounded: Callable = partial(vehicle_steps, rounded, gradient=True, **scheme)
+        self._at_stake: Callable = partial(vehicles_at_stake, self._model, **scheme)
+        self.admissible = Admissible(network, self._model, guidance=guidance)
+        self._open = self.admissible.open(self._moves)
+        self._gating = PiGating(scenario) if scenario.protected else None
+        self.fault: str | None = None  # injected (nmfd.faults)
+        self.reset()
+
+    def reset(self, seed: int = 0) -> None:
+        self._plan, self._left = self._open, 0  # left: intervals of the plan that are still to come
+        self._gates = False  # PI gating is in control
+
+    def act(self, measurement: Measurement) -> Controls:
+        start, demand = self.forecast(measurement)
+        last = np.concatenate([self._plan[1:], self._plan[-1:]]) if self._left else self._open
+        if self._left and self._exact(start, demand, self._open)[0] < self._exact(start, demand, last)[0]:
+            last = self._open
+        try:
+            found = self._solve(start, demand, last)
+        except (ArithmeticError, ValueError, RuntimeError) as error:  # of NumPy and SciPy, LinAlgError too
+            return self._without(measurement, last, f"solver failed ({type(error).__name__})")
+        known = np.isfinite(found.gap)
+        solved = found.reason is None or (known and found.gap <= ACCEPTABLE * found.value)
+        if not solved and (found.point is last or not known) and found.reason != AT_REST:
+            return self._without(measurement, last, found.reason)
+        self._plan, self._left, self._gates = found.point, self._moves - 1, False
+        return self._first(status="ok" if solved else f"{found.reason}: best plan so far used")
+
+    def _without(self, measurement: Measurement, last: np.ndarray, reason: str) -> Controls:
+        """The controls of an interval for which no plan was found."""
+        self._plan = last
+        if self._left:
+            self._left -= 1
+            return self._first(status=f"{reason}: last plan used")
+        if self._gating is None or not np.isfinite(measurement.accumulation).all():
+            return replace(self._first(), status=f"{reason}: perimeter opened, nominal splits")
+        if not self._gates:
+            self._gating.reset()
+        self._gates = True
+        _, splits = self.admissible.controls(self._open[0])
+        return replace(self._gating.act(measurement), splits=splits, status=f"{reason}: pi-gating in control")
+
+    def _first(self, status: str = "ok") -> Controls:
+        """The first interval of the plan."""
+        perimeter, splits = self.admissible.controls(self._plan[0])
+        return Controls(perimeter=perimeter, splits=splits, status=status)
+
+    def cost(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> float:
+        """Total time spent over the horizon [veh s] by the exact model, under a plan (moves, E + V)."""
+        return self._step * self._exact(start, demand, plan)[0]
+
+    def forecast(self, measurement: Measurement) -> tuple[np.ndarray, np.ndarray]:
+        """The cells (C,) [veh] now and the demand (horizon, C) [veh/s] of them, as edge_model numbers them."""
+        first, horizon = min(measurement.step, self._steps), self.options.horizon
+        known = self._demand[first:first + horizon]
+        demand = np.zeros((horizon, *known.shape[1:]))
+        demand[:len(known)] = known
+        demand[0] += measurement.backlog / self._step
+        start = np.maximum(measurement.accumulation, 0.0)[:, self._used].ravel()
+        return start, demand[:, :, self._used].reshape(horizon, -1)
+
+    def _solve(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> Minimum:
+        """The best plan found from `plan` (moves, E + V); its value, in vehicles, is that of the rounded model."""
+        if self.fault == "solver-fails":
+            raise FloatingPointError("ordered")
+        if self.fault == "solver-late":
+            return Minimum(point=plan, value=np.inf, gap=np.inf, evaluations=0, reason="time limit")
+        objective = _diverging if self.fault == "solver-diverges" else partial(self._rounded, start, demand)
+        return minimise(
+            objective, self.admissible.project, self.admissible.gap, plan,
+            metric=(self._at_stake(start, demand, plan) + FEW) ** 2, tolerance=TOLERANCE,
+            iterations=self.options.max_iterations, seconds=self.options.time_limit)
+
+
+def _diverging(plan: np.ndarray) -> tuple[float, np.ndarray]:
+    return np.nan, np.full_like(plan, np.nan)

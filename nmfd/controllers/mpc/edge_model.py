@@ -1,0 +1,234 @@
+"""The regional model along the list of its turns, with exact gradients: for optimisation, also over many regions.
+
+A turn (i, h, j) is the way of the vehicles in i bound for j over the boundary to h: theta in edge-list form. Only turns
+and destinations in use are listed, so that a plane city costs R^2 and not R^3. The equations are those of
+`nmfd.model.dynamics`; the gradient of the total time spent follows by the adjoint method, at about the
+cost of two more rollouts.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, Network
+
+# Weights of the slopes of an explicit Runge-Kutta scheme, and where each slope but the first is taken, in steps along
+# the slope before it.
+SCHEMES = {"euler": ((1.0,), ()), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.5, 0.5, 1.0))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Turns:
+    """One network with J destinations in use, as C = R J cells x_ij, E edges u_ih and V turns theta_ihj.
+
+    destinations: (J,) int; cells are numbered (i, n) -> i J + n for the n-th of them
+    edges: (E, 2) int, the (i, h) that a turn crosses; turns: (V, 3) int, the (i, h, j)
+    edge: (V,) int, edge of every turn; source, target: (V,) int, the cells x_ij and x_hj of every turn
+    own: (V,) [-], the nominal theta_ihj
+    region: (C,) int; ends: (C,) bool, trips end here (i = j)
+    a, b, c, jam: (R,) of the MFDs
+    exit_rates: (C,) [-]; capacity: (E,) [veh/s] under u = 1, or None; storage: (R,) [veh] or None
+    rounding: [veh], width over which the kink of the MFDs at the jam accumulation is rounded off; 0 for the exact model
+    """
+
+    destinations: np.ndarray
+    edges: np.ndarray
+    turns: np.ndarray
+    edge: np.ndarray
+    source: np.ndarray
+    target: np.ndarray
+    own: np.ndarray
+    region: np.ndarray
+    ends: np.ndarray
+    a: np.ndarray
+    b: np.ndarray
+    c: np.ndarray
+    jam: np.ndarray
+    exit_rates: np.ndarray
+    capacity: np.ndarray | None
+    storage: np.ndarray | None
+    rounding: float
+
+
+def build(network: Network, destinations: np.ndarray, *, guidance: bool) -> Turns:
+    """The turns of vehicles bound for `destinations` (J,): all possible ones with guidance, else the nominal ones."""
+    regions, count = network.regions, len(destinations)
+    in_use = np.isin(np.arange(regions), destinations)
+    turns = np.argwhere((network.split_mask if guidance else network.nominal_splits > 0) & in_use)
+    here, onward, bound = turns.T
+    number = np.zeros(regions, dtype=int)
+    number[destinations] = np.arange(count)
+    edges, edge = np.unique(here * regions + onward, return_inverse=True)
+    cells, edges = np.arange(regions * count), np.stack([edges // regions, edges % regions], axis=1)
+    rates = np.ones(network.adjacency.shape) if network.exit_rates is None else network.exit_rates
+    return Turns(
+        exit_rates=rates[:, destinations].ravel(), storage=network.storage,
+        capacity=None if network.capacity is None else network.open_capacity[tuple(edges.T)],
+        destinations=destinations, edges=edges, turns=turns, edge=edge,
+        source=here * count + number[bound], target=onward * count + number[bound],
+        own=network.nominal_splits[here, onward, bound], region=cells // count,
+        ends=cells // count == np.asarray(destinations)[cells % count],
+        **{name: np.array([getattr(m, name) for m in network.mfds]) for name in ("a", "b", "c", "jam")},
+        rounding=0.0)
+
+
+def rate(model: Turns, accumulation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """q_i [1/s] (R,) and dq_i/dx_i [1/(veh s)] (R,) of the accumulations x_i (R,) [veh].
+
+    With rounding r, min(x, jam) is (x + jam - sqrt((x - jam)^2 + r^2)) / 2: off by r/2 at the jam accumulation, and by
+    less than r^2 / (4 |x - jam|) elsewhere.
+    """
+    above = accumulation - model.jam
+    spread = np.sqrt(above**2 + model.rounding**2)
+    share = 0.5 - 0.5 * above / np.maximum(spread, 1e-12)  # d min(x, jam) / dx
+    body = 0.5 * (accumulation + model.jam - spread)
+    top = accumulation - body + model.jam
+    q = ((model.a * body + model.b) * body + model.c) * model.jam / top
+    return q, ((2.0 * model.a * body + model.b) * share * model.jam - q * (1.0 - share)) / top
+
+
+def derivative(
+    model: Turns, x: np.ndarray, demand: np.ndarray, perimeter: np.ndarray, splits: np.ndarray,
+) -> tuple[np.ndarray, tuple]:
+    """dx/dt (C,) [veh/s] of x (C,) [veh] under demand (C,) [veh/s], perimeter (E,) [-] and splits (V,) [-].
+
+    Also what `pull_derivative` needs.
+    """
+    cells = len(x)
+    accumulation = x.reshape(len(model.jam), -1).sum(axis=1)
+    q, change_of_q = rate(model, accumulation)
+    q = model.exit_rates * q[model.region]
+    leaving = q * x
+    wish = splits * leaving[model.source]
+    boundary = None
+    share = perimeter
+    if model.capacity is not None:
+        boundary = _boundary(model, np.bincount(model.edge, wish, len(model.edges)), perimeter, accumulation)
+        share = boundary[0]
+    transfers = share[model.edge] * wish
+    change = demand - np.where(model.ends, leaving, 0.0)
+    change -= np.bincount(model.source, transfers, cells)
+    change += np.bincount(model.target, transfers, cells)
+    return change, (x, leaving, q, change_of_q, wish, share, boundary)
+
+
+def _boundary(model: Turns, wish: np.ndarray, perimeter: np.ndarray, accumulation: np.ndarray) -> tuple:
+    """The share of `wish` (E,) [veh/s] that passes (dynamics.passing) [-], and how it changes (E,) with the wish
+    [s/veh], with u [-] and with the accumulation of the region ahead [1/veh]."""
+    ahead = model.edges[:, 1]
+    free = 1.0 - accumulation[ahead] / model.storage[ahead]
+    room, open_capacity = np.maximum(free, LEAST_ROOM), model.capacity
+    limit = perimeter * open_capacity * room + LEAST_LIMIT
+    ratio = wish / limit
+    power = ratio ** (SHARPNESS - 1)
+    share = (1.0 + power * ratio) ** (-1.0 / SHARPNESS)
+    of_ratio = -power * share / (1.0 + power * ratio)
+    of_limit = -of_ratio * ratio / limit
+    of_ahead = np.where(free > LEAST_ROOM, -perimeter * open_capacity / model.storage[ahead], 0.0)
+    return share, of_ratio / limit, of_limit * open_capacity * room, of_limit * of_ahead
+
+
+def pull_derivative(
+    model: Turns, price: np.ndarray, perimeter: np.ndarray, splits: np.ndarray, record: tuple,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The worth of x (C,), of the perimeter (E,) and the splits (V,), where a unit of dx/dt is worth `price` (C,)."""
+    x, leaving, q, change_of_q, wish, share, boundary = record
+    regions, edges = len(model.jam), len(model.edges)
+    gain = price[model.target] - price[model.source]
+    of_perimeter = np.bincount(model.edge, gain * wish, edges)
+    of_wish, of_accumulation = share[model.edge] * gain, 0.0
+    if boundary is not None:
+        of_share = of_perimeter
+        _, by_wish, by_perimeter, by_ahead = boundary
+        of_wish = of_wish + (of_share * by_wish)[model.edge]
+        of_perimeter = of_share * by_perimeter
+        of_accumulation = np.bincount(model.edges[:, 1], of_share * by_ahead, regions)
+    of_leaving = np.bincount(model.source, splits * of_wish, len(x)) - np.where(model.ends, price, 0.0)
+    of_region = of_accumulation + change_of_q * (of_leaving * model.exit_rates * x).reshape(regions, -1).sum(axis=1)
+    return q * of_leaving + of_region[model.region], of_perimeter, of_wish * leaving[model.source]
+
+
+def advance(
+    model: Turns, x, demand, perimeter, splits, step: float, integrator: str = "euler",
+) -> tuple[np.ndarray, list]:
+    """x (C,) after `step` [s] by one step of the integrator, and what `pull_advance` needs."""
+    weights, nodes = SCHEMES[integrator]
+    total, records, at = np.zeros_like(x), [], x
+    for stage, weight in enumerate(weights):
+        slope, record = derivative(model, at, demand, perimeter, splits)
+        records.append(record)
+        total += weight * slope
+        if stage < len(nodes):
+            at = x + step * nodes[stage] * slope
+    return x + step * total, records
+
+
+def pull_advance(
+    model: Turns, price, perimeter, splits, records: list, step: float, integrator: str = "euler",
+) -> tuple[np.ndarray, np.ndarray]:
+    """The worth of x (C,) and of the decision (E + V,) before a step, where x after it is worth `price` (C,)."""
+    weights, nodes = SCHEMES[integrator]
+    of_x, of_decision, of_node = price, np.zeros(len(perimeter) + len(splits)), None
+    for stage in reversed(range(len(weights))):
+        of_slope = step * weights[stage] * price
+        if stage < len(nodes):
+            of_slope = of_slope + step * nodes[stage] * of_node
+        of_node, *more = pull_derivative(model, of_slope, perimeter, splits, records[stage])
+        of_x, of_decision = of_x + of_node, of_decision + np.concatenate(more)
+    return of_x, of_decision
+
+
+def vehicle_steps(
+    model: Turns, start: np.ndarray, demand: np.ndarray, plan: np.ndarray, step: float, *, substeps: int = 1,
+    integrator: str = "euler", gradient: bool = False,
+) -> tuple[float, np.ndarray | None]:
+    """Vehicles in the network, summed over the ends of H control intervals of `step` [s], and its gradient.
+
+    start: (C,) [veh]; demand: (H, C) [veh/s]
+    plan: (K, E + V) [-], u of the edges and theta of the turns in every interval; the last stays in force
+    The gradient (K, E + V) is None unless asked for.
+    """
+    interval, edges = _intervals(plan, len(demand), substeps), len(model.edges)
+    x, total, tape = start, 0.0, []
+    for node, k in enumerate(interval):
+        x, records = advance(
+            model, x, demand[node // substeps], plan[k, :edges], plan[k, edges:], step / substeps, integrator)
+        if gradient:
+            tape.append(records)
+        if (node + 1) % substeps == 0:
+            total += float(x.sum())
+    if not gradient:
+        return total, None
+    worth, price = np.zeros_like(plan), np.zeros_like(x)
+    for node, k in reversed(list(enumerate(interval))):
+        if (node + 1) % substeps == 0:
+            price = price + 1.0
+        price, of_decision = pull_advance(
+            model, price, plan[k, :edges], plan[k, edges:], tape.pop(), step / substeps, integrator)
+        worth[k] += of_decision
+    return total, worth
+
+
+def vehicles_at_stake(
+    model: Turns, start: np.ndarray, demand: np.ndarray, plan: np.ndarray, step: float, *, substeps: int = 1,
+    integrator: str = "euler",
+) -> np.ndarray:
+    """How many vehicles every number of the plan decides on (K, E + V) [veh]; arguments as in `vehicle_steps`.
+
+    Of an edge, those that want to cross it in that interval; of a turn, those that leave its cell.
+    """
+    edges = len(model.edges)
+    x, leaving = start, np.zeros((len(plan), len(model.turns)))
+    wish = np.zeros((len(plan), edges))
+    for node, k in enumerate(_intervals(plan, len(demand), substeps)):
+        x, records = advance(
+            model, x, demand[node // substeps], plan[k, :edges], plan[k, edges:], step / substeps, integrator)
+        now = step / substeps * records[0][1][model.source]
+        leaving[k] += now
+        wish[k] += np.bincount(model.edge, plan[k, edges:] * now, edges)
+    return np.concatenate([wish, leaving], axis=1)
+
+
+def _intervals(plan: np.ndarray, horizon: int, substeps: int) -> np.ndarray:
+    """The row of the plan in force at every integration step."""
+    return np.minimum(np.arange(horizon * substeps) // substeps, len(plan) - 1)

@@ -1,0 +1,1 @@
+"""The regional model (NMFD) and everything that follows from it alone."""

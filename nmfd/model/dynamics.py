@@ -1,0 +1,124 @@
+"""The regional model in torch, batched and differentiable (design.md, section 2). CasADi twin: dynamics_casadi.
+
+Shapes: `...` is any batch. x (..., R, R) [veh], [i, j] in region i bound for j; demand (..., R, R) [veh/s];
+perimeter (..., R, R) [-], [i, h]; splits (..., R, R, R) [-], [i, h, j].
+"""
+
+from dataclasses import dataclass
+
+import torch
+
+from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, Network
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameters:
+    """The network as tensors. a, b, c, jam: (R,) of the MFDs; adjacency, off_diagonal: (R, R), 0 or 1.
+
+    exit_rates: (R, R) [-] or None; capacity: (R, R) [veh/s] under u = 1, or None; storage: (R,) [veh]
+    """
+
+    a: torch.Tensor
+    b: torch.Tensor
+    c: torch.Tensor
+    jam: torch.Tensor
+    adjacency: torch.Tensor
+    off_diagonal: torch.Tensor
+    exit_rates: torch.Tensor | None = None
+    capacity: torch.Tensor | None = None
+    storage: torch.Tensor | None = None
+
+
+def parameters(network: Network, *, dtype=torch.float64, device="cpu") -> Parameters:
+    def tensor(values):
+        return None if values is None else torch.tensor(values, dtype=dtype, device=device)
+
+    def row(name):
+        return tensor([getattr(m, name) for m in network.mfds])
+
+    return Parameters(
+        a=row("a"), b=row("b"), c=row("c"), jam=row("jam"), adjacency=tensor(network.adjacency),
+        off_diagonal=1.0 - torch.eye(network.regions, dtype=dtype, device=device),
+        exit_rates=tensor(network.exit_rates), capacity=tensor(network.open_capacity), storage=tensor(network.storage))
+
+
+def rate(p: Parameters, accumulation: torch.Tensor) -> torch.Tensor:
+    """q_i = g_i(min(x_i, jam_i)) / x_i [1/s], of accumulation (..., R) [veh]; no division by zero at x = 0."""
+    body = torch.minimum(accumulation, p.jam)
+    return ((p.a * body + p.b) * body + p.c) * p.jam / torch.maximum(accumulation, p.jam)
+
+
+def flows(p: Parameters, x, perimeter, splits) -> tuple[torch.Tensor, torch.Tensor]:
+    """Trip completions m_ii (..., R) and transfer flows (..., R, R, R) [veh/s].
+
+    As published, u_ih m_ihj. Not published: with exit rates k_ij, m_ihj = k_ij theta_ihj q_i x_ij, and likewise m_ii;
+    with capacities, u_ih is replaced by `passing`.
+    """
+    accumulation = x.sum(-1)
+    leaving = rate(p, accumulation).unsqueeze(-1) * x
+    if p.exit_rates is not None:
+        leaving = leaving * p.exit_rates
+    completions = torch.diagonal(leaving, dim1=-2, dim2=-1)
+    wishing = (leaving * p.off_diagonal).unsqueeze(-2)
+    if p.capacity is None:
+        return completions, (perimeter * p.adjacency).unsqueeze(-1) * splits * wishing
+    transfers = splits * wishing
+    return completions, passing(p, transfers.sum(-1), perimeter, accumulation).unsqueeze(-1) * transfers
+
+
+def passing(p: Parameters, wish, perimeter, accumulation) -> torch.Tensor:
+    """The share of `wish` (..., R, R) [veh/s], from i to h, that passes a boundary with a capacity (..., R, R) [-].
+
+    The limit is u_ih times the capacity times the room in h, 1 - x_h / storage_h (boundary capacity that falls with the
+    receiving accumulation, as in Geroliminis, Haddad and Ramezani, 2013), accumulation (..., R) [veh].
+    """
+    room = (1.0 - accumulation / p.storage).clamp(min=LEAST_ROOM)
+    limit = perimeter * p.capacity * room.unsqueeze(-2)
+    return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
+
+
+def derivative(p: Parameters, x, demand, perimeter, splits) -> torch.Tensor:
+    """dx_ij/dt (..., R, R) [veh/s]."""
+    completions, transfers = flows(p, x, perimeter, splits)
+    return demand - torch.diag_embed(completions) - transfers.sum(-2) + transfers.sum(-3)
+
+
+def euler(p: Parameters, x, demand, perimeter, splits, step: float) -> torch.Tensor:
+    """x after `step` [s] by forward Euler; keeps x >= 0 where step * q <= 1 and demand >= 0."""
+    return x + step * derivative(p, x, demand, perimeter, splits)
+
+
+def rk4(p: Parameters, x, demand, perimeter, splits, step: float) -> torch.Tensor:
+    """x after `step` [s] by the classical fourth-order Runge-Kutta scheme."""
+    k1 = derivative(p, x, demand, perimeter, splits)
+    k2 = derivative(p, x + 0.5 * step * k1, demand, perimeter, splits)
+    k3 = derivative(p, x + 0.5 * step * k2, demand, perimeter, splits)
+    k4 = derivative(p, x + step * k3, demand, perimeter, splits)
+    return x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+
+INTEGRATORS = {"euler": euler, "rk4": rk4}
+# Weights of the slopes of each, and where each slope is taken, in steps along the slope before it.
+SCHEMES = {"euler": ((1.0,), (0.0,)), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0))}
+
+
+def advance(p: Parameters, x, demand, perimeter, splits, step: float, *, integrator="euler", substeps=1):
+    """x after one control interval of `step` [s], in `substeps` equal steps under constant controls and demand."""
+    for _ in range(substeps):
+        x = INTEGRATORS[integrator](p, x, demand, perimeter, splits, step / substeps)
+    return x
+
+
+def advance_counted(
+    p: Parameters, x, demand, perimeter, splits, step: float, *, integrator="euler", substeps=1,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """As `advance`, and the trips (...) [veh] that ended meanwhile, by the same scheme: for the ledger."""
+    step, ended = step / substeps, torch.zeros(x.shape[:-2], dtype=x.dtype)
+    for _ in range(substeps):
+        slope, total, completed = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(ended)
+        for weight, place in zip(*SCHEMES[integrator], strict=True):
+            completions, transfers = flows(p, x + place * step * slope, perimeter, splits)
+            slope = demand - torch.diag_embed(completions) - transfers.sum(-2) + transfers.sum(-3)
+            total, completed = total + weight * slope, completed + weight * completions.sum(-1)
+        x, ended = x + step * total, ended + step * completed
+    return x, ended

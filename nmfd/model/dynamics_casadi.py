@@ -1,0 +1,112 @@
+"""The regional model in CasADi (design.md, section 2): the twin of `dynamics`, for optimisation.
+
+The same names and equations on SX, MX or DM matrices, without a batch: x (R, R) [veh], [i, j] in region i bound for j;
+demand (R, R) [veh/s]; perimeter (R, R) [-], [i, h]; splits: a sequence of R matrices (R, R) [-], splits[i][h, j].
+Structural zeros are kept: what x, perimeter or splits leave out of their sparsity costs nothing.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, Network
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameters:
+    """The network as CasADi constants. a, b, c, jam: (R, 1) of the MFDs; adjacency: (R, R), 1 or structural zero.
+
+    exit_rates: (R, R) [-] or None; capacity: (R, R) [veh/s] under u = 1, or None; storage: (1, R) [veh]
+    """
+
+    a: ca.DM
+    b: ca.DM
+    c: ca.DM
+    jam: ca.DM
+    adjacency: ca.DM
+    exit_rates: ca.DM | None
+    capacity: ca.DM | None
+    storage: ca.DM | None
+
+
+def parameters(network: Network) -> Parameters:
+    def column(name):
+        return ca.DM([getattr(m, name) for m in network.mfds])
+
+    def matrix(values):
+        return None if values is None else ca.DM(values)
+
+    return Parameters(
+        a=column("a"), b=column("b"), c=column("c"), jam=column("jam"),
+        adjacency=ca.sparsify(ca.DM(network.adjacency.astype(float))), exit_rates=matrix(network.exit_rates),
+        capacity=matrix(network.open_capacity), storage=None if network.storage is None else ca.DM(network.storage).T)
+
+
+def splits_list(splits: np.ndarray) -> list[ca.DM]:
+    """theta (R, R, R) [i, h, j] as the R sparse matrices [h, j] that this module takes."""
+    return [ca.sparsify(ca.DM(rows)) for rows in splits]
+
+
+def rate(p: Parameters, accumulation):
+    """q_i = g_i(min(x_i, jam_i)) / x_i [1/s], of accumulation (R, 1) [veh]; no division by zero at x = 0."""
+    body = ca.fmin(accumulation, p.jam)
+    return ((p.a * body + p.b) * body + p.c) * p.jam / (accumulation + p.jam - body)
+
+
+def flows(p: Parameters, x, perimeter, splits: Sequence) -> tuple:
+    """Trip completions m_ii (R, 1) and transfer flows [veh/s], R matrices (R, R) [h, j]; options as in `dynamics`."""
+    regions, accumulation = x.shape[0], ca.sum2(x)
+    leaving = ca.repmat(rate(p, accumulation), 1, regions) * x
+    if p.exit_rates is not None:
+        leaving *= p.exit_rates
+    completions = ca.diag(leaving)
+    wishing = leaving - ca.diag(completions)
+    transfers = [splits[i] * ca.repmat(wishing[i, :], regions, 1) for i in range(regions)]
+    if p.capacity is None:
+        open_share = perimeter * p.adjacency
+    else:
+        wish = ca.vertcat(*(ca.sum2(transfer).T for transfer in transfers))
+        open_share = passing(p, wish, perimeter, accumulation) * p.adjacency
+    return completions, [
+        ca.repmat(open_share[i, :].T, 1, regions) * transfer for i, transfer in enumerate(transfers)]
+
+
+def passing(p: Parameters, wish, perimeter, accumulation):
+    """The share of `wish` (R, R) [veh/s], from i to h, that passes a boundary with a capacity (R, R) [-]."""
+    room = ca.fmax(1.0 - accumulation.T / p.storage, LEAST_ROOM)
+    limit = perimeter * p.capacity * ca.repmat(room, wish.shape[0], 1)
+    return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
+
+
+def derivative(p: Parameters, x, demand, perimeter, splits: Sequence):
+    """dx_ij/dt (R, R) [veh/s]."""
+    completions, transfers = flows(p, x, perimeter, splits)
+    leaving = ca.vertcat(*(ca.sum1(transfer) for transfer in transfers))
+    entering = sum(transfers[1:], transfers[0])
+    return demand - ca.diag(completions) - leaving + entering
+
+
+def euler(p: Parameters, x, demand, perimeter, splits: Sequence, step: float):
+    """x after `step` [s] by forward Euler; keeps x >= 0 where step * q <= 1 and demand >= 0."""
+    return x + step * derivative(p, x, demand, perimeter, splits)
+
+
+def rk4(p: Parameters, x, demand, perimeter, splits: Sequence, step: float):
+    """x after `step` [s] by the classical fourth-order Runge-Kutta scheme."""
+    k1 = derivative(p, x, demand, perimeter, splits)
+    k2 = derivative(p, x + 0.5 * step * k1, demand, perimeter, splits)
+    k3 = derivative(p, x + 0.5 * step * k2, demand, perimeter, splits)
+    k4 = derivative(p, x + step * k3, demand, perimeter, splits)
+    return x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+
+INTEGRATORS = {"euler": euler, "rk4": rk4}
+
+
+def advance(p: Parameters, x, demand, perimeter, splits: Sequence, step: float, *, integrator="euler", substeps=1):
+    """x after one control interval of `step` [s], in `substeps` equal steps under constant controls and demand."""
+    for _ in range(substeps):
+        x = INTEGRATORS[integrator](p, x, demand, perimeter, splits, step / substeps)
+    return x

@@ -1,0 +1,347 @@
+"""Estimates of x_ij from loop detectors, boundary counts and probe vehicles: an extended Kalman filter on the NMFD.
+
+After Saeedmanesh, Kouvelas and Geroliminis, "An extended Kalman filter approach for real-time state estimation in
+multi-region MFD urban networks", Transportation Research C 132 (2021); joint estimation of state and model parameters
+as in Wang and Papageorgiou, "Real-time freeway traffic state estimation based on extended Kalman filter",
+Transportation Research B 39 (2005).
+
+State: x (R, R) [veh] and, per region, three relative errors that wander about zero: of the outflow of the MFD (the
+model is wrong), of the forecast demand (it is not that day's, or vehicles cannot enter), and of the expansion of the
+loop detectors (those links are not the average link). What is measured during a control interval is predicted together
+with the state at its end: the mean accumulations, the vehicles over the boundaries, and what the probes do. The
+covariance follows from counting vehicles: every flow is Poisson, and a probe that moves is one of the vehicles that
+move. So a probe that was seen before is little news; that it left, or that another one set out, is.
+
+Bounds: no cell can hold fewer vehicles than the probes seen in it. An estimate below is projected on the bounds in the
+metric of its covariance (Simon, "Kalman filtering with state constraints", IET Control Theory and Applications 4,
+2010), which moves what correlates with it, where clipping would invent vehicles.
+
+Integrated by forward Euler in the scenario's substeps. The Jacobian is taken by forward differences, all in one batch:
+R^2 rollouts of one interval, which is a few milliseconds for 7 regions and not meant for hundreds.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.optimize import nnls
+
+from nmfd.model import dynamics
+from nmfd.model.scenario import Scenario
+from nmfd.types import Controls
+
+# The three relative errors: standard deviation [-] (of the expansion it is `Instruments.detector_error`), and the time
+# after which they are forgotten [s]: queues come and go in a quarter of an hour, which links are busy changes slowly.
+MEMORY, EXPANSION_MEMORY = 900.0, 3600.0
+OUTFLOW_ERROR, DEMAND_ERROR = 0.3, 0.3
+# Of every single flow, and of every way out of a cell as a share of what leaves it: drivers take other ways, and trips
+# are not exponential. As long as MEMORY too, but not worth a state each: white noise that sums up to the same.
+FLOW_ERROR, STRAY = 0.2, 0.02
+COUNT_ERROR = 0.3     # [-], of vehicles over a boundary, expanded from one counted gateway to all alike
+FLOOR = 0.01          # [veh^2], variance of a reading that would be exact
+DIFFERENCE = 1e-5     # of the Jacobian [veh], [-]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Instruments:
+    """What is known of the instruments.
+
+    detector_share: (R,) [-], share of the lane length of the region that loop detectors stand for; 0: none there
+    detector_error, detector_noise: (R,) [-], standard deviations of the relative error of the expanded accumulation, of
+        the part that lasts and of that which is another one in every interval
+    counted_share: (R, R) [-], [i, h] = share of the lanes over that boundary that are counted
+    counted_gateways: (R, R), their number
+    probe_share: of all vehicles [-]
+    """
+
+    detector_share: np.ndarray
+    detector_error: np.ndarray
+    detector_noise: np.ndarray
+    counted_share: np.ndarray
+    counted_gateways: np.ndarray
+    probe_share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """What was measured in one control interval; NaN where nothing was.
+
+    accumulation: (R,) [veh], mean over the interval, expanded from the detectors to the region
+    crossings: (R, R) [veh], [i, h], counted during the interval, expanded to all gateways
+    probes: (R, R) [veh], [i, j] = in region i bound for j at the end of the interval; not expanded
+    probe_departures: (R, R) [veh], [i, j] = set out during the interval; not expanded
+    """
+
+    accumulation: np.ndarray
+    crossings: np.ndarray
+    probes: np.ndarray
+    probe_departures: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Belief:
+    """mean: (3 R + R^2,), the relative errors of outflow, demand and expansion, and x by rows; covariance of it
+    probes: (R, R) [veh], where they were last seen
+    surprise: normalised squared innovation of the last update, over the number of readings that were uncertain: 1 on
+        average if the covariances are right; NaN without a reading
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    probes: np.ndarray
+    surprise: float
+
+
+class Estimator:
+    """The filter along one run: `step` once per control interval. `accumulation` (R, R) [veh] is the estimate."""
+
+    def __init__(self, scenario: Scenario, instruments: Instruments):
+        self._scenario, self._instruments = scenario, instruments
+        self._model = _Model(scenario, instruments)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin with an empty network."""
+        self._k, self._seen = 0, []
+        self.belief = self._model.empty()
+
+    @property
+    def accumulation(self) -> np.ndarray:
+        regions = self._scenario.network.regions
+        return self.belief.mean[3 * regions :].reshape(regions, regions).copy()
+
+    def step(self, controls: Controls, observation: Observation) -> np.ndarray:
+        """The estimate at the end of the interval under `controls`; the forecast is the scenario's demand."""
+        demand = self._scenario.demand[min(self._k, self._scenario.steps - 1)]
+        splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
+        # A detector that shows to the last digit what it showed twice before is stuck.
+        self._seen = [*self._seen[-2:], observation.accumulation]
+        stuck = np.ptp(self._seen, axis=0) == 0 if len(self._seen) == 3 else np.zeros(len(demand), dtype=bool)
+        loops = np.where(stuck & (observation.accumulation > 0), np.nan, observation.accumulation)
+        self.belief = self._model.advance(self.belief, demand, controls.perimeter, splits, observation, loops)
+        self._k += 1
+        return self.accumulation
+
+
+class _Model:
+    """Prediction and update. In torch: its threads are limited where runs stand side by side, NumPy's are not.
+
+    Z = (3 relative errors, x | mean accumulations (R,), crossings (E,), probes (R^2,), departures of probes (R^2,)):
+    the state at the end of an interval, and what is measured of it, jointly Gaussian. E: the boundaries (i, h).
+    """
+
+    def __init__(self, scenario: Scenario, instruments: Instruments):
+        network, self._instruments = scenario.network, instruments
+        self._step, self._substeps = scenario.step, scenario.substeps
+        self._parameters, self._probe_share = dynamics.parameters(network), instruments.probe_share
+        regions = self._regions = network.regions
+        cells = self._cells = regions**2
+        self._fastest = torch.tensor(
+            [m.rate(np.linspace(0.0, m.jam, 501)).max() for m in network.mfds])
+        if network.exit_rates is not None:
+            self._fastest *= torch.from_numpy(network.exit_rates.max(axis=1))
+        self._boundaries = np.argwhere(network.adjacency)
+        sizes = (2 * regions, regions, cells, regions, len(self._boundaries), cells, cells)
+        ends = np.cumsum(sizes)
+        (self._factors, self._expansion, self._x, self._mean, self._crossings, self._probes, self._departures) = (
+            slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True))
+        self._states, self._size = int(ends[2]), int(ends[-1])
+        self._spread = torch.from_numpy(np.concatenate([
+            np.full(regions, OUTFLOW_ERROR), np.full(regions, DEMAND_ERROR), instruments.detector_error]))
+        memory = torch.tensor([MEMORY, MEMORY, EXPANSION_MEMORY], dtype=torch.float64)
+        self._kept = torch.exp(-self._step / memory).repeat_interleave(regions)
+        kept = np.exp(-self._step / MEMORY)
+        self._lasting = float((1.0 + kept) / (1.0 - kept))  # variance of white noise over that of what lasts
+        self._turns = np.argwhere(network.split_mask)
+        self._from = torch.from_numpy(np.concatenate([  # the cell, of every event but departures
+            self._turns[:, 0] * regions + self._turns[:, 2], np.arange(regions) * (regions + 1)]))
+        vehicle, probe = (torch.from_numpy(part) for part in self._effects())
+        self._pairs = [_pairs(vehicle, vehicle), _pairs(vehicle, probe), _pairs(probe, probe)]
+        self._half = vehicle[cells : cells + regions]
+
+    def _effects(self) -> tuple[np.ndarray, np.ndarray]:
+        """(first part, events), (second part, events): what one vehicle changes in (x | mean accumulations, crossings),
+        and a probe besides in (probes, departures), by a turn (i, h, j), the end of a trip in i, a departure from i for
+        j, in this order."""
+        regions, cells = self._regions, np.arange(self._cells)
+        here, onward, bound = self._turns.T
+        number, turns = np.arange(len(here)), len(here)
+        place = np.zeros((self._cells, turns + regions + self._cells))
+        place[here * regions + bound, number] = -1.0
+        place[onward * regions + bound, number] = 1.0
+        place[np.arange(regions) * (regions + 1), turns + np.arange(regions)] = -1.0
+        place[cells, turns + regions + cells] = 1.0
+        crossing, departure = np.zeros((len(self._boundaries), place.shape[1])), np.zeros_like(place)
+        crossing[:, :turns] = (self._turns[None, :, :2] == self._boundaries[:, None]).all(axis=2)
+        departure[cells, turns + regions + cells] = 1.0
+        # An event is in the middle of the interval on average, and so counts half in the mean.
+        half = 0.5 * place.reshape(regions, regions, -1).sum(axis=1)
+        return np.concatenate([place, half, crossing]), np.concatenate([place, departure])
+
+    def empty(self) -> Belief:
+        mean, variance = np.zeros(self._states), torch.full((self._cells,), FLOOR, dtype=torch.float64)
+        return Belief(
+            mean=mean, covariance=torch.diag(torch.cat([self._spread**2, variance])).numpy(),
+            probes=np.zeros((self._regions, self._regions)), surprise=np.nan)
+
+    def advance(self, belief: Belief, demand, perimeter, splits, observation: Observation, loops) -> Belief:
+        """The belief one control interval later. loops: (R,) [veh], the accumulations that are to be trusted."""
+        z, covariance, leaving = self._predicted(belief, demand, perimeter, splits)
+        mean, posterior, surprise = z[: self._states], covariance[: self._states, : self._states], np.nan
+        reading, expected, noise = self._readings(z, leaving, observation, loops)
+        there = np.flatnonzero(np.isfinite(reading))
+        if len(there):
+            ahead = self._rows(z, covariance)[there]
+            spread = self._rows(z, ahead.T)[there] + torch.diag(torch.from_numpy(noise[there]))
+            towards = ahead[:, : self._states]
+            root = torch.linalg.cholesky(spread)
+            innovation = torch.from_numpy((reading - expected)[there])[:, None]
+            # With S = L L' the spread of the readings: L^-1 of what they say, and of what the state has to do with it.
+            whitened = torch.linalg.solve_triangular(root, torch.cat([towards, innovation], dim=1), upper=False)
+            mean = mean + (whitened[:, :-1].T @ whitened[:, -1]).numpy()
+            posterior = posterior - whitened[:, :-1].T @ whitened[:, :-1]
+            measured = there < len(reading) - self._cells  # the last ones are not: see `_readings`
+            uncertain = (spread.diagonal().numpy() > 10.0 * FLOOR)[measured].sum()
+            surprise = float((whitened[measured, -1] ** 2).sum()) / max(int(uncertain), 1)
+        posterior = (0.5 * (posterior + posterior.T)).numpy()
+        known = np.isfinite(observation.probes)
+        probes = np.where(known, observation.probes, np.maximum(z[self._probes].reshape(known.shape), 0.0))
+        lower = np.concatenate([np.full(self._x.start, -0.95), np.where(known, probes, 0.0).ravel()])
+        mean = bounded(mean, posterior, lower)
+        probes = np.minimum(probes, mean[self._x].reshape(known.shape))
+        return Belief(mean=mean, covariance=posterior, probes=probes, surprise=surprise)
+
+    def _predicted(self, belief: Belief, demand, perimeter, splits) -> tuple[np.ndarray, torch.Tensor, np.ndarray]:
+        """Z (size,), its covariance, and what leaves every cell (R^2,) [veh]."""
+        mean, errors, first = torch.from_numpy(belief.mean), self._x.start, self._expansion.start
+        # Of the flows: all inputs but the expansion.
+        inputs = torch.cat([torch.arange(first), torch.arange(errors, self._states)])
+        points = mean[inputs].repeat(len(inputs) + 1, 1)
+        points[1:] += DIFFERENCE * torch.eye(len(inputs), dtype=torch.float64)
+        outputs, moves, seen = self._rollout(points, belief.probes, demand, perimeter, splits)
+        jacobian = torch.zeros(self._size, self._states, dtype=torch.float64)
+        jacobian[:errors, :errors] = torch.diag(self._kept)
+        jacobian[errors:, inputs] = (outputs[1:] - outputs[0]).T / DIFFERENCE
+        covariance = jacobian @ torch.from_numpy(belief.covariance) @ jacobian.T
+        covariance.diagonal()[:errors] += (1.0 - self._kept**2) * self._spread**2
+        leaving = torch.zeros(self._cells, dtype=torch.float64).index_add_(
+            0, self._from, moves[: len(self._from)])  # the turns and ends of trips
+        covariance[errors:, errors:] += self._flow_noise(belief, moves, seen, leaving)
+        return torch.cat([self._kept * mean[:errors], outputs[0]]).numpy(), covariance, leaving.numpy()
+
+    def _rollout(self, points, probes, demand, perimeter, splits) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """All of Z but the relative errors at `points` (B, 2 R + R^2); and the events of the first one, (events,)
+        [veh], of all vehicles and of probes."""
+        regions, batch = self._regions, len(points)
+        duration = self._step / self._substeps
+        perimeter, splits = (torch.tensor(given, dtype=torch.float64) for given in (perimeter, splits))
+        x = points[:, 2 * regions :].reshape(batch, regions, regions)
+        outflow, wish = (1.0 + points[:, : 2 * regions].reshape(batch, 2, regions)).clamp(min=0.0).unbind(1)
+        outflow = outflow.minimum(1.0 / (duration * self._fastest))  # no more leave than there are
+        entering = duration * torch.from_numpy(demand) * wish[:, :, None]
+        n = torch.from_numpy(probes).expand(batch, -1, -1)
+        mean, crossings = torch.zeros_like(outflow), torch.zeros_like(x)
+        moves = torch.zeros(2, regions, regions, regions, dtype=x.dtype)
+        ends = torch.zeros(2, regions, dtype=x.dtype)
+        for _ in range(self._substeps):
+            completions, transfers = dynamics.flows(self._parameters, x + 1e-9, perimeter, splits)
+            completions = duration * outflow * completions
+            transfers = duration * outflow[:, :, None, None] * transfers
+            share = n / (x + 1e-9)
+            for level, part in enumerate((torch.ones_like(share), share)):
+                moves[level] += (transfers * part.unsqueeze(2))[0]
+                ends[level] += (completions * torch.diagonal(part, dim1=1, dim2=2))[0]
+            crossings = crossings + transfers.sum(3)
+            before, arrived = x.sum(2), self._probe_share * entering
+            x = x + entering - torch.diag_embed(completions) - transfers.sum(2) + transfers.sum(1)
+            n = n + arrived + _moved(share, completions, transfers)
+            mean = mean + 0.5 * (before + x.sum(2)) / self._substeps
+        departed = self._substeps * self._probe_share * entering
+        crossings = crossings[:, *self._boundaries.T]
+        outputs = torch.cat([part.reshape(batch, -1) for part in (x, mean, crossings, n, departed)], dim=1)
+        entered = (self._substeps * entering)[0].reshape(-1)
+        share = (1.0, self._probe_share)
+        here, onward, bound = self._turns.T
+        events = [torch.cat([moves[k][here, onward, bound], ends[k], share[k] * entered]) for k in (0, 1)]
+        every = events[0].clamp(min=0.0)
+        return outputs, every, events[1].clamp(min=0.0).minimum(every)
+
+    def _flow_noise(self, belief: Belief, moves, seen, leaving) -> torch.Tensor:
+        """The covariance of Z without its relative errors that comes from the flows (events,) [veh] of which `seen` are
+        probes: whole vehicles, so Poisson, and other flows than modelled, for probes and others alike."""
+        x, turns = torch.from_numpy(belief.mean[self._x]), len(self._turns)
+        cell = self._from[:turns]
+        error = FLOW_ERROR * moves
+        error[:turns] += STRAY * leaving[cell]
+        share = seen / moves.clamp(min=1e-9)
+        in_cell = torch.from_numpy(belief.probes.ravel()) / x.clamp(min=1e-9)
+        share[:turns] = torch.where(moves[:turns] > 1e-9, share[:turns], in_cell[cell].clamp(max=1.0))
+        wrong = self._lasting * error**2
+        weights = moves + wrong, seen + share * wrong, seen + share**2 * wrong
+        parts = [
+            torch.zeros(shape, dtype=x.dtype).index_put_(index[:2], value * weight[index[2]], accumulate=True)
+            for (shape, index, value), weight in zip(self._pairs, weights, strict=True)]
+        # When in the interval an event was also moves the mean: evenly distributed, a variance of 1/12 of its effect.
+        parts[0].diagonal()[self._cells : self._cells + self._regions] += self._half**2 @ moves / 3.0
+        return torch.cat([torch.cat(parts[:2], dim=1), torch.cat([parts[1].T, parts[2]], dim=1)])
+
+    def _readings(self, z: np.ndarray, leaving: np.ndarray, observation: Observation, loops: np.ndarray) -> tuple:
+        """All readings (m,), NaN where there is none, their expectation and the variance of their own noise (m,).
+
+        The last R^2 are no measurements, but keep a wrong model from going astray: that the probes are a share of the
+        vehicles. A draw of probes lasts until they leave, MEMORY at most, so the longer, the less it counts each time.
+        """
+        known = self._instruments
+        here, to = self._boundaries.T
+        mean, expansion, counts = z[self._mean], z[self._expansion], z[self._crossings]
+        share = np.maximum(known.detector_share, 1e-6)
+        boundary, gateways = (
+            np.maximum(part[here, to], low) for part, low in ((known.counted_share, 1e-6), (known.counted_gateways, 1)))
+        cells, p = np.full(self._cells, FLOOR), self._probe_share
+        there = np.maximum(z[self._x], 1.0)
+        kept = np.minimum(np.exp(-leaving / there), np.exp(-self._step / MEMORY))
+        thinning = p * (1.0 - p) * there * (1.0 + kept) / (1.0 - kept) + FLOOR
+        parts = (
+            # a share of the links sees a share of the vehicles; the lasting part of the error is a state
+            (loops, (1.0 + expansion) * mean,
+             np.maximum(mean, 1.0) * (1.0 - share) / share + (known.detector_noise * mean) ** 2 + FLOOR),
+            (observation.crossings[here, to], counts,
+             (1.0 - boundary) * (np.maximum(counts, 1.0) / boundary + COUNT_ERROR**2 * counts**2 / gateways) + FLOOR),
+            (observation.probes.ravel(), z[self._probes], cells),
+            (observation.probe_departures.ravel(), z[self._departures], cells),
+            (0.0 * observation.probes.ravel(), z[self._probes] - self._probe_share * z[self._x], thinning))
+        return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+    def _rows(self, z: np.ndarray, matrix: torch.Tensor) -> torch.Tensor:
+        """(m, n): how the readings change with Z, times a matrix (size, n)."""
+        expansion, mean = (torch.from_numpy(z[part])[:, None] for part in (self._expansion, self._mean))
+        loops = (1.0 + expansion) * matrix[self._mean] + mean * matrix[self._expansion]
+        share = matrix[self._probes] - self._probe_share * matrix[self._x]
+        return torch.cat([loops, matrix[self._crossings.start :], share])
+
+
+def _pairs(left: torch.Tensor, right: torch.Tensor) -> tuple:
+    """What of left (m, events) meets what of right (n, events) in one event, for the sums left diag(w) right' (m, n):
+    their shape, (row, column, event), product."""
+    product = left[:, None] * right[None]
+    index = product.nonzero(as_tuple=True)
+    return product.shape[:2], index, product[index]
+
+
+def _moved(share, completions, transfers):
+    """Net change (B, R, R) of what is `share` of the vehicles of every cell."""
+    out = share.unsqueeze(2) * transfers
+    return out.sum(1) - out.sum(2) - torch.diag_embed(torch.diagonal(share, dim1=1, dim2=2) * completions)
+
+
+def bounded(mean: np.ndarray, covariance: np.ndarray, lower: np.ndarray) -> np.ndarray:
+    """The point nearest to `mean` (n,), in the metric of `covariance` (n, n), that is nowhere below `lower` (n,).
+
+    It is mean + C y with multipliers y >= 0 of the bounds: a non-negative least-squares problem in y.
+    """
+    below = lower - mean
+    if (below <= 0).all():
+        return mean
+    root = np.linalg.cholesky(covariance + (1e-6 + 1e-9 * np.trace(covariance)) * np.eye(len(mean)))
+    multipliers, _ = nnls(root.T, np.linalg.solve(root, below), maxiter=30 * len(mean))
+    return np.maximum(mean + covariance @ multipliers, lower)  # beyond the bounds only what the jitter leaves

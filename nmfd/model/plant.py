@@ -1,0 +1,107 @@
+"""The regional plants: the NMFD itself and its acyclic variant."""
+
+import numpy as np
+import torch
+
+from nmfd import ledger
+from nmfd.model import acyclic, dynamics
+from nmfd.model.scenario import Scenario
+from nmfd.types import Controls, Measurement
+
+
+class NmfdPlant:
+    """The regional model as a plant (nmfd.types.Plant), in float64."""
+
+    def __init__(self, scenario: Scenario):
+        self._scenario = scenario
+        self._parameters = dynamics.parameters(scenario.network)
+        self._demand = torch.from_numpy(scenario.demand)
+
+    def reset(self, seed: int) -> Measurement:
+        """Empty network; the model is deterministic, `seed` changes nothing."""
+        self._k, self._entered, self._ended = 0, 0.0, 0.0
+        self._x = torch.zeros_like(self._demand[0])
+        return self._measurement()
+
+    def step(self, controls: Controls) -> Measurement:
+        demand = self._demand[self._k]
+        splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
+        self._x, ended = dynamics.advance_counted(
+            self._parameters, self._x, demand, torch.from_numpy(controls.perimeter), torch.from_numpy(splits),
+            self._scenario.step, integrator=self._scenario.integrator, substeps=self._scenario.substeps)
+        self._entered += float(demand.sum()) * self._scenario.step
+        self._ended += float(ended)
+        self._k += 1
+        ledger.check(
+            self._k, self._k * self._scenario.step, entered=self._entered, ended=self._ended,
+            inside=float(self._x.sum()), least=float(self._x.min()))
+        return self._measurement()
+
+    def completed(self) -> float:
+        return self._ended
+
+    def close(self) -> None:
+        pass
+
+    def _measurement(self) -> Measurement:
+        x = self._x.numpy()
+        return Measurement(
+            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=np.zeros_like(x))
+
+
+class AcyclicPlant:
+    """The acyclic regional model as a plant (nmfd.types.Plant), in float64."""
+
+    def __init__(self, scenario: Scenario):
+        self._scenario = scenario
+        self._model = acyclic.build(scenario.network)
+
+    def reset(self, seed: int) -> Measurement:
+        """Empty network; the model is deterministic, `seed` changes nothing."""
+        self._k, self._entered, self._ended, self._forced = 0, 0.0, 0.0, 0.0
+        self._x = np.zeros(len(self._model.region))
+        return self._measurement()
+
+    @property
+    def state(self) -> np.ndarray:
+        """x_ogij (C,) [veh], in the cells of `nmfd.model.acyclic.build`."""
+        return self._x.copy()
+
+    @property
+    def forced_moves(self) -> float:
+        """Vehicles since the reset [veh] whose region theta left them no way on, sent to the least-bad next region.
+
+        Taken at the rate of the beginning of each control interval.
+        """
+        return self._forced
+
+    def step(self, controls: Controls) -> Measurement:
+        scenario, model = self._scenario, self._model
+        demand = scenario.demand[self._k]
+        splits = scenario.network.nominal_splits if controls.splits is None else controls.splits
+        theta, forced = acyclic.shares(model, splits)
+        if forced.any():
+            leaving = model.exit_rates * acyclic.rate(model, self._x)[model.region] * self._x
+            passing = acyclic.transfers(model, self._x, leaving, controls.perimeter, theta)
+            self._forced += scenario.step * float(passing[model.fallback[forced]].sum())
+        self._x, ended = acyclic.advance_counted(
+            model, self._x, demand, controls.perimeter, theta, scenario.step, integrator=scenario.integrator,
+            substeps=scenario.substeps)
+        self._entered += float(demand.sum()) * scenario.step
+        self._ended += ended
+        self._k += 1
+        ledger.check(
+            self._k, self._k * scenario.step, entered=self._entered, ended=self._ended, inside=float(self._x.sum()),
+            least=float(self._x.min()))
+        return self._measurement()
+
+    def completed(self) -> float:
+        return self._ended
+
+    def close(self) -> None:
+        pass
+
+    def _measurement(self) -> Measurement:
+        x = acyclic.translate(self._model, self._x)
+        return Measurement(
+            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=np.zeros_like(x))

@@ -1,0 +1,1 @@
+"""Studies on the regional model: benchmark, robustness, scaling, ablations, bounds, and their pictures."""

@@ -1,0 +1,221 @@
+"""The benchmark: controllers x seeds on a regional plant, with a table and the paper's figures."""
+
+import math
+import statistics
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import torch
+from scipy.special import stdtrit
+
+from nmfd import closed_loop, faults
+from nmfd.controllers import registry
+from nmfd.model.plant import AcyclicPlant, NmfdPlant
+from nmfd.model.scenario import Scenario
+from nmfd.runs import run_folder
+from nmfd.runs.workers import Failure, attempt, ended, outcomes
+from nmfd.studies.text_table import aligned
+from nmfd.types import Plant, Trajectory
+
+PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
+REFERENCE = "no-control"
+CAPTION = (
+    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against no-control; control: time of all\n"
+    "decisions of a run; step: median / longest decision; failures: decisions that were a fallback, all seeds")
+BOUND_CAPTION = "above bound: TTS against the bound with the same controls, perimeter alone (PC) or with routes (PCRG)"
+
+
+def run_one(
+    run: tuple[str, int], *, scenario: Scenario, plant: str, policies: Mapping[str, Path],
+    progress: Callable[[int, int], None] | None = None,
+) -> Trajectory:
+    """The closed loop of `run` = (controller, seed), on one thread."""
+    torch.set_num_threads(1)
+    name, seed = run
+    controller = registry.make(name, scenario, policy=policies.get(name))
+    trajectory = closed_loop.run(PLANTS[plant](scenario), controller, scenario, seed=seed, progress=progress)
+    return run_folder.labelled(trajectory, controller=name, plant=plant)
+
+
+def benchmark(
+    scenario: Scenario, controllers: Sequence[str], seeds: Sequence[int], plant: str, *, out: Path,
+    policies: Mapping[str, Path] | None = None, workers: int = 1,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> list[dict]:
+    """Run what is not yet in the run folder `out`, add the figures, and return all rows of its summary.csv.
+
+    progress: called with the control intervals done and to do, and what is running.
+
+    Raises InputError, before anything is written, for a controller that cannot be made; RunFailed at the end if runs
+    failed, which the message names. Every finished run is kept, whatever happens to the others.
+    """
+    policies = policies or {}
+    for name in controllers:
+        registry.make(name, scenario, policy=policies.get(name))
+    common, settings = configuration(scenario, controllers, plant, policies)
+    wanted = [(name, seed) for name in controllers for seed in seeds]
+    session = {"scenario_folder": str(scenario.folder), "workers": workers}
+    with run_folder.open_folder(
+            out, configuration=common, controllers=settings, order=wanted, session=session) as folder:
+        todo = [run for run in wanted if run not in folder.finished]
+        failures = []
+        work = partial(run_one, scenario=scenario, plant=plant, policies=policies)
+        for run, outcome in results(work, todo, workers, scenario.steps, progress, label=_label):
+            if isinstance(outcome, Failure):
+                failures.append((f"controller {_label(run)}", outcome))
+            else:
+                folder.add(outcome)
+        if folder.finished:
+            draw(folder.path, scenario, folder.trajectories())
+        if failures:
+            raise ended(failures)
+        return folder.rows()
+
+
+def configuration(scenario: Scenario, controllers, plant: str, policies) -> tuple[dict, dict]:
+    """What all runs have in common, and what each controller depends on besides. InputError for a fault that the
+    regional model cannot have."""
+    faults.without_city(faults.of(scenario), f"{scenario.name}: faults")
+    settings = {}
+    for name in controllers:
+        policy = registry.policy_path(name, scenario, policies.get(name))
+        settings[name] = registry.fingerprint(name, policy)
+    common = {
+        "scenario": scenario.name, "scenario_hash": run_folder.scenario_hash(scenario),
+        "network": scenario.network.name,
+        "network_hash": scenario.network.hash, "plant": plant, "step_s": scenario.step, "steps": scenario.steps,
+        "measurement_std_veh": scenario.measurement_std}
+    return common, settings
+
+
+def _label(run: tuple[str, int]) -> str:
+    return f"{run[0]}, seed {run[1]}"
+
+
+def results(
+    work: Callable, todo: Sequence[tuple], workers: int, steps: int, progress, *, label: Callable[..., str],
+) -> Iterator[tuple]:
+    """(run, result or Failure) of every run, in this process if there is one worker.
+
+    work(run), or work(run, progress=...) in this process, is one closed loop of `steps` control intervals; progress
+    as in `benchmark`, with the `label` of the run.
+    """
+    report = progress or (lambda done, total, note: None)
+    total = steps * len(todo)
+    if workers > 1:
+        for done, (run, outcome) in enumerate(outcomes(work, todo, min(workers, len(todo))), start=1):
+            report(done * steps, total, f"{done}/{len(todo)} runs, last {label(run)}")
+            yield run, outcome
+        return
+    for done, run in enumerate(todo):
+        def tick(k, _, before=done * steps, run=run):
+            report(before + k, total, label(run))
+
+        yield run, attempt(partial(work, progress=tick), run)
+
+
+def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -> None:
+    """The paper's figures of `trajectories` and of their scenario, as png files in `folder`."""
+    draw_accumulations(folder, scenario, trajectories)
+    draw_scenario(folder, scenario)
+
+
+def draw_accumulations(
+    folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory], *, seed: int | None = None,
+    title: str | None = None,
+) -> None:
+    """Total and regional accumulation over time, as png files in `folder`.
+
+    seed: shown instead of the mean over seeds; title: above both pictures.
+    """
+    from nmfd.studies import plots  # workers import this module, and none of them draws
+
+    drawing = plots.figure(8.0, 4.6)
+    ax = plots.total_accumulation(drawing.subplots(), trajectories, seed)
+    drawing.suptitle(title, fontsize="medium")
+    plots.legend_below(drawing, [ax], columns=6)
+    plots.save(drawing, folder / "total_accumulation.png")
+    network = scenario.network
+    drawing, axes = plots.panels(network.regions)
+    for region, ax in enumerate(axes):
+        plots.region_accumulation(ax, network, region, trajectories, seed)
+    drawing.suptitle(title, fontsize="medium")
+    plots.legend_below(drawing, axes, columns=3)
+    plots.save(drawing, folder / "region_accumulation.png")
+
+
+def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
+    """Spawn matrix, region map and MFDs of `scenario`, as png files in `folder`."""
+    from nmfd.studies import plots
+
+    network = scenario.network
+    drawing = plots.figure(11.0, 4.8)
+    left, right = drawing.subplots(1, 2)
+    plots.spawn_matrix(left, scenario)
+    plots.demand(right, scenario)
+    plots.legend_below(drawing, [right])
+    files = [plots.save(drawing, folder / "spawn_matrix.png")]
+    drawing = plots.figure(5.5, 5.0)
+    plots.region_map(drawing.subplots(), network)
+    files.append(plots.save(drawing, folder / "region_map.png"))
+    kinds: dict = {}
+    for region, mfd in enumerate(network.mfds):
+        kinds.setdefault(mfd, []).append(region)
+    drawing, axes = plots.panels(len(kinds))
+    for ax, (mfd, regions) in zip(axes, kinds.items(), strict=True):
+        plots.mfd(ax, mfd)
+        ax.set_title("region " + ", ".join(map(str, regions)) if len(kinds) > 1 else "every region", fontsize="medium")
+    plots.legend_below(drawing, axes)
+    files.append(plots.save(drawing, folder / "mfd.png"))
+    return files
+
+
+def interval(values: Sequence[float]) -> float:
+    """Half of the 95 % interval of the mean of `values` (Student's t); NaN of a single one."""
+    if len(values) < 2:
+        return math.nan
+    return float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
+
+
+def table(rows: Sequence[Mapping]) -> str:
+    """The rows of summary.csv as text: one line per controller, means over seeds, TTS with its 95 % interval."""
+    groups: dict[str, list[Mapping]] = {}
+    for row in rows:
+        groups.setdefault(row["controller"], []).append(row)
+    tts = {name: [row["total_time_spent_veh_s"] for row in group] for name, group in groups.items()}
+    with_bound = any(name in tts for name in ("bound-pc", "bound-pcrg"))
+    lines = [["controller", "seeds", "TTS [veh s]", "change", *["above bound"] * with_bound, "final [veh]",
+              "max [veh]", "completed [veh]", "control [s]", "step [ms]", "failures"]]
+    for name, group in groups.items():
+        def mean(column, group=group):
+            return statistics.fmean(row[column] for row in group)
+
+        spread = interval(tts[name])
+        change = ""
+        if REFERENCE in tts and name != REFERENCE:
+            change = _percent(tts[name], tts[REFERENCE])
+        bound = "bound-pcrg" if "-pcrg" in name else "bound-pc"
+        above = _percent(tts[name], tts[bound]) if bound in tts and name != bound else ""
+        lines.append([
+            name, str(len(group)), _scientific(statistics.fmean(tts[name])) + (
+                "" if math.isnan(spread) else f" ± {_scientific(spread, 1)}"),
+            change, *[above] * with_bound, f"{mean('final_accumulation_veh'):,.0f}",
+            f"{mean('max_accumulation_veh'):,.0f}",
+            f"{mean('completed_veh'):,.0f}", f"{mean('evaluation_time_s'):.3g}",
+            f"{mean('control_step_ms_median'):.3g} / {max(row['control_step_ms_max'] for row in group):.3g}",
+            str(sum(row["solver_failures"] for row in group))])
+    return "\n".join([*aligned(lines), CAPTION, *[BOUND_CAPTION] * with_bound])
+
+
+def _percent(values: Sequence[float], reference: Sequence[float]) -> str:
+    """How far the mean of `values` is above that of `reference`, like +1.7 %."""
+    return f"{100 * (statistics.fmean(values) / statistics.fmean(reference) - 1):+.1f} %"
+
+
+def _scientific(value: float, digits: int = 4) -> str:
+    """Like 1.7730e8."""
+    if value == 0:
+        return "0"
+    mantissa, exponent = f"{value:.{digits}e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
