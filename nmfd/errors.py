@@ -1,5 +1,8 @@
 """The one error that a user can cause."""
 
+import difflib
+from collections.abc import Iterable
+
 
 class InputError(ValueError):
     """A mistake in a file, key, value or command line.
@@ -7,3 +10,9 @@ class InputError(ValueError):
     The message is one line that names the file, the key, the value, what is allowed and the remedy; the command
     lines print it and exit with status 2.
     """
+
+
+def did_you_mean(word: str, choices: Iterable[str]) -> str:
+    """"; did you mean ...?" with the one of `choices` that is written most like `word`; "" if none is."""
+    close = difflib.get_close_matches(word, list(choices), n=1)
+    return f"; did you mean {close[0]}?" if close else ""

@@ -148,7 +148,7 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
     scenario = scenario_of(tasks[0])
     found = simulate(tasks[0]).trajectory
     for model, same in zip(models, (True, False), strict=True):
-        plant = SumoPlant(scenario, overrides=replace(settings(scenario), measurement="estimate"),
+        plant = SumoPlant(scenario, overrides=settings(scenario).changed(measurement="estimate"),
                           model=replace(scenario, network=model))
         try:
             again = closed_loop.run(plant, registry.make("route-guidance", scenario), scenario, seed=3)

@@ -254,7 +254,7 @@ def city(tmp_path_factory):
 def in_sumo(city, *ordered, perimeter=None, watch=None, **changed):
     """The measurements and the record of a run with these faults; watch(plant) is called when it begins."""
     scenario = replace(city, faults=ordered)
-    plant = SumoPlant(scenario, overrides=replace(settings(scenario), **changed))
+    plant = SumoPlant(scenario, overrides=settings(scenario).changed(**changed))
     opened = np.where(city.network.adjacency, city.network.u_max if perimeter is None else perimeter, 0.0)
     try:
         measurements = [plant.reset(0)]

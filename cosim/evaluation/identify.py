@@ -265,7 +265,7 @@ def prediction_table(network: Network, held_out: Sequence[Observed], scheme: dic
 
 def _sumo_table(folder: Path, target: Path) -> dict[str, str]:
     """The table [sumo] of the network in `folder`, its paths seen from `target`."""
-    table = config.read(folder / "network.toml").raw_table("sumo")
+    table = config.read(folder / "network.toml").get("sumo", {})
     return {
         key: os.path.relpath(folder / value, target) if key in PATHS and isinstance(value, str) else value
         for key, value in table.items()}

@@ -103,7 +103,7 @@ def drive(
     with ExitStack() as stack:
         files = {kind: stack.enter_context(disk.atomic(path)) for kind, path in (outputs or {}).items()}
         plant = SumoPlant(
-            scenario, overrides=replace(settings(scenario), **strategy.overrides), outputs=files,
+            scenario, overrides=settings(scenario).changed(**strategy.overrides), outputs=files,
             model=model)
         stack.callback(plant.close)
         trajectory = run_folder.labelled(

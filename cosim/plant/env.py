@@ -48,4 +48,4 @@ def _city(scenario: Scenario | Path | str, steps: int | None, city: str) -> tupl
     if steps is not None:
         loaded = replace(loaded, steps=min(steps, loaded.steps), demand=loaded.demand[:steps])
     overrides = {**(parse(city).overrides if city else {}), "gateways_fixed": True}
-    return loaded, SumoPlant(loaded, overrides=replace(settings(loaded), **overrides))
+    return loaded, SumoPlant(loaded, overrides=settings(loaded).changed(**overrides))

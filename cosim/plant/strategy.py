@@ -8,17 +8,18 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario, as_modelled, guided_model, with_model
 
 ALONE = "no-control"  # the controller of a name that is only options
-FIXED, WEBSTER, ACTUATED, MAX_PRESSURE = "fixed", "webster", "actuated", "max-pressure"
-SIGNALS = (FIXED, WEBSTER, ACTUATED, MAX_PRESSURE)
-HOLD_BACK, REDISTRIBUTE = "hold-back", "redistribute"
-MODES = (HOLD_BACK, REDISTRIBUTE)
+Signals = Literal["fixed", "webster", "actuated", "max-pressure"]
+Mode = Literal["hold-back", "redistribute"]
+SIGNALS, MODES = get_args(Signals), get_args(Mode)
+FIXED, WEBSTER, ACTUATED, MAX_PRESSURE = SIGNALS
+HOLD_BACK, REDISTRIBUTE = MODES
 
 # Option -> (field of cosim.plant.settings.Settings, its value).
 _WORDS = {

@@ -12,6 +12,7 @@ from importlib import metadata
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
+from cosim.sumo.recipe import CityTable, RecipeTable
 from nmfd.errors import InputError
 from nmfd.model.regional_model import Network
 from nmfd.runs import config
@@ -78,21 +79,17 @@ def ensure_built(network: Network) -> SumoFiles:
     if network.folder is None:
         raise InputError(f"network {network.name}: was not loaded from a folder; load it with load_network")
     path = network.folder / "network.toml"
-    root = config.read(path)
-    if not root.has("sumo"):
+    content = config.read(path)
+    if "sumo" not in content:
         raise InputError(
             f'{path}: sumo: missing; this network has no city to simulate: add [sumo] with recipe = "city.toml"')
-    table = config.Table(root.raw_table("sumo"), path, "sumo.")
-    if table.has("recipe"):
-        recipe = network.folder / table.text("recipe")
-        table.close()
-        return _built(recipe, network)
-    files = SumoFiles(
-        net_file=network.folder / table.text("net"), regions_csv=network.folder / table.text("regions"))
-    table.close()
+    table = config.checked(CityTable, content["sumo"], path, "sumo.")
+    if table.recipe is not None:
+        return _built(network.folder / table.recipe, network)
+    files = SumoFiles(net_file=network.folder / table.net, regions_csv=network.folder / table.regions)
     for key, file in (("net", files.net_file), ("regions", files.regions_csv)):
         if not file.is_file():
-            raise table.error(key, f"no such file: {file}; give the path of an existing one")
+            raise config.error(path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one")
     return files
 
 
@@ -124,44 +121,29 @@ def _stamp(recipe_file: Path) -> str:
 
 
 def read_recipe(path: Path, regions: int) -> Recipe:
-    """Read and check a city.toml. Raises InputError."""
-    root = config.read(path)
-    centre, outer, signals = (root.table(key) for key in ("centre", "outer", "signals"))
-    region = centre.integer("region", high=regions - 1)
-    centre_x, centre_y = _lines(centre, "x"), _lines(centre, "y")
-    outer_x, outer_y = _lines(outer, "x"), _lines(outer, "y")
-    picture = [line.split() for line in outer.lines("regions")][::-1]
-    if [len(row) for row in picture] != [len(outer_x)] * len(outer_y):
-        raise outer.error("regions", f"expected {len(outer_y)} rows of {len(outer_x)} regions or dots; correct it")
-    nodes = {}
-    for i, x in enumerate(centre_x):
-        for j, y in enumerate(centre_y):
-            nodes[f"c{i}{j}"] = Node(id=f"c{i}{j}", x=x, y=y, region=region, centre=True)
-    for j, y in enumerate(outer_y):
-        for i, x in enumerate(outer_x):
-            inside = centre_x[0] <= x <= centre_x[-1] and centre_y[0] <= y <= centre_y[-1]
+    """Read and check a city.toml (cosim.sumo.recipe). Raises InputError."""
+    table = config.checked(RecipeTable, config.read(path), path)
+    centre, outer, signals = table.centre, table.outer, table.signals
+    if centre.region >= regions:
+        raise config.error(path, "centre.region", config.got(f"a whole number from 0 to {regions - 1}", centre.region))
+    picture, nodes = outer.picture[::-1], {}
+    for i, x in enumerate(centre.x):
+        for j, y in enumerate(centre.y):
+            nodes[f"c{i}{j}"] = Node(id=f"c{i}{j}", x=x, y=y, region=centre.region, centre=True)
+    for j, y in enumerate(outer.y):
+        for i, x in enumerate(outer.x):
+            inside = centre.x[0] <= x <= centre.x[-1] and centre.y[0] <= y <= centre.y[-1]
             word = picture[j][i]
             if inside and word == ".":
                 continue
             if inside or word not in map(str, range(regions)):
                 allowed = "a dot (it lies in the centre)" if inside else f"a region from 0 to {regions - 1}"
-                raise outer.error("regions", f"expected {allowed} at x = {x:g}, y = {y:g}, got {word!r} instead")
+                raise config.error(
+                    path, "outer.regions", f"expected {allowed} at x = {x:g}, y = {y:g}, got {word!r} instead")
             nodes[f"o{i}{j}"] = Node(id=f"o{i}{j}", x=x, y=y, region=int(word), centre=False)
-    recipe = Recipe(
-        nodes=nodes, streets=_streets(nodes), centre_speed=centre.number("speed", above=0.0),
-        outer_speed=outer.number("speed", above=0.0), pocket=centre.number("pocket", low=10.0),
-        cycle=signals.integer("cycle", low=30), yellow=signals.integer("yellow", low=1),
-        all_red=signals.integer("all_red"), left_green=signals.integer("left_green", low=1))
-    for table in (centre, outer, signals, root):
-        table.close()
-    return recipe
-
-
-def _lines(table: config.Table, key: str) -> tuple[float, ...]:
-    lines = table.numbers(key)
-    if not 3 <= len(lines) <= 10 or any(b - a < 60 for a, b in zip(lines, lines[1:], strict=False)):
-        raise table.error(key, f"expected 3 to 10 rising numbers at least 60 m apart, got {list(lines)} instead")
-    return lines
+    return Recipe(
+        nodes=nodes, streets=_streets(nodes), centre_speed=centre.speed, outer_speed=outer.speed, pocket=centre.pocket,
+        **vars(signals))
 
 
 def _streets(nodes: dict[str, Node]) -> list[tuple[str, str]]:
