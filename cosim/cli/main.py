@@ -6,6 +6,7 @@ import click
 
 from cosim.cli.city import identify, import_
 from cosim.cli.options import CONTROLLER_HELP, parsed_compliance, parsed_levels, tell
+from cosim.cli.reference import reference
 from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
 from nmfd.cli.errors import Commands, Interrupted
@@ -163,5 +164,5 @@ def sweep(
         tell(f"{failed} of {len(rows)} runs failed, see the column reason; the same command tries them again")
 
 
-for command in (run, compare, report, video, watch, identify, import_):
+for command in (run, compare, report, video, watch, identify, import_, reference):
     main.add_command(command)

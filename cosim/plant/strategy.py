@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from nmfd.controllers import registry
-from nmfd.errors import InputError
+from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, as_modelled, guided_model, with_model
 
 ALONE = "no-control"  # the controller of a name that is only options
@@ -115,4 +115,5 @@ def _unknown(name: str, word: str, *, controllers: bool) -> InputError:
     where = f"controller {name!r}" if word == name else f"strategy {name!r}: {word!r}"
     ranges = ", ".join(f"{stem}-N from {least} to {most} {unit}" for stem, (_, least, most, unit) in _NUMBERS.items())
     first = f"{', '.join(registry.choice())} or file.py:Class, with options joined by +: " if controllers else ""
-    return InputError(f"{where} is unknown; choose from {first}{', '.join(OPTIONS)} (whole numbers, {ranges})")
+    hint = did_you_mean(word, [*(registry.choice() if controllers else ()), *OPTIONS])
+    return InputError(f"{where} is unknown{hint}; choose from {first}{', '.join(OPTIONS)} (whole numbers, {ranges})")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from nmfd.controllers.pi_gating import PiGating
+from nmfd.controllers.pi_gating import PiGating, SetPoint
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config
 from nmfd.types import Controls, Measurement
@@ -22,8 +22,8 @@ class Probing:
     and never those between the others. With guidance, theta lies between the drivers' own and a point of the simplex
     drawn by lot. Everything is drawn anew every few control intervals, from the seed of the run.
 
-    Options, in [controllers.probing-pc] or [controllers.probing-pcrg]:
-        set_point: [veh], one per protected region, the middle of the set points; default the critical accumulation
+    The set points are around the option set_point ([controllers.probing-pc] or [controllers.probing-pcrg]), or else the
+    critical accumulation.
     """
 
     def __init__(self, scenario: Scenario, *, guidance: bool):
@@ -31,10 +31,10 @@ class Probing:
         self.name = "probing-pcrg" if guidance else "probing-pc"
         self._network, self._guidance, self._gating = scenario.network, guidance, None
         where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-        options = config.Table(scenario.controller_options.get(self.name, {}), where, f"controllers.{self.name}.")
+        options = config.checked(
+            SetPoint, scenario.controller_options.get(self.name, {}), where, f"controllers.{self.name}.")
         critical = tuple(scenario.network.mfds[region].critical for region in scenario.protected)
-        middle = options.numbers("set_point", critical, length=len(critical))
-        options.close()
+        middle = options.of_regions(len(critical), where, self.name) or critical
         if middle:
             self._gating = PiGating(replace(scenario, controller_options={PiGating.name: {"set_point": list(middle)}}))
             self._gating.critical = np.array(middle)

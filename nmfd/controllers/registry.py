@@ -258,3 +258,14 @@ def check_options(scenario: Scenario) -> None:
                 _WITHOUT_POLICY[name](custom)
         else:
             table.close()
+
+
+def declarations():
+    from nmfd.controllers import excitation, pi_gating
+    from nmfd.controllers.dpc import options
+    from nmfd.controllers.mpc import controller
+    from nmfd.runs.config import Settings
+    found = dict.fromkeys(names(), Settings)
+    found.update({"pi-gating": pi_gating.Options, **dict.fromkeys(("probing-pc", "probing-pcrg"), pi_gating.SetPoint),
+      **dict.fromkeys(("mpc-pc","mpc-pcrg"), controller.Options), **dict.fromkeys(_WITH_POLICY, options.Training), **dict.fromkeys(_ONLINE, options.Online)})
+    return found

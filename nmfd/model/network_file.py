@@ -47,7 +47,7 @@ class RegionTable(Settings):
     """A region; regions are numbered from 0 in the order of the file."""
 
     name: Name | None = setting("of the region; without one, its number", None)
-    position: Annotated[tuple[float, float], Field(strict=False)] = setting("where it is drawn on the map", unit="any")
+    position: Annotated[tuple[float, float], Field(strict=False)] = setting("where it is drawn on the map, in any unit")
     adjacent: Regions = setting("regions that share a boundary with it; each of them lists it, too")
     no_way_to: Regions = setting("adjacent regions into which no road leads from here", ())
     mfd: MfdTable | None = setting("its own MFD instead of that of [mfd]", None)

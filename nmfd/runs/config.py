@@ -81,7 +81,8 @@ def read(path: Path) -> dict[str, Any]:
     try:
         content = path.read_bytes()
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give the path of an existing one") from None
+        hint = did_you_mean(path.parent.name, (file.parent.name for file in path.parent.parent.glob(f"*/{path.name}")))
+        raise InputError(f"{path}: no such file{hint}; give the path of an existing one") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give a readable file") from None
     try:

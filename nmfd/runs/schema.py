@@ -1,6 +1,5 @@
 """The JSON schema of declared settings, and what a setting may be, in words."""
 
-import math
 from typing import Any
 
 from pydantic import BaseModel
@@ -70,11 +69,11 @@ def _range(schema: Schema) -> str:
     low, high, above = (schema.get(key) for key in ("minimum", "maximum", "exclusiveMinimum"))
     if above is not None:
         return f" above {above:g}" + ("" if high is None else f" up to {high:g}")
-    if low is None and high is None:
+    if low is None:
         return ""
-    if schema["type"] == "integer":
-        return f" from {low} " + ("up" if high is None else f"to {high}")
-    return f" in [{-math.inf if low is None else low:g}, {math.inf if high is None else high:g}]"
+    if high is None:
+        return f" from {low:g} up"
+    return f" from {low} to {high}" if schema["type"] == "integer" else f" in [{low:g}, {high:g}]"
 
 
 def _list(schema: Schema) -> str:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from nmfd.controllers.dpc.options import Online
 from nmfd.controllers.dpc.policy import DpcController, Policy, check_guidance, load_policy
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.model import dynamics
@@ -73,33 +74,27 @@ class ModelEstimate:
         return parts
 
 
-def options(scenario: Scenario, name: str) -> tuple[int, int, float, int]:
-    """look_ahead, iterations, learning_rate and rollouts (OnlineDpc) in the table of `name`. Raises InputError."""
+def options(scenario: Scenario, name: str) -> Online:
+    """The options in the table of `name`. Raises InputError."""
     where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-    table = config.Table(scenario.controller_options.get(name, {}), where, f"controllers.{name}.")
-    found = (
-        table.integer("look_ahead", 80, low=1), table.integer("iterations", 2, low=0),
-        table.number("learning_rate", 3e-4, above=0.0), table.integer("rollouts", 4, low=1))
-    table.close()
-    return found
+    return config.checked(Online, scenario.controller_options.get(name, {}), where, f"controllers.{name}.")
 
 
 class OnlineDpc:
     """A policy that is fine-tuned between control steps (nmfd.types.Controller).
 
     The frozen policy stays at hand: an interval is left to whichever of the two spends less time in the corrected
-    model. Options, in [controllers.dpc-pc-online] or [controllers.dpc-pcrg-online]:
-        look_ahead: control intervals of the rollouts; default 80
-        iterations: Adam steps per control interval; default 2
-        learning_rate: of Adam; default 3e-4
-        rollouts: per Adam step, each from the measured state with some noise; default 4
+    model. Options (nmfd.controllers.dpc.options.Online) are in [controllers.dpc-pc-online] or
+    [controllers.dpc-pcrg-online].
 
     demand, outflow: (R,) [-], the present estimate
     """
 
     def __init__(self, policy: Policy, scenario: Scenario):
         self.name = f"dpc-{'pcrg' if policy.architecture.guidance else 'pc'}-online"
-        self._look_ahead, self._iterations, self._learning_rate, self._count = options(scenario, self.name)
+        chosen = options(scenario, self.name)
+        self._look_ahead, self._iterations = chosen.look_ahead, chosen.iterations
+        self._learning_rate, self._count = chosen.learning_rate, chosen.rollouts
         self._scenario, self._frozen = scenario, policy.eval()
         self._rollout = Rollout(scenario)
         self._nominal = self._rollout.parameters

@@ -8,7 +8,7 @@ gradients, while an interior-point method factorises the whole horizon some twen
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -19,6 +19,7 @@ from nmfd.controllers.pi_gating import PiGating
 from nmfd.model.regional_model import Network
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config
+from nmfd.runs.config import setting, whole
 from nmfd.types import Controls, Measurement
 
 ROUNDING = 0.005    # of the smallest jam accumulation: over which the solver sees the kink of the MFD there rounded off
@@ -29,31 +30,21 @@ ACCEPTABLE = 1e-5
 FEW = 5.0           # veh: added to the vehicles that a control decides on, where these scale the solver's steps
 
 
-@dataclass(frozen=True, kw_only=True)
-class Options:
-    """The table [controllers.mpc-pc] or [controllers.mpc-pcrg] of scenario.toml.
+class Options(config.Settings):
+    """Of model predictive control."""
 
-    horizon: control intervals that the plan looks ahead
-    max_iterations: of the solver, per decision
-    time_limit: deadline of the solver, per decision [s]; default the control interval, as a later answer would be of
-        no use
-    """
-
-    horizon: int
-    max_iterations: int
-    time_limit: float
+    horizon: int = whole("control intervals that the plan looks ahead", 8, low=2, high=1000)
+    max_iterations: int = whole("of the solver, per decision", 1000)
+    time_limit: float | None = setting(
+        "deadline of the solver, per decision; without one, the control interval: a later answer is of no use", None,
+        unit="s", gt=0.0)
 
 
 def options(scenario: Scenario, name: str) -> Options:
     """The options of controller `name`, checked; InputError for an unknown key or a wrong value."""
     where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-    table = config.Table(scenario.controller_options.get(name, {}), where, f"controllers.{name}.")
-    chosen = Options(
-        horizon=table.integer("horizon", 8, low=2, high=1000),
-        max_iterations=table.integer("max_iterations", 1000),
-        time_limit=table.number("time_limit", scenario.step, above=0.0))
-    table.close()
-    return chosen
+    chosen = config.checked(Options, scenario.controller_options.get(name, {}), where, f"controllers.{name}.")
+    return chosen if chosen.time_limit is not None else chosen.changed(time_limit=scenario.step)
 
 
 class Admissible:
