@@ -1,13 +1,14 @@
 """Reference pages and JSON schemas are what the declarations of the settings give, and what is in the files."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
 import pytest
 
-from cosim.cli.reference import files
 from cosim.plant.settings import SumoTable
+from cosim.report.reference import files
 from nmfd.runs import reference, schema
 
 ROOT = Path(__file__).parents[1]
@@ -25,9 +26,9 @@ def test_every_committed_file_names_its_schema_and_has_only_keys_of_it(file):
     root = json.loads((file.parent / line.removeprefix("#:schema ")).read_text())
 
     def check(table, declared, path):
-        patterns = list(declared.get("patternProperties", {}).values())
         for key, value in table.items():
-            here = schema.resolved(root, declared["properties"].get(key) or patterns[0])
+            fitting = [other for form, other in declared.get("patternProperties", {}).items() if re.search(form, key)]
+            here = schema.resolved(root, [*fitting, declared["properties"].get(key)][0])
             for row in value if isinstance(value, list) else [value]:
                 if isinstance(row, dict):
                     check(row, schema.resolved(root, here.get("items", here)), f"{path}.{key}")

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from nmfd.controllers.options import options
 from nmfd.controllers.pi_gating import PiGating, SetPoint
 from nmfd.model.scenario import Scenario
-from nmfd.runs import config
 from nmfd.types import Controls, Measurement
 
 HOLD = (3, 9)            # control intervals between two draws, from and to
@@ -30,11 +30,8 @@ class Probing:
         """InputError for a wrong option."""
         self.name = "probing-pcrg" if guidance else "probing-pc"
         self._network, self._guidance, self._gating = scenario.network, guidance, None
-        where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-        options = config.checked(
-            SetPoint, scenario.controller_options.get(self.name, {}), where, f"controllers.{self.name}.")
         critical = tuple(scenario.network.mfds[region].critical for region in scenario.protected)
-        middle = options.of_regions(len(critical), where, self.name) or critical
+        middle = options(SetPoint, scenario, self.name).set_point or critical
         if middle:
             self._gating = PiGating(replace(scenario, controller_options={PiGating.name: {"set_point": list(middle)}}))
             self._gating.critical = np.array(middle)

@@ -1,31 +1,28 @@
 """PI gating: the entries of a protected region are metered so that its accumulation stays at a set point."""
 
-from pathlib import Path
-
 import numpy as np
 
+from nmfd.controllers.options import Options, options
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
-from nmfd.runs import config
-from nmfd.runs.config import setting
+from nmfd.runs.config import PositiveNumbers, Problem, got, setting
 from nmfd.types import Controls, Measurement
 
 
-class SetPoint(config.Settings):
-    """Of controllers that draw gates by lot."""
+class SetPoint(Options):
+    """Of controllers that hold the accumulation of the protected regions."""
 
-    set_point: config.PositiveNumbers | None = setting(
+    set_point: PositiveNumbers | None = setting(
         "accumulation of each protected region to hold; without it, from the MFD", None, unit="veh")
 
-    def of_regions(self, count: int, where: Path | str, name: str) -> tuple[float, ...] | None:
-        """set_point of `count` regions, or None. InputError for another number of them."""
-        if self.set_point is not None and len(self.set_point) != count:
-            raise config.error(
-                where, f"controllers.{name}.set_point", config.got(f"a list of {count} numbers", list(self.set_point)))
-        return self.set_point
+    def misfit(self, scenario: Scenario) -> Problem | None:
+        count = len(scenario.protected)  # without a protected region gating cannot be made, and is not made
+        if not count or self.set_point is None or len(self.set_point) == count:
+            return None
+        return Problem("set_point", got(f"a list of {count} numbers", list(self.set_point)))
 
 
-class Options(SetPoint):
+class Gating(SetPoint):
     """Of PI gating. The default gains are moderate ones from the flat part of a sweep on the benchmark, where kp from 0
     to 5 and ki from 0.01 to 0.1 differ by less than 2 % in total time spent; relative to the critical accumulation,
     they carry over to other cities."""
@@ -59,13 +56,12 @@ class PiGating:
             raise InputError(
                 f"{where}: protected: pi-gating needs at least one protected region, got none; "
                 f"add protected = [<region>, ...] with regions from 0 to {network.regions - 1}")
-        options = config.checked(
-            Options, scenario.controller_options.get(self.name, {}), where, f"controllers.{self.name}.")
+        chosen = options(Gating, scenario, self.name)
         self._regions = np.array(scenario.protected)
         self.critical = np.array([network.mfds[region].critical for region in self._regions])
-        self.set_point = np.array(options.of_regions(len(self._regions), where, self.name) or [
-            network.mfds[region].reaching(options.outflow_share) for region in self._regions])
-        self._kp, self._ki = options.kp, options.ki * scenario.step
+        self.set_point = np.array(chosen.set_point or [
+            network.mfds[region].reaching(chosen.outflow_share) for region in self._regions])
+        self._kp, self._ki = chosen.kp, chosen.ki * scenario.step
         self._open = np.where(network.adjacency, network.u_max, 0.0)
         self._entries = network.adjacency[:, self._regions]
         self._bounds = network.u_min, network.u_max

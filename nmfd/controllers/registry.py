@@ -10,9 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmfd.errors import InputError
+from nmfd.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:  # `names` must answer without numpy, torch or casadi
+    from nmfd.controllers.options import Options
     from nmfd.model.scenario import Scenario
     from nmfd.types import Controller
 
@@ -93,7 +94,8 @@ def policy_names() -> tuple[str, ...]:
 def check(name: str) -> None:
     """InputError unless `name` is a controller."""
     if not known(name):
-        raise InputError(f"controller {name!r} is unknown; choose from {', '.join(choice())}, or file.py:Class")
+        raise InputError(f"controller {name!r} is unknown{did_you_mean(name, choice())}; choose from "
+                         f"{', '.join(choice())}, or file.py:Class")
 
 
 def split(name: str) -> tuple[str, list[str]]:
@@ -216,6 +218,18 @@ def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Contro
     return dpc.load(path, scenario, guidance=_WITH_POLICY[name])
 
 
+def declarations() -> dict[str, type[Options]]:
+    """Controller -> the declaration of its options."""
+    from nmfd.controllers.dpc.options import TRAINED, Online
+    from nmfd.controllers.mpc.controller import Mpc
+    from nmfd.controllers.options import Options
+    from nmfd.controllers.pi_gating import Gating, SetPoint
+
+    return {**dict.fromkeys(names(), Options), "pi-gating": Gating, **TRAINED,
+            **dict.fromkeys(("probing-pc", "probing-pcrg"), SetPoint), **dict.fromkeys(("mpc-pc", "mpc-pcrg"), Mpc),
+            **dict.fromkeys(_ONLINE, Online)}
+
+
 def check_options(scenario: Scenario) -> None:
     """InputError for a wrong option of any controller in the scenario's [controllers], whether it is run or not.
 
@@ -224,48 +238,23 @@ def check_options(scenario: Scenario) -> None:
     """
     from dataclasses import replace
 
+    from nmfd.controllers.options import options
+    from nmfd.model.scenario_file import PlanningOptions
     from nmfd.runs import config
 
     where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-    tables = config.Table(scenario.controller_options, where, "controllers.")
-    for variant in scenario.controller_options:
+    tables = scenario.controller_options
+    declared = declarations()
+    for variant, table in tables.items():
         if variant == OWN:  # checked by those controllers, if at all
-            tables.table(OWN)
             continue
-        table, name = tables.table(variant), split(variant)[0]
+        name = split(variant)[0]
         if name not in names():
-            raise tables.error(variant, f"unknown controller; choose from {', '.join(names())}, or one of them with + "
-                               "and the options of a strategy; that of a controller of your own is "
-                               f"controllers.{OWN}.{variant}")
-        table.text("model", None)
-        options = {**scenario.controller_options.get(name, {}), **table.raw()}
-        options.pop("model", None)
-        custom = replace(scenario, controller_options=dict.fromkeys((name, variant), options))
-        if name.startswith("mpc-"):
-            from nmfd.controllers.mpc import controller
-
-            controller.options(custom, name)
-        elif name in _WITH_POLICY:
-            from nmfd.controllers.dpc import training
-
-            training.settings(custom, variant)
-        elif name in _ONLINE:
-            from nmfd.controllers.dpc import online
-
-            online.options(custom, name)
-        elif name in ("pi-gating", "probing-pc", "probing-pcrg"):
-            if scenario.protected:  # without a protected region gating cannot be made, and is not made
-                _WITHOUT_POLICY[name](custom)
-        else:
-            table.close()
-
-
-def declarations():
-    from nmfd.controllers import excitation, pi_gating
-    from nmfd.controllers.dpc import options
-    from nmfd.controllers.mpc import controller
-    from nmfd.runs.config import Settings
-    found = dict.fromkeys(names(), Settings)
-    found.update({"pi-gating": pi_gating.Options, **dict.fromkeys(("probing-pc", "probing-pcrg"), pi_gating.SetPoint),
-      **dict.fromkeys(("mpc-pc","mpc-pcrg"), controller.Options), **dict.fromkeys(_WITH_POLICY, options.Training), **dict.fromkeys(_ONLINE, options.Online)})
-    return found
+            raise config.error(
+                where, f"controllers.{variant}", f"unknown controller{did_you_mean(name, names())}; choose from "
+                f"{', '.join(names())}, or one of them with + and the options of a strategy; that of a controller of "
+                f"your own is controllers.{OWN}.{variant}")
+        own = {**tables.get(name, {}), **table}
+        model = {"model": own.pop("model")} if "model" in own else {}
+        config.checked(PlanningOptions, model, where, f"controllers.{variant}.")
+        options(declared[name], replace(scenario, controller_options={name: own}), name, variant)

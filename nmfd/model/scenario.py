@@ -12,7 +12,7 @@ import numpy as np
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.model.regional_model import Network, check_step, load_network
-from nmfd.model.scenario_file import MOST_NUMBERS, ScenarioTable, read_tables
+from nmfd.model.scenario_file import MOST_NUMBERS, PlanningOptions, ScenarioTable, read_tables
 from nmfd.runs import config
 
 GUIDED = "guided"         # in a network's folder: that of the same city's model with guided drivers
@@ -181,10 +181,9 @@ def as_modelled(scenario: Scenario, controller: str) -> Scenario:
     options = {**tables.get(name, {}), **tables.get(controller, {})}
     configured = replace(scenario, controller_options={**tables, name: options})
     if "model" in options and scenario.folder is not None:
-        table = config.Table(options, scenario.folder / "scenario.toml", f"controllers.{controller}.")
-        folder = scenario.folder / table.text("model")
-        del options["model"]
-        return with_model(configured, folder, functools.partial(table.error, "model"))
+        where, table = scenario.folder / "scenario.toml", f"controllers.{controller}."
+        model = config.checked(PlanningOptions, {"model": options.pop("model")}, where, table).model
+        return with_model(configured, scenario.folder / model, functools.partial(config.error, where, f"{table}model"))
     if name.startswith(GUIDING) and (folder := guided_model(scenario.network)) is not None:
         return with_model(configured, folder)
     return configured

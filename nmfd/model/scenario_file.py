@@ -41,6 +41,14 @@ class DemandTable(Settings):
     both_ways: bool = setting("the same flow the other way, too", False)
 
 
+class PlanningOptions(Settings):
+    """Of every controller, beside its own options."""
+
+    model: Text | None = setting(
+        "folder of the regional model that it plans with; without it, that of the scenario's network or, of "
+        "controllers that guide routes, the one in the folder guided of that network", None)
+
+
 class ScenarioTable(Settings):
     """What happens: a network, its demand, the noise, for how long."""
 

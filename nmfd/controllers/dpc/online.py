@@ -15,9 +15,9 @@ import torch
 from nmfd.controllers.dpc.options import Online
 from nmfd.controllers.dpc.policy import DpcController, Policy, check_guidance, load_policy
 from nmfd.controllers.dpc.rollout import Rollout
+from nmfd.controllers.options import options
 from nmfd.model import dynamics
 from nmfd.model.scenario import Scenario
-from nmfd.runs import config
 from nmfd.types import Controls, Measurement
 
 MEMORY = 0.97  # of what was seen, per control interval: half is forgotten after 23
@@ -74,12 +74,6 @@ class ModelEstimate:
         return parts
 
 
-def options(scenario: Scenario, name: str) -> Online:
-    """The options in the table of `name`. Raises InputError."""
-    where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-    return config.checked(Online, scenario.controller_options.get(name, {}), where, f"controllers.{name}.")
-
-
 class OnlineDpc:
     """A policy that is fine-tuned between control steps (nmfd.types.Controller).
 
@@ -92,7 +86,7 @@ class OnlineDpc:
 
     def __init__(self, policy: Policy, scenario: Scenario):
         self.name = f"dpc-{'pcrg' if policy.architecture.guidance else 'pc'}-online"
-        chosen = options(scenario, self.name)
+        chosen = options(Online, scenario, self.name)
         self._look_ahead, self._iterations = chosen.look_ahead, chosen.iterations
         self._learning_rate, self._count = chosen.learning_rate, chosen.rollouts
         self._scenario, self._frozen = scenario, policy.eval()

@@ -1,17 +1,28 @@
 """The options of DPC policies, declared: how they are trained, and how one goes on learning while it drives."""
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import model_validator
 
-from nmfd.runs.config import Problem, Settings, setting, whole
+from nmfd.controllers.options import Options
+from nmfd.model.scenario import Scenario
+from nmfd.runs.config import Problem, setting, whole
 
 MOST_STEPS = 10**7
 WIDEST, DEEPEST = 10_000, 100  # units per layer, layers: of a policy that fits into memory
 Activation = Literal["gelu", "relu", "tanh", "soft-exponential"]
 
 
-class Training(Settings):
+ROBUST_NOISE = 3.0  # veh/s
+
+
+def _noise(default: float) -> Any:
+    return setting(
+        "largest standard deviation of the Gaussian noise on the demand of the pairs that have any, at every step; "
+        "every rollout has its own, evenly from 0 to this", default, unit="veh/s", ge=0.0, le=1e6)
+
+
+class Training(Options):
     """Of the policy, and of the training that makes it: `nmfd train SCENARIO --controller NAME`."""
 
     width: int = whole("units per hidden layer", 128, low=1, high=WIDEST)
@@ -32,10 +43,7 @@ class Training(Settings):
     initial_share: float = setting(
         "share of the rollouts that start from a random state, at a random time of the scenario", 0.5, unit="-", ge=0.0,
         le=1.0)
-    noise: float = setting(
-        "largest standard deviation of the Gaussian noise on the demand of the pairs that have any, at every step; "
-        "every rollout has its own, evenly from 0 to this; 3 for policies whose name ends in -robust", 0.0,
-        unit="veh/s", ge=0.0, le=1e6)
+    noise: float = _noise(0.0)
     noise_all: float = setting(
         "the same of noise on every pair of regions, in every other rollout, instead of noise", 0.0, unit="veh/s",
         ge=0.0, le=1e6)
@@ -60,12 +68,26 @@ class Training(Settings):
             raise Problem("from_gating", "a policy cannot begin as both, a gate and no control; omit one")
         return self
 
+    def misfit(self, scenario: Scenario) -> Problem | None:
+        if not self.from_gating or scenario.protected:
+            return None
+        return Problem("from_gating", "expected a scenario with protected regions; name them, or omit it")
+
     @property
     def levels(self) -> tuple[float, float]:
         return self.demand_low, self.demand_high
 
 
-class Online(Settings):
+class RobustTraining(Training):
+    """The same of the policies whose name ends in -robust."""
+
+    noise: float = _noise(ROBUST_NOISE)
+
+
+TRAINED = {"dpc-pc": Training, "dpc-pcrg": Training, "dpc-pc-robust": RobustTraining, "dpc-pcrg-robust": RobustTraining}
+
+
+class Online(Options):
     """Of a policy that goes on learning while it drives."""
 
     look_ahead: int = whole("control intervals of the rollouts", 80, low=1)

@@ -13,19 +13,18 @@ import numpy as np
 import torch
 
 from nmfd.controllers.dpc import fallback
-from nmfd.controllers.dpc.options import Training
+from nmfd.controllers.dpc.options import TRAINED, Training
 from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
 from nmfd.controllers.dpc.rollout import Rollout, compiled_step
+from nmfd.controllers.options import options
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
 from nmfd.model.regional_model import Network
 from nmfd.model.scenario import Scenario, as_modelled
-from nmfd.runs import config
 from nmfd.runs.files import atomic, locked, sweep
 from nmfd.runs.workers import RunFailed
 
 VALIDATE_EVERY = 20  # Adam steps
-ROBUST_NOISE = 3.0     # veh/s, of the policies whose name ends in -robust
 WORTH_COMPILING = 200  # Adam steps
 # Of the first policy from a gate: Adam steps, states in each, learning rate; width of the gate and the fullest region,
 # as a share of the set point; share of u where there is no gate.
@@ -48,13 +47,7 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
             f"--controller: {controller!r} needs a table [controllers.\"{controller}\"] in {scenario.folder}/"
             f"scenario.toml that says what is different from {name}; add one, or train {name}")
     scenario = as_modelled(scenario, controller)
-    where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-    noise = {"noise": ROBUST_NOISE} if name.endswith("-robust") else {}
-    chosen = config.checked(
-        Training, {**noise, **scenario.controller_options.get(name, {})}, where, f"controllers.{controller}.")
-    if chosen.from_gating and not scenario.protected:
-        raise config.error(where, f"controllers.{controller}.from_gating",
-                           "expected a scenario with protected regions; name them, or omit it")
+    chosen = options(TRAINED[name], scenario, name, controller)
     return chosen if steps is None else chosen.changed(steps=steps)
 
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from nmfd.controllers.mpc.edge_model import Turns, build, vehicle_steps, vehicles_at_stake
 from nmfd.controllers.mpc.projected_gradient import AT_REST, Minimum, minimise
+from nmfd.controllers.options import Options, options
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.model.regional_model import Network
 from nmfd.model.scenario import Scenario
-from nmfd.runs import config
 from nmfd.runs.config import setting, whole
 from nmfd.types import Controls, Measurement
 
@@ -30,7 +30,7 @@ ACCEPTABLE = 1e-5
 FEW = 5.0           # veh: added to the vehicles that a control decides on, where these scale the solver's steps
 
 
-class Options(config.Settings):
+class Mpc(Options):
     """Of model predictive control."""
 
     horizon: int = whole("control intervals that the plan looks ahead", 8, low=2, high=1000)
@@ -38,13 +38,6 @@ class Options(config.Settings):
     time_limit: float | None = setting(
         "deadline of the solver, per decision; without one, the control interval: a later answer is of no use", None,
         unit="s", gt=0.0)
-
-
-def options(scenario: Scenario, name: str) -> Options:
-    """The options of controller `name`, checked; InputError for an unknown key or a wrong value."""
-    where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-    chosen = config.checked(Options, scenario.controller_options.get(name, {}), where, f"controllers.{name}.")
-    return chosen if chosen.time_limit is not None else chosen.changed(time_limit=scenario.step)
 
 
 class Admissible:
@@ -130,7 +123,7 @@ class EconomicMpc:
     def __init__(self, scenario: Scenario, *, guidance: bool):
         """InputError for a wrong option."""
         self.name = "mpc-pcrg" if guidance else "mpc-pc"
-        self.options = options(scenario, self.name)
+        self.options = options(Mpc, scenario, self.name)
         network, horizon = scenario.network, self.options.horizon
         used = np.flatnonzero(scenario.forecast.sum(axis=(0, 1)) > 0)
         self._used = used if len(used) else np.arange(network.regions)
@@ -213,7 +206,7 @@ class EconomicMpc:
         return minimise(
             objective, self.admissible.project, self.admissible.gap, plan,
             metric=(self._at_stake(start, demand, plan) + FEW) ** 2, tolerance=TOLERANCE,
-            iterations=self.options.max_iterations, seconds=self.options.time_limit)
+            iterations=self.options.max_iterations, seconds=self.options.time_limit or self._step)
 
 
 def _diverging(plan: np.ndarray) -> tuple[float, np.ndarray]:
