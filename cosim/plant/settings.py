@@ -9,7 +9,7 @@ from cosim.plant.strategy import FIXED, HOLD_BACK, Mode, Signals
 from nmfd.model.scenario import Scenario
 from nmfd.model.scenario_file import read_tables
 from nmfd.runs import config
-from nmfd.runs.config import Problem, Texts, setting
+from nmfd.runs.config import Problem, Seconds, Share, Texts, setting
 
 EXACT, ESTIMATE = "exact", "estimate"
 FILES = ("routes", "background", "additional")
@@ -19,41 +19,36 @@ class SumoTable(config.Settings):
     """How the city is simulated, actuated and measured. Files are relative to the scenario's folder."""
 
     step_length: float = setting("time step of SUMO, a divisor of the control interval", 1.0, unit="s", gt=0.0, le=1.0)
-    time_to_teleport: float = setting("standing time after which SUMO moves a vehicle on; -1 for never", -1.0, unit="s",
-                                      ge=-1.0)
+    time_to_teleport: float = setting(
+        "standing time after which SUMO moves a vehicle on; -1 for never", -1.0, unit="s", ge=-1.0)
     collision_action: Literal["none", "warn", "teleport", "remove"] = setting("of SUMO", "warn")
-    actuation: Mode = setting("whether green that the perimeter control takes away is red for all, or goes to the "
-                              "other movements", HOLD_BACK)
-    min_green: float = setting("least green of a gateway movement, and of every stage under max-pressure", 5.0,
-                               unit="s", ge=1.0)
-    queue_override: float = setting(
-        "a gateway whose edge held this share of its room in the last control interval is left open; 0 for never", 0.0,
-        unit="-", ge=0.0, le=1.0)
-    compliance: float = setting("share of the decisions in which a driver follows the route guidance", 1.0, unit="-",
-                                ge=0.0, le=1.0)
-    guidance_period: float = setting(
+    actuation: Mode = setting(
+        "whether green that the perimeter control takes away is red for all, or goes to the other movements", HOLD_BACK)
+    min_green: float = setting(
+        "least green of a gateway movement, and of every stage under max-pressure", 5.0, unit="s", ge=1.0)
+    queue_override: Share = setting(
+        "a gateway whose edge held this share of its room in the last control interval is left open; 0 for never", 0.0)
+    compliance: Share = setting("share of the decisions in which a driver follows the route guidance", 1.0)
+    guidance_period: Seconds = setting(
         "guided drivers are asked again after this time in the same region; 0: when they depart and when they enter a "
-        "region only", 0.0, unit="s", ge=0.0)
-    most_detour: float = setting("drivers do not follow route guidance into a next region that costs them more", 60.0,
-                                 unit="s", ge=0.0)
+        "region only", 0.0)
+    most_detour: Seconds = setting("drivers do not follow route guidance into a next region that costs them more", 60.0)
     ways_return: bool = setting(
         "guided drivers may leave a region and come back to it where that is the fastest way of all, as on a main road "
         "along a ragged boundary", False)
-    rerouting: float = setting("share of the drivers with SUMO's own rerouting device", 0.0, unit="-", ge=0.0, le=1.0)
+    rerouting: Share = setting("share of the drivers with SUMO's own rerouting device", 0.0)
     measurement: Literal["exact", "estimate"] = setting(
         "what controllers see: the exact state, or what detectors and probes tell", EXACT)
-    detector_share: float = setting("share of the links with loop detectors", 0.3, unit="-", ge=0.0, le=1.0)
-    probe_share: float = setting("share of the vehicles that tell where they are bound for", 0.1, unit="-", ge=0.0,
-                                 le=1.0)
+    detector_share: Share = setting("share of the links with loop detectors", 0.3)
+    probe_share: Share = setting("share of the vehicles that tell where they are bound for", 0.1)
     signals: Signals = setting("control of the signals", FIXED)
     routes: Texts = setting(
         "route files of the city's own vehicles; without any, trips are drawn from the scenario's demand", ())
-    background: Texts = setting(
-        "route files of what is no demand and is left alone: public transport, persons", ())
+    background: Texts = setting("route files of what is no demand and is left alone: public transport, persons", ())
     additional: Texts = setting("SUMO's additional files: vehicle types, stops, signal programmes", ())
-    begin: float = setting("simulation time at which interval 0 begins", 0.0, unit="s", ge=0.0)
-    departure_jitter: float = setting("departures of the city's own vehicles are moved by up to this, either way, by "
-                                      "the seed", 10.0, unit="s", ge=0.0)
+    begin: Seconds = setting("simulation time at which interval 0 begins", 0.0)
+    departure_jitter: Seconds = setting(
+        "departures of the city's own vehicles are moved by up to this, either way, by the seed", 10.0)
     leave_signals: Texts = setting("signals that perimeter control leaves alone", ())
     mesoscopic: bool = setting(
         "SUMO's queue model instead of its car-following, about ten times as fast, for quick studies: no lanes and no "

@@ -58,17 +58,11 @@ class Node:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """A city.toml that was read and checked: junctions, streets between neighbours, speeds and signals."""
+    """A city.toml that was read and checked, with its junctions and the streets between neighbours."""
 
+    table: RecipeTable
     nodes: dict[str, Node]
     streets: list[tuple[str, str]]
-    centre_speed: float
-    outer_speed: float
-    pocket: float
-    cycle: int
-    yellow: int
-    all_red: int
-    left_green: int
 
 
 def ensure_built(network: Network) -> SumoFiles:
@@ -123,7 +117,7 @@ def _stamp(recipe_file: Path) -> str:
 def read_recipe(path: Path, regions: int) -> Recipe:
     """Read and check a city.toml (cosim.sumo.recipe). Raises InputError."""
     table = config.checked(RecipeTable, config.read(path), path)
-    centre, outer, signals = table.centre, table.outer, table.signals
+    centre, outer = table.centre, table.outer
     if centre.region >= regions:
         raise config.error(path, "centre.region", config.got(f"a whole number from 0 to {regions - 1}", centre.region))
     picture, nodes = outer.picture[::-1], {}
@@ -141,9 +135,7 @@ def read_recipe(path: Path, regions: int) -> Recipe:
                 raise config.error(
                     path, "outer.regions", f"expected {allowed} at x = {x:g}, y = {y:g}, got {word!r} instead")
             nodes[f"o{i}{j}"] = Node(id=f"o{i}{j}", x=x, y=y, region=int(word), centre=False)
-    return Recipe(
-        nodes=nodes, streets=_streets(nodes), centre_speed=centre.speed, outer_speed=outer.speed, pocket=centre.pocket,
-        **vars(signals))
+    return Recipe(table=table, nodes=nodes, streets=_streets(nodes))
 
 
 def _streets(nodes: dict[str, Node]) -> list[tuple[str, str]]:
@@ -191,14 +183,14 @@ def _plain_xml(recipe: Recipe) -> tuple[str, str, str, dict[str, int]]:
     edge_rows, connection_rows, region_of, first, last, lanes = [], [], {}, {}, {}, {}
     for a, b in recipe.streets:
         start, end, name = nodes[a], nodes[b], f"{a}-{b}"
-        speed = recipe.centre_speed if start.centre or end.centre else recipe.outer_speed
+        speed = (recipe.table.centre if start.centre or end.centre else recipe.table.outer).speed
         if start.centre and end.centre:
             pieces = [(name, a, b, 1)]
             if legs[b] > 2:
                 joint = f"{name}.j"
                 length = abs(end.x - start.x) + abs(end.y - start.y)
                 # netconvert cuts about 10 m off for the junction itself
-                share = 1.0 - (recipe.pocket + 10.0) / length
+                share = 1.0 - (recipe.table.centre.pocket + 10.0) / length
                 node_rows.append(_row(
                     "node", id=joint, x=start.x + share * (end.x - start.x), y=start.y + share * (end.y - start.y),
                     type="priority"))
@@ -256,6 +248,7 @@ def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
     import sumo
 
     *plain, region_of = _plain_xml(recipe)
+    signals = recipe.table.signals
     with Scratch("cosim-") as folder:
         options = []
         for kind, content in zip(("node", "edge", "connection"), plain, strict=True):
@@ -263,9 +256,9 @@ def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
             options += [f"--{kind}-files", f"{kind}.xml"]
         command = [
             str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"), *options, "--output-file", "net.xml",
-            "--no-turnarounds", "true", "--tls.cycle.time", str(recipe.cycle),
-            "--tls.yellow.time", str(recipe.yellow),
-            "--tls.allred.time", str(recipe.all_red), "--tls.left-green.time", str(recipe.left_green)]
+            "--no-turnarounds", "true", "--tls.cycle.time", str(signals.cycle),
+            "--tls.yellow.time", str(signals.yellow), "--tls.allred.time", str(signals.all_red),
+            "--tls.left-green.time", str(signals.left_green)]
         result = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, check=False,
             env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME})

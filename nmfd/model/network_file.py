@@ -5,7 +5,8 @@ from typing import Annotated, Any
 from pydantic import Field, model_validator
 
 from nmfd.model.mfd import Mfd
-from nmfd.runs.config import Name, Numbers, PositiveNumbers, Problem, Region, Regions, Rows, Settings, got, setting
+from nmfd.runs import config
+from nmfd.runs.config import Problem, Regions, Rows, Settings, Share, got, setting
 
 MOST = 1e9  # veh in a region: beyond, it is a mistake
 OF_ALL = ("exit_rates", "capacity", "storage")  # options that every region has or none
@@ -14,8 +15,8 @@ OF_ALL = ("exit_rates", "capacity", "storage")  # options that every region has 
 class PerimeterTable(Settings):
     """Bounds of the perimeter control at every boundary."""
 
-    min: float = setting("least control", unit="-", ge=0.0, le=1.0)
-    max: float = setting("largest control, more than min", unit="-", ge=0.0, le=1.0)
+    min: Share = setting("least control")
+    max: Share = setting("largest control, more than min")
 
     @model_validator(mode="after")
     def _ordered(self):
@@ -46,15 +47,15 @@ class MfdTable(Settings):
 class RegionTable(Settings):
     """A region; regions are numbered from 0 in the order of the file."""
 
-    name: Name | None = setting("of the region; without one, its number", None)
+    name: config.Name | None = setting("of the region; without one, its number", None)
     position: Annotated[tuple[float, float], Field(strict=False)] = setting("where it is drawn on the map, in any unit")
     adjacent: Regions = setting("regions that share a boundary with it; each of them lists it, too")
     no_way_to: Regions = setting("adjacent regions into which no road leads from here", ())
     mfd: MfdTable | None = setting("its own MFD instead of that of [mfd]", None)
-    exit_rates: PositiveNumbers | None = setting(
+    exit_rates: config.PositiveNumbers | None = setting(
         "how fast vehicles leave it, relative to the mean of the MFD, per region that they are bound for; for every "
         "region or for none", None, unit="-")
-    capacity: PositiveNumbers | None = setting(
+    capacity: config.PositiveNumbers | None = setting(
         "the most that passes under the largest control into each adjacent region while that is empty, in the order of "
         "adjacent, without those of no_way_to; together with storage, for every region or for none", None, unit="veh/s")
     storage: float | None = setting(
@@ -80,16 +81,16 @@ class SplitsTable(Settings):
     """Where drivers in a region go next on their way to another, where it was measured; elsewhere they cross the
     fewest boundaries."""
 
-    region: Region = setting("where they are")
-    destination: Region = setting("where they are bound for")
+    region: config.Region = setting("where they are")
+    destination: config.Region = setting("where they are bound for")
     next: Regions = setting("the adjacent regions that they go to next", min_length=1)
-    share: Annotated[Numbers, Field(min_length=1)] = setting("of the drivers, for each of next; sum 1", unit="-")
+    share: Annotated[config.Numbers, Field(min_length=1)] = setting("of the drivers, for each of next; sum 1", unit="-")
 
 
 class NetworkTable(Settings):
     """The regional model of a city."""
 
-    name: Name = setting("of the model")
+    name: config.Name = setting("of the model")
     perimeter: PerimeterTable = setting("bounds of the control")
     mfd: MfdTable | None = setting("of every region without one of its own", None)
     regions: Rows[RegionTable] = setting("one table per region", min_length=1)

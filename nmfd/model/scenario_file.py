@@ -7,7 +7,7 @@ from typing import Any, Literal
 from pydantic import model_validator
 
 from nmfd.runs import config
-from nmfd.runs.config import Name, Problem, Region, Regions, Rows, Settings, Text, Texts, setting, whole
+from nmfd.runs.config import Flow, Name, Problem, Region, Regions, Rows, Seconds, Settings, Text, Texts, setting, whole
 
 MOST_NUMBERS = 2 * 10**8  # of a demand table: more would not fit into memory
 LONGEST_STEP = 86_400.0   # s
@@ -33,11 +33,11 @@ class DemandTable(Settings):
 
     origin: Region = setting("region in which the vehicles start", alias="from")
     to: Region = setting("region that they are bound for")
-    start: float = setting("when the flow begins", unit="s", ge=0.0)
-    peak: float = setting("largest flow", unit="veh/s", ge=0.0, le=1e6)
-    ramp_up: float = setting("time in which it rises to the peak", unit="s", ge=0.0)
-    flat: float = setting("time that it stays there", unit="s", ge=0.0)
-    ramp_down: float = setting("time in which it falls to 0", unit="s", ge=0.0)
+    start: Seconds = setting("when the flow begins")
+    peak: Flow = setting("largest flow")
+    ramp_up: Seconds = setting("time in which it rises to the peak")
+    flat: Seconds = setting("time that it stays there")
+    ramp_down: Seconds = setting("time in which it falls to 0")
     both_ways: bool = setting("the same flow the other way, too", False)
 
 
@@ -62,8 +62,7 @@ class ScenarioTable(Settings):
     substeps: int = whole("integration steps of the regional model per control interval", 1, low=1, high=1000)
     protected: Regions = setting("regions that gating protects", ())
     demand_factor: float = setting("multiplies the whole demand", 1.0, unit="-", ge=0.0, le=1000.0)
-    demand_file: Text | None = setting(
-        "csv with the columns interval, from, to, veh_s, added to [[demand]]", None)
+    demand_file: Text | None = setting("csv with the columns interval, from, to, veh_s, added to [[demand]]", None)
     faults: Texts = setting("injected into every run: KIND[:VALUE][@FROM-TO], as of --fault", ())
     noise: NoiseTable = setting("of the measurements", NoiseTable())
     forecast: ForecastTable = setting("of the demand", ForecastTable())

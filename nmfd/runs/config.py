@@ -70,6 +70,9 @@ Region = Annotated[int, Field(ge=0)]
 Regions = Annotated[tuple[Region, ...], *DISTINCT]
 Numbers = Annotated[tuple[float, ...], Field(strict=False)]
 PositiveNumbers = Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(strict=False)]
+Share = Annotated[float, Field(ge=0.0, le=1.0, json_schema_extra={"unit": "-"})]
+Seconds = Annotated[float, Field(ge=0.0, json_schema_extra={"unit": "s"})]
+Flow = Annotated[float, Field(ge=0.0, le=1e6, json_schema_extra={"unit": "veh/s"})]
 S = TypeVar("S", bound=Settings)
 Rows = Annotated[tuple[S, ...], Field(strict=False)]  # a list of tables
 

@@ -6,20 +6,18 @@ from pydantic import model_validator
 
 from nmfd.controllers.options import Options
 from nmfd.model.scenario import Scenario
-from nmfd.runs.config import Problem, setting, whole
+from nmfd.runs.config import Flow, Problem, Share, setting, whole
 
 MOST_STEPS = 10**7
 WIDEST, DEEPEST = 10_000, 100  # units per layer, layers: of a policy that fits into memory
 Activation = Literal["gelu", "relu", "tanh", "soft-exponential"]
-
-
 ROBUST_NOISE = 3.0  # veh/s
 
 
 def _noise(default: float) -> Any:
     return setting(
         "largest standard deviation of the Gaussian noise on the demand of the pairs that have any, at every step; "
-        "every rollout has its own, evenly from 0 to this", default, unit="veh/s", ge=0.0, le=1e6)
+        "every rollout has its own, evenly from 0 to this", default)
 
 
 class Training(Options):
@@ -32,24 +30,19 @@ class Training(Options):
     batch: int = whole("rollouts per step", 16, low=1, high=100_000)
     learning_rate: float = setting(
         "of Adam at the start; falls to a tenth along a cosine", 1e-3, unit="-", gt=0.0, le=1.0)
-    alternating: bool = setting(
-        "with route guidance, train the two decoders in turn (the backbone always)", True)
-    demand_spread: float = setting(
-        "every flow is scaled by a factor drawn from 1 - this to 1 + this, per rollout", 0.2, unit="-", ge=0.0, le=1.0)
+    alternating: bool = setting("with route guidance, train the two decoders in turn (the backbone always)", True)
+    demand_spread: Share = setting("every flow is scaled by a factor drawn from 1 - this to 1 + this, per rollout", 0.2)
     demand_low: float = setting(
         "every flow is scaled, besides, by one factor from this to demand_high, per rollout", 1.0, unit="-", gt=0.0,
         le=1.0)
     demand_high: float = setting("the upper end of that", 1.0, unit="-", ge=1.0, le=100.0)
-    initial_share: float = setting(
-        "share of the rollouts that start from a random state, at a random time of the scenario", 0.5, unit="-", ge=0.0,
-        le=1.0)
-    noise: float = _noise(0.0)
-    noise_all: float = setting(
-        "the same of noise on every pair of regions, in every other rollout, instead of noise", 0.0, unit="veh/s",
-        ge=0.0, le=1e6)
-    mfd_spread: float = setting(
-        "how far the regional model that every rollout has for itself is from the scenario's", 0.0, unit="-", ge=0.0,
-        le=1.0)
+    initial_share: Share = setting(
+        "share of the rollouts that start from a random state, at a random time of the scenario", 0.5)
+    noise: Flow = _noise(0.0)
+    noise_all: Flow = setting(
+        "the same of noise on every pair of regions, in every other rollout, instead of noise", 0.0)
+    mfd_spread: Share = setting(
+        "how far the regional model that every rollout has for itself is from the scenario's", 0.0)
     mfd_scale: float = setting(
         "of the accumulation axes of these models besides; below 1 for a city that may lock, by chance, before its "
         "mean outflow falls", 1.0, unit="-", ge=0.1, le=1.0)
@@ -81,7 +74,7 @@ class Training(Options):
 class RobustTraining(Training):
     """The same of the policies whose name ends in -robust."""
 
-    noise: float = _noise(ROBUST_NOISE)
+    noise: Flow = _noise(ROBUST_NOISE)
 
 
 TRAINED = {"dpc-pc": Training, "dpc-pcrg": Training, "dpc-pc-robust": RobustTraining, "dpc-pcrg-robust": RobustTraining}
