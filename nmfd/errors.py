@@ -1,4 +1,4 @@
-"""The one error that a user can cause."""
+"""The errors that end a command in one line."""
 
 import difflib
 from collections.abc import Iterable
@@ -10,6 +10,10 @@ class InputError(ValueError):
     The message is one line that names the file, the key, the value, what is allowed and the remedy; the command
     lines print it and exit with status 2.
     """
+
+
+class RunFailed(Exception):
+    """Some runs ended in an error. The message names them in one line."""
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:

@@ -5,10 +5,10 @@ import tiny
 
 from cosim.plant import strategy
 from nmfd import faults
+from nmfd.api import load_scenario
 from nmfd.controllers import registry
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.regional_model import load_network
-from nmfd.model.scenario import load_scenario
 
 
 def problem(call, *arguments) -> str:

@@ -14,7 +14,7 @@ from xml.sax.saxutils import quoteattr
 
 from cosim.sumo.recipe import CityTable, RecipeTable
 from nmfd.errors import InputError
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import config
 from nmfd.runs.scratch import Scratch
 
@@ -65,7 +65,7 @@ class Recipe:
     streets: list[tuple[str, str]]
 
 
-def ensure_built(network: Network) -> SumoFiles:
+def ensure_built(network: RegionalModel) -> SumoFiles:
     """The SUMO files of `network`, built first if they are missing or the recipe has changed.
 
     Raises InputError if network.toml has no [sumo] table, a key of it or a file it names is wrong, or netconvert fails.
@@ -87,7 +87,7 @@ def ensure_built(network: Network) -> SumoFiles:
     return files
 
 
-def _built(recipe_file: Path, network: Network) -> SumoFiles:
+def _built(recipe_file: Path, network: RegionalModel) -> SumoFiles:
     folder = recipe_file.parent / "build"
     files = SumoFiles(net_file=folder / f"{network.name}.net.xml", regions_csv=folder / "regions.csv")
     stamp_file = folder / f"{network.name}.stamp"

@@ -4,9 +4,9 @@ import numpy as np
 
 from nmfd.controllers.options import Options, options
 from nmfd.errors import InputError
-from nmfd.model.scenario import Scenario
+from nmfd.model.planning import PlanningModel
 from nmfd.runs.config import PositiveNumbers, Problem, got, setting
-from nmfd.types import Controls, Measurement
+from nmfd.types import Controls, Observation
 
 
 class SetPoint(Options):
@@ -15,8 +15,8 @@ class SetPoint(Options):
     set_point: PositiveNumbers | None = setting(
         "accumulation of each protected region to hold; without it, from the MFD", None, unit="veh")
 
-    def misfit(self, scenario: Scenario) -> Problem | None:
-        count = len(scenario.protected)  # without a protected region gating cannot be made, and is not made
+    def misfit(self, planning: PlanningModel) -> Problem | None:
+        count = len(planning.protected)  # without a protected region gating cannot be made, and is not made
         if not count or self.set_point is None or len(self.set_point) == count:
             return None
         return Problem("set_point", got(f"a list of {count} numbers", list(self.set_point)))
@@ -48,20 +48,19 @@ class PiGating:
 
     name = "pi-gating"
 
-    def __init__(self, scenario: Scenario):
+    def __init__(self, planning: PlanningModel):
         """InputError without a protected region, or for a wrong option."""
-        network = scenario.network
-        where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-        if not scenario.protected:
+        network = planning.network
+        if not planning.protected:
             raise InputError(
-                f"{where}: protected: pi-gating needs at least one protected region, got none; "
+                f"{planning.where}: protected: pi-gating needs at least one protected region, got none; "
                 f"add protected = [<region>, ...] with regions from 0 to {network.regions - 1}")
-        chosen = options(Gating, scenario, self.name)
-        self._regions = np.array(scenario.protected)
+        chosen = options(Gating, planning, self.name)
+        self._regions = np.array(planning.protected)
         self.critical = np.array([network.mfds[region].critical for region in self._regions])
         self.set_point = np.array(chosen.set_point or [
             network.mfds[region].reaching(chosen.outflow_share) for region in self._regions])
-        self._kp, self._ki = chosen.kp, chosen.ki * scenario.step
+        self._kp, self._ki = chosen.kp, chosen.ki * planning.step
         self._open = np.where(network.adjacency, network.u_max, 0.0)
         self._entries = network.adjacency[:, self._regions]
         self._bounds = network.u_min, network.u_max
@@ -71,8 +70,8 @@ class PiGating:
         self._gate = np.full(len(self._regions), self._bounds[1])
         self._before = None
 
-    def act(self, measurement: Measurement) -> Controls:
-        now = measurement.accumulation.sum(axis=1)[self._regions]
+    def act(self, observation: Observation) -> Controls:
+        now = observation.accumulation.sum(axis=1)[self._regions]
         before = now if self._before is None else self._before
         change = self._kp * (before - now) + self._ki * (self.set_point - now)
         self._gate = np.clip(self._gate + change / self.critical, *self._bounds)

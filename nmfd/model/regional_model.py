@@ -23,7 +23,7 @@ LEAST_LIMIT = 1e-6   # veh/s, against a division by zero
 
 
 @dataclass(frozen=True, kw_only=True)
-class Network:
+class RegionalModel:
     """R regions, numbered from 0.
 
     name
@@ -113,7 +113,7 @@ def _hops(adjacency: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(hops), hops, -1).astype(int)
 
 
-def load_network(folder: Path | str) -> Network:
+def load_network(folder: Path | str) -> RegionalModel:
     """Read `folder`/network.toml (nmfd.model.network_file).
 
     Raises InputError for a missing file, an unknown key, a wrong type or range, an adjacency that is not symmetric
@@ -131,7 +131,7 @@ def load_network(folder: Path | str) -> Network:
         capacity = np.zeros(adjacency.shape)
         for i, row in enumerate(rows):
             capacity[i, list(row.onward)] = row.capacity
-    network = Network(
+    network = RegionalModel(
         name=table.name, region_names=tuple(row.name or str(number) for number, row in enumerate(rows)),
         positions=np.array([row.position for row in rows]), adjacency=adjacency,
         mfds=tuple((row.mfd or table.mfd).mfd for row in rows), u_min=table.perimeter.min, u_max=table.perimeter.max,
@@ -144,7 +144,7 @@ def load_network(folder: Path | str) -> Network:
     return network
 
 
-def _check_ways(network: Network, path: Path) -> None:
+def _check_ways(network: RegionalModel, path: Path) -> None:
     """InputError for a region that cannot be reached, or drivers whose way leads back to where they are."""
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
@@ -157,7 +157,7 @@ def _check_ways(network: Network, path: Path) -> None:
                     path, "own_splits", f"from region {i} to {j} by way of {h} leads back into {i}; remove it")
 
 
-def check_step(network: Network, step: float, where: str) -> None:
+def check_step(network: RegionalModel, step: float, where: str) -> None:
     """InputError unless forward Euler with `step` [s] keeps every accumulation non-negative (step * q <= 1)."""
     for region, mfd in enumerate(network.mfds):
         grid = np.linspace(0.0, mfd.jam, 2001)

@@ -1,22 +1,18 @@
 """Demand, noise, horizon: loaded from scenario.toml and checked."""
 
 import csv
-import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from nmfd.controllers import registry
 from nmfd.errors import InputError
-from nmfd.model.regional_model import Network, check_step, load_network
-from nmfd.model.scenario_file import MOST_NUMBERS, PlanningOptions, ScenarioTable, read_tables
+from nmfd.faults import Fault, parse
+from nmfd.model.regional_model import RegionalModel, check_step, load_network
+from nmfd.model.scenario_file import MOST_NUMBERS, ScenarioTable, read_tables
 from nmfd.runs import config
-
-GUIDED = "guided"         # in a network's folder: that of the same city's model with guided drivers
-GUIDING = ("mpc-pcrg", "dpc-pcrg")  # beginnings of the names of the controllers that plan with it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +36,7 @@ class Scenario:
     """
 
     name: str
-    network: Network
+    network: RegionalModel
     step: float
     steps: int
     demand: np.ndarray
@@ -70,6 +66,20 @@ class Scenario:
         return self.demand * np.exp(spread * normal - spread**2)
 
 
+    @cached_property
+    def ordered_faults(self) -> tuple[Fault, ...]:
+        """`faults`, parsed. InputError."""
+        where = "scenario.toml" if self.folder is None else self.folder / "scenario.toml"
+        return tuple(parse(text, f"{where}: faults", self.network.regions) for text in self.faults)
+
+
+def with_faults(scenario: Scenario, texts: Sequence[str]) -> Scenario:
+    """`scenario` with more faults, as the option --fault gives them. InputError."""
+    for text in texts:
+        parse(text, "--fault", scenario.network.regions)
+    return replace(scenario, faults=(*scenario.faults, *texts))
+
+
 def trapezoid(time: np.ndarray, *, start: float, peak: float, ramp_up: float, flat: float, ramp_down: float):
     """Demand [veh/s] at `time` (T,) [s]: rises from 0 at `start`, stays at `peak` for `flat` and falls to 0."""
     end = start + ramp_up + flat + ramp_down
@@ -78,9 +88,11 @@ def trapezoid(time: np.ndarray, *, start: float, peak: float, ramp_up: float, fl
     return peak * np.clip(np.minimum(rising, falling), 0.0, 1.0)
 
 
-def load_scenario(folder: Path | str) -> Scenario:
-    """Read `folder`/scenario.toml and its network, and check the options of every controller in it. Raises InputError;
-    the table [sumo] is left to cosim."""
+def read_scenario(folder: Path | str) -> Scenario:
+    """Read `folder`/scenario.toml and its network. Raises InputError.
+
+    The table [controllers] is left to the controllers (nmfd.controllers.registry.checked_scenario), [sumo] to cosim.
+    """
     folder = Path(folder)
     path = folder / "scenario.toml"
     table = config.checked(ScenarioTable, read_tables(folder), path)
@@ -95,18 +107,11 @@ def load_scenario(folder: Path | str) -> Scenario:
         measurement_std=table.noise.measurement_std, integrator=table.integrator, substeps=table.substeps,
         protected=table.protected, controller_options=table.controllers, demand_factor=table.demand_factor,
         forecast_error=table.forecast.error, forecast_seed=table.forecast.seed, faults=table.faults, folder=folder)
-    registry.check_options(scenario)
-    _check_faults(scenario)
+    _ = scenario.ordered_faults  # checked here, where the file is known
     return scenario
 
 
-def _check_faults(scenario: Scenario) -> None:
-    from nmfd import faults
-
-    faults.of(scenario)
-
-
-def _check_regions(table: ScenarioTable, network: Network, path: Path) -> None:
+def _check_regions(table: ScenarioTable, network: RegionalModel, path: Path) -> None:
     """InputError for regions that the network has not, or more intervals than there is memory for."""
     most, known = network.regions - 1, f"network {network.name} has the regions 0 to {network.regions - 1}"
     if max(table.protected, default=0) > most:
@@ -162,41 +167,3 @@ def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
         if k < steps:
             demand[k, i, j] += rate
     return demand
-
-
-def guided_model(network: Network) -> Path | None:
-    """The folder of the same city's model with guided drivers, if there is one beside that of the drivers' own."""
-    folder = None if network.folder is None else network.folder / GUIDED
-    return folder if folder is not None and (folder / "network.toml").is_file() else None
-
-
-def as_modelled(scenario: Scenario, controller: str) -> Scenario:
-    """`scenario` with the regional model that `controller` plans with: the network that its option `model` names, or
-    else, where it guides routes, the one in the folder GUIDED of the scenario's network, if there is one.
-
-    Drivers who are guided, or who reroute by themselves, make another model of the same city. A controller "NAME+..."
-    is NAME with the options of [controllers."NAME+..."] over those of [controllers.NAME]. Raises InputError.
-    """
-    name, tables = controller.partition("+")[0], scenario.controller_options
-    options = {**tables.get(name, {}), **tables.get(controller, {})}
-    configured = replace(scenario, controller_options={**tables, name: options})
-    if "model" in options and scenario.folder is not None:
-        where, table = scenario.folder / "scenario.toml", f"controllers.{controller}."
-        model = config.checked(PlanningOptions, {"model": options.pop("model")}, where, table).model
-        return with_model(configured, scenario.folder / model, functools.partial(config.error, where, f"{table}model"))
-    if name.startswith(GUIDING) and (folder := guided_model(scenario.network)) is not None:
-        return with_model(configured, folder)
-    return configured
-
-
-def with_model(
-    scenario: Scenario, folder: Path, wrong: Callable[[str], InputError] | None = None,
-) -> Scenario:
-    """`scenario` with another regional model of the same city. wrong: the error that there is with it, of its words."""
-    model = load_network(folder)
-    if not np.array_equal(model.adjacency, scenario.network.adjacency):
-        error = f"network {model.name} has other regions or boundaries than {scenario.network.name}; identify one " \
-                "for the same city with 'cosim identify'"
-        raise wrong(error) if wrong else InputError(f"{folder / 'network.toml'}: {error}")
-    check_step(model, scenario.step / scenario.substeps, f"{model.folder}")
-    return replace(scenario, network=model)

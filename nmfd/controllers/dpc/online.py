@@ -17,8 +17,8 @@ from nmfd.controllers.dpc.policy import DpcController, Policy, check_guidance, l
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.controllers.options import options
 from nmfd.model import dynamics
-from nmfd.model.scenario import Scenario
-from nmfd.types import Controls, Measurement
+from nmfd.model.planning import PlanningModel
+from nmfd.types import Controls, Observation
 
 MEMORY = 0.97  # of what was seen, per control interval: half is forgotten after 23
 TRUST = 1.0    # how much the nominal model weighs: as one interval with 1 % of the critical accumulations flowing
@@ -35,11 +35,11 @@ class ModelEstimate:
     demand, outflow: (R,) [-]
     """
 
-    def __init__(self, scenario: Scenario):
-        self._scenario, self._regions = scenario, scenario.network.regions
-        self._parameters = dynamics.parameters(scenario.network)
-        self._splits = torch.from_numpy(scenario.network.nominal_splits)
-        flowing = 0.01 * np.mean([mfd.critical for mfd in scenario.network.mfds])
+    def __init__(self, planning: PlanningModel):
+        self._planning, self._regions = planning, planning.network.regions
+        self._parameters = dynamics.parameters(planning.network)
+        self._splits = torch.from_numpy(planning.network.nominal_splits)
+        flowing = 0.01 * np.mean([mfd.critical for mfd in planning.network.mfds])
         self._prior = TRUST * flowing**2 * np.eye(2 * self._regions)
         self.reset()
 
@@ -60,7 +60,7 @@ class ModelEstimate:
 
     def _contributions(self, before: np.ndarray, planned: np.ndarray, controls: Controls) -> np.ndarray:
         """(2 R, R, R) [veh]: what the demand of each origin and the outflow of each region add to x in an interval."""
-        step, regions = self._scenario.step, self._regions
+        step, regions = self._planning.step, self._regions
         x = torch.from_numpy(np.maximum(before, 0.0))
         splits = self._splits if controls.splits is None else torch.from_numpy(controls.splits)
         completions, transfers = (flow.numpy() for flow in dynamics.flows(
@@ -84,16 +84,16 @@ class OnlineDpc:
     demand, outflow: (R,) [-], the present estimate
     """
 
-    def __init__(self, policy: Policy, scenario: Scenario):
+    def __init__(self, policy: Policy, planning: PlanningModel):
         self.name = f"dpc-{'pcrg' if policy.architecture.guidance else 'pc'}-online"
-        chosen = options(Online, scenario, self.name)
+        chosen = options(Online, planning, self.name)
         self._look_ahead, self._iterations = chosen.look_ahead, chosen.iterations
         self._learning_rate, self._count = chosen.learning_rate, chosen.rollouts
-        self._scenario, self._frozen = scenario, policy.eval()
-        self._rollout = Rollout(scenario)
+        self._planning, self._frozen = planning, policy.eval()
+        self._rollout = Rollout(planning)
         self._nominal = self._rollout.parameters
-        self._estimate = ModelEstimate(scenario)
-        self._spread = 0.02 * np.array([[mfd.critical] for mfd in scenario.network.mfds])
+        self._estimate = ModelEstimate(planning)
+        self._spread = 0.02 * np.array([[mfd.critical] for mfd in planning.network.mfds])
         self.reset()
 
     @property
@@ -114,8 +114,8 @@ class OnlineDpc:
         self._generator = torch.Generator().manual_seed(seed)
         self._last: tuple[np.ndarray, Controls, int] | None = None
 
-    def act(self, measurement: Measurement) -> Controls:
-        seen, k = measurement.accumulation, measurement.step
+    def act(self, observation: Observation) -> Controls:
+        seen, k = observation.accumulation, observation.step
         if self._last is not None:
             before, controls, step = self._last
             self._estimate.update(before, seen, self._planned(step), controls)
@@ -127,7 +127,7 @@ class OnlineDpc:
             start = torch.from_numpy(np.maximum(seen, 0.0)).float().unsqueeze(0)
             spent = [float(self._rollout.total_time_spent(policy, start, demand[:, :1], self._generator))
                      for policy in (self._tuned, self._frozen)]
-        controls = self._controllers[0 if spent[0] <= spent[1] else 1].act(measurement)
+        controls = self._controllers[0 if spent[0] <= spent[1] else 1].act(observation)
         self._last = seen, controls, k
         return controls
 
@@ -143,7 +143,7 @@ class OnlineDpc:
 
     def _planned(self, step: int) -> np.ndarray:
         """(R, R) [veh/s] in interval `step`; nothing after the end."""
-        forecast = self._scenario.forecast
+        forecast = self._planning.forecast
         return forecast[step] if step < len(forecast) else np.zeros_like(forecast[0])
 
     def _forecast(self, step: int) -> torch.Tensor:
@@ -156,13 +156,13 @@ class OnlineDpc:
         """The rollouts follow the estimated outflows, as far as the integration step allows."""
         p = self._nominal
         fastest = p.c if p.exit_rates is None else p.c * p.exit_rates.amax(-1)
-        most = 1.0 / (fastest * self._scenario.step / self._scenario.substeps)
+        most = 1.0 / (fastest * self._planning.step / self._planning.substeps)
         factor = torch.minimum(torch.from_numpy(self._estimate.outflow).float(), most)
         self._rollout.parameters = replace(p, a=factor * p.a, b=factor * p.b, c=factor * p.c)
 
 
-def load(path: Path, scenario: Scenario, *, guidance: bool) -> OnlineDpc:
+def load(path: Path, planning: PlanningModel, *, guidance: bool) -> OnlineDpc:
     """The policy in `path`, fine-tuned as it drives. InputError as dpc.load."""
-    policy, _ = load_policy(path, scenario.network)
+    policy, _ = load_policy(path, planning.network)
     check_guidance(policy, path, guidance)
-    return OnlineDpc(policy, scenario)
+    return OnlineDpc(policy, planning)

@@ -5,7 +5,7 @@ from typing import Any, Literal
 from pydantic import model_validator
 
 from nmfd.controllers.options import Options
-from nmfd.model.scenario import Scenario
+from nmfd.model.planning import PlanningModel
 from nmfd.runs.config import Flow, Problem, Share, setting, whole
 
 MOST_STEPS = 10**7
@@ -61,8 +61,8 @@ class Training(Options):
             raise Problem("from_gating", "a policy cannot begin as both, a gate and no control; omit one")
         return self
 
-    def misfit(self, scenario: Scenario) -> Problem | None:
-        if not self.from_gating or scenario.protected:
+    def misfit(self, planning: PlanningModel) -> Problem | None:
+        if not self.from_gating or planning.protected:
             return None
         return Problem("from_gating", "expected a scenario with protected regions; name them, or omit it")
 

@@ -18,11 +18,12 @@ from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
 from nmfd.controllers.dpc.rollout import Rollout, compiled_step
 from nmfd.controllers.options import options
 from nmfd.controllers.pi_gating import PiGating
-from nmfd.errors import InputError
-from nmfd.model.regional_model import Network
-from nmfd.model.scenario import Scenario, as_modelled
+from nmfd.errors import InputError, RunFailed
+from nmfd.model.planning import planning_model
+from nmfd.model.regional_model import RegionalModel
+from nmfd.model.scenario import Scenario
 from nmfd.runs.files import atomic, locked, sweep
-from nmfd.runs.workers import RunFailed
+from nmfd.threads import one_thread
 
 VALIDATE_EVERY = 20  # Adam steps
 WORTH_COMPILING = 200  # Adam steps
@@ -37,7 +38,7 @@ NAMES = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-ro
 def settings(scenario: Scenario, controller: str, steps: int | None = None) -> Training:
     """The training settings of `controller` in `scenario`, checked; `steps` overrides.
 
-    controller: one of NAMES, or "NAME+..." if the scenario has a table of that name (nmfd.model.scenario.as_modelled)
+    controller: one of NAMES, or "NAME+..." if the scenario has a table of that name (planning_model)
     """
     name, variant, _ = controller.partition("+")
     if name not in NAMES:
@@ -46,8 +47,7 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         raise InputError(
             f"--controller: {controller!r} needs a table [controllers.\"{controller}\"] in {scenario.folder}/"
             f"scenario.toml that says what is different from {name}; add one, or train {name}")
-    scenario = as_modelled(scenario, controller)
-    chosen = options(TRAINED[name], scenario, name, controller)
+    chosen = options(TRAINED[name], planning_model(scenario, controller), name, controller)
     return chosen if steps is None else chosen.changed(steps=steps)
 
 
@@ -58,6 +58,7 @@ def available(device: str) -> str:
     return "cuda" if device == "auto" and torch.cuda.is_available() else device.replace("auto", "cpu")
 
 
+@one_thread()
 def train(
     scenario: Scenario, controller: str, *, seed: int, out: Path, steps: int | None = None, resume: bool = False,
     device: str = "cpu", compiled: bool = False, progress: Callable[[int, int, str], None] | None = None,
@@ -71,20 +72,19 @@ def train(
     weights differ by rounding.
     """
     chosen = settings(scenario, controller, steps)
-    scenario = as_modelled(scenario, controller)
+    planning = planning_model(scenario, controller)
     configuration = {
-        "controller": controller, "scenario": scenario.name, "seed": seed, "compiled": compiled, **vars(chosen)}
-    torch.set_num_threads(1)  # the matrices are small: more threads only wait for one another
+        "controller": controller, "scenario": planning.name, "seed": seed, "compiled": compiled, **vars(chosen)}
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     guidance = NAMES[controller.partition("+")[0]]
     architecture = Architecture(
         width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=guidance)
-    policy = Policy(scenario.network, architecture)
+    policy = Policy(planning.network, architecture)
     if chosen.from_no_control:
-        begin_as_no_control(policy, scenario.network)
+        begin_as_no_control(policy, planning.network)
     policy = policy.to(device)
-    rollout = Rollout(scenario, device=device, detour_cost=chosen.detour_cost)
+    rollout = Rollout(planning, device=device, detour_cost=chosen.detour_cost)
     if chosen.from_gating and not resume:
         begin_as_gate(policy, rollout, generator)
     advance = compiled_step(rollout.step) if compiled else rollout.step
@@ -124,7 +124,7 @@ def train(
                     best = score
                     states = fallback.statistics(visited(policy, rollout, chosen, seed))
                     _write(checkpoint(
-                        policy, scenario.network, {**configuration, "validation_veh_s": best}, states), out)
+                        policy, planning.network, {**configuration, "validation_veh_s": best}, states), out)
                 if not last:
                     _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
             if progress:
@@ -136,7 +136,7 @@ def train(
     return out
 
 
-def begin_as_no_control(policy: Policy, network: Network) -> None:
+def begin_as_no_control(policy: Policy, network: RegionalModel) -> None:
     """Let `policy` hardly depend on the state, with nearly open gateways and nearly the drivers' own split ratios."""
     with torch.no_grad():
         policy.perimeter_decoder.weight.mul_(WEAK)
@@ -149,8 +149,8 @@ def begin_as_no_control(policy: Policy, network: Network) -> None:
 
 def begin_as_gate(policy: Policy, rollout: Rollout, generator: torch.Generator) -> None:
     """Let `policy` close the entries of every protected region as this fills, half at the set point of pi-gating."""
-    network, protected = rollout.scenario.network, list(rollout.scenario.protected)
-    set_point = torch.tensor(PiGating(rollout.scenario).set_point, dtype=rollout.dtype, device=rollout.device)
+    network, protected = rollout.planning.network, list(rollout.planning.protected)
+    set_point = torch.tensor(PiGating(rollout.planning).set_point, dtype=rollout.dtype, device=rollout.device)
     counts = rollout.parameters.adjacency.expand(GATE_BATCH, -1, -1)
     optimizer = torch.optim.Adam(policy.parameters(), lr=GATE_RATE)
     for _ in range(GATE_STEPS):
