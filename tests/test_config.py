@@ -45,7 +45,7 @@ class Table(Settings):
     ({"numbers": [1, [2]]}, "numbers: expected a list of numbers, got [1, [2]] instead"),
     ({"gains": [1, 0]}, "gains: expected a list of numbers above 0, got [1, 0] instead"),
     ({"rows": [{"speed": 1}, {"speed": 0}]}, "rows[1].speed: expected a number above 0, got 0 instead"),
-    ({"rows": [{}]}, "rows[0].speed: missing; add speed = <number>"),
+    ({"rows": [{}]}, "rows[0].speed: missing; add speed = <a number above 0>"),
     ({"rows": {}}, "rows: expected a list of tables, got {} instead"),
     ({"rows": [3]}, "rows[0]: expected a table, got 3 instead"),
     ({"table": []}, "table: expected a table, got [] instead"),
@@ -65,5 +65,5 @@ def test_what_is_right_is_taken():
 
 
 def test_changes_are_checked_too():
-    with pytest.raises(ValueError, match="count"):
+    with pytest.raises(InputError, match="settings: count: expected a whole number from 1 to 10, got 11 instead"):
         Table().changed(count=11)

@@ -32,25 +32,26 @@ def _apart(lines: tuple[float, ...]) -> tuple[float, ...]:
 
 
 Lines = Annotated[Numbers, Field(min_length=3, max_length=10), AfterValidator(_apart)]
-RISING = "rising, at least 60 m apart"
 
 
-class CentreTable(Settings):
+class Streets(Settings):
+    """Lines on which junctions and the streets between them are."""
+
+    x: Lines = setting("streets that run north-south; rising, at least 60 m apart", unit="m")
+    y: Lines = setting("streets that run east-west; rising, at least 60 m apart", unit="m")
+    speed: float = setting("speed limit", unit="m/s", gt=0.0)
+
+
+class CentreTable(Streets):
     """The fine grid in the middle: one lane in each direction."""
 
     region: Region = setting("region of the centre")
-    x: Lines = setting(f"streets that run north-south; {RISING}", unit="m")
-    y: Lines = setting(f"streets that run east-west; {RISING}", unit="m")
-    speed: float = setting("speed limit", unit="m/s", gt=0.0)
     pocket: float = setting("length of the second lane before a signal", unit="m", ge=10.0)
 
 
-class OuterTable(Settings):
+class OuterTable(Streets):
     """The lattice of arterials around it: three lanes in each direction."""
 
-    x: Lines = setting(f"roads that run north-south; {RISING}", unit="m")
-    y: Lines = setting(f"roads that run east-west; {RISING}", unit="m")
-    speed: float = setting("speed limit", unit="m/s", gt=0.0)
     regions: str = setting("region of every junction in lines, north at the top; a dot where the centre is")
 
     @property

@@ -77,26 +77,24 @@ class ScenarioTable(Settings):
         return self
 
 
-def read_tables(folder: Path) -> dict[str, Any]:
+def read_tables(folder: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
     """`folder`/scenario.toml; what it does not say is that of the scenario in the folder `base`, if it names one.
 
     Tables are completed key by key, everything else is taken whole. Raises InputError.
+
+    above: the folders of the scenarios that are based on this one
     """
-    path, folders, content = folder / "scenario.toml", [], {}
-    while True:
-        own = config.read(folder / "scenario.toml")
-        if folder.resolve() in folders:
-            raise config.error(
-                folder / "scenario.toml", "base", "the scenarios are each other's base; remove one of the keys")
-        folders.append(folder.resolve())
-        base = own.pop("base", None)
-        _name_from(own, folder, path.parent)
-        content = _completed(content, own)
-        if base is None:
-            return content
-        if not isinstance(base, str) or not base.isprintable():
-            raise config.error(folder / "scenario.toml", "base", config.got("the folder of a scenario in quotes", base))
-        folder = folder / base
+    file, folders = folder / "scenario.toml", (*above, folder)
+    own = config.read(file)
+    base = own.pop("base", None)
+    _name_from(own, folder, folders[0])
+    if folder.resolve() in (other.resolve() for other in above):
+        raise config.error(file, "base", "the scenarios are each other's base; remove one of the keys")
+    if base is None:
+        return own
+    if not isinstance(base, str) or not base.isprintable():
+        raise config.error(file, "base", config.got("the folder of a scenario in quotes", base))
+    return _completed(own, read_tables(folder / base, folders))
 
 
 def _name_from(own: dict, folder: Path, here: Path) -> None:

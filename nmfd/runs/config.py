@@ -7,7 +7,7 @@ JSON schemas for editors come from it (nmfd.runs.reference).
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -45,9 +45,9 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
-    def changed(self, **changes: Any):
-        """A copy with other values, checked like the first."""
-        return type(self).model_validate({**vars(self), **changes})
+    def changed(self, **changes: Any) -> Self:
+        """A copy with other values, checked like the first. InputError."""
+        return checked(type(self), {**vars(self), **changes}, "settings")
 
 
 def _line(text: str) -> str:
@@ -149,7 +149,7 @@ def _told(declaration: type[Settings], values: Any, error: ValidationError) -> s
     if isinstance(problem := first.get("ctx", {}).get("error"), Problem):
         return f"{'.'.join(filter(None, (path, problem.key)))}: {problem}"
     if kind == "missing":
-        return f"{path}: missing; add {schema.example(str(first['loc'][-1]), here)}"
+        return f"{path}: missing; add {first['loc'][-1]} = <{schema.allowed(here)}>"
     if kind == "extra_forbidden":
         keys = list(table["properties"])
         hint = did_you_mean(str(first["loc"][-1]), keys)

@@ -7,7 +7,6 @@ from pydantic.json_schema import GenerateJsonSchema
 
 Schema = dict[str, Any]
 
-EXAMPLES = {"number": "<number>", "integer": "<whole number>", "boolean": "true or false", "string": '"..."'}
 PLURALS = {"number": "numbers", "integer": "whole numbers", "string": "texts in quotes"}
 
 
@@ -35,19 +34,6 @@ def resolved(root: Schema, schema: Schema) -> Schema:
     if "$ref" not in schema:
         return schema
     return {**root["$defs"][schema["$ref"].rpartition("/")[2]], **schema}
-
-
-def example(key: str, schema: Schema) -> str:
-    """What to add where `key` is missing."""
-    kind, items = schema["type"], schema.get("items", {})
-    if kind == "object":
-        return f"a table [{key}]"
-    if "$ref" in items:
-        return f"a list of tables [[{key}]]"
-    if "enum" in schema:
-        return f'{key} = "{schema["enum"][0]}"'
-    of_list = EXAMPLES[items.get("type", "number")]
-    return f"{key} = {EXAMPLES.get(kind, f'[{of_list}, ...]')}"
 
 
 def allowed(schema: Schema) -> str:
