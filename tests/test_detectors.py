@@ -88,8 +88,9 @@ def test_all_links_and_all_probes_see_everything(scenario):
     seen = []
     try:
         state, controller = plant.reset(3), PiGating(scenario)
-        observation = plant._detectors.observation
-        plant._detectors.observation = lambda flow: (seen.append(observation(flow)), seen[-1])[1]
+        detectors = plant._sensing._estimation._detectors
+        observation = detectors.observation
+        detectors.observation = lambda flow: (seen.append(observation(flow)), seen[-1])[1]
         for _ in range(scenario.steps):
             before, state = state, plant.step(controller.act(state))
         crossings = plant.record().crossings[-1].sum(axis=2)
