@@ -69,6 +69,7 @@ def evaluate(
     import os
 
     from cosim.evaluation import evaluate, statistics
+    from cosim.report import pictures
     from nmfd.cli.progress import progress_line
     from nmfd.model.scenario import load_scenario
     from nmfd.runs import files as disk
@@ -82,6 +83,9 @@ def evaluate(
     try:
         with progress_line("evaluate") as progress:
             table, failures = evaluate.evaluate(chosen, workers=workers, progress=progress, tell=tell)
+            if len(table):
+                pictures.draw_all(
+                    chosen.out, evaluate.level_folders(chosen.out), loaded, evaluate.all_runs(chosen))
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted; finished runs are in {chosen.out}: the same command goes on") from None
     if len(table):

@@ -8,10 +8,19 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
+from cosim.evaluation import estimation_errors, run_metrics
+from cosim.plant.plant import SumoPlant
+from cosim.plant.settings import settings
 from cosim.plant.strategy import Strategy, configured, modelled, parse
+from cosim.sumo import outputs as sumo_output
+from nmfd import closed_loop
+from nmfd.controllers import registry
 from nmfd.faults import with_faults
 from nmfd.model.scenario import Scenario, load_scenario
+from nmfd.runs import files as disk
+from nmfd.runs import run_folder
 from nmfd.types import Controller, Trajectory
 
 # Columns of sumo.csv, beside those of summary.csv.
@@ -67,10 +76,6 @@ def scenario_of(task: Task) -> Scenario:
 
 def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> Result:
     """Run `task` in this process, which must hold no other SUMO session. Raises InputError."""
-    import torch
-
-    from nmfd.controllers import registry
-
     torch.set_num_threads(1)  # runs stand side by side, one core each
     begin = time.perf_counter()
     scenario, strategy = scenario_of(task), parse(task.controller)
@@ -91,14 +96,6 @@ def drive(
     only if all goes well; model: `scenario` with the regional model with which states are estimated, if not its own.
     Raises InputError.
     """
-    from cosim.evaluation import run_metrics
-    from cosim.plant.plant import SumoPlant
-    from cosim.plant.settings import settings
-    from cosim.sumo import outputs as sumo_output
-    from nmfd import closed_loop
-    from nmfd.runs import files as disk
-    from nmfd.runs import run_folder
-
     begin = time.perf_counter() if begin is None else begin
     with ExitStack() as stack:
         files = {kind: stack.enter_context(disk.atomic(path)) for kind, path in (outputs or {}).items()}
@@ -131,7 +128,5 @@ def _estimation(scenario: Scenario, trajectory: Trajectory) -> dict[str, float]:
     """Errors of the estimate, over all regions; NaN where the controller saw the exact state."""
     if trajectory.estimate is None:
         return {"estimate_rmse_share": math.nan, "estimate_cell_rmse_veh": math.nan}
-    from cosim.evaluation import estimation_errors
-
     whole = estimation_errors.errors(scenario.network, trajectory)[-1]
     return {"estimate_rmse_share": whole["rmse_share"], "estimate_cell_rmse_veh": whole["cell_rmse_veh"]}
