@@ -7,21 +7,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trajectories
 
 from nmfd.cli.progress import ProgressLine, progress_line
 from nmfd.errors import InputError
 from nmfd.runs import files, run_folder, workers
-from nmfd.types import Trajectory
+from nmfd.types import Status
 
 CONFIGURATION = {"scenario": "x", "step": 30.0, "protected": (1, 2)}
 
 
 def trajectory(controller="no-control", seed=0, steps=4):
     rng = np.random.default_rng(seed)
-    return Trajectory(
+    return trajectories.made(
         controller=controller, plant="nmfd", seed=seed, step=30.0, accumulation=rng.random((steps + 1, 2, 2)),
         backlog=np.zeros((steps + 1, 2, 2)), completed=np.arange(steps + 1.0), perimeter=rng.random((steps, 2, 2)),
-        splits=rng.random((steps, 2, 2, 2)), decision_time=rng.random(steps), status=("ok",) * (steps - 1) + ("no",),
+        splits=rng.random((steps, 2, 2, 2)), decision_time=rng.random(steps), note=("",) * (steps - 1) + ("no",),
+        status=np.array([0] * (steps - 1) + [(Status.SOLVER_FAILURE | Status.FALLBACK).value]),
         wall_time=1.0)
 
 
@@ -35,10 +37,11 @@ def test_trajectory_round_trip_and_same_bytes(tmp_path):
     run_folder.write_trajectory(tmp_path / "a.npz", original)
     run_folder.write_trajectory(tmp_path / "b.npz", replace(original, decision_time=2 * original.decision_time))
     back = run_folder.read_trajectory(tmp_path / "a.npz")
-    for name in ("accumulation", "backlog", "completed", "perimeter", "splits"):
+    for name in (
+            "accumulation", "backlog", "completed", "observed", "observed_backlog", "perimeter", "splits", "status"):
         np.testing.assert_array_equal(getattr(back, name), getattr(original, name))
     assert (back.controller, back.plant, back.seed, back.step) == ("no-control", "nmfd", 0, 30.0)
-    assert back.status == original.status
+    assert back.note == original.note
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 

@@ -58,7 +58,7 @@ def identify(
     """
     from cosim.evaluation import identify  # heavy
     from cosim.importing import find
-    from nmfd.model.scenario import load_scenario
+    from nmfd.api import load_scenario
 
     factors = parsed_levels("--levels", levels)
     scenario = find.scenario_of(scenario)

@@ -16,9 +16,8 @@ from cosim.cli.run import compare, run
 from nmfd.cli.errors import Commands, Interrupted
 from nmfd.cli.options import COUNT, FOLDER, SEED, policy_files
 from nmfd.cli.progress import progress_line
-from nmfd.errors import InputError
+from nmfd.errors import InputError, RunFailed
 from nmfd.runs import files as disk
-from nmfd.runs.workers import RunFailed
 
 
 @click.group(name="cosim", cls=Commands)
@@ -74,7 +73,7 @@ def evaluate(
 
     from cosim.evaluation import evaluate, statistics  # heavy
     from cosim.report import pictures
-    from nmfd.model.scenario import load_scenario
+    from nmfd.api import load_scenario
 
     loaded = load_scenario(scenario)
     chosen = evaluate.Evaluation(
@@ -145,7 +144,7 @@ def sweep(
     files = policy_files(policies, names)
 
     from cosim.evaluation import sweeps  # heavy
-    from nmfd.model.scenario import load_scenario
+    from nmfd.api import load_scenario
 
     order = sweeps.Sweep(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),

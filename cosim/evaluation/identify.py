@@ -16,12 +16,14 @@ import numpy as np
 from cosim.evaluation import experiment, mfd_bands
 from cosim.evaluation.model_validation import HELD_UP, draw_mfds, outflow_samples
 from cosim.evaluation.simulate import Result, Task
+from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model import identification, mfd
 from nmfd.model.identification import Observed, observed_split_ratios
 from nmfd.model.model_file import network_toml
-from nmfd.model.regional_model import Network
-from nmfd.model.scenario import GUIDED, GUIDING, Scenario, load_scenario
+from nmfd.model.planning import GUIDED, GUIDING
+from nmfd.model.regional_model import RegionalModel
+from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files
 from nmfd.runs.workers import ended
 
@@ -37,7 +39,7 @@ class Loading:
     guided: with route guidance, first towards the drivers' own split ratios, then probing; else without
     options: of the strategies (cosim.plant.strategy.OPTIONS), of a city that has, say, max-pressure signals
     network: the folder whose network.toml is written; None for the scenario's own or, if guided, the one where
-        controllers that guide look for their model (nmfd.model.scenario.guided_model)
+        controllers that guide look for their model (nmfd.model.planning.guided_model)
     iterations: of the fit
     """
 
@@ -94,7 +96,7 @@ def identify(
     held_out = [result for result in found if len(loading.seeds) > 1 and result.trajectory.seed == loading.seeds[-1]]
     scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
-    def fitted(results: Sequence[Result], samples: Sequence[dict], what: str) -> Network:
+    def fitted(results: Sequence[Result], samples: Sequence[dict], what: str) -> RegionalModel:
         def tell(done, total, note):
             progress(done, total, f"{what}, {note}")
 
@@ -136,7 +138,7 @@ def _load(
     return [experiment.read_run(folder, controller, task.seed) for folder, task in plan]
 
 
-def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> Network:
+def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> RegionalModel:
     """The scenario's network with the published model: an MFD per region, fitted to outflow samples, and own splits,
     if drivers were not guided."""
     network = replace(scenario.network, exit_rates=None, capacity=None, storage=None)
@@ -156,7 +158,7 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
     return replace(network, own_splits=observed_split_ratios(network, crossings))
 
 
-def samples_of(network: Network, results: Sequence[Result]) -> list[dict[str, np.ndarray]]:
+def samples_of(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, np.ndarray]]:
     """Outflow samples of every region (cosim.evaluation.model_validation.outflow_samples)."""
     return [
         outflow_samples(
@@ -177,7 +179,7 @@ def nearly_empty(samples: Sequence[dict[str, np.ndarray]]) -> list[int]:
     return [region for region, cloud in enumerate(samples) if len(own_points(cloud)) < SAMPLES]
 
 
-def as_it_was(network: Network, model: Network, regions: Sequence[int]) -> Network:
+def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[int]) -> RegionalModel:
     """`model` with these regions as they are in `network`, and room for as many vehicles as their MFDs are meant for:
     what was fitted to hardly any vehicles knows nothing of more."""
     alone = np.isin(np.arange(model.regions), regions)
@@ -209,7 +211,7 @@ def hysteresis(cloud: dict[str, np.ndarray]) -> float:
     return float((both[0] - both[1]).sum() / both.mean(axis=0).sum()) if both.size else float("nan")
 
 
-def fit_table(network: Network, samples: Sequence[dict]) -> str:
+def fit_table(network: RegionalModel, samples: Sequence[dict]) -> str:
     """Per region: the curve of the MFD, how well it explains the samples, and their hysteresis."""
     lines = [f"{'region':<16}{'critical':>10}{'jam':>8}{'storage':>9}{'max outflow':>13}{'samples':>9}{'R2':>7}"
              f"{'hysteresis':>12}   [veh, veh/s]"]
@@ -228,7 +230,7 @@ def fit_table(network: Network, samples: Sequence[dict]) -> str:
     return "\n".join(lines)
 
 
-def unreached(network: Network, accumulations: Sequence[np.ndarray]) -> str:
+def unreached(network: RegionalModel, accumulations: Sequence[np.ndarray]) -> str:
     """A line on the regions whose critical accumulation no loading run reached, each run (T+1, R, R) [veh]; or none."""
     most = np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
     short = [f"{region} {network.region_names[region]} ({100 * most[region] / curve.critical:.0f} % of it)"
@@ -239,7 +241,7 @@ def unreached(network: Network, accumulations: Sequence[np.ndarray]) -> str:
             "Give higher --levels, or take it that perimeter control has nothing to protect there")
 
 
-def prediction_table(network: Network, held_out: Sequence[Observed], scheme: dict) -> str:
+def prediction_table(network: RegionalModel, held_out: Sequence[Observed], scheme: dict) -> str:
     """RMSE of the accumulation one control interval and AHEAD seconds ahead, in runs that the fit did not see."""
     intervals = identification.intervals_within(AHEAD, scheme["step"], held_out)
     share = identification.prediction_shares(network, held_out, (1, intervals), **scheme)

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.plant.strategy import parse
-from nmfd.model.scenario import Scenario, load_scenario
+from nmfd.api import load_scenario
+from nmfd.model.scenario import Scenario
 
 if TYPE_CHECKING:
     from nmfd.rl import RegionalEnv, RegionsEnv

@@ -10,7 +10,7 @@ import numpy as np
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
 from nmfd.ledger import LedgerError
-from nmfd.types import Measurement
+from nmfd.types import State
 
 
 @dataclass
@@ -71,9 +71,11 @@ class Meter:
         # Several movements may lead from one region to one edge: they share its flow.
         self._alike = Counter((g.source, g.to_edge) for g in city.gateways)
 
-    def measurement(self, step: int, time: float) -> Measurement:
-        """The exact state at `time` [s] since the start, at which control step `step` begins. LedgerError."""
-        return Measurement(step=step, time=time, accumulation=self.accumulation(step), backlog=self.backlog())
+    def state(self, step: int, time: float) -> State:
+        """What the city is in at `time` [s] since the start, when control step `step` begins. LedgerError."""
+        return State(
+            step=step, time=time, accumulation=self.accumulation(step), backlog=self.backlog(),
+            completed=float(self.arrivals.sum()))
 
     def gateway_flow(self) -> np.ndarray:
         """(G,) [veh] over each gateway of the city since the beginning."""

@@ -20,10 +20,10 @@ from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, Gateway, check_adjacency, load_city
 from cosim.sumo.session import Session, Window
 from cosim.sumo.tripinfo import TripFacts, read_trip_facts
-from nmfd import faults
 from nmfd.errors import InputError
+from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
-from nmfd.types import Controls, Measurement
+from nmfd.types import Controls, Observation, State
 
 GUIDANCE = 0x67756964  # keeps the random numbers of the guided drivers apart from others of the same seed
 
@@ -38,15 +38,15 @@ class SumoPlant:
 
     def __init__(
         self, scenario: Scenario, *, overrides: Settings | None = None, outputs: Mapping[str, Path] | None = None,
-        window: Window | None = None, model: Scenario | None = None,
+        window: Window | None = None, planning: PlanningModel | None = None,
     ):
         """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network.
 
         outputs: kind (cosim.sumo.outputs) -> file, of SUMO's own outputs; complete after `trip_facts` or `close`
         window: to watch; the simulation is the same, only slower
-        model: `scenario` with the regional model with which states are estimated, if not its own
+        planning: what states are estimated with; of the scenario itself, if None
         """
-        self._scenario, self._model = scenario, model or scenario
+        self._scenario, self._planning = scenario, planning or planning_model(scenario)
         self._settings = chosen = overrides or settings(scenario)
         _check_mesoscopic(scenario, chosen)
         files = ensure_built(scenario.network)
@@ -60,19 +60,19 @@ class SumoPlant:
             scenario, chosen, self.city, self._signals, self._layout, outputs=dict(outputs or {}), window=window)
         self._session: Session | None = None
 
-    def reset(self, seed: int) -> Measurement:
+    def reset(self, seed: int) -> State:
         """Trips, drivers and reroutes all follow from `seed`."""
         self._end_session()
         self._k, self._session = 0, self._launch.start(seed)
-        self._incidents = Incidents(faults.of(self._scenario), self._session, self.city)
+        self._incidents = Incidents(self._scenario.ordered_faults, self._session, self.city)
         self._sensing = self._new_sensing(seed)
         self._guide = self._new_guide(seed)
         self._actuation = self._new_actuation()
-        measurement = self._sensing.first()
+        state = self._sensing.state(0)
         self._recorder = Recorder(self._sensing.meter, self._guide, self._actuation)
-        return measurement
+        return state
 
-    def step(self, controls: Controls) -> Measurement:
+    def step(self, controls: Controls) -> State:
         """One control interval: in every simulation step actuate, simulate, measure and guide; then record."""
         end, streets = self._session.time + self._scenario.step, self._sensing.streets
         vehicles, speed = (None, None) if streets is None else (streets.vehicles, streets.speed)
@@ -83,16 +83,17 @@ class SumoPlant:
         for _ in range(round(self._scenario.step / self._session.step_length)):
             self._actuation.play()
             self._session.step()
-            entered = self._sensing.observe()
+            entered = self._sensing.measure()
             self._guide.apply(entered)
         assert abs(self._session.time - end) < 1e-6
         self._k += 1
-        measurement = self._sensing.measure(self._k, controls)
+        state = self._sensing.finish(self._k, controls)
         self._recorder.add(self._sensing.streets)
-        return measurement
+        return state
 
-    def completed(self) -> float:
-        return float(self._sensing.meter.arrivals.sum())
+    def observe(self) -> Observation | None:
+        """The estimate, where states are estimated."""
+        return self._sensing.observation(self._k)
 
     def close(self) -> None:
         self._end_session()
@@ -134,7 +135,7 @@ class SumoPlant:
             meter, estimation = Meter(self._session, self.city), None
         else:
             meter = Meter(self._session, self.city, probes(self._launch.vehicles, chosen.probe_share, seed))
-            estimation = Estimation(self._session, self.city, self._layout, meter, self._instruments, self._model)
+            estimation = Estimation(self._session, self.city, self._layout, meter, self._instruments, self._planning)
         return Sensing(self._scenario, self._session, self.city, self._incidents, meter, estimation)
 
     def _new_guide(self, seed: int) -> Guide:

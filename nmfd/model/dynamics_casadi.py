@@ -1,4 +1,4 @@
-"""The regional model in CasADi (design.md, section 2): the twin of `dynamics`, for optimisation.
+"""The regional model in CasADi: the twin of `dynamics`, for optimisation by IPOPT.
 
 The same names and equations on SX, MX or DM matrices, without a batch: x (R, R) [veh], [i, j] in region i bound for j;
 demand (R, R) [veh/s]; perimeter (R, R) [-], [i, h]; splits: a sequence of R matrices (R, R) [-], splits[i][h, j].
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, Network
+from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class Parameters:
     storage: ca.DM | None
 
 
-def parameters(network: Network) -> Parameters:
+def parameters(network: RegionalModel) -> Parameters:
     def column(name):
         return ca.DM([getattr(m, name) for m in network.mfds])
 

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.config import quoted
 
 
-def network_toml(network: Network, sumo: Mapping[str, str], comment: str) -> str:
+def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) -> str:
     """network.toml of `network` with this table [sumo]."""
     out = io.StringIO()
     out.write(f"# {comment}\nname = {quoted(network.name)}\n\n")
@@ -35,7 +35,7 @@ def network_toml(network: Network, sumo: Mapping[str, str], comment: str) -> str
     return out.getvalue()
 
 
-def _options(network: Network, region: int) -> str:
+def _options(network: RegionalModel, region: int) -> str:
     """exit_rates, capacity and storage of one region, as far as the network has them."""
     lines = ""
     if network.exit_rates is not None:
