@@ -163,5 +163,5 @@ def _check_mesoscopic(scenario: Scenario, chosen: Settings) -> None:
         if chosen.mesoscopic and getattr(chosen, key) == value:
             where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
             raise InputError(
-                f"{where}: sumo.{key}: {value} {what}, but SUMO's mesoscopic model has no lanes; leave it away, or set "
+                f"{where}: sumo.{key}: {value} {what}, but SUMO's mesoscopic model has no lanes; omit it, or set "
                 "mesoscopic = false (import the city without --mesoscopic)")
