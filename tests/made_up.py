@@ -57,7 +57,6 @@ def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(experiment, "outcomes", lambda function, todo, workers, *, fresh: (
             (task, result(task, city)) for task in todo))
-        patch.setattr(evaluate.pictures, "draw_all", lambda *_: None)
         evaluate.evaluate(evaluate.Evaluation(
             scenario=SCENARIO, controllers=controllers, seeds=seeds, levels=levels, steps=STEPS, out=out))
     return out

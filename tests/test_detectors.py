@@ -89,8 +89,9 @@ def test_all_links_and_all_probes_see_everything(scenario):
     seen = []
     try:
         state, controller = plant.reset(3), PiGating(planning_model(scenario))
-        readings = plant._detectors.readings
-        plant._detectors.readings = lambda flow: (seen.append(readings(flow)), seen[-1])[1]
+        detectors = plant._sensing._estimation._detectors
+        readings = detectors.readings
+        detectors.readings = lambda flow: (seen.append(readings(flow)), seen[-1])[1]
         for _ in range(scenario.steps):
             before, state = state, plant.step(controller.act(plant.observe()))
         estimate = plant.observe()

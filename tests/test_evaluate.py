@@ -13,6 +13,7 @@ from click.testing import CliRunner
 from cosim.cli.main import main
 from cosim.evaluation import evaluate, experiment
 from cosim.evaluation.simulate import FACTS, Result
+from cosim.report import pictures
 from nmfd.errors import InputError
 from nmfd.runs.workers import Failure
 
@@ -48,7 +49,6 @@ def ran(monkeypatch):
             yield task, Failure("SUMO fell over") if (task.controller, task.seed) in failing else made_up(task)
 
     monkeypatch.setattr(experiment, "outcomes", outcomes)
-    monkeypatch.setattr(evaluate.pictures, "draw_all", lambda *_: None)
     return tasks, failing
 
 
@@ -166,8 +166,8 @@ def test_a_small_evaluation_in_sumo(city, tmp_path):
 
 def test_titles_name_the_most_teleports():
     rows = pd.DataFrame([{"controller": f"c{n}", "teleports": 0} for n in (1, 2)])
-    assert evaluate.pictures.teleports(rows) == "no teleport in any run"
+    assert pictures.teleports(rows) == "no teleport in any run"
     rows = pd.DataFrame([{"controller": name, "teleports": count} for name, count in (
         ("a", 1), ("b", 9), ("c", 4), ("d", 0), ("b", 2))])
-    assert evaluate.pictures.teleports(rows) == "teleports: b 11, c 4, others fewer"
-    assert evaluate.pictures.teleports(rows[rows["controller"] != "a"]) == "teleports: b 11, c 4"
+    assert pictures.teleports(rows) == "teleports: b 11, c 4, others fewer"
+    assert pictures.teleports(rows[rows["controller"] != "a"]) == "teleports: b 11, c 4"

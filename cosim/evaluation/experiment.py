@@ -13,7 +13,7 @@ import pandas as pd
 from cosim.evaluation import estimation_errors
 from cosim.evaluation.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.plant import incidents
-from cosim.plant.plant import own_vehicles
+from cosim.plant.launch import own_vehicles
 from cosim.plant.settings import FILES, Settings, settings
 from cosim.plant.strategy import MAX_PRESSURE, configured, parse
 from cosim.sumo import outputs

@@ -12,6 +12,8 @@ from importlib import metadata
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
+import sumo
+
 from cosim.sumo.recipe import CityTable, RecipeTable
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
@@ -245,8 +247,6 @@ def _link(source: str, target: str, lane: int, into: int) -> str:
 
 def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
     """The bytes of net.xml and regions.csv; the same recipe gives the same bytes. InputError if netconvert fails."""
-    import sumo
-
     *plain, region_of = _plain_xml(recipe)
     signals = recipe.table.signals
     with Scratch("cosim-") as folder:
