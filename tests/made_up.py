@@ -37,10 +37,12 @@ def result(task, city) -> Result:
     record = {
         "departures": random.integers(0, 9, (steps, regions, regions)), "crossings": crossings,
         "arrivals": random.integers(0, 50, (steps, regions)),
-        "edge_vehicles": random.uniform(0.0, 20.0, (steps, edges)).astype(np.float16),
+        "edge_vehicles": random.uniform(0.0, 20.0, (steps, edges)).astype(np.float32),
         "gateway_green": original * (0.7 if acts else 1.0), "gateway_original_green": original,
         "gateway_flow": random.uniform(0.0, 9.0, (steps, gateways)),
         "gateway_queue": random.uniform(0.0, 9.0, (steps, gateways)),
+        "gateway_queue_max": np.full((steps, gateways), 9), "teleports": np.zeros(steps, dtype=int),
+        "production": random.uniform(0.0, 9.0, (steps, regions)), "mean_accumulation": np.ones((steps, regions)),
         "guided": crossings * guides}
     facts = {name: random.uniform(0.1, 100.0) for name in FACTS} | {
         "controller": task.controller, "seed": task.seed, "trips": 600, "late_decisions": 0,

@@ -2,6 +2,8 @@
 
 import csv
 import functools
+import hashlib
+import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -70,6 +72,20 @@ class Scenario:
         spread = self.forecast_error / np.sqrt(2.0)
         normal = random.standard_normal((1, *self.demand.shape[1:])) + random.standard_normal(self.demand.shape)
         return self.demand * np.exp(spread * normal - spread**2)
+
+
+    @cached_property
+    def hash(self) -> str:
+        """A fingerprint of all that a run depends on, whatever its files are called."""
+        settings = [
+            self.network.hash, self.step, self.steps, self.measurement_std, self.integrator, self.substeps,
+            self.protected, self.controller_options]
+        if self.forecast_error:
+            settings.append([self.forecast_error, self.forecast_seed])
+        if self.faults:
+            settings.append(self.faults)
+        text = json.dumps(settings, sort_keys=True, default=str)
+        return hashlib.sha256(text.encode() + np.ascontiguousarray(self.demand).tobytes()).hexdigest()[:16]
 
 
 def trapezoid(time: np.ndarray, *, start: float, peak: float, ramp_up: float, flat: float, ramp_down: float):

@@ -21,7 +21,6 @@ from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import Network
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import atomic
-from nmfd.runs.run_folder import scenario_hash
 from nmfd.types import Controls, Measurement
 
 NAMES = {"bound-pc": False, "bound-pcrg": True}  # whether routes are guided too
@@ -199,8 +198,8 @@ def _total_time_spent(scenario: Scenario, parameters, demand, perimeter, splits)
 
 
 def model_hash(scenario: Scenario) -> str:
-    """A fingerprint of all that a plan depends on: runs.scenario_hash without controllers and measurement noise."""
-    return scenario_hash(replace(scenario, controller_options={}, protected=(), measurement_std=0.0))
+    """A fingerprint of all that a plan depends on: Scenario.hash without controllers and measurement noise."""
+    return replace(scenario, controller_options={}, protected=(), measurement_std=0.0).hash
 
 
 def write(plan: Plan, scenario: Scenario, path: Path) -> None:
