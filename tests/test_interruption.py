@@ -1,7 +1,6 @@
 """kill -9 at any moment: what was finished stays, nothing half-written counts, and the same command goes on to the same
 bytes. Commands run in forked processes, which kill themselves beside a write, or are killed after a while."""
 
-import fcntl
 import json
 import os
 import random
@@ -26,7 +25,7 @@ from cosim.plant.plant import SumoPlant
 from nmfd.controllers.dpc import training
 from nmfd.errors import InputError
 from nmfd.model.scenario import load_scenario
-from nmfd.runs import files, run_folder, workers
+from nmfd.runs import files, run_folder, scratch, workers
 from nmfd.runs.files import TEMPORARY
 from nmfd.runs.run_folder import LOCK
 from nmfd.runs.scratch import Scratch, sweep
@@ -383,14 +382,15 @@ def test_scratch_folders_of_killed_processes_go_at_the_next_start(tmp_path, monk
 
 def test_what_is_made_while_others_look_for_old_folders_stays(tmp_path, monkeypatch):
     """A folder that was taken for an old one before it was locked is made anew."""
-    flock = fcntl.flock
+    acquire = scratch.FileLock.acquire
 
-    def swept_before(file, operation):
-        monkeypatch.setattr(fcntl, "flock", flock)
+    def swept_before(lock):
+        monkeypatch.setattr(scratch.FileLock, "acquire", acquire)
+        Path(lock.lock_file).touch()
         sweep(tmp_path, "x-")
-        flock(file, operation)
+        return acquire(lock)
 
-    monkeypatch.setattr(fcntl, "flock", swept_before)
+    monkeypatch.setattr(scratch.FileLock, "acquire", swept_before)
     with Scratch("x-", where=tmp_path) as folder:
         sweep(tmp_path, "x-")
         assert list(tmp_path.iterdir()) == [folder]

@@ -11,7 +11,7 @@ from cosim.cli.run import compare, run
 from nmfd.cli.errors import Commands, Interrupted
 from nmfd.cli.options import COUNT, FOLDER, SEED
 from nmfd.errors import InputError
-from nmfd.runs.workers import RunFailed
+from nmfd.runs.workers import RunFailed, cores
 
 
 @click.group(name="cosim", cls=Commands)
@@ -66,8 +66,6 @@ def evaluate(
         raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
     files = policy_files(policies, names)
 
-    import os
-
     from cosim.evaluation import evaluate, statistics
     from nmfd.cli.progress import progress_line
     from nmfd.model.scenario import load_scenario
@@ -78,7 +76,7 @@ def evaluate(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
         levels=tuple(parsed_levels("--demand", demand)), steps=steps, policies=files, reference=reference,
         out=Path("runs") / f"{disk.file_name(loaded.name)}-evaluate" if out is None else out)
-    workers = len(os.sched_getaffinity(0)) if workers is None else workers
+    workers = cores() if workers is None else workers
     try:
         with progress_line("evaluate") as progress:
             table, failures = evaluate.evaluate(chosen, workers=workers, progress=progress, tell=tell)
@@ -139,8 +137,6 @@ def sweep(
         raise InputError("--workers: is for processes here, and --scheduler has workers of its own; leave one away")
     files = policy_files(policies, names)
 
-    import os
-
     from cosim.evaluation import sweeps
     from nmfd.cli.progress import progress_line
     from nmfd.model.scenario import load_scenario
@@ -151,7 +147,7 @@ def sweep(
         levels=tuple(parsed_levels("--demand", demand)), compliance=parsed_compliance(compliance), steps=steps,
         policies=files,
         out=Path("runs") / f"{disk.file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
-    workers = len(os.sched_getaffinity(0)) if workers is None else workers
+    workers = cores() if workers is None else workers
     try:
         with progress_line("sweep") as progress:
             rows = sweeps.sweep(order, workers=workers, scheduler=scheduler, progress=progress, tell=tell)

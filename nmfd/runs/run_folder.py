@@ -62,8 +62,7 @@ def _write_variable(file: netCDF4.Dataset, name: str, dimensions, values: np.nda
     for dimension, size in zip(dimensions, values.shape, strict=True):
         if dimension not in file.dimensions:
             file.createDimension(dimension, size)
-    kind, compression = (str, None) if text else (values.dtype, "zlib")
-    variable = file.createVariable(name, kind, dimensions, compression=compression)
+    variable = file.createVariable(name, str if text else values.dtype, dimensions, zlib=not text)
     variable.setncatts(attributes)
     variable[...] = values.astype(object) if text else values
 
@@ -100,7 +99,7 @@ def opened(path: Path) -> Iterator[netCDF4.Dataset]:
 
 def refuse_old(folder: Path) -> None:
     """InputError for a folder of runs that an older version wrote."""
-    if not any(folder.glob("*.npz")):
+    if not any(folder.glob("*-[0-9]*.npz")):
         return
     command = "the command that made it"
     with suppress(InputError, LookupError):
