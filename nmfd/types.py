@@ -100,7 +100,7 @@ class Trajectory:
     splits: np.ndarray = quantity(
         "interval", "region", "next_region", "destination", unit="1",
         text="share of the vehicles that heads for the next region; nominal where there was no route guidance")
-    decision_time: np.ndarray = quantity("interval", unit="s", text="wall time of Controller.act")
+    decision_time: np.ndarray = quantity("interval", unit="s", text="wall time of Controller.act; not in files")
     status: tuple[str, ...] = quantity("interval", unit="", text="ok, or the declared fallback", repr=False)
     estimate: np.ndarray | None = quantity(
         "time", "region", "destination", unit="veh", default=None,

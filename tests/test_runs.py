@@ -6,6 +6,7 @@ import json
 import os
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from nmfd.errors import InputError
 from nmfd.runs import files, run_folder, workers
 from nmfd.types import Trajectory
 
+ROOT = Path(__file__).parents[1]
 CONFIGURATION = {"scenario": "x", "step": 30.0, "protected": (1, 2)}
 
 
@@ -82,6 +84,11 @@ def test_xarray_opens_a_run_with_names_and_units(tmp_path):
     assert (run_folder.read_trajectory(tmp_path / "a.nc").estimate == 1.0).all()
 
 
+@pytest.mark.parametrize("page, kind", [("nmfd/runs/README.md", Trajectory), ("cosim/plant/record.md", Record)])
+def test_the_pages_list_what_is_in_a_file(page, kind):
+    assert quantities.reference(kind) in (ROOT / page).read_text()
+
+
 def test_the_tables_of_a_run_row_by_row():
     run = trajectory()
     states, controls = run.to_frame(), run.controls_frame()
@@ -111,6 +118,21 @@ def test_a_folder_of_an_older_version_says_what_to_run(tmp_path, plant, command)
 @pytest.mark.parametrize("content", [b"", b"nonsense", b"PK\x03\x04 cut off"])
 def test_a_file_that_is_no_trajectory(tmp_path, content):
     (tmp_path / "a.nc").write_bytes(content)
+    with pytest.raises(InputError, match="a.nc: is no run"):
+        run_folder.read_trajectory(tmp_path / "a.nc")
+
+
+def test_a_run_that_was_cut_off_anywhere(tmp_path):
+    run_folder.write_trajectory(tmp_path / "a.nc", trajectory())
+    whole = (tmp_path / "a.nc").read_bytes()
+    for length in [*range(0, len(whole), len(whole) // 20), len(whole) - 1]:
+        (tmp_path / "a.nc").write_bytes(whole[:length])
+        with pytest.raises(InputError, match="a.nc: is no run"):
+            run_folder.read_trajectory(tmp_path / "a.nc")
+
+
+def test_a_netcdf_file_of_somebody_else(tmp_path):
+    xr.Dataset({"temperature": ("time", np.ones(3))}).to_netcdf(tmp_path / "a.nc", engine="netcdf4")
     with pytest.raises(InputError, match="a.nc: is no run"):
         run_folder.read_trajectory(tmp_path / "a.nc")
 

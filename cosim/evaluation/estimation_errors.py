@@ -47,8 +47,7 @@ def write(folder: Path, network: Network, trajectories: Sequence[Trajectory]) ->
         return rows
     from nmfd.studies import plots
 
-    with files.atomic(folder / "estimation.csv") as temporary:
-        rows.to_csv(temporary, index=False)
+    files.write_text(folder / "estimation.csv", rows.to_csv(index=False))
     for trajectory in estimated:
         path = folder / f"estimate-{run_folder.run_name(trajectory.controller, trajectory.seed)}.png"
         if not path.exists():

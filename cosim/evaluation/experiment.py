@@ -224,8 +224,7 @@ def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
     rows = read_facts(path) if path.is_file() else pd.DataFrame(columns=FACTS)
     same = (rows["controller"] == result.facts["controller"]) & (rows["seed"] == result.facts["seed"])
     rows = pd.DataFrame([*rows[~same].to_dict("records"), result.facts], columns=FACTS)
-    with disk.atomic(path) as temporary:
-        rows.to_csv(temporary, index=False)
+    disk.write_text(path, rows.to_csv(index=False))
 
 
 def overview(folder: Path) -> pd.DataFrame:

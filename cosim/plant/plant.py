@@ -204,7 +204,7 @@ class SumoPlant:
         row["production"], row["mean_accumulation"] = (
             np.bincount(self._edge_region, amount, network.regions) / len(queues) for amount in (metres, vehicles))
         self._opened = self._overridden(vehicles / len(queues))
-        row["edge_vehicles"] = (vehicles / len(queues)).astype(np.float16).astype(np.float32)  # to 0.1 %: it compresses
+        row["edge_vehicles"] = (vehicles / len(queues)).astype(np.float16)  # to 0.1 % and as small as an integer
         queues = np.array(queues).reshape(len(queues), len(self._upstream))
         row["gateway_queue"], row["gateway_queue_max"] = (
             queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))

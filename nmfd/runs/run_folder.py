@@ -9,13 +9,10 @@
 
 import json
 import math
-import platform
-import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
-from importlib import metadata
 from pathlib import Path
 from urllib.parse import quote
 
@@ -26,6 +23,7 @@ from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.quantities import quantities
 from nmfd.runs import files
+from nmfd.runs.provenance import provenance
 from nmfd.types import Trajectory
 
 COLUMNS = {
@@ -34,7 +32,6 @@ COLUMNS = {
     "control_step_ms_median": float, "control_step_ms_max": float, "solver_failures": int,
 }
 LOCK = ".lock"  # of a run folder
-PACKAGES = ("numpy", "torch", "casadi", "libsumo", "perimeter-cosim")
 # What reading raises for a file that is no netCDF, cut off, changed, or without a variable that it should have.
 DAMAGED = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError, MemoryError)
 
@@ -59,6 +56,8 @@ def write_trajectory(path: Path, trajectory: Trajectory, record: Mapping[str, tu
 
 def _write_variable(file: netCDF4.Dataset, name: str, dimensions, values: np.ndarray, attributes: Mapping) -> None:
     dimensions, text = np.atleast_1d(dimensions), values.dtype.kind == "U"
+    if values.dtype == np.float16:  # netCDF has none; compressed it takes no more room
+        values = values.astype(np.float32)
     for dimension, size in zip(dimensions, values.shape, strict=True):
         if dimension not in file.dimensions:
             file.createDimension(dimension, size)
@@ -131,30 +130,6 @@ def read_manifest(path: Path) -> dict:
 def read_summary(path: Path) -> list[dict]:
     """The rows of summary.csv with the types of metrics.summary. Raises InputError."""
     return files.read_rows(path, COLUMNS)
-
-
-def provenance() -> dict:
-    """Date, versions, and the commit of the checkout that this package lies in; commit is None outside one."""
-    versions = {"python": platform.python_version()}
-    for package in PACKAGES:
-        with suppress(metadata.PackageNotFoundError):
-            versions[package] = metadata.version(package)
-    here = Path(__file__).resolve()
-    # An installed copy may lie inside somebody else's checkout: the commit counts only if this file is tracked.
-    tracked = _git(here.parent, "ls-files", "--error-unmatch", here.name) is not None
-    commit = _git(here.parent, "rev-parse", "HEAD") if tracked else None
-    changes = _git(here.parent, "status", "--porcelain", "--untracked-files=no") if commit else None
-    return {
-        "date": datetime.now().astimezone().isoformat(timespec="seconds"), "versions": versions,
-        "commit": commit, "dirty": None if changes is None else bool(changes)}
-
-
-def _git(folder: Path, *arguments: str) -> str | None:
-    try:
-        done = subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, timeout=10)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() if done.returncode == 0 else None
 
 
 def run_name(controller: str, seed: int) -> str:

@@ -215,7 +215,7 @@ def write(plan: Plan, scenario: Scenario, path: Path) -> None:
 def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
     """What `write` wrote; InputError if it is none, of another scenario, or of the other action set."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:  # NumPy leaves others open
             content = {name: file[name] for name in file.files}
         plan = Plan(
             perimeter=content["perimeter"], splits=content.get("splits"), start=str(content["start"]),
