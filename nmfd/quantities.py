@@ -11,29 +11,29 @@ from typing import Any
 import numpy as np
 
 
-def quantity(*dimensions: str, unit: str, text: str, **options) -> Any:
+def quantity(*dimensions: str, unit: str, text: str, attributes: Mapping | None = None, **options) -> Any:
     """A dataclass field that holds an array with these named axes; options: of dataclasses.field.
 
-    unit: "" of texts
+    unit: "" of texts; attributes: more of them, for the file
     """
-    return field(metadata={"dimensions": dimensions, "unit": unit, "text": text}, **options)
+    attributes = {**({"units": unit} if unit else {}), **(attributes or {})}
+    return field(metadata={"dimensions": dimensions, "text": text, "attributes": attributes}, **options)
 
 
 def quantities(kind: type) -> dict[str, Mapping]:
-    """Name -> dimensions, unit and text of the fields of a dataclass that are quantities."""
+    """Name -> dimensions, text and attributes of the fields of a dataclass that are quantities."""
     return {f.name: f.metadata for f in fields(kind) if "dimensions" in f.metadata}
 
 
 def variables(kind: type, values: Mapping) -> dict[str, tuple]:
     """The `values` of quantities of `kind` as xarray.Dataset takes them: name -> (dimensions, array, attributes)."""
     return {
-        name: (about["dimensions"], np.asarray(values[name]),
-               {"long_name": about["text"], **({"units": about["unit"]} if about["unit"] else {})})
-        for name, about in quantities(kind).items() if values.get(name) is not None}
+        name: (about["dimensions"], np.asarray(values[name]), {"long_name": about["text"], **about["attributes"]})
+        for name, about in quantities(kind).items()}
 
 
 def reference(kind: type) -> str:
     """The quantities of `kind` as a Markdown table."""
-    lines = [f"| {name} | {', '.join(about['dimensions'])} | {about['unit']} | {about['text']} |"
+    lines = [f"| {name} | {', '.join(about['dimensions'])} | {about['attributes'].get('units', '')} | {about['text']} |"
              for name, about in quantities(kind).items()]
     return "\n".join(["| variable | dimensions | unit | what |", "|---|---|---|---|", *lines])

@@ -1,6 +1,7 @@
 """What plants, controllers and the closed loop hand to one another."""
 
 from dataclasses import dataclass
+from enum import Flag
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -12,15 +13,35 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+class Status(Flag):
+    """What was not as it should be with one decision: OK, or several of these together. `Controls.note` says why.
+
+    SOLVER_FAILURE: what computes the controls gave no answer that it vouches for: a solver that failed, diverged or
+        stopped short of its tolerance, a policy or controller whose numbers are none
+    FALLBACK: the controls are not those of the controller that was asked for, but of something behind it
+    SENSOR_FAULT: the controller was given a wrong, late or incomplete observation
+    PLANT_FAULT: the city could not do what was commanded, or was not whole, during the interval
+
+    Decisions that took longer than the control interval are no status, for wall times are not part of a result: they
+    are counted in the tables (nmfd.metrics.late_decisions).
+    """
+
+    OK = 0
+    SOLVER_FAILURE = 1
+    FALLBACK = 2
+    SENSOR_FAULT = 4
+    PLANT_FAULT = 8
+
+
 @dataclass(frozen=True, kw_only=True)
-class Measurement:
-    """What a controller sees at the start of control interval `step`.
+class State:
+    """What a plant is in at the start of control interval `step`: the truth, which only tables and pictures see.
 
     step: k = 0, 1, ...
     time: seconds since the start [s]
     accumulation: (R, R) [veh], [i, j] = in region i bound for j
     backlog: (R, R) [veh], [i, j] = waiting outside the network to enter region i, bound for j; zero in the NMFD
-    estimate, estimated_backlog: (R, R) [veh], what a controller sees instead where the plant only estimates them
+    completed: trips ended since the start [veh]
     problem: what the plant could not do in the interval that has just ended, "" if nothing
     """
 
@@ -28,9 +49,28 @@ class Measurement:
     time: float
     accumulation: np.ndarray
     backlog: np.ndarray
-    estimate: np.ndarray | None = None
-    estimated_backlog: np.ndarray | None = None
+    completed: float
     problem: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """What a controller is given at the start of control interval `step`: with noise, with faults, or an estimate.
+
+    step, time: as of the State
+    accumulation: (R, R) [veh], [i, j] = in region i bound for j
+    backlog: (R, R) [veh], [i, j] = waiting outside the network to enter region i, bound for j
+    """
+
+    step: int
+    time: float
+    accumulation: np.ndarray
+    backlog: np.ndarray
+
+    def copy(self) -> "Observation":
+        """The same with arrays of its own."""
+        return Observation(
+            step=self.step, time=self.time, accumulation=self.accumulation.copy(), backlog=self.backlog.copy())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,40 +81,41 @@ class Controls:
         ignored where h is not adjacent to i
     splits: (R, R, R) [-], [i, h, j] = theta_ihj, share of the vehicles in i bound for j that head for h;
         None without route guidance: drivers keep the routes they have (in the regional model the nominal splits)
-    status: "ok", or why these controls are a fallback
+    status: OK, or what these controls are instead; note: the same in words, "" if OK
     """
 
     perimeter: np.ndarray
     splits: np.ndarray | None
-    status: str = "ok"
+    status: Status = Status.OK
+    note: str = ""
 
 
 class Plant(Protocol):
     """A city, regional or microscopic. `step` is one control interval."""
 
-    def reset(self, seed: int) -> Measurement:
-        """Start again from the beginning; the exact state."""
+    def reset(self, seed: int) -> State:
+        """Start again from the beginning."""
 
-    def step(self, controls: Controls) -> Measurement:
-        """Apply `controls` for one control interval; the exact state at its end."""
+    def step(self, controls: Controls) -> State:
+        """Apply `controls` for one control interval; the state at its end."""
 
-    def completed(self) -> float:
-        """Trips ended since the reset [veh]."""
+    def observe(self) -> Observation | None:
+        """What the plant's own instruments tell now; None where it has none, and the state itself is measured."""
 
     def close(self) -> None:
         """Release what the plant holds; nothing may be called afterwards but `reset`."""
 
 
 class Controller(Protocol):
-    """Anything that turns measurements into controls."""
+    """Anything that turns observations into controls."""
 
     name: str
 
     def reset(self, seed: int = 0) -> None:
         """Forget everything of an earlier run; what the controller draws by lot follows from `seed`."""
 
-    def act(self, measurement: Measurement) -> Controls:
-        """The controls of the interval that begins now."""
+    def act(self, observation: Observation) -> Controls:
+        """The controls of the interval that begins now. The arrays of `observation` are the controller's own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +124,7 @@ class Trajectory:
 
     controller, plant, seed
     step: control interval [s]
+    estimated: whether what was observed is an estimate of the plant's own instruments
     wall_time: of the whole loop [s]
     """
 
@@ -90,10 +132,16 @@ class Trajectory:
     plant: str
     seed: int
     step: float
+    estimated: bool
     wall_time: float
     accumulation: np.ndarray = quantity("time", "region", "destination", unit="veh", text="vehicles inside")
     backlog: np.ndarray = quantity("time", "region", "destination", unit="veh", text="vehicles waiting to enter")
     completed: np.ndarray = quantity("time", unit="veh", text="trips ended, cumulative")
+    observed: np.ndarray = quantity(
+        "time", "region", "destination", unit="veh",
+        text="vehicles inside as the controller was given them; the last as it would have been")
+    observed_backlog: np.ndarray = quantity(
+        "time", "region", "destination", unit="veh", text="vehicles waiting to enter as the controller was given them")
     perimeter: np.ndarray = quantity(
         "interval", "region", "next_region", unit="1",
         text="share of the desired transfer flow that may pass; 0 between regions that are not adjacent")
@@ -101,10 +149,11 @@ class Trajectory:
         "interval", "region", "next_region", "destination", unit="1",
         text="share of the vehicles that heads for the next region; nominal where there was no route guidance")
     decision_time: np.ndarray = quantity("interval", unit="s", text="wall time of Controller.act; not in files")
-    status: tuple[str, ...] = quantity("interval", unit="", text="ok, or the declared fallback", repr=False)
-    estimate: np.ndarray | None = quantity(
-        "time", "region", "destination", unit="veh", default=None,
-        text="vehicles inside as the controller saw them, where the plant estimated them")
+    status: np.ndarray = quantity(
+        "interval", unit="1", text="what was not as it should be with the decision, 0 if nothing (nmfd.types.Status)",
+        attributes={"flag_masks": [kind.value for kind in Status],
+                    "flag_meanings": " ".join(str(kind.name).lower() for kind in Status)})
+    note: tuple[str, ...] = quantity("interval", unit="", text="the status in words", repr=False)
 
     @property
     def variables(self) -> dict[str, tuple]:
@@ -117,8 +166,10 @@ class Trajectory:
 
     @property
     def labels(self) -> dict[str, str | int | float]:
-        """What run this is: controller, plant, seed and step [s]."""
-        return {name: getattr(self, name) for name in ("controller", "plant", "seed", "step")}
+        """What run this is: controller, plant, seed, step [s] and estimated (0 or 1)."""
+        return {
+            "controller": self.controller, "plant": self.plant, "seed": self.seed, "step": self.step,
+            "estimated": int(self.estimated)}
 
     def to_dataset(self) -> "xr.Dataset":
         """Everything but `wall_time`, with named dimensions, times in seconds, and units as attributes."""

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trajectories
 
 from cosim.evaluation import evaluate, experiment
 from cosim.evaluation.simulate import FACTS, Result, scenario_of
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import load_city
-from nmfd.model.scenario import load_scenario
-from nmfd.types import Trajectory
+from nmfd.api import load_scenario
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
 STEPS = 5
@@ -27,11 +27,11 @@ def result(task, city) -> Result:
     acts, guides = task.controller != "no-control", "rg" in task.controller
     perimeter = random.uniform(0.3, 0.9, (steps, regions, regions)) if acts else np.full((steps, regions, regions), 0.9)
     crossings = random.integers(0, 9, (steps, regions, regions, regions)) * network.split_mask
-    trajectory = Trajectory(
+    trajectory = trajectories.made(
         controller=task.controller, plant="sumo", seed=task.seed, step=scenario.step, accumulation=accumulation,
         backlog=np.zeros_like(accumulation), completed=100.0 * np.arange(steps + 1), perimeter=perimeter,
         splits=np.repeat(network.nominal_splits[None], steps, axis=0),
-        decision_time=random.uniform(0.001, 0.01, steps), status=("ok",) * steps, wall_time=1.0)
+        decision_time=random.uniform(0.001, 0.01, steps), wall_time=1.0)
     edges, gateways = len(city.edges), len(city.gateways)
     original = np.full((steps, gateways), 30.0)
     record = {

@@ -23,10 +23,10 @@ from click.testing import CliRunner
 import cosim.cli.main
 import nmfd.cli.main
 from nmfd import closed_loop
+from nmfd.api import load_scenario
 from nmfd.controllers.dpc import training
 from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
 from nmfd.model.regional_model import load_network
-from nmfd.model.scenario import load_scenario
 from nmfd.studies import benchmark
 
 ROOT = Path(__file__).parents[1]

@@ -7,6 +7,7 @@ import copies
 import numpy as np
 import pandas as pd
 import pytest
+import trajectories
 from click.testing import CliRunner
 
 from cosim.cli.main import main
@@ -16,7 +17,6 @@ from cosim.plant.record import Record
 from nmfd.errors import InputError
 from nmfd.quantities import quantities
 from nmfd.runs.workers import Failure
-from nmfd.types import Trajectory
 
 ROOT = Path(__file__).parents[1]
 
@@ -55,10 +55,10 @@ def ran(monkeypatch):
 
 
 def made_up(task) -> Result:
-    trajectory = Trajectory(
+    trajectory = trajectories.made(
         controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=np.ones((3, 7, 7)),
         backlog=np.zeros((3, 7, 7)), completed=np.zeros(3), perimeter=np.ones((2, 7, 7)),
-        splits=np.zeros((2, 7, 7, 7)), decision_time=np.zeros(2), status=("ok", "ok"), wall_time=1.0)
+        splits=np.zeros((2, 7, 7, 7)), decision_time=np.zeros(2), wall_time=1.0)
     facts = {name: 0 for name in FACTS} | {"controller": task.controller, "seed": task.seed}
     record = {name: np.zeros([2] + [7] * (len(about["dimensions"]) - 1)) for name, about in quantities(Record).items()}
     return Result(trajectory=trajectory, record=record, facts=facts)

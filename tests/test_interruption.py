@@ -22,9 +22,9 @@ from click.testing import CliRunner
 import cosim.cli.main
 import nmfd.cli.main
 from cosim.plant.plant import SumoPlant
+from nmfd.api import load_scenario
 from nmfd.controllers.dpc import training
 from nmfd.errors import InputError
-from nmfd.model.scenario import load_scenario
 from nmfd.runs import files, run_folder, scratch, workers
 from nmfd.runs.files import TEMPORARY
 from nmfd.runs.run_folder import LOCK

@@ -8,10 +8,10 @@ import tiny
 import torch
 from click.testing import CliRunner
 
+from nmfd.api import load_scenario
 from nmfd.cli.main import main
 from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint, load_policy
 from nmfd.model.regional_model import load_network
-from nmfd.model.scenario import load_scenario
 
 ROOT = Path(__file__).parents[1]
 onnxruntime = pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trajectories
 import xarray as xr
 
 from cosim.plant.record import Record
@@ -17,7 +18,7 @@ from nmfd import quantities
 from nmfd.cli.progress import ProgressLine, progress_line
 from nmfd.errors import InputError
 from nmfd.runs import files, run_folder, workers
-from nmfd.types import Trajectory
+from nmfd.types import Status, Trajectory
 
 ROOT = Path(__file__).parents[1]
 CONFIGURATION = {"scenario": "x", "step": 30.0, "protected": (1, 2)}
@@ -25,10 +26,11 @@ CONFIGURATION = {"scenario": "x", "step": 30.0, "protected": (1, 2)}
 
 def trajectory(controller="no-control", seed=0, steps=4):
     rng = np.random.default_rng(seed)
-    return Trajectory(
+    return trajectories.made(
         controller=controller, plant="nmfd", seed=seed, step=30.0, accumulation=rng.random((steps + 1, 2, 2)),
         backlog=np.zeros((steps + 1, 2, 2)), completed=np.arange(steps + 1.0), perimeter=rng.random((steps, 2, 2)),
-        splits=rng.random((steps, 2, 2, 2)), decision_time=rng.random(steps), status=("ok",) * (steps - 1) + ("no",),
+        splits=rng.random((steps, 2, 2, 2)), decision_time=rng.random(steps), note=("",) * (steps - 1) + ("no",),
+        status=np.array([0] * (steps - 1) + [(Status.SOLVER_FAILURE | Status.FALLBACK).value]),
         wall_time=1.0)
 
 
@@ -42,10 +44,10 @@ def test_trajectory_round_trip_and_same_bytes(tmp_path):
     run_folder.write_trajectory(tmp_path / "a.nc", original)
     run_folder.write_trajectory(tmp_path / "b.nc", replace(original, decision_time=2 * original.decision_time))
     back = run_folder.read_trajectory(tmp_path / "a.nc")
-    for name in ("accumulation", "backlog", "completed", "perimeter", "splits"):
+    for name in ("accumulation", "backlog", "completed", "observed", "observed_backlog", "perimeter", "splits"):
         np.testing.assert_array_equal(getattr(back, name), getattr(original, name))
     assert (back.controller, back.plant, back.seed, back.step) == ("no-control", "nmfd", 0, 30.0)
-    assert back.status == original.status and back.estimate is None
+    assert back.note == original.note and back.estimated is False and (back.status == original.status).all()
     assert (tmp_path / "a.nc").read_bytes() == (tmp_path / "b.nc").read_bytes()
 
 
@@ -67,21 +69,24 @@ def made_up_record(steps=4):
 
 
 def test_xarray_opens_a_run_with_names_and_units(tmp_path):
-    original, record = replace(trajectory(), estimate=np.ones((5, 2, 2))), made_up_record()
+    original, record = replace(trajectory(), estimated=True), made_up_record()
     run_folder.write_trajectory(tmp_path / "a.nc", original, quantities.variables(Record, record))
     with xr.open_dataset(tmp_path / "a.nc") as data:
         assert dict(data.sizes) == {
             "time": 5, "interval": 4, "region": 2, "destination": 2, "next_region": 2, "gateway": 3, "edge": 5}
-        assert data.attrs == {"controller": "no-control", "plant": "nmfd", "seed": 0, "step": 30.0}
+        assert data.attrs == {"controller": "no-control", "plant": "nmfd", "seed": 0, "step": 30.0, "estimated": 1}
         assert set(data.data_vars) == {*quantities.quantities(Trajectory), *record} - {"decision_time"}
         for name, values in data.variables.items():
-            assert values.attrs["long_name"] and ("units" in values.attrs or name == "status"), name
-        assert list(data["status"].values) == ["ok", "ok", "ok", "no"]
+            assert values.attrs["long_name"] and ("units" in values.attrs or name == "note"), name
+        assert tuple(data["note"].values) == original.note == ("", "", "", "no")
+        assert list(data["status"].values) == [0, 0, 0, 3]  # a solver failure and a fallback
+        assert data["status"].attrs["flag_meanings"] == "solver_failure fallback sensor_fault plant_fault"
+        assert list(data["status"].attrs["flag_masks"]) == [1, 2, 4, 8]
         assert list(data["time"].values) == [0.0, 30.0, 60.0, 90.0, 120.0] and data["time"].attrs["units"] == "s"
         assert float(data["accumulation"].sel(time=60.0, region=1, destination=0)) == original.accumulation[2, 1, 0]
         for name, values in record.items():
             np.testing.assert_array_equal(data[name].values, values)
-    assert (run_folder.read_trajectory(tmp_path / "a.nc").estimate == 1.0).all()
+    assert run_folder.read_trajectory(tmp_path / "a.nc").estimated is True
 
 
 @pytest.mark.parametrize("page, kind", [("nmfd/runs/README.md", Trajectory), ("cosim/plant/record.md", Record)])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 
 NETWORK = """
 name = "{name}"
@@ -61,7 +61,7 @@ def write(folder: Path, *, scenario: str = SCENARIO, network: str | None = None)
     return folder / "scenario"
 
 
-def limited(network: Network, *, seed: int = 0) -> Network:
+def limited(network: RegionalModel, *, seed: int = 0) -> RegionalModel:
     """`network` with exit rates, boundary capacities and storage, all of a size that matters."""
     random, shape = np.random.default_rng(seed), network.adjacency.shape
     most = max(mfd.capacity for mfd in network.mfds)

@@ -10,8 +10,8 @@ from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
 from nmfd.cli.errors import Commands, Interrupted
 from nmfd.cli.options import COUNT, FOLDER, SEED
-from nmfd.errors import InputError
-from nmfd.runs.workers import RunFailed, cores
+from nmfd.errors import InputError, RunFailed
+from nmfd.runs.workers import cores
 
 
 @click.group(name="cosim", cls=Commands)
@@ -67,8 +67,8 @@ def evaluate(
     files = policy_files(policies, names)
 
     from cosim.evaluation import evaluate, statistics
+    from nmfd.api import load_scenario
     from nmfd.cli.progress import progress_line
-    from nmfd.model.scenario import load_scenario
     from nmfd.runs import files as disk
 
     loaded = load_scenario(scenario)
@@ -138,8 +138,8 @@ def sweep(
     files = policy_files(policies, names)
 
     from cosim.evaluation import sweeps
+    from nmfd.api import load_scenario
     from nmfd.cli.progress import progress_line
-    from nmfd.model.scenario import load_scenario
     from nmfd.runs import files as disk
 
     order = sweeps.Sweep(

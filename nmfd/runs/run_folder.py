@@ -29,7 +29,8 @@ from nmfd.types import Trajectory
 COLUMNS = {
     "controller": str, "seed": int, "plant": str, "total_time_spent_veh_s": float, "final_accumulation_veh": float,
     "max_accumulation_veh": float, "completed_veh": float, "evaluation_time_s": float,
-    "control_step_ms_median": float, "control_step_ms_max": float, "solver_failures": int,
+    "control_step_ms_median": float, "control_step_ms_max": float, "solver_failures": int, "fallbacks": int,
+    "late_decisions": int, "sensor_faults": int, "plant_faults": int,
 }
 LOCK = ".lock"  # of a run folder
 # What reading raises for a file that is no netCDF, cut off, changed, or without a variable that it should have.
@@ -74,11 +75,12 @@ def read_trajectory(path: Path) -> Trajectory:
 
 def trajectory_in(file: netCDF4.Dataset) -> Trajectory:
     """That of a run's file (`opened`)."""
-    arrays = {name: file[name][...] for name in quantities(Trajectory) if name in file.variables}
-    arrays["status"] = tuple(map(str, file["status"][...]))
+    arrays = {name: file[name][...] for name in quantities(Trajectory) if name != "decision_time"}
+    arrays["note"] = tuple(arrays["note"])
     return Trajectory(
-        controller=file.controller, plant=file.plant, seed=int(file.seed), step=float(file.step), wall_time=math.nan,
-        decision_time=np.full(len(arrays["status"]), math.nan), **arrays)
+        controller=file.controller, plant=file.plant, seed=int(file.seed), step=float(file.step),
+        estimated=bool(file.estimated), decision_time=np.full(len(arrays["note"]), math.nan), wall_time=math.nan,
+        **arrays)
 
 
 @contextmanager

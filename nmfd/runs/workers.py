@@ -15,7 +15,7 @@ from pathlib import Path
 
 import psutil
 
-from nmfd.errors import InputError
+from nmfd.errors import InputError, RunFailed
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,6 @@ class Failure:
 
     reason: str
     mistake: bool = False
-
-
-class RunFailed(Exception):
-    """Some runs ended in an error. The message names them in one line."""
 
 
 def ended(failures: Sequence[tuple[str, Failure]]) -> Exception:
