@@ -165,7 +165,7 @@ def test_same_seed_same_bytes(scenario, run, tmp_path):
     for name, trajectory in (("a", run), ("b", again)):
         run_folder.write_trajectory(tmp_path / f"{name}.nc", trajectory)
     assert (tmp_path / "a.nc").read_bytes() == (tmp_path / "b.nc").read_bytes()
-    assert (run_folder.read_trajectory(tmp_path / "a.nc").estimate == run.estimate).all()
+    assert (run_folder.read_trajectory(tmp_path / "a.nc").observed == run.observed).all()
 
 
 def test_table_and_picture(scenario, run, tmp_path):
