@@ -1,5 +1,6 @@
 """Run folders: nothing half-written, resumable, the same bytes; and the processes that fill them."""
 
+import ast
 import hashlib
 import io
 import json
@@ -140,6 +141,12 @@ def test_a_netcdf_file_of_somebody_else(tmp_path):
     xr.Dataset({"temperature": ("time", np.ones(3))}).to_netcdf(tmp_path / "a.nc", engine="netcdf4")
     with pytest.raises(InputError, match="a.nc: is no run"):
         run_folder.read_trajectory(tmp_path / "a.nc")
+
+
+def test_no_module_of_one_system_is_imported_at_the_top_of_a_file():
+    found = [(path.name, name.name) for folder in ("nmfd", "cosim") for path in (ROOT / folder).rglob("*.py")
+             for line in ast.parse(path.read_text()).body if isinstance(line, ast.Import) for name in line.names]
+    assert len(found) > 100 and not [pair for pair in found if pair[1] in ("fcntl", "grp", "pwd", "resource")]
 
 
 def test_atomic_leaves_the_old_file_and_nothing_else_when_writing_fails(tmp_path):
