@@ -41,6 +41,8 @@ def result(task, city) -> Result:
         "gateway_green": original * (0.7 if acts else 1.0), "gateway_original_green": original,
         "gateway_flow": random.uniform(0.0, 9.0, (steps, gateways)),
         "gateway_queue": random.uniform(0.0, 9.0, (steps, gateways)),
+        "gateway_queue_max": np.full((steps, gateways), 9), "teleports": np.zeros(steps, dtype=int),
+        "production": random.uniform(0.0, 9.0, (steps, regions)), "mean_accumulation": np.ones((steps, regions)),
         "guided": crossings * guides}
     facts = {name: random.uniform(0.1, 100.0) for name in FACTS} | {
         "controller": task.controller, "seed": task.seed, "trips": 600, "late_decisions": 0,

@@ -13,8 +13,10 @@ from click.testing import CliRunner
 from cosim.cli.main import main
 from cosim.evaluation import evaluate, experiment
 from cosim.evaluation.simulate import FACTS, Result
+from cosim.plant.record import Record
 from cosim.report import pictures
 from nmfd.errors import InputError
+from nmfd.quantities import quantities
 from nmfd.runs.workers import Failure
 
 ROOT = Path(__file__).parents[1]
@@ -58,7 +60,8 @@ def made_up(task) -> Result:
         backlog=np.zeros((3, 7, 7)), completed=np.zeros(3), perimeter=np.ones((2, 7, 7)),
         splits=np.zeros((2, 7, 7, 7)), decision_time=np.zeros(2), wall_time=1.0)
     facts = {name: 0 for name in FACTS} | {"controller": task.controller, "seed": task.seed}
-    return Result(trajectory=trajectory, record={"departures": np.zeros(1)}, facts=facts)
+    record = {name: np.zeros([2] + [7] * (len(about["dimensions"]) - 1)) for name, about in quantities(Record).items()}
+    return Result(trajectory=trajectory, record=record, facts=facts)
 
 
 def evaluation(city, tmp_path, *, controllers=("no-control", "pi-gating"), seeds=(2000, 2001), **others):
@@ -158,10 +161,10 @@ def test_a_small_evaluation_in_sumo(city, tmp_path):
     level = out / "demand-1"
     for picture in ("total_accumulation", "region_accumulation", "link_densities", "gateway_queues", "perimeter"):
         assert (level / f"{picture}.png").stat().st_size > 10_000
-    assert max(path.stat().st_size for path in level.glob("*.record.npz")) < 1_000_000
-    before = {path: path.read_bytes() for path in level.glob("*.npz")}
+    assert max(path.stat().st_size for path in level.glob("*.nc")) < 1_000_000
+    before = {path: path.read_bytes() for path in level.glob("*.nc")}
     assert cosim(*arguments).exit_code == 0
-    assert before == {path: path.read_bytes() for path in level.glob("*.npz")}
+    assert before == {path: path.read_bytes() for path in level.glob("*.nc")}
 
 
 def test_titles_name_the_most_teleports():

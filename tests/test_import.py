@@ -360,7 +360,7 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
                       tmp_path / "loading"))
     assert "Drivers who go their own ways:" in text and "Drivers who are guided:" in text
     assert f"Written to {network / 'guided' / 'network.toml'}" in text
-    assert (tmp_path / "loading" / "guided" / "level-2" / "probing-pcrg-1000.npz").is_file()
+    assert (tmp_path / "loading" / "guided" / "level-2" / "probing-pcrg-1000.nc").is_file()
     loaded = load_scenario(scenario)
     guided = planning_model(loaded, "dpc-pcrg").network
     assert guided.hash != loaded.network.hash and guided.own_splits == loaded.network.own_splits

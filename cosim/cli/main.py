@@ -4,7 +4,6 @@ What brings numpy, pandas, torch or libsumo is imported inside the commands, so 
 instead of 3 s.
 """
 
-import os
 from pathlib import Path
 
 import click
@@ -19,6 +18,7 @@ from nmfd.cli.options import COUNT, FOLDER, SEED, policy_files
 from nmfd.cli.progress import progress_line
 from nmfd.errors import InputError, RunFailed
 from nmfd.runs import files as disk
+from nmfd.runs.workers import cores
 
 
 @click.group(name="cosim", cls=Commands)
@@ -81,7 +81,7 @@ def evaluate(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
         levels=tuple(parsed_levels("--demand", demand)), steps=steps, policies=files, reference=reference,
         out=Path("runs") / f"{disk.file_name(loaded.name)}-evaluate" if out is None else out)
-    workers = len(os.sched_getaffinity(0)) if workers is None else workers
+    workers = cores() if workers is None else workers
     try:
         with progress_line("evaluate") as progress:
             table, failures = evaluate.evaluate(chosen, workers=workers, progress=progress, tell=tell)
@@ -152,7 +152,7 @@ def sweep(
         levels=tuple(parsed_levels("--demand", demand)), compliance=parsed_compliance(compliance), steps=steps,
         policies=files,
         out=Path("runs") / f"{disk.file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
-    workers = len(os.sched_getaffinity(0)) if workers is None else workers
+    workers = cores() if workers is None else workers
     try:
         with progress_line("sweep") as progress:
             rows = sweeps.sweep(order, workers=workers, scheduler=scheduler, progress=progress, tell=tell)

@@ -66,9 +66,9 @@ def run(
     out, rows = _experiment(tasks, out, kinds)
     click.echo(experiment.table(rows))
     if parquet:
-        from nmfd.runs import frames  # heavy
+        from nmfd.runs import frames, run_folder  # heavy
 
-        frames.write(out, experiment.trajectories(out), {"summary": rows})
+        frames.write(out, run_folder.trajectories(out), {"summary": rows})
     if (out / "estimation.csv").is_file():
         import pandas as pd
 
@@ -161,7 +161,7 @@ def _experiment(tasks: list, out: Path | None, sumo_output: tuple[str, ...] = ()
     from nmfd.api import load_scenario
     from nmfd.runs import run_folder
 
-    out = run_folder.default_folder(load_scenario(tasks[0].scenario)) if out is None else out
+    out = run_folder.default_folder(load_scenario(tasks[0].scenario).name) if out is None else out
     tasks = [replace(task, sumo_output=paths(sumo_output, out, task.controller, task.seed)) for task in tasks]
     try:
         with progress_line("cosim") as progress:

@@ -160,8 +160,7 @@ def write(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
     predicted = predict(scenario, result)
     rows = pd.DataFrame(errors(scenario, result, predicted), columns=COLUMNS)
     name = run_folder.run_name(result.trajectory.controller, result.trajectory.seed)
-    with files.atomic(folder / f"compare-{name}.csv") as temporary:
-        rows.to_csv(temporary, index=False)
+    files.write_text(folder / f"compare-{name}.csv", rows.to_csv(index=False))
     drawing, axes = plots.panels(scenario.network.regions + 1)
     for region, ax in enumerate(axes[:-1]):
         plots.region_accumulation(ax, scenario.network, region, [result.trajectory, predicted])

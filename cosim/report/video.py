@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib import animation, rc_context
 
-from cosim.evaluation.experiment import read_run, record_path
+from cosim.evaluation.experiment import read_run
 from cosim.evaluation.results import Finished, Level
 from cosim.evaluation.simulate import Result
 from cosim.report import figures, pictures
@@ -59,15 +59,10 @@ def film(
 ) -> Path:
     """Write the film, atomically; the suffix of `path` chooses the format. rate: frames per second.
 
-    Raises InputError for another suffix, a missing ffmpeg, and runs whose record lacks densities.
+    Raises InputError for another suffix, a missing ffmpeg, and runs that cannot be read.
     """
     with _writer(path, rate) as writer:
         results = {name: read_run(level.folder, name, seed) for name in names}
-        for name, result in results.items():
-            if "edge_vehicles" not in result.record:
-                raise InputError(
-                    f"{record_path(level.folder, name, seed)}: holds no link densities, which this version "
-                    "records; run it again")
         drawing, update = scene(finished.city, results, f"{finished.scenario.name}, demand times {level.demand:g}")
         steps = min(len(result.record["edge_vehicles"]) for result in results.values())
         shown = range(0, steps, -(-steps // FRAMES))

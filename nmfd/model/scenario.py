@@ -1,6 +1,8 @@
 """Demand, noise, horizon: loaded from scenario.toml and checked."""
 
 import csv
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -65,6 +67,19 @@ class Scenario:
         normal = random.standard_normal((1, *self.demand.shape[1:])) + random.standard_normal(self.demand.shape)
         return self.demand * np.exp(spread * normal - spread**2)
 
+
+    @cached_property
+    def hash(self) -> str:
+        """A fingerprint of all that a run depends on, whatever its files are called."""
+        settings = [
+            self.network.hash, self.step, self.steps, self.measurement_std, self.integrator, self.substeps,
+            self.protected, self.controller_options]
+        if self.forecast_error:
+            settings.append([self.forecast_error, self.forecast_seed])
+        if self.faults:
+            settings.append(self.faults)
+        text = json.dumps(settings, sort_keys=True, default=str)
+        return hashlib.sha256(text.encode() + np.ascontiguousarray(self.demand).tobytes()).hexdigest()[:16]
 
     @cached_property
     def ordered_faults(self) -> tuple[Fault, ...]:
