@@ -7,9 +7,8 @@ import copies
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
+from commands import cosim
 
-from cosim.cli.main import main
 from cosim.evaluation import evaluate, experiment
 from cosim.evaluation.simulate import FACTS, Result
 from nmfd.errors import InputError
@@ -24,10 +23,6 @@ def change(file: Path, pattern: str, new: str) -> None:
     text, count = re.subn(pattern, new, file.read_text(), count=1)
     assert count == 1
     file.write_text(text)
-
-
-def cosim(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 @pytest.fixture

@@ -3,18 +3,13 @@
 import pytest
 import tiny
 import torch
-from click.testing import CliRunner
+from commands import nmfd
 
-from nmfd.cli.main import main
 from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
 from nmfd.model.regional_model import load_network
 
 TO_1 = "to = 1"
 BENCHMARK = ["benchmark", "{scenario}", "--out", "{out}", "--controllers"]
-
-
-def nmfd(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 def assert_one_line(result, *fragments):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_actuate import MIN_GREEN, check
+from signal_rules import MIN_GREEN, check
 
 from cosim.plant.guidance import shifted
 from cosim.plant.plant import SumoPlant

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_runs import trajectory
+from tiny import trajectory
 
 from nmfd.controllers import registry
 from nmfd.model.mfd import Mfd

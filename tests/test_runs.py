@@ -7,22 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tiny import trajectory
 
 from nmfd.cli.progress import ProgressLine, progress_line
 from nmfd.errors import InputError
 from nmfd.runs import files, run_folder, workers
-from nmfd.types import Trajectory
 
 CONFIGURATION = {"scenario": "x", "step": 30.0, "protected": (1, 2)}
-
-
-def trajectory(controller="no-control", seed=0, steps=4):
-    rng = np.random.default_rng(seed)
-    return Trajectory(
-        controller=controller, plant="nmfd", seed=seed, step=30.0, accumulation=rng.random((steps + 1, 2, 2)),
-        backlog=np.zeros((steps + 1, 2, 2)), completed=np.arange(steps + 1.0), perimeter=rng.random((steps, 2, 2)),
-        splits=rng.random((steps, 2, 2, 2)), decision_time=rng.random(steps), status=("ok",) * (steps - 1) + ("no",),
-        wall_time=1.0)
 
 
 def opened(path, *, controllers=("no-control",), seeds=(0,), settings=None):

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
-from test_interruption import killed
+from commands import killed
 
 from cosim.cli.main import main
 from cosim.evaluation import dask_worker, sweeps

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from nmfd.model.regional_model import Network
+from nmfd.types import Trajectory
 
 NETWORK = """
 name = "{name}"
@@ -69,3 +70,21 @@ def limited(network: Network, *, seed: int = 0) -> Network:
         network, exit_rates=random.uniform(0.5, 1.5, shape),
         capacity=random.uniform(0.1, 0.6, shape) * most * network.adjacency,
         storage=random.uniform(0.8, 1.6, network.regions) * np.array([m.jam for m in network.mfds]))
+
+
+def random_controls(random, network, batch=()):
+    """Admissible perimeter (*batch, R, R) and splits (*batch, R, R, R)."""
+    shape = (*batch, network.regions, network.regions)
+    perimeter = random.uniform(network.u_min, network.u_max, shape) * network.adjacency
+    splits = random.uniform(size=(*shape, network.regions)) ** 3 * network.split_mask
+    sums = splits.sum(axis=-2, keepdims=True)
+    return perimeter, splits / np.where(sums > 0, sums, 1.0)
+
+
+def trajectory(controller="no-control", seed=0, steps=4):
+    rng = np.random.default_rng(seed)
+    return Trajectory(
+        controller=controller, plant="nmfd", seed=seed, step=30.0, accumulation=rng.random((steps + 1, 2, 2)),
+        backlog=np.zeros((steps + 1, 2, 2)), completed=np.arange(steps + 1.0), perimeter=rng.random((steps, 2, 2)),
+        splits=rng.random((steps, 2, 2, 2)), decision_time=rng.random(steps), status=("ok",) * (steps - 1) + ("no",),
+        wall_time=1.0)
