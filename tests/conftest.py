@@ -14,7 +14,8 @@ ALLOWED = ("no GPU", "no real city")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--no-skips", action="store_true", help="a skipped test fails, unless a GPU or a real city is missing")
+    parser.addoption(
+        "--no-skips", action="store_true", help="a skipped test fails, unless a GPU or a real city is missing")
 
 
 def _fail_if_skipped(report: pytest.TestReport | pytest.CollectReport, config: pytest.Config) -> None:
