@@ -23,7 +23,8 @@ SURVIVED, NO_TESTS = 0, (5, 33)  # exit codes in mutmut's own files
 
 def mutants(module: Path) -> list[str]:
     """The names of all mutants of a module."""
-    return [get_mutant_name(module, name) for name in mutate_file_contents(str(module), module.read_text()).mutant_names]
+    mutated = mutate_file_contents(str(module), module.read_text())
+    return [get_mutant_name(module, name) for name in mutated.mutant_names]
 
 
 def main() -> None:
