@@ -5,11 +5,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from cosim.evaluation.simulate import Result, drive
-from cosim.plant.strategy import ALONE, configured, modelled, parse
+from cosim.plant.strategy import ALONE, configured, parse, planning_of
 from cosim.sumo.outputs import check
-from nmfd.api import named
+from nmfd.api import load_scenario, named
 from nmfd.errors import InputError
-from nmfd.model.scenario import Scenario, load_scenario
+from nmfd.model.planning import planning_model
+from nmfd.model.scenario import Scenario
 from nmfd.types import Controller
 
 
@@ -49,13 +50,13 @@ def run(
     if isinstance(controller, str):
         strategy = parse(f"{controller}+{city}" if city else controller)
         _, acting = named(configured(strategy.name, scenario.controller_options), scenario, policy)
-        model = modelled(scenario, strategy.name)
+        planning = planning_of(scenario, strategy.name)
     else:
-        name, acting, model = *named(controller, scenario, policy), scenario
+        name, acting, planning = *named(controller, scenario, policy), planning_model(scenario)
         strategy = parse(city or ALONE)
         strategy = replace(
             strategy, name=f"{name}+{city}" if city else name, controller=name,
             overrides={**strategy.overrides, "gateways_fixed": name != ALONE})
     outputs = {kind: Path(file) for kind, file in (sumo_output or {}).items()}
     check(outputs)
-    return drive(scenario, strategy, acting, seed=seed, progress=progress, outputs=outputs, model=model)
+    return drive(scenario, strategy, acting, seed=seed, progress=progress, outputs=outputs, planning=planning)

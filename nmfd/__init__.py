@@ -15,26 +15,28 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from nmfd.api import benchmark, controller, run, train
+    from nmfd.api import benchmark, controller, load_scenario, run, train
     from nmfd.errors import InputError
     from nmfd.metrics import summary, total_time_spent
+    from nmfd.model.planning import PlanningModel
     from nmfd.model.plant import AcyclicPlant, NmfdPlant
-    from nmfd.model.regional_model import Network, load_network
-    from nmfd.model.scenario import Scenario, load_scenario
+    from nmfd.model.regional_model import RegionalModel, load_network
+    from nmfd.model.scenario import Scenario
     from nmfd.runs.run_folder import read_trajectory, write_trajectory
     from nmfd.studies.benchmark import table
-    from nmfd.types import Controller, Controls, Measurement, Plant, Trajectory
+    from nmfd.types import Controller, Controls, Observation, Plant, State, Status, Trajectory
 
-__all__ = [
-    "AcyclicPlant", "Controller", "Controls", "InputError", "Measurement", "Network", "NmfdPlant", "Plant", "Scenario",
-    "Trajectory", "benchmark", "controller", "load_network", "load_scenario", "read_trajectory", "run", "summary",
-    "table", "total_time_spent", "train", "write_trajectory"]
 _MODULES = {
-    "api": ("benchmark", "controller", "run", "train"), "studies.benchmark": ("table",), "errors": ("InputError",),
-    "metrics": ("summary", "total_time_spent"), "model.regional_model": ("Network", "load_network"),
-    "model.plant": ("AcyclicPlant", "NmfdPlant"), "runs.run_folder": ("read_trajectory", "write_trajectory"),
-    "model.scenario": ("Scenario", "load_scenario"),
-    "types": ("Controller", "Controls", "Measurement", "Plant", "Trajectory")}
+    "api": ("benchmark", "controller", "load_scenario", "run", "train"), "errors": ("InputError",),
+    "metrics": ("summary", "total_time_spent"), "model.planning": ("PlanningModel",),
+    "model.plant": ("AcyclicPlant", "NmfdPlant"), "model.regional_model": ("RegionalModel", "load_network"),
+    "model.scenario": ("Scenario",), "runs.run_folder": ("read_trajectory", "write_trajectory"),
+    "studies.benchmark": ("table",),
+    "types": ("Controller", "Controls", "Observation", "Plant", "State", "Status", "Trajectory")}
+__all__ = [
+    "AcyclicPlant", "Controller", "Controls", "InputError", "NmfdPlant", "Observation", "Plant", "PlanningModel",
+    "RegionalModel", "Scenario", "State", "Status", "Trajectory", "benchmark", "controller", "load_network",
+    "load_scenario", "read_trajectory", "run", "summary", "table", "total_time_spent", "train", "write_trajectory"]
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 

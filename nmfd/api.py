@@ -6,10 +6,20 @@ from pathlib import Path
 
 from nmfd import closed_loop
 from nmfd.controllers import registry
+from nmfd.controllers.dpc import training
 from nmfd.errors import InputError
-from nmfd.model.scenario import Scenario, load_scenario
+from nmfd.model.scenario import Scenario, read_scenario
 from nmfd.runs import run_folder
+from nmfd.studies import benchmark as benchmarks
+from nmfd.studies.benchmark import PLANTS
 from nmfd.types import Controller, Plant, Trajectory
+
+
+def load_scenario(folder: Path | str) -> Scenario:
+    """The scenario in `folder`, with its network; the options of all its controllers are checked. Raises InputError."""
+    scenario = read_scenario(Path(folder))
+    registry.check_options(scenario)
+    return scenario
 
 
 def controller(name: str, scenario: Scenario | Path | str, *, policy: Path | str | None = None) -> Controller:
@@ -42,8 +52,6 @@ def run(
 
     The same seed gives the same trajectory (but for wall times). Raises InputError.
     """
-    from nmfd.studies.benchmark import PLANTS
-
     scenario = _loaded(scenario)
     if steps is not None:
         if steps < 1:
@@ -72,8 +80,6 @@ def benchmark(
 
     `nmfd.table(rows)` gives the text that the command prints. Raises InputError and nmfd.runs.workers.RunFailed.
     """
-    from nmfd.studies import benchmark as benchmarks
-
     scenario = _loaded(scenario)
     return benchmarks.benchmark(
         scenario, list(controllers), range(seeds) if isinstance(seeds, int) else list(seeds), plant,
@@ -89,8 +95,6 @@ def train(
 
     steps: Adam steps; what scenario.toml says, else 400, if None. Raises InputError.
     """
-    from nmfd.controllers.dpc import training
-
     return training.train(
         _loaded(scenario), controller, seed=seed, out=Path(out), steps=steps, resume=resume, progress=progress)
 

@@ -8,59 +8,92 @@ import numpy as np
 
 from nmfd import faults
 from nmfd.model.scenario import Scenario
-from nmfd.types import Controller, Controls, Measurement, Plant, Trajectory
+from nmfd.threads import one_thread
+from nmfd.types import Controller, Controls, Observation, Plant, State, Status, Trajectory
 
 
+@one_thread()
 def run(
     plant: Plant, controller: Controller, scenario: Scenario, *, seed: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
     """Drive `plant` with `controller` for `scenario.steps` control intervals.
 
-    The controller sees every x_ij with Gaussian noise of `scenario.measurement_std`, drawn from `seed`, or the plant's
-    estimate as it is; the trajectory holds the exact state. `progress(done, steps)` is called after every interval.
-    The faults that the scenario orders are injected (nmfd.faults). What was wrong with a measurement, or what the plant
-    could not do in an interval, is in the status of that decision.
+    The controller is given what the plant's own instruments tell, or, of a plant that has none, every x_ij with
+    Gaussian noise of `scenario.measurement_std`, drawn from `seed`; the trajectory holds this and the exact state. What
+    goes to and fro is copied: a controller that writes into what it is given, or into what it returned, changes
+    nothing. `progress(done, steps)` is called after every interval. The faults that the scenario orders are injected
+    (nmfd.faults). What was wrong with an observation, or what the plant could not do in an interval, is in the status
+    of that decision.
     """
-    random = np.random.default_rng([seed, 0x6E6F6973])
-    ordered, network = faults.of(scenario), scenario.network
-    sensors = faults.Sensors(ordered, seed)
-    watched = faults.Supervised(controller, ordered, np.where(network.adjacency, network.u_max, 0.0))
-    watched.reset(seed)
+    network = scenario.network
+    opened = np.where(network.adjacency, network.u_max, 0.0)
+    supervised = faults.Supervised(controller, scenario.ordered_faults, opened)
+    supervised.reset(seed)
+    sensors = _Sensors(scenario, seed)
     states, controls, decision_time = [plant.reset(seed)], [], []
-    completed = [plant.completed()]
+    observed, problem = sensors.observe(states[-1], plant.observe())
+    observations = [observed]
     begin = time.perf_counter()
     for k in range(scenario.steps):
-        noise = scenario.measurement_std * random.standard_normal(states[-1].accumulation.shape)
-        seen, problem = sensors.see(
-            what_is_seen(states[-1], noise), estimated=states[-1].estimate is not None)
+        given = observed.copy()
         before = time.perf_counter()
-        controls.append(watched.act(seen, problem))
+        decided = supervised.act(given, problem)
         decision_time.append(time.perf_counter() - before)
-        states.append(plant.step(controls[-1]))
-        if states[-1].problem:
-            controls[-1] = _noted(controls[-1], states[-1].problem)
-        completed.append(plant.completed())
+        decided = _copied(decided)
+        states.append(plant.step(decided))
+        controls.append(_with_problem(decided, states[-1].problem))
+        observed, problem = sensors.observe(states[-1], plant.observe())
+        observations.append(observed)
         if progress:
             progress(k + 1, scenario.steps)
     return Trajectory(
         controller=controller.name, plant=type(plant).__name__, seed=seed, step=scenario.step,
         accumulation=np.stack([s.accumulation for s in states]), backlog=np.stack([s.backlog for s in states]),
-        completed=np.array(completed), perimeter=np.stack([c.perimeter for c in controls]),
-        splits=np.stack([scenario.network.nominal_splits if c.splits is None else c.splits for c in controls]),
-        decision_time=np.array(decision_time),
-        status=tuple(c.status for c in controls), wall_time=time.perf_counter() - begin,
-        estimate=None if states[0].estimate is None else np.stack([s.estimate for s in states]))
+        completed=np.array([s.completed for s in states]), observed=np.stack([o.accumulation for o in observations]),
+        observed_backlog=np.stack([o.backlog for o in observations]), estimated=sensors.estimated,
+        perimeter=np.stack([c.perimeter for c in controls]),
+        splits=np.stack([network.nominal_splits if c.splits is None else c.splits for c in controls]),
+        decision_time=np.array(decision_time), status=np.array([c.status.value for c in controls]),
+        note=tuple(c.note for c in controls), wall_time=time.perf_counter() - begin)
 
 
-def _noted(controls: Controls, problem: str) -> Controls:
-    status = problem if controls.status == "ok" else f"{controls.status}; {problem}"
-    return replace(controls, status=status)
+class _Sensors:
+    """What is between the state and the controller: instruments or noise, and the faults of the sensors."""
+
+    def __init__(self, scenario: Scenario, seed: int):
+        self._faulty = faults.Sensors(scenario.ordered_faults, seed)
+        self._std, self._random = scenario.measurement_std, noise_of(seed)
+        self.estimated = False
+
+    def observe(self, state: State, told: Observation | None) -> tuple[Observation, str]:
+        """The observation as it arrives, and what is wrong with it, "" if nothing is. told: by the plant's own."""
+        noise = self._std * self._random.standard_normal(state.accumulation.shape)
+        self.estimated = told is not None
+        return self._faulty.see(noisy(state, noise) if told is None else told, estimated=self.estimated)
 
 
-def what_is_seen(state: Measurement, noise: np.ndarray) -> Measurement:
-    """The plant's estimate where it makes one, else the exact state with `noise` (R, R) [veh]."""
-    if state.estimate is None:
-        return replace(state, accumulation=state.accumulation + noise)
-    return Measurement(
-        step=state.step, time=state.time, accumulation=state.estimate, backlog=state.estimated_backlog)
+def noise_of(seed: int) -> np.random.Generator:
+    """What the measurement noise of a run is drawn from."""
+    return np.random.default_rng([seed, 0x6E6F6973])
+
+
+def noisy(state: State, noise: np.ndarray) -> Observation:
+    """The state as it is measured with `noise` (R, R) [veh] on the accumulation."""
+    return Observation(
+        step=state.step, time=state.time, accumulation=state.accumulation + noise, backlog=state.backlog)
+
+
+def _copied(controls: Controls) -> Controls:
+    """With arrays of its own: a controller may go on writing into those that it returned."""
+    splits = None if controls.splits is None else np.array(controls.splits)
+    return replace(controls, perimeter=np.array(controls.perimeter), splits=splits)
+
+
+def _with_problem(controls: Controls, problem: str) -> Controls:
+    """With what the plant could not do in its status."""
+    if not problem:
+        return controls
+    return replace(
+        controls, status=controls.status | Status.PLANT_FAULT,
+        note="; ".join(note for note in (controls.note, problem) if note))

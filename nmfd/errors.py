@@ -1,4 +1,4 @@
-"""The one error that a user can cause."""
+"""The errors that end a command in one line."""
 
 
 class InputError(ValueError):
@@ -7,3 +7,7 @@ class InputError(ValueError):
     The message is one line that names the file, the key, the value, what is allowed and the remedy; the command
     lines print it and exit with status 2.
     """
+
+
+class RunFailed(Exception):
+    """Some runs ended in an error. The message names them in one line."""

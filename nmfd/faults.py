@@ -2,7 +2,7 @@
 
 A fault is a text, KIND[:VALUE][@FROM-TO], in the list `faults` of scenario.toml or behind --fault; FROM and TO are
 control intervals, TO the first one that is well again; without them it lasts for the whole run. Whatever is done
-instead is in the status of every decision (trajectory, and the column failures of the tables).
+instead is in the status of every decision (nmfd.types.Status, counted apart in every table).
 """
 
 import re
@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nmfd.errors import InputError
-from nmfd.model.scenario import Scenario
-from nmfd.types import Controller, Controls, Measurement
+from nmfd.types import Controller, Controls, Observation, Status
 
 # Kind -> what its value is, or None. Of the measurements, of what computes the controls, and of the city.
 SENSORS = {"frozen": None, "delayed": "intervals", "missing": "region", "detectors": "share", "off": "factor"}
@@ -79,19 +78,6 @@ def without_city(faults: Sequence[Fault], where: str) -> None:
                 f"{where}: {fault.kind} is a fault of a city in SUMO, not of the regional model; leave it out")
 
 
-def of(scenario: Scenario) -> list[Fault]:
-    """The faults that the scenario orders. InputError."""
-    where = "scenario.toml" if scenario.folder is None else f"{scenario.folder / 'scenario.toml'}"
-    return [parse(text, f"{where}: faults", scenario.network.regions) for text in scenario.faults]
-
-
-def with_faults(scenario: Scenario, texts: Sequence[str]) -> Scenario:
-    """`scenario` with more faults, as the option --fault gives them. InputError."""
-    for text in texts:
-        parse(text, "--fault", scenario.network.regions)
-    return replace(scenario, faults=(*scenario.faults, *texts))
-
-
 class Sensors:
     """What controllers see, with the faults of `SENSORS`; what is missing is what was seen last, 0 before the first.
 
@@ -102,57 +88,57 @@ class Sensors:
         self._faults = [fault for fault in faults if fault.kind in SENSORS]
         self._random = np.random.default_rng([seed, 0x6661756C])
         longest = max((int(fault.number) for fault in self._faults if fault.kind == "delayed"), default=0)
-        self._seen: deque[Measurement] = deque(maxlen=longest + 1)
-        self._frozen: dict[int, Measurement] = {}
+        self._seen: deque[Observation] = deque(maxlen=longest + 1)
+        self._frozen: dict[int, Observation] = {}
         self._silent: np.ndarray | None = None
         self._last: np.ndarray | None = None
 
-    def see(self, measurement: Measurement, *, estimated: bool) -> tuple[Measurement, str]:
-        """The measurement as it arrives, and what is wrong with it, "" if nothing is."""
-        problems, k = [], measurement.step
-        self._seen.append(measurement)
+    def see(self, observation: Observation, *, estimated: bool) -> tuple[Observation, str]:
+        """The observation as it arrives, and what is wrong with it, "" if nothing is."""
+        problems, k = [], observation.step
+        self._seen.append(observation)
         for number, fault in enumerate(self._faults):
             if not fault.active(k):
                 continue
-            x, problem = measurement.accumulation, ""
+            x, problem = observation.accumulation, ""
             match fault.kind:
                 case "frozen":
-                    measurement, problem = self._then(self._frozen.setdefault(number, measurement), k), "frozen"
+                    observation, problem = self._then(self._frozen.setdefault(number, observation), k), "frozen"
                 case "delayed":
                     late = min(int(fault.number), len(self._seen) - 1)
-                    measurement, problem = self._then(self._seen[-1 - late], k), f"{late} intervals late"
+                    observation, problem = self._then(self._seen[-1 - late], k), f"{late} intervals late"
                 case "missing":
-                    measurement = replace(measurement, accumulation=np.where(
+                    observation = replace(observation, accumulation=np.where(
                         np.arange(len(x))[:, None] == int(fault.number), np.nan, x))
                 case "detectors" if not estimated:
                     if self._silent is None:
                         self._silent = self._random.random(x.shape) < fault.number
-                    measurement = replace(measurement, accumulation=np.where(self._silent, np.nan, x))
+                    observation = replace(observation, accumulation=np.where(self._silent, np.nan, x))
                 case "off":
-                    measurement = replace(measurement, accumulation=fault.number * x, backlog=(
-                        fault.number * measurement.backlog))
+                    observation = replace(observation, accumulation=fault.number * x, backlog=(
+                        fault.number * observation.backlog))
                     problem = f"off by a factor of {fault.number:g}"
             problems += [problem] if problem else []
-        measurement, missing = self._filled(measurement)
-        problems += [f"{missing} of {measurement.accumulation.size} entries missing, last ones used"] if missing else []
-        return measurement, f"measurement {', '.join(problems)}" if problems else ""
+        observation, missing = self._filled(observation)
+        problems += [f"{missing} of {observation.accumulation.size} entries missing, last ones used"] if missing else []
+        return observation, f"measurement {', '.join(problems)}" if problems else ""
 
     @staticmethod
-    def _then(before: Measurement, k: int) -> Measurement:
+    def _then(before: Observation, k: int) -> Observation:
         """`before` as if it were of now: the controller does not know better."""
         return replace(before, step=k)
 
-    def _filled(self, measurement: Measurement) -> tuple[Measurement, int]:
+    def _filled(self, observation: Observation) -> tuple[Observation, int]:
         """With what was seen last in place of what is no number, and how many entries that were."""
-        x, backlog = measurement.accumulation, measurement.backlog
+        x, backlog = observation.accumulation, observation.backlog
         good = np.isfinite(x)
         missing = int(x.size - good.sum())
         if missing or not np.isfinite(backlog).all():
             last = np.zeros_like(x) if self._last is None else self._last
-            measurement = replace(
-                measurement, accumulation=np.where(good, x, last), backlog=np.nan_to_num(backlog, posinf=0.0))
-        self._last = measurement.accumulation
-        return measurement, missing
+            observation = replace(
+                observation, accumulation=np.where(good, x, last), backlog=np.nan_to_num(backlog, posinf=0.0))
+        self._last = observation.accumulation
+        return observation, missing
 
 
 class Supervised:
@@ -169,15 +155,19 @@ class Supervised:
     def reset(self, seed: int = 0) -> None:
         self._controller.reset(seed)
 
-    def act(self, measurement: Measurement, problem: str = "") -> Controls:
-        """problem: with the measurement, for the status"""
+    def act(self, observation: Observation, problem: str = "") -> Controls:
+        """problem: with the observation, for the status"""
         if self._faults and hasattr(self._controller, "fault"):  # others have no solver and no policy
-            kinds = [fault.kind for fault in self._faults if fault.active(measurement.step)]
+            kinds = [fault.kind for fault in self._faults if fault.active(observation.step)]
             self._controller.fault = kinds[0] if kinds else None
-        controls = self._controller.act(measurement)
+        controls = self._controller.act(observation)
         if not np.isfinite(controls.perimeter).all() or (
                 controls.splits is not None and not np.isfinite(controls.splits).all()):
             controls = Controls(
-                perimeter=self._opened, splits=None, status="the controls were no numbers: perimeter opened")
-        reasons = [reason for reason in (problem, "" if controls.status == "ok" else controls.status) if reason]
-        return replace(controls, status="; ".join(reasons)) if reasons else controls
+                perimeter=self._opened, splits=None, status=Status.SOLVER_FAILURE | Status.FALLBACK,
+                note="the controls were no numbers: perimeter opened")
+        if not problem:
+            return controls
+        return replace(
+            controls, status=controls.status | Status.SENSOR_FAULT,
+            note="; ".join(note for note in (problem, controls.note) if note))

@@ -1,14 +1,44 @@
 """Figures of merit of a trajectory."""
 
+from collections import Counter
+
 import numpy as np
 
-from nmfd.types import Trajectory
+from nmfd.types import Status, Trajectory
+
+# What was not as it should be with decisions: column of summary.csv -> its heading in every table, and what it counts.
+COUNTED = {
+    "solver_failures": ("failures", "of the solver or policy"),
+    "fallbacks": ("fallbacks", "controls of something behind the controller"),
+    "late_decisions": ("late", "decisions longer than the control interval"),
+    "sensor_faults": ("sensor", "decisions on a wrong or missing measurement"),
+    "plant_faults": ("plant", "intervals in which the city could not do what was commanded"),
+}
 
 
 def total_time_spent(trajectory: Trajectory) -> float:
-    """dt * sum over k = 0 .. T-1 of all vehicles, running and waiting to enter [veh s] (design.md, section 2)."""
+    """dt * sum over k = 0 .. T-1 of all vehicles, running and waiting to enter [veh s].
+
+    The objective of Tumu et al., with those who wait outside; the state at the end of the horizon is not counted.
+    """
     vehicles = trajectory.accumulation[:-1].sum() + trajectory.backlog[:-1].sum()
     return float(trajectory.step * vehicles)
+
+
+def decisions(trajectory: Trajectory, kind: Status) -> int:
+    """How many decisions have `kind` in their status."""
+    return int(((trajectory.status & kind.value) != 0).sum())
+
+
+def late_decisions(trajectory: Trajectory) -> int:
+    """Decisions that took longer than the control interval, by the wall clock."""
+    return int((trajectory.decision_time > trajectory.step).sum())
+
+
+def notes(trajectory: Trajectory, most: int = 3) -> str:
+    """What was said of the decisions that were not OK, the `most` frequent ones, such as "2 x solver failed: ..."."""
+    counted = Counter(note for note, status in zip(trajectory.note, trajectory.status, strict=True) if status)
+    return "; ".join(f"{count} x {note}" for note, count in counted.most_common(most))
 
 
 def summary(trajectory: Trajectory) -> dict[str, float | int | str]:
@@ -26,5 +56,9 @@ def summary(trajectory: Trajectory) -> dict[str, float | int | str]:
         "evaluation_time_s": float(trajectory.decision_time.sum()),
         "control_step_ms_median": float(np.median(decision_ms)),
         "control_step_ms_max": float(decision_ms.max()),
-        "solver_failures": sum(status != "ok" for status in trajectory.status),
+        "solver_failures": decisions(trajectory, Status.SOLVER_FAILURE),
+        "fallbacks": decisions(trajectory, Status.FALLBACK),
+        "late_decisions": late_decisions(trajectory),
+        "sensor_faults": decisions(trajectory, Status.SENSOR_FAULT),
+        "plant_faults": decisions(trajectory, Status.PLANT_FAULT),
     }

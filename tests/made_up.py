@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import trajectories
 
 from cosim.evaluation import evaluate, experiment, statistics
 from cosim.evaluation.simulate import FACTS, Result, scenario_of
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import load_city
-from nmfd.model.scenario import load_scenario
+from nmfd.api import load_scenario
 from nmfd.runs.run_folder import COLUMNS
-from nmfd.types import Trajectory
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
 STEPS = 5
@@ -29,11 +29,11 @@ def result(task, city) -> Result:
     acts, guides = task.controller != "no-control", "rg" in task.controller
     perimeter = random.uniform(0.3, 0.9, (steps, regions, regions)) if acts else np.full((steps, regions, regions), 0.9)
     crossings = random.integers(0, 9, (steps, regions, regions, regions)) * network.split_mask
-    trajectory = Trajectory(
+    trajectory = trajectories.made(
         controller=task.controller, plant="sumo", seed=task.seed, step=scenario.step, accumulation=accumulation,
         backlog=np.zeros_like(accumulation), completed=100.0 * np.arange(steps + 1), perimeter=perimeter,
         splits=np.repeat(network.nominal_splits[None], steps, axis=0),
-        decision_time=random.uniform(0.001, 0.01, steps), status=("ok",) * steps, wall_time=1.0)
+        decision_time=random.uniform(0.001, 0.01, steps), wall_time=1.0)
     edges, gateways = len(city.edges), len(city.gateways)
     original = np.full((steps, gateways), 30.0)
     record = {
@@ -67,7 +67,7 @@ def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1
 
 def rows_of(values: dict[tuple[float, str], dict[int, float]]) -> pd.DataFrame:
     """(level, controller) -> seed -> TTS; everything else is 1 or empty."""
-    blank = {name: 1.0 for name in (*COLUMNS, *FACTS)} | {"teleports": 0, "fallbacks": "", "solver_failures": 0}
+    blank = {name: 1.0 for name in (*COLUMNS, *FACTS)} | dict.fromkeys(("teleports", *statistics.COUNTED), 0)
     return pd.DataFrame([
         blank | {"demand": level, "controller": name, "seed": seed, statistics.TTS: tts}
         for (level, name), seeds in values.items() for seed, tts in seeds.items()])

@@ -10,13 +10,14 @@ import torch
 from click.testing import CliRunner
 
 from nmfd import api
+from nmfd.api import load_scenario
 from nmfd.cli.main import main
 from nmfd.controllers import registry
 from nmfd.controllers.dpc.online import ModelEstimate, OnlineDpc
 from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
 from nmfd.metrics import total_time_spent
+from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import load_scenario
 from nmfd.studies.adaptation import CASES, changed
 
 BENCHMARK = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")
@@ -41,7 +42,7 @@ def test_the_estimate_finds_what_changed(case, demand, outflow):
     """From noisy measurements of the loading phase."""
     actual, random = changed(BENCHMARK, case), np.random.default_rng(0)
     plant, controller = NmfdPlant(actual), registry.make("pi-gating", BENCHMARK)
-    estimate, before = ModelEstimate(BENCHMARK), plant.reset(0)
+    estimate, before = ModelEstimate(planning_model(BENCHMARK)), plant.reset(0)
     for k in range(35):
         controls = controller.act(before)
         after = plant.step(controls)

@@ -22,10 +22,10 @@ from commands import call, good
 
 from cosim.sumo.recorded_trips import read_originals
 from nmfd import closed_loop
+from nmfd.api import load_scenario
 from nmfd.controllers.dpc import training
 from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
 from nmfd.model.regional_model import load_network
-from nmfd.model.scenario import load_scenario
 from nmfd.studies import benchmark
 
 ROOT = Path(__file__).parents[1]

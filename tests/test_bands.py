@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cosim.evaluation.mfd_bands import BINS, band, draw_production, production_samples
-from nmfd.model.scenario import load_scenario
+from nmfd.api import load_scenario
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
 

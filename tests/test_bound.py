@@ -9,13 +9,14 @@ import tiny
 from commands import nmfd
 
 from nmfd import closed_loop
-from nmfd.controllers import registry
+from nmfd.api import load_scenario
+from nmfd.controllers import open_loop, registry
 from nmfd.controllers.no_control import NoControl
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
 from nmfd.metrics import total_time_spent
+from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import load_scenario
 from nmfd.studies import bound
 
 ECONOMIC = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
@@ -36,14 +37,15 @@ def closed(scenario, controller):
 
 
 def test_names_are_those_of_the_registry():
-    assert registry._WITH_PLAN == bound.NAMES
+    assert set(open_loop.NAMES) < set(registry.names())
 
 
 def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
     free = replace(scenario, demand=0.01 * scenario.demand)
     plan = bound.compute(free, "bound-pc", starts=[], iterations=100)
     assert plan.perimeter[:8, 0, 1].min() > 0.85  # later intervals move vehicles that the horizon does not count
-    assert closed(free, bound.OpenLoop(plan)) == pytest.approx(closed(free, NoControl(free)), rel=1e-3)
+    uncontrolled = closed(free, NoControl(planning_model(free)))
+    assert closed(free, open_loop.OpenLoop(plan)) == pytest.approx(uncontrolled, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", bound.NAMES)
@@ -58,7 +60,7 @@ def test_plans_are_admissible_and_replayed_exactly(name):
         assert (plan.splits[:, ~network.split_mask] == 0.0).all()
         np.testing.assert_allclose(
             plan.splits.sum(axis=2), np.broadcast_to(1.0 - np.eye(7), (40, 7, 7)), rtol=0.0, atol=1e-12)
-    assert closed(scenario, bound.OpenLoop(plan)) == pytest.approx(plan.totals[plan.start], rel=1e-12)
+    assert closed(scenario, open_loop.OpenLoop(plan)) == pytest.approx(plan.totals[plan.start], rel=1e-12)
     assert plan.totals[plan.start] == min(plan.totals.values())
     assert set(plan.totals) == {"open", "middle", "pi-gating"}
 
@@ -67,7 +69,7 @@ def test_the_bound_is_not_above_the_closed_loop_it_started_from(scenario):
     crowded = replace(scenario, demand=3.0 * scenario.demand)
     plan = bound.compute(crowded, "bound-pc", starts=["pi-gating"], iterations=200)
     # A sigmoid never quite reaches the bounds of u.
-    assert plan.totals[plan.start] <= (1.0 + 1e-4) * closed(crowded, PiGating(crowded))
+    assert plan.totals[plan.start] <= (1.0 + 1e-4) * closed(crowded, PiGating(planning_model(crowded)))
 
 
 def test_an_interrupted_descent_keeps_the_best_so_far(scenario):
@@ -109,12 +111,12 @@ def test_wrong_names_and_missing_plans(folder, tmp_path):
 
 def test_files_that_do_not_fit(scenario, tmp_path):
     path, start = tmp_path / "p.npz", bound.neutral_starts(scenario.network, scenario.steps, guidance=False)
-    bound.write(bound.solve(scenario, start, guidance=False, iterations=1), scenario, path)
-    assert bound.read(path, replace(scenario, measurement_std=9.0), guidance=False).start in start
+    open_loop.write(bound.solve(scenario, start, guidance=False, iterations=1), scenario, path)
+    assert open_loop.read(path, replace(scenario, measurement_std=9.0), guidance=False).start in start
     with pytest.raises(InputError, match="another demand or network"):
-        bound.read(path, replace(scenario, demand=2.0 * scenario.demand), guidance=False)
+        open_loop.read(path, replace(scenario, demand=2.0 * scenario.demand), guidance=False)
     with pytest.raises(InputError, match="without route guidance, expected one with"):
-        bound.read(path, scenario, guidance=True)
+        open_loop.read(path, scenario, guidance=True)
     path.write_bytes(b"nothing")
     with pytest.raises(InputError, match="is no plan"):
-        bound.read(path, scenario, guidance=False)
+        open_loop.read(path, scenario, guidance=False)

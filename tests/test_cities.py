@@ -14,7 +14,7 @@ from tiny_city import driven
 
 from cosim.importing.quality import pieces
 from cosim.importing.streets import read_streets
-from nmfd.model.scenario import load_scenario
+from nmfd.api import load_scenario
 
 GAMES = Path(sumo.SUMO_HOME) / "tools" / "game"
 CITIES = Path(os.environ.get("CITIES", Path(__file__).parents[2] / "shared" / "cities"))

@@ -23,7 +23,8 @@ HEAVY = ("torch", "casadi", "libsumo", "numpy", "pandas", "matplotlib")
 TIMES = ("evaluation_time_s", "control_step_ms_median", "control_step_ms_max")
 COLUMNS = (
     "controller,seed,plant,total_time_spent_veh_s,final_accumulation_veh,max_accumulation_veh,completed_veh,"
-    "evaluation_time_s,control_step_ms_median,control_step_ms_max,solver_failures")
+    "evaluation_time_s,control_step_ms_median,control_step_ms_max,solver_failures,fallbacks,"
+    "late_decisions,sensor_faults,plant_faults")
 
 
 @pytest.fixture
@@ -78,10 +79,6 @@ def test_without_arguments_the_help_is_shown():
 
 def test_the_help_names_every_controller():
     assert ",".join(registry.names()) in "".join(nmfd("benchmark", "--help").stdout.split())
-
-
-def test_registry_agrees_with_training():
-    assert registry._WITH_POLICY == training.NAMES
 
 
 def test_benchmark_writes_a_run_folder(benchmark_command, tmp_path):

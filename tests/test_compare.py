@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+import trajectories
 
 from cosim.evaluation.identify import (
     as_it_was,
@@ -20,11 +21,10 @@ from cosim.evaluation.identify import (
 )
 from cosim.evaluation.model_validation import errors, held_up, outflow_samples, predict, predict_next
 from cosim.evaluation.simulate import Result
-from cosim.plant.strategy import modelled
+from cosim.plant.strategy import planning_of
+from nmfd.api import load_scenario
 from nmfd.model import dynamics, mfd
 from nmfd.model.regional_model import load_network
-from nmfd.model.scenario import load_scenario
-from nmfd.types import Trajectory
 
 ROOT = Path(__file__).parents[1]
 
@@ -49,11 +49,11 @@ def result(scenario):
         perimeter.append(u)
         crossings.append(scenario.step * transfers.numpy())
         arrivals.append(scenario.step * completions.numpy())
-    trajectory = Trajectory(
+    trajectory = trajectories.made(
         controller="random", plant="sumo", seed=0, step=scenario.step, accumulation=np.stack(states),
         backlog=np.zeros((scenario.steps + 1, 7, 7)), completed=np.zeros(scenario.steps + 1),
         perimeter=np.stack(perimeter), splits=np.repeat(network.nominal_splits[None], scenario.steps, axis=0),
-        decision_time=np.zeros(scenario.steps), status=("ok",) * scenario.steps, wall_time=1.0)
+        decision_time=np.zeros(scenario.steps), wall_time=1.0)
     record = {
         "departures": scenario.step * scenario.demand, "crossings": np.stack(crossings), "arrivals": np.stack(arrivals)}
     return Result(trajectory=trajectory, record=record, facts={})
@@ -83,14 +83,14 @@ def test_the_model_of_those_who_drive():
     """A controller's own model, or what the scenario names for a strategy; else the scenario's; or another one."""
     scenario = load_scenario(ROOT / "scenarios" / "grid7_peak")
     network = scenario.network.folder
-    names = {strategy: modelled(scenario, strategy).network.folder.resolve().name for strategy in (
+    names = {strategy: planning_of(scenario, strategy).network.folder.resolve().name for strategy in (
         "no-control", "pi-gating", "dpc-pcrg", "dpc-pcrg+max-pressure+compliance-50", "route-guidance",
         "rerouting-30", "max-pressure+rerouting-30")}
     assert names == {
         "no-control": "grid7", "pi-gating": "grid7", "dpc-pcrg": "grid7_guided", "route-guidance": "grid7_guided",
         "dpc-pcrg+max-pressure+compliance-50": "grid7_max_pressure", "rerouting-30": "grid7_rerouting",
         "max-pressure+rerouting-30": "grid7_rerouting"}
-    assert modelled(scenario, "dpc-pcrg", network).network.folder == network
+    assert planning_of(scenario, "dpc-pcrg", network).network.folder == network
 
 
 def test_outflow_samples_lie_on_the_mfd(scenario, result):

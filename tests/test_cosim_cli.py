@@ -11,9 +11,10 @@ import pytest
 import torch
 from commands import cosim, error_line, good
 
+from nmfd.api import load_scenario
 from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
+from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import load_network
-from nmfd.model.scenario import as_modelled, load_scenario
 from nmfd.runs.run_folder import COLUMNS
 
 ROOT = Path(__file__).parents[1]
@@ -35,7 +36,7 @@ def small(tmp_path_factory):
     scenario = load_scenario(folder / "scenarios" / "small")
     for name, guidance in (("dpc-pc", False), ("dpc-pcrg", True)):
         torch.manual_seed(0)
-        network = as_modelled(scenario, name).network
+        network = planning_model(scenario, name).network
         policy = Policy(network, Architecture(width=8, guidance=guidance))
         torch.save(checkpoint(policy, network, {}), scenario.folder / f"{name}.pt")
     return scenario.folder

@@ -12,17 +12,18 @@ from cosim.evaluation.simulate import Task, scenario_of, simulate
 from cosim.plant.detectors import instruments, lay_out, probes
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import Settings, settings
-from cosim.plant.strategy import modelled
+from cosim.plant.strategy import planning_of
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import load_city
 from nmfd import closed_loop
+from nmfd.api import load_scenario
 from nmfd.controllers import registry
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
-from nmfd.model.scenario import load_scenario
+from nmfd.model.planning import planning_model
 from nmfd.runs import run_folder
 from nmfd.studies import plots
-from nmfd.types import Measurement
+from nmfd.types import Observation
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
 INTERVALS = 3
@@ -44,7 +45,7 @@ def city(scenario):
 def drive(scenario, **overrides):
     plant = SumoPlant(scenario, overrides=Settings(**overrides))
     try:
-        return closed_loop.run(plant, PiGating(scenario), scenario, seed=3)
+        return closed_loop.run(plant, PiGating(planning_model(scenario)), scenario, seed=3)
     finally:
         plant.close()
 
@@ -87,17 +88,18 @@ def test_all_links_and_all_probes_see_everything(scenario):
     plant = SumoPlant(scenario, overrides=Settings(measurement="estimate", detector_share=1.0, probe_share=1.0))
     seen = []
     try:
-        state, controller = plant.reset(3), PiGating(scenario)
-        observation = plant._detectors.observation
-        plant._detectors.observation = lambda flow: (seen.append(observation(flow)), seen[-1])[1]
+        state, controller = plant.reset(3), PiGating(planning_model(scenario))
+        readings = plant._detectors.readings
+        plant._detectors.readings = lambda flow: (seen.append(readings(flow)), seen[-1])[1]
         for _ in range(scenario.steps):
-            before, state = state, plant.step(controller.act(state))
+            before, state = state, plant.step(controller.act(plant.observe()))
+        estimate = plant.observe()
         crossings = plant.record().crossings[-1].sum(axis=2)
     finally:
         plant.close()
     assert (seen[-1].probes == state.accumulation).all()
-    assert np.abs(state.estimate - state.accumulation).max() < 3.0
-    assert (state.estimated_backlog == state.backlog).all()
+    assert np.abs(estimate.accumulation - state.accumulation).max() < 3.0
+    assert (estimate.backlog == state.backlog).all()
     mean = 0.5 * (before.accumulation + state.accumulation).sum()
     assert seen[-1].accumulation.sum() == pytest.approx(mean, rel=0.25)
     there = np.isfinite(seen[-1].crossings)
@@ -107,15 +109,15 @@ def test_all_links_and_all_probes_see_everything(scenario):
 
 def test_the_closed_loop_runs_on_estimates(scenario, run):
     """The estimate is what the gate sees, the trajectory stays exact, and they are not far apart."""
-    assert run.estimate.shape == run.accumulation.shape and np.isfinite(run.estimate).all()
-    assert run.estimate.min() >= 0.0 and (run.estimate[0] == 0.0).all()
+    assert run.observed.shape == run.accumulation.shape and np.isfinite(run.observed).all()
+    assert run.observed.min() >= 0.0 and (run.observed[0] == 0.0).all()
     assert (run.accumulation == np.round(run.accumulation)).all()
-    assert (run.estimate[1:] != np.round(run.estimate[1:])).any()
+    assert (run.observed[1:] != np.round(run.observed[1:])).any()
     rows = estimation_errors.errors(scenario.network, run)
     assert [row["region"] for row in rows] == [*range(7), "all"]
     assert 0.0 < rows[-1]["rmse_share"] < 0.15 and 0.0 < rows[-1]["cell_rmse_veh"] < 10.0
     vehicles = run.accumulation[-1].sum()
-    assert abs(run.estimate[-1].sum() - vehicles) < 0.2 * vehicles
+    assert abs(run.observed[-1].sum() - vehicles) < 0.2 * vehicles
 
 
 def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
@@ -126,7 +128,7 @@ def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
         def reset(self, seed=0):
             pass
 
-        def act(self, measurement: Measurement):
+        def act(self, measurement: Observation):
             from nmfd.types import Controls
             return Controls(perimeter=run.perimeter[measurement.step], splits=None)
 
@@ -135,7 +137,7 @@ def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
         exact = closed_loop.run(plant, Again(), scenario, seed=3)
     finally:
         plant.close()
-    assert exact.estimate is None
+    assert not exact.estimated and run.estimated
     assert (exact.accumulation == run.accumulation).all()
 
 
@@ -143,19 +145,19 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
     """`simulate` gives the plant the model with which the controller plans: another estimate of the same city."""
     tasks = [Task(scenario=SCENARIO, controller=name, seed=3, steps=INTERVALS)
              for name in ("route-guidance+estimate", "route-guidance+estimate+max-pressure")]
-    models = [modelled(scenario_of(task), task.controller).network for task in tasks]
+    models = [planning_of(scenario_of(task), task.controller).network for task in tasks]
     assert [model.folder.name for model in models] == ["grid7_guided", "grid7_max_pressure"]
     scenario = scenario_of(tasks[0])
     found = simulate(tasks[0]).trajectory
     for model, same in zip(models, (True, False), strict=True):
         plant = SumoPlant(scenario, overrides=replace(settings(scenario), measurement="estimate"),
-                          model=replace(scenario, network=model))
+                          planning=replace(planning_model(scenario), network=model))
         try:
             again = closed_loop.run(plant, registry.make("route-guidance", scenario), scenario, seed=3)
         finally:
             plant.close()
         assert (again.accumulation == found.accumulation).all()
-        assert (again.estimate == found.estimate).all() == same
+        assert (again.observed == found.observed).all() == same
 
 
 def test_same_seed_same_bytes(scenario, run, tmp_path):
@@ -163,18 +165,18 @@ def test_same_seed_same_bytes(scenario, run, tmp_path):
     for name, trajectory in (("a", run), ("b", again)):
         run_folder.write_trajectory(tmp_path / f"{name}.npz", trajectory)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    assert (run_folder.read_trajectory(tmp_path / "a.npz").estimate == run.estimate).all()
+    assert (run_folder.read_trajectory(tmp_path / "a.npz").observed == run.observed).all()
 
 
 def test_table_and_picture(scenario, run, tmp_path):
-    rows = estimation_errors.write(tmp_path, scenario.network, [run, replace(run, seed=4, estimate=None)])
+    rows = estimation_errors.write(tmp_path, scenario.network, [run, replace(run, seed=4, estimated=False)])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate-pi-gating-3.png", "estimation.csv"]
     assert len(pd.read_csv(tmp_path / "estimation.csv")) == len(rows) == 8
     assert "x_ij RMSE" in estimation_errors.table(rows) and "mean of the regions" in estimation_errors.table(rows)
     ax = plots.region_estimate(plots.figure(4.0, 3.0).subplots(), scenario.network, 3, run)
     lines = [line.get_ydata() for line in ax.get_lines()]
-    np.testing.assert_allclose(lines, [run.accumulation[:, 3].sum(axis=1), run.estimate[:, 3].sum(axis=1)])
-    assert estimation_errors.write(tmp_path / "none", scenario.network, [replace(run, estimate=None)]).empty
+    np.testing.assert_allclose(lines, [run.accumulation[:, 3].sum(axis=1), run.observed[:, 3].sum(axis=1)])
+    assert estimation_errors.write(tmp_path / "none", scenario.network, [replace(run, estimated=False)]).empty
 
 
 @pytest.mark.parametrize("lines, problem", [

@@ -8,15 +8,16 @@ import pytest
 import tiny
 import torch
 
+from nmfd.api import load_scenario
 from nmfd.controllers.dpc import policy as dpc
 from nmfd.controllers.dpc import training
 from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy, SoftExponential
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
 from nmfd.model import dynamics
+from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import load_network
-from nmfd.model.scenario import load_scenario
-from nmfd.types import Measurement
+from nmfd.types import Observation, Status
 
 NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
 
@@ -31,7 +32,7 @@ def policy(*, guidance, activation="gelu", network=NETWORK, spread=1.0):
 
 
 def measurement(accumulation):
-    return Measurement(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros_like(accumulation))
+    return Observation(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros_like(accumulation))
 
 
 @pytest.mark.parametrize("activation", dpc.ACTIVATIONS)
@@ -40,7 +41,7 @@ def test_any_weights_and_any_state_give_admissible_controls(guidance, activation
     controller, random = DpcController(policy(guidance=guidance, activation=activation)), np.random.default_rng(0)
     for scale in (0.0, 1.0, 1e3, 1e5, 1e7):
         controls = controller.act(measurement(scale * random.standard_normal((7, 7))))
-        assert controls.status == "ok"
+        assert controls.status == Status.OK
         u = controls.perimeter[NETWORK.adjacency]
         assert NETWORK.u_min - 1e-7 <= u.min() and u.max() <= NETWORK.u_max + 1e-7
         assert (controls.perimeter[~NETWORK.adjacency] == 0.0).all()
@@ -62,7 +63,7 @@ def test_forbidden_regions_have_no_gradient_and_no_nan():
 
 def test_a_policy_that_returns_nan_opens_the_perimeter_and_says_so():
     controls = DpcController(policy(guidance=True)).act(measurement(np.full((7, 7), np.nan)))
-    assert controls.status == "dpc: policy returned NaN, perimeter opened"
+    assert controls.note == "dpc: policy returned NaN, perimeter opened"
     np.testing.assert_allclose(controls.perimeter, np.where(NETWORK.adjacency, NETWORK.u_max, 0.0))
 
 
@@ -206,7 +207,7 @@ def test_training_may_begin_as_no_control():
 def test_training_lowers_the_total_time_spent(tmp_path, scenario):
     """An untrained policy holds the perimeter half closed, to no purpose."""
     trained = training.train(scenario, "dpc-pc", seed=0, out=tmp_path / "p.pt", steps=20)
-    rollout = training.Rollout(scenario)
+    rollout = training.Rollout(planning_model(scenario))
     torch.manual_seed(0)
     fresh = Policy(scenario.network, Architecture())
     after = training.validate(dpc.load_policy(trained, scenario.network)[0], rollout, 0, training.Training())
@@ -233,7 +234,8 @@ def test_every_tensor_of_a_training_step_is_on_the_device(scenario, controller):
     """On the device "meta", which like a GPU refuses tensors of another."""
     guidance = training.NAMES[controller]
     made = Policy(scenario.network, Architecture(width=8, guidance=guidance)).to("meta")
-    rollout, generator = training.Rollout(scenario, device="meta", detour_cost=1.0), torch.Generator().manual_seed(0)
+    rollout = training.Rollout(planning_model(scenario), device="meta", detour_cost=1.0)
+    generator = torch.Generator().manual_seed(0)
     rollout.draw_model(4, 0.1, generator)
     x, demand = rollout.random_start(4, 0.2, 0.5, generator)
     demand = rollout.perturb(demand, torch.rand(4, generator=generator), 1.0, 1.0, generator)
@@ -282,7 +284,7 @@ def test_a_sparse_policy_is_the_dense_one_with_the_same_weights(guidance):
 def test_every_rollout_has_a_model_of_its_own(scenario):
     """Around the nominal one, always valid for the integration step; without a spread it is the nominal one again."""
     limited = replace(scenario, network=tiny.limited(scenario.network))
-    rollout = training.Rollout(limited)
+    rollout = training.Rollout(planning_model(limited))
     nominal = rollout.parameters
     rollout.draw_model(4000, 0.2, torch.Generator().manual_seed(0))
     p = rollout.parameters
@@ -304,7 +306,8 @@ def test_every_rollout_has_a_model_of_its_own(scenario):
 
 def test_a_policy_begins_as_a_gate(scenario):
     """Entries of the protected region close as it fills, about the set point of pi-gating; the others stay open."""
-    rollout, generator, network = training.Rollout(scenario), torch.Generator().manual_seed(0), scenario.network
+    rollout, network = training.Rollout(planning_model(scenario)), scenario.network
+    generator = torch.Generator().manual_seed(0)
     torch.manual_seed(0)
     made = Policy(network, Architecture(width=32, guidance=False))
     training.begin_as_gate(made, rollout, generator)
@@ -313,7 +316,7 @@ def test_a_policy_begins_as_a_gate(scenario):
     shares = []
     for full in (0.7, 1.0, 1.4):
         filled = x.clone()
-        filled[:, 1] *= (full * PiGating(scenario).set_point[0] / x[:, 1].sum(-1)).unsqueeze(-1)
+        filled[:, 1] *= (full * PiGating(planning_model(scenario)).set_point[0] / x[:, 1].sum(-1)).unsqueeze(-1)
         with torch.no_grad():
             shares.append((made(filled)[0] - network.u_min) / (network.u_max - network.u_min))
     assert shares[0][:, 0, 1].min() > 0.8 and shares[2][:, 0, 1].max() < 0.2
@@ -334,7 +337,8 @@ def test_detours_cost_what_they_divert(scenario):
     """Everybody who leaves a region by another way than usual loses the time that a detour costs."""
     torch.manual_seed(0)
     made = Policy(scenario.network, Architecture(width=8, guidance=True))
-    plain, costly = (training.Rollout(scenario, dtype=torch.float32, detour_cost=cost) for cost in (0.0, 50.0))
+    plain, costly = (
+        training.Rollout(planning_model(scenario), dtype=torch.float32, detour_cost=cost) for cost in (0.0, 50.0))
     generator = torch.Generator()
     x, demand = plain.random_start(2, 0.2, 1.0, generator.manual_seed(0))
     demand = demand[:3]

@@ -12,7 +12,7 @@ from tiny import random_controls
 
 from nmfd.model import dynamics, dynamics_casadi
 from nmfd.model.mfd import Mfd
-from nmfd.model.regional_model import LEAST_ROOM, Network, load_network
+from nmfd.model.regional_model import LEAST_ROOM, RegionalModel, load_network
 
 STEP = 30.0
 NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
@@ -30,7 +30,7 @@ def random_tensors(seed, *, filling, batch=()):
 
 
 def one_region(mfd):
-    return dynamics.parameters(Network(
+    return dynamics.parameters(RegionalModel(
         name="one", region_names=("only",), positions=np.zeros((1, 2)), adjacency=np.zeros((1, 1), dtype=bool),
         mfds=(mfd,), u_min=0.1, u_max=0.9))
 

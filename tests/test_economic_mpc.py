@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from nmfd.api import load_scenario
 from nmfd.closed_loop import run
 from nmfd.controllers.no_control import NoControl
 from nmfd.metrics import summary
+from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import load_scenario
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
 
@@ -20,7 +21,7 @@ def scenario():
 
 
 def no_control(scenario):
-    return summary(run(NmfdPlant(scenario), NoControl(scenario), scenario, seed=0))
+    return summary(run(NmfdPlant(scenario), NoControl(planning_model(scenario)), scenario, seed=0))
 
 
 def test_demand_is_the_reconstruction(scenario):

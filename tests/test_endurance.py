@@ -13,10 +13,10 @@ from click.testing import CliRunner
 from cosim.cli.main import main
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
+from nmfd.api import load_scenario
 from nmfd.closed_loop import run
 from nmfd.controllers import registry
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
-from nmfd.model.scenario import load_scenario
 from nmfd.types import Controls
 
 PEAK = Path(__file__).parents[1] / "scenarios" / "grid7_peak"

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from nmfd.api import load_scenario
 from nmfd.model import dynamics, estimation
-from nmfd.model.estimation import Estimator, Instruments, Observation, bounded
+from nmfd.model.estimation import Estimator, Instruments, Readings, bounded
+from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import load_scenario
 from nmfd.types import Controls
 
 # With one curve per region, as published: what is tested here is the filter, not how good a model a city has.
@@ -33,7 +34,7 @@ def equipped(*, detectors=0.3, probes=0.1, error=0.15):
 
 def nothing():
     unknown = np.full((REGIONS, REGIONS), np.nan)
-    return Observation(accumulation=unknown[0], crossings=unknown, probes=unknown, probe_departures=unknown)
+    return Readings(accumulation=unknown[0], crossings=unknown, probes=unknown, probe_departures=unknown)
 
 
 class Crowd:
@@ -92,7 +93,7 @@ class Crowd:
         share = np.where(NETWORK.adjacency, known.counted_share, 1.0)
         uneven = np.sqrt(np.maximum(1.0 - share, 0.0)) * random.normal(size=share.shape) * np.sqrt(
             crossings / share + estimation.COUNT_ERROR**2 * crossings**2 / np.maximum(known.counted_gateways, 1))
-        return Observation(
+        return Readings(
             accumulation=np.maximum((1.0 + self._expansion) * mean + noise, 0.0),
             crossings=np.where(NETWORK.adjacency, crossings + uneven, np.nan), probes=self.groups[0].astype(float),
             probe_departures=departures)
@@ -100,7 +101,7 @@ class Crowd:
 
 def watch(seed, known, *, steps=40, changed=lambda observation: observation, wrong=1.0):
     """Truth and estimate (steps, R, R), what the detectors said (steps, R), and the surprises."""
-    crowd, estimator, rows = Crowd(seed, known, wrong=wrong), Estimator(SCENARIO, known), []
+    crowd, estimator, rows = Crowd(seed, known, wrong=wrong), Estimator(planning_model(SCENARIO), known), []
     for k in range(steps):
         observation = crowd.step(k)
         estimate = estimator.step(OPEN, changed(observation))
@@ -159,10 +160,10 @@ def test_unbiased_and_consistent(runs):
 def test_never_negative_nor_fewer_than_the_probes(runs):
     for _, estimate, *_ in runs:
         assert estimate.min() >= 0.0
-    random, estimator = np.random.default_rng(0), Estimator(SCENARIO, equipped())
+    random, estimator = np.random.default_rng(0), Estimator(planning_model(SCENARIO), equipped())
     for _ in range(30):  # readings that contradict one another
         probes = random.integers(0, 40, (REGIONS, REGIONS)).astype(float)
-        observation = Observation(
+        observation = Readings(
             accumulation=random.uniform(0.0, 300.0, REGIONS), probes=probes,
             crossings=np.where(NETWORK.adjacency, random.uniform(0.0, 50.0, (REGIONS, REGIONS)), np.nan),
             probe_departures=random.integers(0, 5, (REGIONS, REGIONS)).astype(float))
@@ -178,7 +179,7 @@ def test_everything_measured_is_the_state():
 
 def test_without_readings_it_is_the_regional_model():
     """So it conserves vehicles as that does."""
-    plant, estimator = NmfdPlant(SCENARIO), Estimator(SCENARIO, equipped())
+    plant, estimator = NmfdPlant(SCENARIO), Estimator(planning_model(SCENARIO), equipped())
     plant.reset(0)
     for _ in range(30):
         exact = plant.step(OPEN).accumulation
@@ -223,7 +224,7 @@ def test_the_same_readings_give_the_same_bytes():
 
 
 def test_reset_forgets():
-    estimator, crowd = Estimator(SCENARIO, equipped()), Crowd(0, equipped())
+    estimator, crowd = Estimator(planning_model(SCENARIO), equipped()), Crowd(0, equipped())
     observations = [crowd.step(k) for k in range(4)]
     runs = []
     for _ in range(2):
@@ -243,11 +244,11 @@ def test_bounded_moves_what_correlates():
 
 def readings(known, *, mean=40.0, expansion=0.1, crossings=9.0, x=25.0, probes=10.0, leaving=2.0):
     """Expectations and variances of the readings of one kind each, where all regions and boundaries are alike."""
-    model = estimation._Model(SCENARIO, known)
+    model = estimation._Model(planning_model(SCENARIO), known)
     z = np.zeros(model._size)
     z[model._expansion], z[model._x], z[model._mean] = expansion, x, mean
     z[model._crossings], z[model._probes], z[model._departures] = crossings, probes, 3.0
-    observation = Observation(
+    observation = Readings(
         accumulation=np.full(REGIONS, 1.0), crossings=np.full((REGIONS, REGIONS), 2.0),
         probes=np.full((REGIONS, REGIONS), 3.0), probe_departures=np.full((REGIONS, REGIONS), 4.0))
     columns = model._readings(z, np.full(REGIONS**2, leaving), observation, observation.accumulation)
@@ -298,7 +299,7 @@ def test_probes_move_as_a_share_of_the_vehicles():
 
 def test_probes_that_are_not_seen_go_on_with_the_vehicles():
     """Seen once, then never again: they stay a share of what is there."""
-    estimator, crowd = Estimator(SCENARIO, equipped(probes=0.5)), Crowd(0, equipped(probes=0.5))
+    estimator, crowd = Estimator(planning_model(SCENARIO), equipped(probes=0.5)), Crowd(0, equipped(probes=0.5))
     for k in range(10):
         estimator.step(OPEN, crowd.step(k))
     before = estimator.belief.probes.sum(), estimator.accumulation.sum()
@@ -311,7 +312,7 @@ def test_probes_that_are_not_seen_go_on_with_the_vehicles():
 
 def test_a_detector_is_stuck_at_its_third_same_reading():
     """Two may be chance, and an empty street shows 0 for ever."""
-    taken, model = [], Estimator(SCENARIO, equipped())
+    taken, model = [], Estimator(planning_model(SCENARIO), equipped())
     advance = model._model.advance
     model._model.advance = lambda belief, demand, perimeter, splits, observation, loops: taken.append(
         loops[:3].tolist()) or advance(belief, demand, perimeter, splits, observation, loops)
@@ -325,7 +326,7 @@ def test_a_detector_is_stuck_at_its_third_same_reading():
 
 def test_one_vehicle_changes_what_it_should():
     """A turn leaves one cell for another; departures and ends of trips change one; each counts half in the mean."""
-    model = estimation._Model(SCENARIO, equipped())
+    model = estimation._Model(planning_model(SCENARIO), equipped())
     vehicle, probe = model._effects()
     cells, turns = REGIONS**2, int(NETWORK.split_mask.sum())
     place, half, crossing = np.split(vehicle, [cells, cells + REGIONS])

@@ -7,13 +7,13 @@ import copies
 import numpy as np
 import pandas as pd
 import pytest
+import trajectories
 from commands import cosim
 
 from cosim.evaluation import evaluate, experiment
 from cosim.evaluation.simulate import FACTS, Result
 from nmfd.errors import InputError
 from nmfd.runs.workers import Failure
-from nmfd.types import Trajectory
 
 ROOT = Path(__file__).parents[1]
 
@@ -48,10 +48,10 @@ def ran(monkeypatch):
 
 
 def made_up(task) -> Result:
-    trajectory = Trajectory(
+    trajectory = trajectories.made(
         controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=np.ones((3, 7, 7)),
         backlog=np.zeros((3, 7, 7)), completed=np.zeros(3), perimeter=np.ones((2, 7, 7)),
-        splits=np.zeros((2, 7, 7, 7)), decision_time=np.zeros(2), status=("ok", "ok"), wall_time=1.0)
+        splits=np.zeros((2, 7, 7, 7)), decision_time=np.zeros(2), wall_time=1.0)
     facts = {name: 0 for name in FACTS} | {"controller": task.controller, "seed": task.seed}
     return Result(trajectory=trajectory, record={"departures": np.zeros(1)}, facts=facts)
 

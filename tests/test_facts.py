@@ -10,7 +10,7 @@ from cosim.evaluation import run_metrics
 from cosim.plant.plant import SumoPlant
 from cosim.sumo.net import edge_room
 from cosim.sumo.tripinfo import CLASS, read_trip_facts
-from nmfd.model.scenario import load_scenario
+from nmfd.api import load_scenario
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"

@@ -25,6 +25,7 @@ from cosim.plant.settings import settings
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import load_city
 from nmfd import faults
+from nmfd.api import load_scenario
 from nmfd.closed_loop import run
 from nmfd.controllers import registry
 from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy
@@ -32,10 +33,10 @@ from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.controllers.no_control import NoControl
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
+from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import load_scenario
 from nmfd.runs import run_folder
-from nmfd.types import Controls, Measurement
+from nmfd.types import Controls, Observation
 
 MAINS = {"nmfd": nmfd.cli.main.main, "cosim": cosim.cli.main.main}
 
@@ -64,30 +65,31 @@ def driven(scenario, controller, *ordered):
     ("solver-late", "time limit")])
 @pytest.mark.parametrize("guidance", [False, True])
 def test_mpc_without_a_solver_uses_its_plan_and_then_gates(scenario, kind, reason, guidance):
-    controller = EconomicMpc(scenario, guidance=guidance)
-    status = driven(scenario, controller, f"{kind}@3-15").status
+    controller = EconomicMpc(planning_model(scenario), guidance=guidance)
+    status = driven(scenario, controller, f"{kind}@3-15").note
     reach = controller.options.horizon - 2
-    assert set(status[:3]) == set(status[15:]) == {"ok"}
+    assert set(status[:3]) == set(status[15:]) == {""}
     assert set(status[3 : 3 + reach]) == {f"{reason}: last plan used"}
     assert set(status[3 + reach : 15]) == {f"{reason}: pi-gating in control"}
 
 
 def test_the_plan_is_moved_on_and_gating_is_pi_gating(scenario):
-    controller = EconomicMpc(scenario, guidance=False)
-    busy = Measurement(step=2, time=60.0, accumulation=np.array([[0.0, 200.0], [0.0, 500.0]]), backlog=np.zeros((2, 2)))
+    controller = EconomicMpc(planning_model(scenario), guidance=False)
+    busy = Observation(step=2, time=60.0, accumulation=np.array([[0.0, 200.0], [0.0, 500.0]]), backlog=np.zeros((2, 2)))
     controller.act(busy)
     plan = controller._plan.copy()
     controller.fault = "solver-fails"
     for ahead in range(1, len(plan)):
         expected, _ = controller.admissible.controls(plan[ahead])
         np.testing.assert_array_equal(controller.act(busy).perimeter, expected)
-    gating = PiGating(scenario)
+    gating = PiGating(planning_model(scenario))
     for _ in range(3):
         np.testing.assert_array_equal(controller.act(busy).perimeter, gating.act(busy).perimeter)
 
 
 def test_without_a_protected_region_the_perimeter_is_opened(scenario):
-    status = driven(scenario, EconomicMpc(replace(scenario, protected=()), guidance=True), "solver-fails").status
+    controller = EconomicMpc(planning_model(replace(scenario, protected=())), guidance=True)
+    status = driven(scenario, controller, "solver-fails").note
     assert set(status) == {"solver failed (FloatingPointError): perimeter opened, nominal splits"}
 
 
@@ -96,8 +98,8 @@ def test_a_policy_that_returns_nan(scenario, guidance):
     torch.manual_seed(0)
     controller = DpcController(Policy(scenario.network, Architecture(width=4, guidance=guidance)))
     trajectory = driven(scenario, controller, "policy-nan@5-8")
-    assert [k for k, status in enumerate(trajectory.status) if status != "ok"] == [5, 6, 7]
-    assert set(trajectory.status[5:8]) == {"dpc: policy returned NaN, perimeter opened"}
+    assert [k for k, status in enumerate(trajectory.note) if status] == [5, 6, 7]
+    assert set(trajectory.note[5:8]) == {"dpc: policy returned NaN, perimeter opened"}
     np.testing.assert_allclose(trajectory.perimeter[5:8, 0, 1], scenario.network.u_max, rtol=1e-6)
 
 
@@ -105,7 +107,7 @@ def test_a_policy_whose_weights_are_nan(scenario):
     policy = Policy(scenario.network, Architecture(width=4))
     with torch.no_grad():
         policy.perimeter_decoder.weight[:] = torch.nan
-    assert set(driven(scenario, DpcController(policy)).status) == {"dpc: policy returned NaN, perimeter opened"}
+    assert set(driven(scenario, DpcController(policy)).note) == {"dpc: policy returned NaN, perimeter opened"}
 
 
 class Mad(NoControl):
@@ -114,7 +116,8 @@ class Mad(NoControl):
 
 
 def test_controls_of_any_controller_that_are_no_numbers(scenario):
-    assert set(driven(scenario, Mad(scenario)).status) == {"the controls were no numbers: perimeter opened"}
+    note = driven(scenario, Mad(planning_model(scenario))).note
+    assert set(note) == {"the controls were no numbers: perimeter opened"}
 
 
 class Diary(NoControl):
@@ -133,16 +136,16 @@ class Diary(NoControl):
 def seen(scenario):
     """What controllers see with faults: (exact accumulations (T, 2, 2), seen ones, statuses)."""
     def look(*ordered):
-        diary = Diary(scenario)
+        diary = Diary(planning_model(scenario))
         trajectory = driven(scenario, diary, *ordered)
         assert [m.step for m in diary.seen] == list(range(scenario.steps))
-        return trajectory.accumulation[:-1], np.stack([m.accumulation for m in diary.seen]), trajectory.status
+        return trajectory.accumulation[:-1], np.stack([m.accumulation for m in diary.seen]), trajectory.note
 
     return look
 
 
 def noted(status, begin, end, text):
-    assert [k for k, one in enumerate(status) if one != "ok"] == list(range(begin, end))
+    assert [k for k, one in enumerate(status) if one] == list(range(begin, end))
     assert set(status[begin:end]) == {text}
 
 
@@ -169,8 +172,8 @@ def test_missing_detectors(scenario, tmp_path):
     """Of the 49 entries of seven regions."""
     hexagon = load_scenario(tiny.Path(__file__).parents[1] / "scenarios" / "economic_mpc")
     hexagon = replace(hexagon, steps=12, demand=hexagon.demand[:12], measurement_std=0.0)
-    diary = Diary(hexagon)
-    status = run(NmfdPlant(hexagon), diary, replace(hexagon, faults=("detectors:0.2@5-12",)), seed=1).status
+    diary = Diary(planning_model(hexagon))
+    status = run(NmfdPlant(hexagon), diary, replace(hexagon, faults=("detectors:0.2@5-12",)), seed=1).note
     missing = int(re.match(r"measurement (\d+) of 49 entries missing", status[-1])[1])
     assert 4 <= missing <= 16 and len(set(status[5:])) == 1
     moved = np.stack([m.accumulation for m in diary.seen])
@@ -189,11 +192,12 @@ def test_measurements_that_are_off_by_half(seen, factor):
 @pytest.mark.parametrize("ordered", ["frozen@3-9", "delayed:2", "missing:1@3-9", "detectors:0.5", "off:0.5", "off:1.5"])
 def test_controllers_survive_every_fault_of_the_sensors(scenario, name, ordered):
     trajectory = driven(scenario, registry.make(name, scenario), ordered)
-    assert np.isfinite(trajectory.accumulation).all() and any(status != "ok" for status in trajectory.status)
+    assert np.isfinite(trajectory.accumulation).all() and any(trajectory.note)
 
 
 def test_several_faults_at_once_are_all_named(scenario):
-    status = driven(scenario, EconomicMpc(scenario, guidance=False), "off:1.5", "delayed:1", "solver-fails@1-2").status
+    controller = EconomicMpc(planning_model(scenario), guidance=False)
+    status = driven(scenario, controller, "off:1.5", "delayed:1", "solver-fails@1-2").note
     assert status[1] == (
         "measurement off by a factor of 1.5, 1 intervals late; solver failed (FloatingPointError): last plan used")
 
@@ -253,12 +257,14 @@ def in_sumo(city, *ordered, perimeter=None, watch=None, **changed):
     plant = SumoPlant(scenario, overrides=replace(settings(scenario), **changed))
     opened = np.where(city.network.adjacency, city.network.u_max if perimeter is None else perimeter, 0.0)
     try:
-        measurements = [plant.reset(0)]
+        states = [plant.reset(0)]
+        observations = [plant.observe()]
         if watch:
             watch(plant)
         for _ in range(STEPS):
-            measurements.append(plant.step(Controls(perimeter=opened, splits=None)))
-        return measurements, plant.record()
+            states.append(plant.step(Controls(perimeter=opened, splits=None)))
+            observations.append(plant.observe())
+        return states, plant.record(), observations
     finally:
         plant.close()
 
@@ -267,7 +273,7 @@ def test_a_closed_street(city):
     edge, found = "B1C1", {}
     n = loaded(city).edges.index(edge)
     for ordered in ((), (f"closed:{edge}@2-5",)):
-        measurements, record = in_sumo(city, *ordered)
+        measurements, record, _ = in_sumo(city, *ordered)
         found[ordered] = record
         problems = [m.problem for m in measurements[1:]]
         assert problems == [f"edge {edge} closed" if ordered and 2 <= k < 5 else "" for k in range(STEPS)]
@@ -285,8 +291,8 @@ def loaded(city):
 def test_a_signal_that_takes_no_programme(city):
     gateways, closed = loaded(city).gateways, city.network.u_min
     signal = next(gateway.signal for gateway in gateways if gateway.signal is not None)
-    _, free = in_sumo(city, perimeter=closed)
-    measurements, record = in_sumo(city, f"signal:{signal}@3-6", perimeter=closed)
+    _, free, _ = in_sumo(city, perimeter=closed)
+    measurements, record, _ = in_sumo(city, f"signal:{signal}@3-6", perimeter=closed)
     problems = [m.problem for m in measurements[1:]]
     assert problems == [f"signal {signal} took no programme" if 3 <= k < 6 else "" for k in range(STEPS)]
     own = [n for n, gateway in enumerate(gateways) if gateway.signal == signal]
@@ -310,7 +316,7 @@ def test_a_deaf_signal_runs_its_own_programme(city, signals, gateway):
         step = plant.session.step
         plant.session.step = lambda: (step(), shown.append(plant.session.signal_state(name)))
 
-    measurements, _ = in_sumo(
+    measurements, _, _ = in_sumo(
         city, f"signal:{name}@3-6", perimeter=city.network.u_min, watch=watch, signals=signals)
     problems = [m.problem for m in measurements[1:]]
     assert problems == [f"signal {name} took no programme" if 3 <= k < 6 else "" for k in range(STEPS)]
@@ -328,8 +334,8 @@ def test_silent_loop_detectors(city):
     """The estimate goes on, and differs from that with all loops."""
     estimates = []
     for ordered in ((), ("detectors:0.2@1-8",)):
-        measurements, _ = in_sumo(city, *ordered, measurement="estimate", detector_share=1.0, probe_share=0.3)
-        estimates.append(np.stack([m.estimate for m in measurements]))
+        measurements, _, seen = in_sumo(city, *ordered, measurement="estimate", detector_share=1.0, probe_share=0.3)
+        estimates.append(np.stack([one.accumulation for one in seen]))
         assert np.isfinite(estimates[-1]).all()
         wanted = "20 % of the loop detectors silent" if ordered else ""
         assert [m.problem for m in measurements[2:]] == [wanted] * (STEPS - 1)
@@ -381,10 +387,12 @@ def test_statuses_of_a_city_are_in_its_tables(city, tmp_path):
     result = call("cosim", "run", city.folder, "--controller", "mpc-pc", "--steps", 4, "--out", out, "--fault",
                   "closed:B1C1@1-3", "--fault", "solver-fails@2-3")
     assert result.exit_code == 0, result.output
-    facts = pd.read_csv(out / "sumo.csv").loc[0, "fallbacks"]
+    facts = pd.read_csv(out / "sumo.csv").loc[0, "notes"]
     assert "1 x edge B1C1 closed" in facts
     assert "solver failed (FloatingPointError): last plan used; edge B1C1 closed" in facts
-    assert run_folder.read_summary(out / "summary.csv")[0]["solver_failures"] == 2
+    row = run_folder.read_summary(out / "summary.csv")[0]
+    counted = {name: row[name] for name in ("solver_failures", "fallbacks", "sensor_faults", "plant_faults")}
+    assert counted == {"solver_failures": 1, "fallbacks": 1, "sensor_faults": 0, "plant_faults": 2}
 
 
 # A full disk, as far as one can be had without filling one: no file may grow beyond a limit.

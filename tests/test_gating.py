@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nmfd.api import load_scenario
 from nmfd.closed_loop import run
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
 from nmfd.metrics import summary
+from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import load_scenario
-from nmfd.types import Measurement
+from nmfd.types import Observation, Status
 
 SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")
 NETWORK, CENTRE = SCENARIO.network, 3
@@ -23,7 +24,7 @@ def seen(vehicles, step=0):
     """A measurement with `vehicles` in the centre."""
     accumulation = np.zeros((7, 7))
     accumulation[CENTRE, 0] = vehicles
-    return Measurement(step=step, time=30.0 * step, accumulation=accumulation, backlog=np.zeros((7, 7)))
+    return Observation(step=step, time=30.0 * step, accumulation=accumulation, backlog=np.zeros((7, 7)))
 
 
 def gate(controls):
@@ -38,7 +39,7 @@ def with_options(**options):
 
 
 def test_benchmark_row():
-    trajectory = run(NmfdPlant(SCENARIO), PiGating(SCENARIO), SCENARIO, seed=0)
+    trajectory = run(NmfdPlant(SCENARIO), PiGating(planning_model(SCENARIO)), SCENARIO, seed=0)
     row = summary(trajectory)
     assert row["total_time_spent_veh_s"] == pytest.approx(8.9e7, rel=0.02)
     assert row["final_accumulation_veh"] < 500.0
@@ -46,7 +47,7 @@ def test_benchmark_row():
 
 
 def test_only_the_entries_are_metered_and_within_bounds():
-    controller, random = PiGating(SCENARIO), np.random.default_rng(0)
+    controller, random = PiGating(planning_model(SCENARIO)), np.random.default_rng(0)
     others = NETWORK.adjacency.copy()
     others[:, CENTRE] = False
     for step in range(100):
@@ -54,7 +55,7 @@ def test_only_the_entries_are_metered_and_within_bounds():
         assert NETWORK.u_min <= gate(controls) <= NETWORK.u_max
         assert (controls.perimeter[others] == NETWORK.u_max).all()
         assert (controls.perimeter[~NETWORK.adjacency] == 0.0).all()
-        assert controls.splits is None and controls.status == "ok"
+        assert controls.splits is None and controls.status == Status.OK
 
 
 @pytest.mark.parametrize("long, then, limit", [(0.0, 1.2, "u_max"), (3.0, 0.8, "u_min")])
@@ -62,7 +63,7 @@ def test_the_integral_does_not_wind_up(long, then, limit):
     """After hours at one bound, the gate leaves it as fast as after ten minutes."""
     gates = []
     for intervals in (20, 1000):
-        controller = PiGating(SCENARIO)
+        controller = PiGating(planning_model(SCENARIO))
         for step in range(intervals):
             controls = controller.act(seen(long * CRITICAL, step))
         assert gate(controls) == getattr(NETWORK, limit)
@@ -72,14 +73,14 @@ def test_the_integral_does_not_wind_up(long, then, limit):
 
 
 def test_one_step_by_hand():
-    controller = PiGating(with_options(set_point=[3000.0], kp=0.5, ki=0.001))
+    controller = PiGating(planning_model(with_options(set_point=[3000.0], kp=0.5, ki=0.001)))
     controller.act(seen(3000.0))
     by_hand = 0.9 + (0.5 * (3000.0 - 3600.0) + 0.001 * 30.0 * (3000.0 - 3600.0)) / CRITICAL
     assert gate(controller.act(seen(3600.0, 1))) == pytest.approx(by_hand, rel=1e-12)
 
 
 def test_reset_forgets():
-    controller = PiGating(SCENARIO)
+    controller = PiGating(planning_model(SCENARIO))
     for step in range(5):
         controller.act(seen(2.0 * CRITICAL, step))
     controller.reset()
@@ -92,18 +93,18 @@ def test_reset_forgets():
     ({"set_point": [-5.0]}, "set_point: expected numbers above 0")])
 def test_wrong_options(options, problem):
     with pytest.raises(InputError, match=f"controllers.pi-gating.{problem}") as caught:
-        PiGating(with_options(**options))
+        PiGating(planning_model(with_options(**options)))
     assert "\n" not in str(caught.value)
 
 
 def test_something_must_be_protected():
     with pytest.raises(InputError, match="protected: pi-gating needs at least one protected region, got none"):
-        PiGating(replace(SCENARIO, protected=()))
+        PiGating(planning_model(replace(SCENARIO, protected=())))
 
 
 def test_the_set_point_by_a_share_of_the_maximum_outflow():
     mfd = NETWORK.mfds[3]
     for share in (0.5, 0.95, 1.0):
-        (point,) = PiGating(with_options(outflow_share=share)).set_point
+        (point,) = PiGating(planning_model(with_options(outflow_share=share))).set_point
         assert point <= mfd.critical and mfd.outflow(point) == pytest.approx(share * mfd.capacity, rel=1e-3)
-    assert PiGating(with_options(outflow_share=0.5, set_point=[3000.0])).set_point == [3000.0]
+    assert PiGating(planning_model(with_options(outflow_share=0.5, set_point=[3000.0]))).set_point == [3000.0]

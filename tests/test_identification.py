@@ -9,12 +9,13 @@ import tiny
 import torch
 
 from nmfd import closed_loop
+from nmfd.api import load_scenario
 from nmfd.controllers.excitation import Probing
 from nmfd.model import dynamics, identification
 from nmfd.model.identification import Observed
 from nmfd.model.mfd import Mfd
+from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import load_scenario
 
 ROOT = Path(__file__).parents[1]
 
@@ -30,7 +31,8 @@ def scenario():
 
 def observe(scenario, seed, factor):
     demanded = replace(scenario, demand=factor * scenario.demand)
-    trajectory = closed_loop.run(NmfdPlant(demanded), Probing(demanded, guidance=False), demanded, seed=seed)
+    controller = Probing(planning_model(demanded), guidance=False)
+    trajectory = closed_loop.run(NmfdPlant(demanded), controller, demanded, seed=seed)
     return Observed(
         accumulation=trajectory.accumulation, demand=demanded.demand[:demanded.steps],
         perimeter=trajectory.perimeter, splits=trajectory.splits,
@@ -74,7 +76,8 @@ def test_windows_are_the_intervals_in_order(runs):
 
 def test_probing_moves_every_gate_and_repeats_itself(scenario):
     def trajectory(seed, guidance=True):
-        return closed_loop.run(NmfdPlant(scenario), Probing(scenario, guidance=guidance), scenario, seed=seed)
+        controller = Probing(planning_model(scenario), guidance=guidance)
+        return closed_loop.run(NmfdPlant(scenario), controller, scenario, seed=seed)
 
     first, again, other = trajectory(0), trajectory(0), trajectory(1)
     np.testing.assert_array_equal(first.perimeter, again.perimeter)

@@ -22,8 +22,9 @@ from cosim.plant.settings import settings
 from cosim.sumo.net import load_city
 from cosim.sumo.recorded_trips import read_originals, read_routes
 from cosim.sumo.turning_flows import own_flows
+from nmfd.api import load_scenario
 from nmfd.errors import InputError
-from nmfd.model.scenario import as_modelled, load_scenario
+from nmfd.model.planning import planning_model
 from nmfd.types import Controls
 
 
@@ -345,11 +346,11 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
     assert f"Written to {network / 'guided' / 'network.toml'}" in text
     assert (tmp_path / "loading" / "guided" / "level-2" / "probing-pcrg-1000.npz").is_file()
     loaded = load_scenario(scenario)
-    guided = as_modelled(loaded, "dpc-pcrg").network
+    guided = planning_model(loaded, "dpc-pcrg").network
     assert guided.hash != loaded.network.hash and guided.own_splits == loaded.network.own_splits
     assert "PLACEHOLDERS" not in (network / "network.toml").read_text()
     good(cosim("import", config, "--regions", 2, "--method", "geometric", "--no-run", "--out", network, "--force"))
-    assert as_modelled(load_scenario(scenario), "dpc-pcrg").network.regions == 2
+    assert planning_model(load_scenario(scenario), "dpc-pcrg").network.regions == 2
 
 
 def test_the_chain_in_a_city_without_signals(tmp_path):

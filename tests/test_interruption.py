@@ -21,9 +21,9 @@ import torch
 from commands import MAINS, call, good, killed
 
 from cosim.plant.plant import SumoPlant
+from nmfd.api import load_scenario
 from nmfd.controllers.dpc import training
 from nmfd.errors import InputError
-from nmfd.model.scenario import load_scenario
 from nmfd.runs import files, run_folder, workers
 from nmfd.runs.files import TEMPORARY
 from nmfd.runs.run_folder import LOCK

@@ -15,11 +15,11 @@ from cosim.importing.case import seconds
 from cosim.plant.strategy import parse
 from cosim.sumo.net import load_city
 from cosim.sumo.recorded_trips import read_originals
+from nmfd.api import load_scenario
 from nmfd.cli.options import policy_files, whole_numbers
 from nmfd.controllers.dpc.policy import load_policy
 from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
-from nmfd.model.scenario import load_scenario
 from nmfd.runs import run_folder
 from nmfd.studies import bound
 

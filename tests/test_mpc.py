@@ -9,15 +9,16 @@ import tiny
 import torch
 from tiny import random_controls
 
+from nmfd.api import load_scenario
 from nmfd.closed_loop import run
 from nmfd.controllers.mpc.controller import TOLERANCE, EconomicMpc
 from nmfd.controllers.no_control import NoControl
 from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.model import dynamics
+from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import load_scenario
-from nmfd.types import Measurement
+from nmfd.types import Observation, Status
 
 SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")
 NETWORK = SCENARIO.network
@@ -27,9 +28,9 @@ BOTH = pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
 @pytest.fixture(scope="module")
 def states():
     """Measurements of a run without control: its first 50 intervals, from empty to gridlock in the centre."""
-    trajectory = run(NmfdPlant(SCENARIO), NoControl(SCENARIO), replace(SCENARIO, steps=50), seed=0)
+    trajectory = run(NmfdPlant(SCENARIO), NoControl(planning_model(SCENARIO)), replace(SCENARIO, steps=50), seed=0)
     return [
-        Measurement(step=k, time=30.0 * k, accumulation=x, backlog=np.zeros((7, 7)))
+        Observation(step=k, time=30.0 * k, accumulation=x, backlog=np.zeros((7, 7)))
         for k, x in enumerate(trajectory.accumulation)]
 
 
@@ -49,18 +50,18 @@ def assert_admissible(controls, guidance):
 
 @BOTH
 def test_controls_are_admissible_and_solved(states, guidance):
-    controller = EconomicMpc(SCENARIO, guidance=guidance)
+    controller = EconomicMpc(planning_model(SCENARIO), guidance=guidance)
     for k in range(0, 50, 6):
         controls = controller.act(states[k])
-        assert controls.status == "ok"
+        assert controls.status == Status.OK
         assert_admissible(controls, guidance)
 
 
 @BOTH
 @pytest.mark.parametrize("k", [10, 30])
 def test_no_random_plan_nearby_or_far_is_better(states, guidance, k):
-    controller, random = EconomicMpc(SCENARIO, guidance=guidance), np.random.default_rng(k)
-    assert controller.act(states[k]).status == "ok"
+    controller, random = EconomicMpc(planning_model(SCENARIO), guidance=guidance), np.random.default_rng(k)
+    assert controller.act(states[k]).status == Status.OK
     forecast, plan = controller.forecast(states[k]), controller._plan
     best = controller.cost(*forecast, plan)
     for _ in range(300):
@@ -77,10 +78,10 @@ def test_two_decisions_against_brute_force(tmp_path):
     """A jammed region behind a gate: the best of all pairs of u on a grid."""
     network = tiny.row_network(2).replace("jam = 1000.0", "jam = 700.0")
     scenario = load_scenario(tiny.write(tmp_path, network=network))
-    controller = EconomicMpc(with_options(scenario, horizon=6), guidance=False)
+    controller = EconomicMpc(planning_model(with_options(scenario, horizon=6)), guidance=False)
     accumulation = np.array([[0.0, 900.0], [0.0, 330.0]])
-    measurement = Measurement(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros((2, 2)))
-    assert controller.act(measurement).status == "ok"
+    measurement = Observation(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros((2, 2)))
+    assert controller.act(measurement).status == Status.OK
     forecast, plan = controller.forecast(measurement), controller._plan
     assert plan.shape == (5, 2)  # u and the one share, 1
     best = min(
@@ -92,7 +93,7 @@ def test_two_decisions_against_brute_force(tmp_path):
 @BOTH
 def test_the_plan_costs_what_the_regional_model_says(states, guidance):
     for scenario in (SCENARIO, replace(SCENARIO, step=90.0, substeps=3), replace(SCENARIO, integrator="rk4")):
-        controller = EconomicMpc(scenario, guidance=guidance)
+        controller = EconomicMpc(planning_model(scenario), guidance=guidance)
         start, demand = controller.forecast(states[20])
         random = np.random.default_rng(7)
         plan = controller.admissible.project(np.stack([
@@ -110,7 +111,7 @@ def test_the_plan_costs_what_the_regional_model_says(states, guidance):
 
 
 def test_the_backlog_is_demand_and_noise_is_not_negative(states):
-    controller = EconomicMpc(SCENARIO, guidance=False)
+    controller = EconomicMpc(planning_model(SCENARIO), guidance=False)
     backlog = np.zeros((7, 7))
     backlog[0, 6] = 60.0
     start, demand = controller.forecast(replace(states[0], backlog=backlog, accumulation=np.full((7, 7), -0.5)))
@@ -120,27 +121,27 @@ def test_the_backlog_is_demand_and_noise_is_not_negative(states):
 
 
 def test_nothing_is_demanded_after_the_end(states):
-    controller = EconomicMpc(SCENARIO, guidance=False)
+    controller = EconomicMpc(planning_model(SCENARIO), guidance=False)
     for step in (SCENARIO.steps - 2, SCENARIO.steps, SCENARIO.steps + 50):
         controls = controller.act(replace(states[5], step=step))
-        assert controls.status == "ok"
+        assert controls.status == Status.OK
 
 
 @BOTH
 def test_a_solver_without_iterations_says_so_and_does_not_act(states, guidance):
-    controls = EconomicMpc(with_options(max_iterations=0), guidance=guidance).act(states[30])
-    assert controls.status == "iteration limit: pi-gating in control"
-    controller = EconomicMpc(replace(with_options(max_iterations=0), protected=()), guidance=guidance)
+    controls = EconomicMpc(planning_model(with_options(max_iterations=0)), guidance=guidance).act(states[30])
+    assert controls.note == "iteration limit: pi-gating in control"
+    controller = EconomicMpc(planning_model(replace(with_options(max_iterations=0), protected=())), guidance=guidance)
     controls = controller.act(states[30])
-    assert controls.status == "iteration limit: perimeter opened, nominal splits"
+    assert controls.note == "iteration limit: perimeter opened, nominal splits"
     assert (controls.perimeter[NETWORK.adjacency] == NETWORK.u_max).all()
     if guidance:
         np.testing.assert_array_equal(controls.splits, NETWORK.nominal_splits)
 
 
 def test_a_time_limit_is_a_recorded_failure(states):
-    controls = EconomicMpc(with_options(time_limit=1e-6), guidance=True).act(states[30])
-    assert controls.status == "time limit: pi-gating in control"
+    controls = EconomicMpc(planning_model(with_options(time_limit=1e-6)), guidance=True).act(states[30])
+    assert controls.note == "time limit: pi-gating in control"
     assert_admissible(controls, True)
 
 
@@ -148,29 +149,29 @@ def test_a_time_limit_is_a_recorded_failure(states):
 def test_more_iterations_never_make_the_plan_worse(states, guidance):
     costs = []
     for most in (0, 1, 2, 4, 8, 100):
-        controller = EconomicMpc(with_options(max_iterations=most), guidance=guidance)
+        controller = EconomicMpc(planning_model(with_options(max_iterations=most)), guidance=guidance)
         assert_admissible(controller.act(states[30]), guidance)
         costs.append(controller.cost(*controller.forecast(states[30]), controller._plan))
     assert costs == sorted(costs, reverse=True) and costs[-1] < costs[0]
 
 
 def test_without_a_measurement_the_last_plan_is_used_until_it_ends(states):
-    controller = EconomicMpc(SCENARIO, guidance=True)
+    controller = EconomicMpc(planning_model(SCENARIO), guidance=True)
     nothing = np.full((7, 7), np.nan)
-    assert controller.act(states[20]).status == "ok"
+    assert controller.act(states[20]).status == Status.OK
     plan = controller._plan
     for ahead in range(1, len(plan)):
         controls = controller.act(replace(states[20 + ahead], accumulation=nothing))
-        assert controls.status == "not a number: last plan used"
+        assert controls.note == "not a number: last plan used"
         np.testing.assert_array_equal(controls.perimeter, controller.admissible.controls(plan[ahead])[0])
     controls = controller.act(replace(states[20], accumulation=nothing))
-    assert controls.status == "not a number: perimeter opened, nominal splits"
+    assert controls.note == "not a number: perimeter opened, nominal splits"
     assert (controls.perimeter[NETWORK.adjacency] == NETWORK.u_max).all()
-    assert controller.act(states[20]).status == "ok"
+    assert controller.act(states[20]).status == Status.OK
 
 
 def test_reset_forgets_the_plan(states):
-    controller = EconomicMpc(SCENARIO, guidance=False)
+    controller = EconomicMpc(planning_model(SCENARIO), guidance=False)
     first = controller.act(states[25]).perimeter
     controller.act(states[26])
     controller.reset()
@@ -183,13 +184,13 @@ def test_reset_forgets_the_plan(states):
     ({"time_limit": 0.0}, "time_limit: expected a number above 0")])
 def test_wrong_options(options, problem):
     with pytest.raises(InputError, match=f"controllers.mpc-pc.{problem}") as caught:
-        EconomicMpc(with_options(**options), guidance=False)
+        EconomicMpc(planning_model(with_options(**options)), guidance=False)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("guidance, most", [
     pytest.param(False, 1.381e8, id="pc"), pytest.param(True, 9.0e7, id="pcrg")])
 def test_benchmark_row(guidance, most):
-    row = summary(run(NmfdPlant(SCENARIO), EconomicMpc(SCENARIO, guidance=guidance), SCENARIO, seed=0))
+    row = summary(run(NmfdPlant(SCENARIO), EconomicMpc(planning_model(SCENARIO), guidance=guidance), SCENARIO, seed=0))
     assert row["total_time_spent_veh_s"] < most
     assert row["solver_failures"] == 0

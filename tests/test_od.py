@@ -14,8 +14,8 @@ from cosim.importing.demand import read_traffic
 from cosim.importing.od import read_od, trips
 from cosim.importing.streets import read_streets
 from cosim.sumo.recorded_trips import read_originals
+from nmfd.api import load_scenario
 from nmfd.errors import InputError
-from nmfd.model.scenario import load_scenario
 
 RELATIONS = """<data><interval id="morning" begin="7:30:00" end="30600">
   <tazRelation from="west" to="east" count="90"/><tazRelation from="east" to="west" count="30.5"/>

@@ -8,9 +8,9 @@ import tiny
 import torch
 from commands import nmfd
 
+from nmfd.api import load_scenario
 from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint, load_policy
 from nmfd.model.regional_model import load_network
-from nmfd.model.scenario import load_scenario
 
 ROOT = Path(__file__).parents[1]
 onnxruntime = pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")

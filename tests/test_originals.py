@@ -8,9 +8,9 @@ import pytest
 import tiny
 
 from cosim.sumo.recorded_trips import draw, read_originals, write_originals
+from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
-from nmfd.model.scenario import load_scenario
 
 VEHICLES = "<routes>" + "".join(
     f'<vehicle id="v{n}" type="lorry" depart="{100 + 2 * n}"><route edges="a b"/><stop lane="a_0" duration="5"/>'

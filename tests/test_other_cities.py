@@ -18,8 +18,8 @@ from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.sumo.recorded_trips import draw, read_originals
 from cosim.sumo.session import REFUSALS
+from nmfd.api import load_scenario
 from nmfd.errors import InputError
-from nmfd.model.scenario import load_scenario
 
 FLOW = '<flow id="f" begin="0" end="600" number="60" from="A1B1" to="C1D1"/>'
 FAST = ("--method", "geometric", "--no-run")

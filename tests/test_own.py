@@ -13,10 +13,10 @@ from commands import nmfd
 
 import cosim.cli.main
 from cosim.plant.strategy import parse
+from nmfd.api import load_scenario
 from nmfd.controllers import custom, registry
 from nmfd.controllers.template import MyController
 from nmfd.errors import InputError
-from nmfd.model.scenario import load_scenario
 from nmfd.runs import run_folder
 
 ROOT = Path(__file__).parents[1]
@@ -64,7 +64,7 @@ def test_the_template_holds_regions_at_their_set_points():
     controller = custom.make(f"{custom.__file__.replace('custom.py', 'template.py')}:MyController", scenario)
     accumulation = np.zeros((7, 7))
     accumulation[3, 0] = 2 * scenario.network.mfds[3].critical
-    perimeter = controller.act(custom.Measurement(
+    perimeter = controller.act(custom.Observation(
         step=0, time=0.0, accumulation=accumulation, backlog=np.zeros((7, 7)))).perimeter
     entries = scenario.network.adjacency[:, 3]
     assert (perimeter[entries, 3] == scenario.network.u_min).all()
@@ -78,7 +78,7 @@ def test_it_has_a_table_of_its_own(place):
     assert nmfd("new-controller", "mine.py").exit_code == 0
     controller = custom.make("mine.py:MyController", load_scenario(place / "scenario"))
     full = np.full((2, 2), 900.0)
-    perimeter = controller.act(custom.Measurement(step=0, time=0.0, accumulation=full, backlog=0 * full)).perimeter
+    perimeter = controller.act(custom.Observation(step=0, time=0.0, accumulation=full, backlog=0 * full)).perimeter
     assert perimeter[0, 1] == 0.9  # without gain nothing is held back
 
 
@@ -118,7 +118,7 @@ def test_in_strategies(place, name, controller, options):
     ("import numpy\n\nclass Mine(:\n", r"mine\.py:3: mine\.py:Mine: import: SyntaxError: invalid syntax"),
     ("\nimport nothing_of_the_kind\n", r"mine\.py:2: mine\.py:Mine: import: ModuleNotFoundError: No module named"),
     ("import sys\nsys.exit('bye')\n", r"mine\.py:2: mine\.py:Mine: import: SystemExit: bye"),
-    (GOOD.replace("self, scenario", "self"), "made with one argument, the scenario, but too many positional"),
+    (GOOD.replace("self, scenario", "self"), "made with one argument, the planning model, but too many positional"),
     (GOOD.replace("def act", "def acts"), "mine.py:Mine: has no method act"),
     (GOOD.replace("def reset", "def rest"), "mine.py:Mine: has no method reset"),
     (GOOD.replace("pass", "1 / 0"), r"mine\.py:8: mine\.py:Mine: reset: ZeroDivisionError"),

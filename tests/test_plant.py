@@ -11,8 +11,8 @@ from cosim.plant.guidance import shifted
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import Settings
 from cosim.sumo.session import Session
+from nmfd.api import load_scenario
 from nmfd.ledger import LedgerError
-from nmfd.model.scenario import load_scenario
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import trajectory
+from trajectories import trajectory
 
+from nmfd.api import load_scenario
 from nmfd.controllers import registry
 from nmfd.model.mfd import Mfd
-from nmfd.model.scenario import load_scenario
 from nmfd.studies import plots
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "economic_mpc"

@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import tiny
+import trajectories
 
 from cosim.evaluation import explain
 from nmfd.model.regional_model import load_network
-from nmfd.types import Trajectory
 
 
 @pytest.fixture
@@ -25,10 +25,10 @@ def run(network, load, u):
     state = np.zeros((11, count, count))
     state[6:] = np.diag(load * critical)
     perimeter = np.broadcast_to(np.where(network.adjacency, u, 0.0), (10, count, count))
-    return Trajectory(
+    return trajectories.made(
         controller="x", plant="sumo", seed=0, step=90.0, accumulation=state, backlog=np.zeros_like(state),
         completed=np.zeros(11), perimeter=perimeter, splits=np.zeros((10, count, count, count)),
-        decision_time=np.zeros(10), status=("ok",) * 10, wall_time=1.0)
+        decision_time=np.zeros(10), wall_time=1.0)
 
 
 def record(network, started, came, guided=0.0):

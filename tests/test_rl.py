@@ -9,10 +9,10 @@ import pytest
 import tiny
 
 from nmfd import api
+from nmfd.api import load_scenario
 from nmfd.controllers import custom
 from nmfd.metrics import total_time_spent
 from nmfd.model.plant import AcyclicPlant
-from nmfd.model.scenario import load_scenario
 
 ROOT = Path(__file__).parents[1]
 gymnasium = pytest.importorskip("gymnasium", reason="the extra rl is not installed")

@@ -11,6 +11,7 @@ import torch
 from commands import nmfd
 
 from nmfd import closed_loop
+from nmfd.api import load_scenario
 from nmfd.controllers import registry
 from nmfd.controllers.dpc import fallback, training
 from nmfd.controllers.dpc import policy as dpc
@@ -18,10 +19,10 @@ from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.metrics import total_time_spent
 from nmfd.model.demand_noise import WHERE, entries, perturbed
+from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import load_scenario
 from nmfd.studies import robustness
-from nmfd.types import Measurement
+from nmfd.types import Observation, Status
 
 BENCHMARK = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
 
@@ -60,7 +61,7 @@ def test_noise_is_common_to_all_sigmas_and_follows_its_seed(scenario):
 
 def test_training_noise_is_that_of_the_evaluation(scenario):
     """Even rollouts: on the pairs in use; odd ones: everywhere; sigma the level times the setting."""
-    rollout = training.Rollout(scenario)
+    rollout = training.Rollout(planning_model(scenario))
     nominal = 50.0 + rollout.demand.unsqueeze(1).repeat(50, 400, 1, 1)
     level = torch.full((400,), 0.5)
     change = rollout.perturb(nominal, level, 2.0, 0.5, torch.Generator().manual_seed(0)) - nominal
@@ -152,26 +153,26 @@ def constant_policy(scenario, logit):
 def guard(scenario, spread=0.1):
     policy = constant_policy(scenario, 20.0)
     states = 0.5 + spread * np.random.default_rng(0).standard_normal((5000, 4))
-    return fallback.Guarded(policy, fallback.statistics(states), scenario)
+    return fallback.Guarded(policy, fallback.statistics(states), planning_model(scenario))
 
 
 def at(scenario, value, step=0):
     critical = scenario.network.mfds[0].critical
-    return Measurement(
+    return Observation(
         step=step, time=30.0 * step, accumulation=np.full((2, 2), value * critical), backlog=np.zeros((2, 2)))
 
 
 def test_the_guard_takes_over_outside_and_hands_back_inside(scenario, monkeypatch):
     monkeypatch.setattr(fallback, "MOST_ERROR", np.inf)  # the states here jump
-    watched, gating = guard(scenario), PiGating(scenario)
-    assert watched.act(at(scenario, 0.5)).status == "ok"
+    watched, gating = guard(scenario), PiGating(planning_model(scenario))
+    assert watched.act(at(scenario, 0.5)).status == Status.OK
     gating.reset()
     for step in (1, 2):
         controls = watched.act(at(scenario, 2.0, step))
-        assert controls.status.startswith("guard: ")
+        assert controls.note.startswith("guard: ")
         np.testing.assert_array_equal(controls.perimeter, gating.act(at(scenario, 2.0, step)).perimeter)
-    statuses = [watched.act(at(scenario, 0.5, step)).status for step in range(3, 3 + fallback.PATIENCE)]
-    assert all(status != "ok" for status in statuses[:-1]) and statuses[-1] == "ok"
+    statuses = [watched.act(at(scenario, 0.5, step)).note for step in range(3, 3 + fallback.PATIENCE)]
+    assert all(statuses[:-1]) and not statuses[-1]
 
 
 def wrong_policy(scenario):
@@ -186,23 +187,23 @@ def test_a_wrong_policy_does_not_make_it_worse_in_silence():
     made = wrong_policy(scenario)
     alone = closed_loop.run(NmfdPlant(scenario), dpc.DpcController(made), scenario, seed=0)
     states = (alone.accumulation[:-1] / made.scale.numpy()).reshape(-1, 49)
-    watched = fallback.Guarded(made, fallback.statistics(np.repeat(states, 4, axis=0)), scenario)
+    watched = fallback.Guarded(made, fallback.statistics(np.repeat(states, 4, axis=0)), planning_model(scenario))
     kept = closed_loop.run(NmfdPlant(scenario), watched, scenario, seed=0)
     nobody = closed_loop.run(NmfdPlant(scenario), registry.make("no-control", scenario), scenario, seed=0)
     assert total_time_spent(alone) > 1.2 * total_time_spent(nobody)
     assert total_time_spent(kept) <= total_time_spent(nobody)
-    assert any("more time than no control, pi-gating in control" in status for status in kept.status)
+    assert any("more time than no control, pi-gating in control" in status for status in kept.note)
 
 
 def test_a_city_that_the_model_does_not_predict_is_noticed(scenario):
     """It is told once that nothing has changed, where the model has seen everybody leave."""
     watched = guard(scenario)
-    assert watched.act(at(scenario, 0.5, 0)).status == "ok"
+    assert watched.act(at(scenario, 0.5, 0)).status == Status.OK
     watched._predicted = watched._predicted + 0.5 * scenario.network.mfds[0].critical
-    status = watched.act(at(scenario, 0.5, 1)).status
+    status = watched.act(at(scenario, 0.5, 1)).note
     assert "predictions miss by" in status and "pi-gating in control" in status
     watched.reset()
-    assert watched.act(at(scenario, 0.5, 0)).status == "ok"
+    assert watched.act(at(scenario, 0.5, 0)).status == Status.OK
 
 
 def test_the_limit_lets_the_training_states_pass(scenario):

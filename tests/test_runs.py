@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tiny import trajectory
+from trajectories import trajectory
 
 from nmfd.cli.progress import ProgressLine, progress_line
 from nmfd.errors import InputError
@@ -26,10 +26,11 @@ def test_trajectory_round_trip_and_same_bytes(tmp_path):
     run_folder.write_trajectory(tmp_path / "a.npz", original)
     run_folder.write_trajectory(tmp_path / "b.npz", replace(original, decision_time=2 * original.decision_time))
     back = run_folder.read_trajectory(tmp_path / "a.npz")
-    for name in ("accumulation", "backlog", "completed", "perimeter", "splits"):
+    for name in (
+            "accumulation", "backlog", "completed", "observed", "observed_backlog", "perimeter", "splits", "status"):
         np.testing.assert_array_equal(getattr(back, name), getattr(original, name))
     assert (back.controller, back.plant, back.seed, back.step) == ("no-control", "nmfd", 0, 30.0)
-    assert back.status == original.status
+    assert back.note == original.note
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import tiny
 
+from nmfd.api import load_scenario
 from nmfd.controllers import registry
 from nmfd.controllers.dpc import training
 from nmfd.errors import InputError
-from nmfd.model.scenario import as_modelled, load_scenario
+from nmfd.model.planning import planning_model
 
 OTHER = """
 name = "other"
@@ -62,9 +63,9 @@ def test_a_controller_plans_with_the_model_that_it_names(base, tmp_path):
     (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 800.0"))
     folder = beside(base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\nhorizon = 4\n')
     scenario = load_scenario(folder)
-    planned = as_modelled(scenario, "mpc-pc")
+    planned = planning_model(scenario, "mpc-pc")
     assert planned.network.mfds[0].jam == 800.0 and planned.controller_options["mpc-pc"] == {"horizon": 4}
-    assert as_modelled(scenario, "mpc-pcrg").network.mfds[0].jam == 1000.0
+    assert planning_model(scenario, "mpc-pcrg").network.mfds[0].jam == 1000.0
     assert registry.make("mpc-pc", scenario).options.horizon == 4
 
 
@@ -76,12 +77,12 @@ def test_guiding_controllers_find_the_model_of_guided_drivers(base, tmp_path):
     (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 700.0"))
     scenario = load_scenario(beside(
         base, 'name = "x"\nbase = "../scenario"\n[controllers."dpc-pcrg+max-pressure"]\nmodel = "../model"\n'))
-    jam = {name: as_modelled(scenario, name).network.mfds[0].jam for name in (
+    jam = {name: planning_model(scenario, name).network.mfds[0].jam for name in (
         "dpc-pcrg", "mpc-pcrg", "dpc-pcrg-robust", "dpc-pc", "bound-pcrg", "dpc-pcrg+max-pressure")}
     assert list(jam.values()) == [800.0, 800.0, 800.0, 1000.0, 1000.0, 700.0]
     (network / "guided" / "network.toml").write_text(tiny.row_network(3))
     with pytest.raises(InputError, match="guided/network.toml: network .* has other regions"):
-        as_modelled(scenario, "dpc-pcrg")
+        planning_model(scenario, "dpc-pcrg")
 
 
 def test_an_inherited_model_lies_where_the_base_says(base, tmp_path):
@@ -92,7 +93,7 @@ def test_an_inherited_model_lies_where_the_base_says(base, tmp_path):
     far.mkdir(parents=True)
     [first] = [folder.parent for folder in tmp_path.glob("*/scenario.toml") if 'name = "x"' in folder.read_text()]
     (far / "scenario.toml").write_text(f'name = "y"\nbase = "../../{first.name}"\n')
-    assert as_modelled(load_scenario(far), "mpc-pc").network.mfds[0].jam == 800.0
+    assert planning_model(load_scenario(far), "mpc-pc").network.mfds[0].jam == 800.0
 
 
 def test_a_variant_has_options_model_and_policy_of_its_own(base, tmp_path):

@@ -19,8 +19,8 @@ from cosim.sumo.net import gateway_room_taken, load_city
 from cosim.sumo.signals import Link, read_signals
 from cosim.sumo.trips import make_trips
 from cosim.sumo.turning_flows import turning_flows
+from nmfd.api import load_scenario
 from nmfd.errors import InputError
-from nmfd.model.scenario import load_scenario
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"

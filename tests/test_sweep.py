@@ -12,6 +12,7 @@ import copies
 import numpy as np
 import pandas as pd
 import pytest
+import trajectories
 from click.testing import CliRunner
 from commands import killed
 
@@ -21,7 +22,6 @@ from cosim.evaluation.simulate import FACTS, Result, Task
 from nmfd.errors import InputError
 from nmfd.runs.run_folder import read_summary
 from nmfd.runs.workers import Failure
-from nmfd.types import Trajectory
 
 ROOT = Path(__file__).parents[1]
 
@@ -53,10 +53,10 @@ def ran(monkeypatch):
 
 
 def made_up(task) -> Result:
-    trajectory = Trajectory(
+    trajectory = trajectories.made(
         controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=np.ones((3, 7, 7)),
         backlog=np.zeros((3, 7, 7)), completed=np.arange(3.0), perimeter=np.zeros((2, 7, 7)),
-        splits=np.zeros((2, 7, 7, 7)), decision_time=np.ones(2), status=("ok", "ok"), wall_time=1.0)
+        splits=np.zeros((2, 7, 7, 7)), decision_time=np.ones(2), wall_time=1.0)
     facts = {**dict.fromkeys(FACTS, 1.0), "controller": task.controller, "seed": task.seed}
     return Result(trajectory=trajectory, record={"production": np.zeros((2, 7))}, facts=facts)
 

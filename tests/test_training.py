@@ -8,11 +8,12 @@ import pytest
 import tiny
 import torch
 
+from nmfd.api import load_scenario
 from nmfd.controllers.dpc import training
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.rollout import Rollout
-from nmfd.model.scenario import load_scenario
-from nmfd.runs.workers import RunFailed
+from nmfd.errors import RunFailed
+from nmfd.model.planning import planning_model
 
 # One value that is no default for every setting, and one beyond each end of what is allowed.
 CHOSEN = {
@@ -60,7 +61,7 @@ def test_what_is_out_of_range_is_refused(scenario, key, value):
 
 
 def test_starts_without_a_spread_are_those_of_the_scenario(scenario, generator):
-    x, demand = Rollout(scenario, dtype=torch.float64).random_start(3, 0.0, 0.0, generator)
+    x, demand = Rollout(planning_model(scenario), dtype=torch.float64).random_start(3, 0.0, 0.0, generator)
     assert x.shape == (3, 2, 2) and not x.any()
     for n in range(3):
         np.testing.assert_array_equal(demand[:, n], scenario.demand)
@@ -68,7 +69,7 @@ def test_starts_without_a_spread_are_those_of_the_scenario(scenario, generator):
 
 def test_spread_and_level_scale_the_flows(scenario, generator):
     """Every flow for itself by 1 +- 0.3, evenly and the same at all times; all of a rollout by 0.5 to 2."""
-    rollout = Rollout(scenario, dtype=torch.float64)
+    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
     _, demand = rollout.random_start(4000, 0.3, 0.0, generator)
     busy = int(scenario.demand[:, 0, 1].argmax())
     factor = demand[busy, :, 0, 1] / scenario.demand[busy, 0, 1]
@@ -81,7 +82,7 @@ def test_spread_and_level_scale_the_flows(scenario, generator):
 
 def test_a_share_of_the_rollouts_starts_later_in_a_random_state(scenario, generator):
     """Three quarters of them: up to 80 % of the jam, only for destinations in use; the demand goes on from there."""
-    rollout = Rollout(scenario, dtype=torch.float64)
+    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
     x, demand = rollout.random_start(4000, 0.0, 0.75, generator)
     assert not x[3000:].any() and (x[:3000].sum((1, 2)) > 0).all()
     assert not x[:, :, 0].any()  # nobody is bound for region 0
@@ -96,14 +97,14 @@ def test_a_share_of_the_rollouts_starts_later_in_a_random_state(scenario, genera
 
 def test_every_destination_in_use_gets_its_part(scenario, generator):
     both = replace(scenario, demand=scenario.demand + scenario.demand.transpose(0, 2, 1))
-    x, _ = Rollout(both, dtype=torch.float64).random_start(2000, 0.0, 1.0, generator)
+    x, _ = Rollout(planning_model(both), dtype=torch.float64).random_start(2000, 0.0, 1.0, generator)
     assert (x > 0).all()
     assert (x[:, 0, 0] > x[:, 0, 1]).double().mean() == pytest.approx(0.5, abs=0.05)
 
 
 def test_noise_on_the_demand(scenario, generator):
     """Of the pairs that have any, with the sigma of the rollout; in every other rollout of all pairs."""
-    rollout = Rollout(scenario, dtype=torch.float64)
+    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
     demand = torch.full((20, 4000, 2, 2), 50.0, dtype=torch.float64)
     assert rollout.perturb(demand, torch.ones(4000), 0.0, 0.0, generator) is demand
     level = torch.linspace(0.0, 1.0, 4000, dtype=torch.float64)
@@ -121,7 +122,7 @@ def test_noise_on_the_demand(scenario, generator):
 
 def test_the_total_time_spent_is_that_of_the_states(scenario, generator):
     """Vehicles at every beginning of an interval, times its length."""
-    rollout, policy = Rollout(scenario, dtype=torch.float32), made(scenario)
+    rollout, policy = Rollout(planning_model(scenario), dtype=torch.float32), made(scenario)
     x, demand = rollout.random_start(5, 0.2, 0.5, generator)
     exact, seen = rollout.states(policy, x, demand, generator.manual_seed(1))
     assert torch.equal(exact[0], x) and exact.shape == (20, 5, 2, 2)
@@ -135,7 +136,7 @@ def test_the_total_time_spent_is_that_of_the_states(scenario, generator):
 def test_a_validation_is_the_scenario_itself(scenario):
     """Without noise: the TTS from its own start, whatever the seed."""
     quiet, policy = replace(scenario, measurement_std=0.0), made(scenario)
-    rollout = Rollout(quiet)
+    rollout = Rollout(planning_model(quiet))
     with torch.no_grad():
         expected = rollout.total_time_spent(
             policy, torch.zeros(1, 2, 2), rollout.demand[:, None], torch.Generator()).item()
@@ -149,7 +150,7 @@ def test_a_validation_is_the_scenario_itself(scenario):
 def test_a_validation_is_perturbed_as_the_training(scenario, chosen):
     """18 rollouts instead of 2; the same seed gives the same number, and more demand or noise means more vehicles."""
     quiet, policy = replace(scenario, measurement_std=0.0), made(scenario)
-    rollout, asked = Rollout(quiet), []
+    rollout, asked = Rollout(planning_model(quiet)), []
     total = rollout.total_time_spent
     rollout.total_time_spent = lambda policy, x, demand, generator: asked.append(demand) or total(
         policy, x, demand, generator)
@@ -232,7 +233,8 @@ def test_a_training_that_diverges_says_so(tmp_path, scenario, monkeypatch):
 
 def test_the_states_that_a_policy_sees(scenario):
     """As a share of its scale, of four batches and all intervals; the same seed, the same states."""
-    policy, rollout, chosen = made(scenario), Rollout(scenario), training.Training(batch=3, mfd_spread=0.2, noise=0.5)
+    policy, rollout = made(scenario), Rollout(planning_model(scenario))
+    chosen = training.Training(batch=3, mfd_spread=0.2, noise=0.5)
     seen = [training.visited(policy, rollout, chosen, seed) for seed in (0, 0, 1)]
     assert seen[0].shape == (20 * 12, 4) and np.isfinite(seen[0]).all()
     assert (seen[0] == seen[1]).all() and (seen[0] != seen[2]).any()

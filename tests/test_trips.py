@@ -9,8 +9,8 @@ import pytest
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import load_city
 from cosim.sumo.trips import make_trips, write_trips
+from nmfd.api import load_scenario
 from nmfd.errors import InputError
-from nmfd.model.scenario import load_scenario
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
 

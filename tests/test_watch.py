@@ -19,7 +19,7 @@ from cosim.report import watch
 from cosim.sumo import session
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import edge_shapes, load_city
-from nmfd.model.scenario import load_scenario
+from nmfd.api import load_scenario
 
 ROOT = Path(__file__).parents[1]
 XVFB = shutil.which("Xvfb")

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nmfd.model.regional_model import Network
-from nmfd.types import Trajectory
+from nmfd.model.regional_model import RegionalModel
 
 NETWORK = """
 name = "{name}"
@@ -62,7 +61,7 @@ def write(folder: Path, *, scenario: str = SCENARIO, network: str | None = None)
     return folder / "scenario"
 
 
-def limited(network: Network, *, seed: int = 0) -> Network:
+def limited(network: RegionalModel, *, seed: int = 0) -> RegionalModel:
     """`network` with exit rates, boundary capacities and storage, all of a size that matters."""
     random, shape = np.random.default_rng(seed), network.adjacency.shape
     most = max(mfd.capacity for mfd in network.mfds)
@@ -79,12 +78,3 @@ def random_controls(random, network, batch=()):
     splits = random.uniform(size=(*shape, network.regions)) ** 3 * network.split_mask
     sums = splits.sum(axis=-2, keepdims=True)
     return perimeter, splits / np.where(sums > 0, sums, 1.0)
-
-
-def trajectory(controller="no-control", seed=0, steps=4):
-    rng = np.random.default_rng(seed)
-    return Trajectory(
-        controller=controller, plant="nmfd", seed=seed, step=30.0, accumulation=rng.random((steps + 1, 2, 2)),
-        backlog=np.zeros((steps + 1, 2, 2)), completed=np.arange(steps + 1.0), perimeter=rng.random((steps, 2, 2)),
-        splits=rng.random((steps, 2, 2, 2)), decision_time=rng.random(steps), status=("ok",) * (steps - 1) + ("no",),
-        wall_time=1.0)

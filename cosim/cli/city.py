@@ -52,8 +52,8 @@ def identify(
     """
     from cosim.evaluation import identify
     from cosim.importing import find
+    from nmfd.api import load_scenario
     from nmfd.cli.progress import progress_line
-    from nmfd.model.scenario import load_scenario
     from nmfd.runs import files
 
     factors = parsed_levels("--levels", levels)

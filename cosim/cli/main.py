@@ -10,8 +10,7 @@ from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
 from nmfd.cli.errors import Commands, Interrupted
 from nmfd.cli.options import COUNT, FOLDER, SEED
-from nmfd.errors import InputError
-from nmfd.runs.workers import RunFailed
+from nmfd.errors import InputError, RunFailed
 
 
 @click.group(name="cosim", cls=Commands)
@@ -69,8 +68,8 @@ def evaluate(
     import os
 
     from cosim.evaluation import evaluate, statistics
+    from nmfd.api import load_scenario
     from nmfd.cli.progress import progress_line
-    from nmfd.model.scenario import load_scenario
     from nmfd.runs import files as disk
 
     loaded = load_scenario(scenario)
@@ -142,8 +141,8 @@ def sweep(
     import os
 
     from cosim.evaluation import sweeps
+    from nmfd.api import load_scenario
     from nmfd.cli.progress import progress_line
-    from nmfd.model.scenario import load_scenario
     from nmfd.runs import files as disk
 
     order = sweeps.Sweep(

@@ -1,5 +1,6 @@
 """The commands run and compare of `cosim`. Heavy modules are imported inside them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -130,7 +131,8 @@ def compare(
         task = Task(scenario=target, controller=controller, seed=seed, steps=steps)
         out, _ = _experiment([task], out)
     result = experiment.read_run(out, controller, seed)
-    scenario = strategy.modelled(scenario_of(task), controller, model)
+    scenario = scenario_of(task)
+    scenario = replace(scenario, network=strategy.planning_of(scenario, controller, model).network)
     rows = model_validation.write(out, scenario, result)
     click.echo(model_validation.table(rows))
     name = run_folder.run_name(controller, seed)
@@ -153,8 +155,8 @@ def _experiment(tasks: list, out: Path | None, sumo_output: tuple[str, ...] = ()
 
     from cosim.evaluation import experiment
     from cosim.sumo.outputs import paths
+    from nmfd.api import load_scenario
     from nmfd.cli.progress import progress_line
-    from nmfd.model.scenario import load_scenario
     from nmfd.runs import run_folder
 
     out = run_folder.default_folder(load_scenario(tasks[0].scenario)) if out is None else out

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files, run_folder
 from nmfd.types import Trajectory
 
@@ -18,10 +18,10 @@ CAPTION = (
     "too many; x_ij RMSE: of the single cells (region, destination) in which there were vehicles; mean over runs")
 
 
-def errors(network: Network, trajectory: Trajectory) -> list[dict]:
+def errors(network: RegionalModel, trajectory: Trajectory) -> list[dict]:
     """One row of COLUMNS per region, and one for all of them (region "all"): the mean over regions of the errors, as
     roots of mean squares."""
-    exact, off = trajectory.accumulation, trajectory.estimate - trajectory.accumulation
+    exact, off = trajectory.accumulation, trajectory.observed - trajectory.accumulation
     used = (exact > 0).any(axis=0)
     rows = []
     for i, mfd in enumerate(network.mfds):
@@ -39,9 +39,9 @@ def errors(network: Network, trajectory: Trajectory) -> list[dict]:
     return [*rows, {name: whole[name] for name in COLUMNS}]
 
 
-def write(folder: Path, network: Network, trajectories: Sequence[Trajectory]) -> pd.DataFrame:
+def write(folder: Path, network: RegionalModel, trajectories: Sequence[Trajectory]) -> pd.DataFrame:
     """estimation.csv, and one picture per run that was controlled on estimates; nothing without such a run."""
-    estimated = [trajectory for trajectory in trajectories if trajectory.estimate is not None]
+    estimated = [trajectory for trajectory in trajectories if trajectory.estimated]
     rows = pd.DataFrame([row for trajectory in estimated for row in errors(network, trajectory)], columns=COLUMNS)
     if not estimated:
         return rows

@@ -16,8 +16,8 @@ import pandas as pd
 from cosim.evaluation import experiment, explain, statistics
 from cosim.evaluation.simulate import Task
 from cosim.report import pictures
+from nmfd.api import load_scenario
 from nmfd.errors import InputError
-from nmfd.model.scenario import load_scenario
 from nmfd.runs import files
 from nmfd.runs.workers import ended
 

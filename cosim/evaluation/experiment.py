@@ -21,10 +21,11 @@ from cosim.sumo.build import ensure_built
 from cosim.sumo.net import check_adjacency, load_city
 from cosim.sumo.signals import read_signals
 from cosim.sumo.xml_files import read_xml
-from nmfd import faults
 from nmfd.controllers import registry
 from nmfd.errors import InputError
-from nmfd.model.scenario import Scenario, as_modelled
+from nmfd.metrics import COUNTED
+from nmfd.model.planning import planning_model
+from nmfd.model.scenario import Scenario
 from nmfd.runs import files as disk
 from nmfd.runs import run_folder
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
@@ -139,7 +140,7 @@ def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> d
     if registry.is_own(controller):
         variant, scenario = registry.configured_own(controller, scenario)
         options = scenario.controller_options.get(variant, {})
-    network = as_modelled(scenario, variant).network
+    network = planning_model(scenario, variant).network
     model = json.dumps([network.hash, scenario.integrator, scenario.substeps, scenario.protected])
     return {
         "options": options,
@@ -160,7 +161,7 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
     simple, _ = read_signals(city)
     own_vehicles(scenario, chosen, city)
     everywhere = MAX_PRESSURE in {parse(name).overrides.get("signals", chosen.signals) for name in controllers}
-    incidents.check(faults.of(scenario), city, "faults", [signal.id for signal in simple] if everywhere else ())
+    incidents.check(scenario.ordered_faults, city, "faults", [signal.id for signal in simple] if everywhere else ())
     for name in (*chosen.background, *chosen.additional):
         read_xml(scenario.folder / name)
     configuration = {
@@ -286,7 +287,7 @@ def table(rows: pd.DataFrame) -> str:
             "left inside": f"{group['final_accumulation_veh'].mean():,.0f}",
             "backlog": f"{group['final_backlog_veh'].mean():,.0f}", "teleports": int(group["teleports"].sum()),
             "step [ms]": f"{group['control_step_ms_median'].mean():.3g} / {group['control_step_ms_max'].max():.3g}",
-            "failures": int(group["solver_failures"].sum()),
+            **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
             "wall [s]": f"{group['wall_time_s'].mean():.0f}",
             "outside SUMO": f"{100 * group['overhead_share'].mean():.1f} %"})
     return pd.DataFrame(lines).to_string(index=False) + "\n" + CAPTION

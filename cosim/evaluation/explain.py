@@ -13,7 +13,7 @@ import pandas as pd
 
 from cosim.evaluation import experiment, statistics
 from cosim.plant.strategy import model_free
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import run_folder
 from nmfd.studies.benchmark import REFERENCE
 from nmfd.types import Trajectory
@@ -40,7 +40,7 @@ class Load:
         return np.flatnonzero(self.beyond > HARDLY)
 
 
-def load(network: Network, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> Load:
+def load(network: RegionalModel, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> Load:
     """What some runs were like."""
     critical = np.array([mfd.critical for mfd in network.mfds])
     states = [trajectory.accumulation.sum(axis=2) / critical for trajectory in trajectories]
@@ -72,7 +72,7 @@ class Deeds:
         return " and ".join(parts) or "it never held back and never guided"
 
 
-def deeds(network: Network, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> Deeds:
+def deeds(network: RegionalModel, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> Deeds:
     """What a controller did in some runs."""
     limit = network.u_max - NEARLY_OPEN * (network.u_max - network.u_min)
     held = [(t.perimeter[:, network.adjacency] < limit).mean() for t in trajectories]
@@ -83,7 +83,7 @@ def deeds(network: Network, trajectories: Sequence[Trajectory], records: Iterabl
     return Deeds(held=float(np.mean(held)), guided=float(guided / max(trips, 1.0)))
 
 
-def text(folders: Mapping[float, Path], network: Network, rows: pd.DataFrame) -> str:
+def text(folders: Mapping[float, Path], network: RegionalModel, rows: pd.DataFrame) -> str:
     """Markdown, a section per demand level: what the city was like without control, and a line per controller.
 
     folders: demand level -> its run folder; rows: as in cosim.evaluation.statistics.
@@ -95,7 +95,7 @@ def text(folders: Mapping[float, Path], network: Network, rows: pd.DataFrame) ->
     return "\n\n".join(parts) + "\n"
 
 
-def at(level: float, folder: Path, network: Network, rows: pd.DataFrame) -> tuple[str, list[str]]:
+def at(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame) -> tuple[str, list[str]]:
     """What the city was like without control at one demand level, and a line per controller; rows: of this level."""
     kept = {name: [int(seed) for seed in group["seed"]] for name, group in rows.groupby("controller", sort=False)}
     shown = REFERENCE if REFERENCE in kept else next(iter(kept))
@@ -116,7 +116,7 @@ def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Trajector
 
 
 def verdict(
-    rows: pd.DataFrame, level: float, name: str, found: Load, leaking: float, done: Deeds, network: Network,
+    rows: pd.DataFrame, level: float, name: str, found: Load, leaking: float, done: Deeds, network: RegionalModel,
 ) -> str:
     """What a controller came to against no control, and why, in one line that begins behind its name. rows: of this
     demand level; leaking: share of the flow over the boundaries that passes no signal under control."""
@@ -136,7 +136,7 @@ def verdict(
 
 
 def _reasons(
-    rows: pd.DataFrame, name: str, found: Load, leaking: float, done: Deeds, network: Network,
+    rows: pd.DataFrame, name: str, found: Load, leaking: float, done: Deeds, network: RegionalModel,
 ) -> list[str]:
     """Why perimeter control, or guidance, gains nothing."""
     reasons = []
@@ -155,7 +155,7 @@ def _reasons(
     return [*reasons, str(done)]
 
 
-def _city(network: Network, found: Load, leaking: float, shown: str) -> str:
+def _city(network: RegionalModel, found: Load, leaking: float, shown: str) -> str:
     """The city without control, in two sentences."""
     when = "Without control" if shown == REFERENCE else f"Under {shown}"
     hot = [f"{_list(network, [r])} ({_share(found.beyond[r])} of the time, most {found.most[r]:.1f} times it)"
@@ -167,7 +167,7 @@ def _city(network: Network, found: Load, leaking: float, shown: str) -> str:
     return f"Signals under control see {_share(1.0 - leaking)} of the flow over the boundaries. {when} {state}."
 
 
-def _list(network: Network, regions: Sequence[int]) -> str:
+def _list(network: RegionalModel, regions: Sequence[int]) -> str:
     return ", ".join(f"{r} {network.region_names[r]}" for r in regions)
 
 

@@ -17,11 +17,13 @@ import numpy as np
 from cosim.evaluation import experiment, mfd_bands
 from cosim.evaluation.model_validation import HELD_UP, draw_mfds, outflow_samples
 from cosim.evaluation.simulate import Result, Task
+from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model import identification, mfd
 from nmfd.model.identification import Observed
-from nmfd.model.regional_model import Network
-from nmfd.model.scenario import GUIDED, GUIDING, Scenario, load_scenario
+from nmfd.model.planning import GUIDED, GUIDING
+from nmfd.model.regional_model import RegionalModel
+from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files
 from nmfd.runs.config import quoted
 from nmfd.runs.workers import ended
@@ -39,7 +41,7 @@ class Loading:
     guided: with route guidance, first towards the drivers' own split ratios, then probing; else without
     options: of the strategies (cosim.plant.strategy.OPTIONS), of a city that has, say, max-pressure signals
     network: the folder whose network.toml is written; None for the scenario's own or, if guided, the one where
-        controllers that guide look for their model (nmfd.model.scenario.guided_model)
+        controllers that guide look for their model (nmfd.model.planning.guided_model)
     iterations: of the fit
     """
 
@@ -96,7 +98,7 @@ def identify(
     held_out = [result for result in found if len(loading.seeds) > 1 and result.trajectory.seed == loading.seeds[-1]]
     scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
-    def fitted(results: Sequence[Result], samples: Sequence[dict], what: str) -> Network:
+    def fitted(results: Sequence[Result], samples: Sequence[dict], what: str) -> RegionalModel:
         def tell(done, total, note):
             progress(done, total, f"{what}, {note}")
 
@@ -138,7 +140,7 @@ def _load(
     return [experiment.read_run(folder, controller, task.seed) for folder, task in plan]
 
 
-def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> Network:
+def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> RegionalModel:
     """The scenario's network with the published model: an MFD per region, fitted to outflow samples, and own splits,
     if drivers were not guided."""
     network = replace(scenario.network, exit_rates=None, capacity=None, storage=None)
@@ -157,7 +159,7 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
     return replace(network, own_splits=own_splits(network, [result.record for result in results]))
 
 
-def samples_of(network: Network, results: Sequence[Result]) -> list[dict[str, np.ndarray]]:
+def samples_of(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, np.ndarray]]:
     """Outflow samples of every region (cosim.evaluation.model_validation.outflow_samples)."""
     return [
         outflow_samples(
@@ -178,7 +180,7 @@ def nearly_empty(samples: Sequence[dict[str, np.ndarray]]) -> list[int]:
     return [region for region, cloud in enumerate(samples) if len(own_points(cloud)) < SAMPLES]
 
 
-def as_it_was(network: Network, model: Network, regions: Sequence[int]) -> Network:
+def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[int]) -> RegionalModel:
     """`model` with these regions as they are in `network`, and room for as many vehicles as their MFDs are meant for:
     what was fitted to hardly any vehicles knows nothing of more."""
     alone = np.isin(np.arange(model.regions), regions)
@@ -193,7 +195,7 @@ def own_points(cloud: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate([points for label, points in cloud.items() if label != HELD_UP])
 
 
-def own_splits(network: Network, records: Sequence[dict]) -> dict[tuple[int, int], dict[int, float]]:
+def own_splits(network: RegionalModel, records: Sequence[dict]) -> dict[tuple[int, int], dict[int, float]]:
     """(i, j) -> {h: share}: by which neighbour h the vehicles in i bound for j went on in fact."""
     crossings = sum(record["crossings"].sum(axis=0) for record in records) * network.split_mask
     found = {}
@@ -221,7 +223,7 @@ def hysteresis(cloud: dict[str, np.ndarray]) -> float:
     return float((both[0] - both[1]).sum() / both.mean(axis=0).sum()) if both.size else float("nan")
 
 
-def fit_table(network: Network, samples: Sequence[dict]) -> str:
+def fit_table(network: RegionalModel, samples: Sequence[dict]) -> str:
     """Per region: the curve of the MFD, how well it explains the samples, and their hysteresis."""
     lines = [f"{'region':<16}{'critical':>10}{'jam':>8}{'storage':>9}{'max outflow':>13}{'samples':>9}{'R2':>7}"
              f"{'hysteresis':>12}   [veh, veh/s]"]
@@ -240,7 +242,7 @@ def fit_table(network: Network, samples: Sequence[dict]) -> str:
     return "\n".join(lines)
 
 
-def unreached(network: Network, accumulations: Sequence[np.ndarray]) -> str:
+def unreached(network: RegionalModel, accumulations: Sequence[np.ndarray]) -> str:
     """A line on the regions whose critical accumulation no loading run reached, each run (T+1, R, R) [veh]; or none."""
     most = np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
     short = [f"{region} {network.region_names[region]} ({100 * most[region] / curve.critical:.0f} % of it)"
@@ -251,7 +253,7 @@ def unreached(network: Network, accumulations: Sequence[np.ndarray]) -> str:
             "Give higher --levels, or take it that perimeter control has nothing to protect there")
 
 
-def prediction_table(network: Network, held_out: Sequence[Observed], scheme: dict) -> str:
+def prediction_table(network: RegionalModel, held_out: Sequence[Observed], scheme: dict) -> str:
     """RMSE of the accumulation one control interval and AHEAD seconds ahead, in runs that the fit did not see."""
     intervals = identification.intervals_within(AHEAD, scheme["step"], held_out)
     share = identification.prediction_shares(network, held_out, (1, intervals), **scheme)
@@ -271,7 +273,7 @@ def _sumo_table(folder: Path, target: Path) -> dict[str, str]:
         for key, value in table.items()}
 
 
-def network_toml(network: Network, sumo: Mapping[str, str], comment: str) -> str:
+def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) -> str:
     """network.toml of `network` with this table [sumo]."""
     out = io.StringIO()
     out.write(f"# {comment}\nname = {quoted(network.name)}\n\n")
@@ -297,7 +299,7 @@ def network_toml(network: Network, sumo: Mapping[str, str], comment: str) -> str
     return out.getvalue()
 
 
-def _options(network: Network, region: int) -> str:
+def _options(network: RegionalModel, region: int) -> str:
     """exit_rates, capacity and storage of one region, as far as the network has them."""
     lines = ""
     if network.exit_rates is not None:

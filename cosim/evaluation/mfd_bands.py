@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 from nmfd.studies import plots
 from nmfd.studies.benchmark import interval
 
@@ -49,7 +49,7 @@ def production_samples(record: Mapping[str, np.ndarray], region: int) -> dict[st
     return {"loading": points[seen & rising], "unloading": points[seen & ~rising]}
 
 
-def draw_production(path: Path, network: Network, records: Sequence[Mapping[str, np.ndarray]]) -> None:
+def draw_production(path: Path, network: RegionalModel, records: Sequence[Mapping[str, np.ndarray]]) -> None:
     """The production MFD of every region: samples of all runs, loading and unloading apart, with the band."""
     drawing, axes = plots.panels(network.regions)
     for region, ax in enumerate(axes):

@@ -12,11 +12,11 @@ from cosim.evaluation.simulate import Result
 from nmfd import closed_loop
 from nmfd.model.dynamics import advance, parameters
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
 from nmfd.studies import plots
-from nmfd.types import Controls, Measurement, Trajectory
+from nmfd.types import Controls, Observation, Trajectory
 
 COLUMNS = (
     "region", "name", "critical_veh", "mean_veh", "rmse_veh", "rmse_share", "bias_veh", "next_interval_rmse_veh",
@@ -37,8 +37,8 @@ class Replay:
     def reset(self, seed: int = 0) -> None:
         pass
 
-    def act(self, measurement: Measurement) -> Controls:
-        k = measurement.step
+    def act(self, observation: Observation) -> Controls:
+        k = observation.step
         return Controls(perimeter=self._trajectory.perimeter[k], splits=self._trajectory.splits[k])
 
 
@@ -180,7 +180,7 @@ def write(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
 
 
 def draw_mfds(
-    path: Path, network: Network, samples: Sequence[Mapping[str, np.ndarray]], found: Sequence[np.ndarray] = (),
+    path: Path, network: RegionalModel, samples: Sequence[Mapping[str, np.ndarray]], found: Sequence[np.ndarray] = (),
 ) -> None:
     """The MFD of every region over its outflow samples, as one picture. found: by region, a `bands.band` to draw."""
     drawing, axes = plots.panels(network.regions)

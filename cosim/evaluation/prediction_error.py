@@ -11,9 +11,10 @@ import pandas as pd
 from cosim.evaluation import experiment
 from cosim.evaluation.identify import AHEAD, observed
 from cosim.evaluation.results import Finished
-from cosim.plant.strategy import modelled
+from cosim.plant.strategy import planning_of
 from nmfd.errors import InputError
 from nmfd.model import identification
+from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 
@@ -52,13 +53,15 @@ def foresee(found: Finished, model: Path | None = None) -> list[Foresight]:
     if found.changed:
         raise InputError(f"{found.path}: {found.changed}; run them again to compare them")
     return [
-        _of(level.demand, controller, modelled(found.scenario, controller, model),
+        _of(level.demand, controller, found.scenario, planning_of(found.scenario, controller, model).network,
             [experiment.read_run(level.folder, controller, seed) for seed in rows["seed"]])
         for level in found.levels for controller, rows in level.rows.groupby("controller", sort=False)]
 
 
-def _of(demand: float, controller: str, scenario: Scenario, results: Sequence[experiment.Result]) -> Foresight:
-    seen, network = [observed(result) for result in results], scenario.network
+def _of(
+    demand: float, controller: str, scenario: Scenario, network: RegionalModel, results: Sequence[experiment.Result],
+) -> Foresight:
+    seen = [observed(result) for result in results]
     intervals = identification.intervals_within(AHEAD, scenario.step, seen)
     critical = np.array([curve.critical for curve in network.mfds])
     return Foresight(

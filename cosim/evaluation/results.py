@@ -11,8 +11,9 @@ from cosim.evaluation import evaluate, experiment
 from cosim.evaluation.simulate import FACTS
 from cosim.sumo.build import SumoFiles, ensure_built
 from cosim.sumo.net import City, load_city
+from nmfd.api import load_scenario
 from nmfd.errors import InputError
-from nmfd.model.scenario import Scenario, load_scenario
+from nmfd.model.scenario import Scenario
 from nmfd.runs import files as disk
 
 

@@ -1,6 +1,5 @@
 """One row of sumo.csv: what a run in SUMO came to, beside the figures that every plant has (nmfd.metrics)."""
 
-from collections import Counter
 from collections.abc import Collection
 
 import numpy as np
@@ -8,7 +7,6 @@ import numpy as np
 from cosim.plant.record import Record
 from cosim.sumo.net import City, Gateway, gateway_room_taken
 from cosim.sumo.tripinfo import TripFacts
-from nmfd.types import Trajectory
 
 FULL = 0.8         # share of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards
 
@@ -46,14 +44,6 @@ def upstream_gateways(city: City) -> list[int]:
 def gateway_full(edge_vehicles: np.ndarray, city: City) -> np.ndarray:
     """(T, G) bool: the edge before the gateway holds at least FULL of its room, by edge_vehicles (T, E) [veh]."""
     return gateway_room_taken(edge_vehicles.astype(float), city) >= FULL
-
-
-def decision_facts(trajectory: Trajectory) -> dict:
-    """late_decisions: those that took longer than the control interval; fallbacks: the statuses that were not ok."""
-    reasons = Counter(status for status in trajectory.status if status != "ok")
-    return {
-        "late_decisions": int((trajectory.decision_time > trajectory.step).sum()),
-        "fallbacks": "; ".join(f"{count} x {reason}" for reason, count in reasons.most_common(3))}
 
 
 def leaking_share(record: Record, city: City, leaks: Collection[Gateway]) -> float:

@@ -9,16 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.plant.strategy import Strategy, configured, modelled, parse
-from nmfd.faults import with_faults
-from nmfd.model.scenario import Scenario, load_scenario
+from cosim.plant.strategy import Strategy, configured, parse, planning_of
+from nmfd.api import load_scenario
+from nmfd.model.planning import PlanningModel
+from nmfd.model.scenario import Scenario, with_faults
 from nmfd.types import Controller, Trajectory
 
 # Columns of sumo.csv, beside those of summary.csv.
 FACTS = (
     "controller", "seed", "trips", "departed_veh", "final_backlog_veh", "total_backlog_veh_s", "teleports",
     "mean_trip_time_s", "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh",
-    "gateway_queue_max_veh", "gateway_full_share", "late_decisions", "fallbacks", "leaking_share",
+    "gateway_queue_max_veh", "gateway_full_share", "notes", "leaking_share",
     "estimate_rmse_share", "estimate_cell_rmse_veh", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s",
     "signals_left_alone")
 
@@ -67,35 +68,32 @@ def scenario_of(task: Task) -> Scenario:
 
 def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> Result:
     """Run `task` in this process, which must hold no other SUMO session. Raises InputError."""
-    import torch
-
     from nmfd.controllers import registry
 
-    torch.set_num_threads(1)  # runs stand side by side, one core each
     begin = time.perf_counter()
     scenario, strategy = scenario_of(task), parse(task.controller)
     controller = registry.make(configured(task.controller, scenario.controller_options), scenario, policy=task.policy)
     return drive(
         scenario, strategy, controller, seed=task.seed, progress=progress, begin=begin, outputs=dict(task.sumo_output),
-        model=modelled(scenario, task.controller))
+        planning=planning_of(scenario, task.controller))
 
 
 def drive(
     scenario: Scenario, strategy: Strategy, controller: Controller, *, seed: int,
     progress: Callable[[int, int], None] | None = None, begin: float | None = None,
-    outputs: Mapping[str, Path] | None = None, model: Scenario | None = None,
+    outputs: Mapping[str, Path] | None = None, planning: PlanningModel | None = None,
 ) -> Result:
     """The closed loop of `controller` in SUMO, filed under `strategy.name`, whose options the city takes.
 
     begin: when the setting up began (time.perf_counter); outputs: SUMO's own, kind (cosim.sumo.outputs) -> file, there
-    only if all goes well; model: `scenario` with the regional model with which states are estimated, if not its own.
+    only if all goes well; planning: what states are estimated with, if not the scenario itself.
     Raises InputError.
     """
     from cosim.evaluation import run_metrics
     from cosim.plant.plant import SumoPlant
     from cosim.plant.settings import settings
     from cosim.sumo import outputs as sumo_output
-    from nmfd import closed_loop
+    from nmfd import closed_loop, metrics
     from nmfd.runs import files as disk
     from nmfd.runs import run_folder
 
@@ -104,7 +102,7 @@ def drive(
         files = {kind: stack.enter_context(disk.atomic(path)) for kind, path in (outputs or {}).items()}
         plant = SumoPlant(
             scenario, overrides=replace(settings(scenario), **strategy.overrides), outputs=files,
-            model=model)
+            planning=planning)
         stack.callback(plant.close)
         trajectory = run_folder.labelled(
             closed_loop.run(plant, controller, scenario, seed=seed, progress=progress),
@@ -117,7 +115,7 @@ def drive(
             "controller": strategy.name, "seed": seed, "trips": plant.trips, "departed_veh": departed,
             "final_backlog_veh": int(backlog[-1]), "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
             "teleports": int(record.teleports.sum()), **run_metrics.trip_facts(plant.trip_facts()),
-            **run_metrics.queue_facts(record, plant.city), **run_metrics.decision_facts(trajectory),
+            **run_metrics.queue_facts(record, plant.city), "notes": metrics.notes(trajectory),
             "leaking_share": run_metrics.leaking_share(record, plant.city, leaks),
             **_estimation(scenario, trajectory), "wall_time_s": trajectory.wall_time, "sumo_time_s": sumo_time,
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
@@ -129,7 +127,7 @@ def drive(
 
 def _estimation(scenario: Scenario, trajectory: Trajectory) -> dict[str, float]:
     """Errors of the estimate, over all regions; NaN where the controller saw the exact state."""
-    if trajectory.estimate is None:
+    if not trajectory.estimated:
         return {"estimate_rmse_share": math.nan, "estimate_cell_rmse_veh": math.nan}
     from cosim.evaluation import estimation_errors
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from nmfd.metrics import COUNTED
 from nmfd.runs import files
 from nmfd.studies.benchmark import REFERENCE, interval
 
@@ -26,7 +27,7 @@ CAPTION = (
     "end, and its time integral; teleports: all seeds; trip, delay: mean time on the road, and between the wanted and\n"
     "the real departure, of all trips, unfinished ones with what they had spent at the end; queue: halting on the\n"
     "edges before gateways, mean / longest; full: share of these edges and intervals that were full; decision: median\n"
-    "/ longest; late: decisions longer than the control interval; fallbacks: decisions that were one")
+    "/ longest; " + "; ".join(f"{heading}: {what}" for heading, what in COUNTED.values()))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,8 +93,7 @@ def statistics(rows: pd.DataFrame, reference: str | None = None) -> pd.DataFrame
                 "teleports": int(part["teleports"].sum()),
                 "gateway_queue_max_veh": part["gateway_queue_max_veh"].max(),
                 "control_step_ms_max": part["control_step_ms_max"].max(),
-                "late_decisions": part["late_decisions"].sum(min_count=1),  # unknown in runs of an older version
-                "fallbacks": int(part["solver_failures"].sum())}
+                **{column: int(part[column].sum()) for column in COUNTED}}
             out.append(row)
     return pd.DataFrame(out)
 
@@ -135,7 +135,7 @@ def shown(table: pd.DataFrame, reference: str | None = None) -> tuple[pd.DataFra
             "queue [veh]": f"{row['gateway_queue_mean_veh']:.1f} / {row['gateway_queue_max_veh']:.0f}",
             "full": f"{100 * row['gateway_full_share']:.1f} %",
             "decision [ms]": f"{row['control_step_ms_median']:.3g} / {row['control_step_ms_max']:.3g}",
-            "late": row["late_decisions"], "fallbacks": row["fallbacks"],
+            **{heading: row[column] for column, (heading, _) in COUNTED.items()},
             "outside SUMO": f"{100 * row['overhead_share']:.1f} %", "teleports": teleports})
     return pd.DataFrame(first), pd.DataFrame(second)
 

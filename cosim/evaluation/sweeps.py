@@ -16,9 +16,9 @@ from cosim.evaluation.evaluate import level_folders
 from cosim.evaluation.simulate import Result, Task
 from cosim.plant.settings import settings
 from cosim.plant.strategy import parse
+from nmfd.api import load_scenario
 from nmfd.controllers import registry
 from nmfd.errors import InputError
-from nmfd.model.scenario import load_scenario
 from nmfd.runs.frames import write_parquet
 from nmfd.runs.workers import Failure, ended, outcomes
 

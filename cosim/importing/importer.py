@@ -19,8 +19,8 @@ from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.net import City, load_city
 from cosim.sumo.recorded_trips import MESOSCOPIC, read_originals, write_originals
 from nmfd.errors import InputError
-from nmfd.model.regional_model import Network
-from nmfd.model.scenario import GUIDED
+from nmfd.model.planning import GUIDED
+from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.scratch import LOCK, Scratch
 
 LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
@@ -238,7 +238,7 @@ def _level_line(order: Order, factor: float, congests: bool) -> str:
     return f"\nlevel: not even demand times {factor:g} congests this city without control"
 
 
-def _protected(streets: Streets, regions: np.ndarray, baseline: Baseline | None, network: Network) -> int:
+def _protected(streets: Streets, regions: np.ndarray, baseline: Baseline | None, network: RegionalModel) -> int:
     """The densest region; without a run, the one nearest to the middle."""
     if baseline is not None:
         load = np.bincount(regions, baseline.density(streets) * streets.lane_metres, network.regions)
@@ -251,7 +251,7 @@ def _notes(traffic: Traffic) -> str:
     return "".join(f"; {note}: {count:,}" for note, count in sorted(traffic.notes.items()))
 
 
-def _report(order: Order, case: Case, streets: Streets, traffic: Traffic, clock: model.Clock, network: Network,
+def _report(order: Order, case: Case, streets: Streets, traffic: Traffic, clock: model.Clock, network: RegionalModel,
             asked: int, city: City, found: quality.Tables, left: Mapping[str, str], baseline: Baseline | None) -> str:
     """What was found, what was left alone and what cannot be done, in a few lines."""
     usable, part = streets.drivable.sum(), streets.main_part.sum()

@@ -14,7 +14,7 @@ from cosim.importing.regions import digraph, names, positions
 from cosim.importing.streets import Streets
 from cosim.sumo.net import JAM_SPACING
 from nmfd.model.mfd import Mfd
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.config import quoted
 
 # The shape of the published MFD, g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam, for want of anything measured.
@@ -87,9 +87,9 @@ def region_demand(traffic: Traffic, regions: np.ndarray, clock: Clock) -> np.nda
     return demand
 
 
-def network_of(streets: Streets, regions: np.ndarray, name: str, baseline: Baseline | None) -> Network:
+def network_of(streets: Streets, regions: np.ndarray, name: str, baseline: Baseline | None) -> RegionalModel:
     """The regional model: adjacency from the streets, own splits from the baseline, MFDs from lanes and speeds."""
-    network = Network(
+    network = RegionalModel(
         name=name, region_names=names(streets, regions), positions=positions(streets, regions).round(1),
         adjacency=digraph(streets, regions) > 0, mfds=_placeholders(streets, regions, baseline), u_min=0.1, u_max=0.9)
     if baseline is None:
@@ -114,7 +114,7 @@ def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline | No
     return tuple(found)
 
 
-def network_text(network: Network, sumo: Mapping[str, str], source: str) -> str:
+def network_text(network: RegionalModel, sumo: Mapping[str, str], source: str) -> str:
     return network_toml(
         network, sumo,
         f"Imported from {source}. The MFDs are PLACEHOLDERS from lane length and speed limits:\n"
@@ -122,7 +122,7 @@ def network_text(network: Network, sumo: Mapping[str, str], source: str) -> str:
 
 
 def scenario_text(
-    network: Network, clock: Clock, case: Case, *, name: str, network_path: str, protected: int, files: Mapping,
+    network: RegionalModel, clock: Clock, case: Case, *, name: str, network_path: str, protected: int, files: Mapping,
     leave: Sequence[str], factor: float = 1.0, mesoscopic: bool = False,
 ) -> str:
     """scenario.toml; files: routes, background, additional -> file names beside it."""

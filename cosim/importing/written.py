@@ -13,7 +13,7 @@ from cosim.importing import atlas, layers, model, quality
 from cosim.importing.baseline import Baseline
 from cosim.importing.demand import Traffic, wrapped
 from cosim.importing.streets import Streets
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 
 NET = "city.net.xml.gz"
 FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz", "additional": "city.add.xml.gz"}
@@ -59,7 +59,7 @@ def write_demand(path: Path, demand: np.ndarray) -> None:
         (k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)))
 
 
-def write_network(folder: Path, streets: Streets, regions: np.ndarray, network: Network, found: quality.Tables,
+def write_network(folder: Path, streets: Streets, regions: np.ndarray, network: RegionalModel, found: quality.Tables,
                    baseline: Baseline | None, source: str) -> None:
     """network.toml, its tables, layers and map; source: the name of what the user gave."""
     (folder / "network.toml").write_text(model.network_text(

@@ -21,7 +21,7 @@ import numpy as np
 from cosim.plant.meter import Meter
 from cosim.sumo.net import City
 from cosim.sumo.session import Session
-from nmfd.model.estimation import Instruments, Observation
+from nmfd.model.estimation import Instruments, Readings
 
 LAYOUT = 0x6C6F6F70   # seed of the places of the loops: a property of the city, not of a run
 PROBES = 0x70726F62   # keeps the random numbers of the probes apart from others of the same seed
@@ -108,7 +108,7 @@ def probes(vehicles: Sequence[str], share: float, seed: int) -> frozenset[str]:
 
 
 class Detectors:
-    """The readings of one run. `sample` after every EVERY seconds; `observation` at the end of a control interval."""
+    """The readings of one run. `sample` after every EVERY seconds; `readings` at the end of a control interval."""
 
     def __init__(self, session: Session, city: City, layout: Layout, meter: Meter, known: Instruments):
         self._session, self._meter, self._known, self._layout, self._city = session, meter, known, layout, city
@@ -130,7 +130,7 @@ class Detectors:
         self._occupancy += [occupancy(loop) for loop in self._loops]
         self._samples += 1
 
-    def observation(self, gateway_flow: np.ndarray) -> Observation:
+    def readings(self, gateway_flow: np.ndarray) -> Readings:
         """Of the time since the last one. gateway_flow: (G,) [veh] over the city's gateways since then, of which only
         the counted ones are looked at."""
         regions, share = self._city.regions, self._known.detector_share
@@ -147,7 +147,7 @@ class Detectors:
         self._departed = self._meter.probe_departures.copy()
         unknown = np.full((regions, regions), np.nan)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return Observation(
+            return Readings(
                 accumulation=np.where(share > 0, vehicles / share, np.nan),
                 crossings=np.where(self._known.counted_share > 0, counts / self._known.counted_share, np.nan),
                 probes=self._meter.probes() if self._known.probe_share > 0 else unknown,

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cosim.plant.strategy import parse
-from nmfd.model.scenario import Scenario, load_scenario
+from nmfd.api import load_scenario
+from nmfd.model.scenario import Scenario
 
 if TYPE_CHECKING:
     from cosim.plant.plant import SumoPlant

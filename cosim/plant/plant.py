@@ -28,12 +28,12 @@ from cosim.sumo.tripinfo import TripFacts, read_trip_facts, trip_options
 from cosim.sumo.trips import write_trips
 from cosim.sumo.turning_flows import own_flows, turning_flows
 from cosim.sumo.xml_files import file_list
-from nmfd import faults
 from nmfd.errors import InputError
 from nmfd.model.estimation import Estimator
+from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.runs.scratch import Scratch
-from nmfd.types import Controls, Measurement
+from nmfd.types import Controls, Observation, State
 
 SAMPLE_EVERY = 10.0  # s, between two samples of the production and of the queues
 # Equipped drivers take the fastest route by the mean speeds of the last 180 s (SUMO's default): when they depart, which
@@ -60,15 +60,15 @@ class SumoPlant:
 
     def __init__(
         self, scenario: Scenario, *, overrides: Settings | None = None, outputs: Mapping[str, Path] | None = None,
-        window: Window | None = None, model: Scenario | None = None,
+        window: Window | None = None, planning: PlanningModel | None = None,
     ):
         """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network.
 
         outputs: kind (cosim.sumo.outputs) -> file, of SUMO's own outputs; complete after `trip_facts` or `close`
         window: to watch; the simulation is the same, only slower
-        model: `scenario` with the regional model with which states are estimated, if not its own
+        planning: what states are estimated with; of the scenario itself, if None
         """
-        self._scenario, self._window, self._model = scenario, window, model or scenario
+        self._scenario, self._window, self._planning = scenario, window, planning or planning_model(scenario)
         self._originals: Originals | None = None
         self._outputs = dict(outputs or {})
         self._settings = overrides or settings(scenario)
@@ -95,7 +95,7 @@ class SumoPlant:
         self._folder = Scratch("cosim-")
         self._session: Session | None = None
 
-    def reset(self, seed: int) -> Measurement:
+    def reset(self, seed: int) -> State:
         """Trips, drivers and reroutes all follow from `seed`."""
         self._end_session()
         scenario, chosen = self._scenario, self._settings
@@ -135,12 +135,12 @@ class SumoPlant:
         self._detectors, self._estimator = None, None
         if estimating:
             self._detectors = Detectors(self._session, self.city, self._layout, self._meter, self._instruments)
-            self._estimator = Estimator(self._model, self._instruments)
+            self._estimator = Estimator(self._planning, self._instruments)
         self._guide = Guide(
             self._session, self.city, scenario.network.nominal_splits, compliance=chosen.compliance,
             most_detour=chosen.most_detour, ways_return=chosen.ways_return, period=chosen.guidance_period,
             random=np.random.default_rng([seed, 0x67756964]))
-        self._incidents = Incidents(faults.of(scenario), self._session, self.city)
+        self._incidents = Incidents(scenario.ordered_faults, self._session, self.city)
         self._max_pressure, self._rationed = None, {}
         if chosen.signals == MAX_PRESSURE:
             flows = self._own_flows()
@@ -156,9 +156,9 @@ class SumoPlant:
         self._actuator = Actuator(list(self._signals.values()), self._incidents.show)
         self._speed: np.ndarray | None = None
         self._k, self._rows, self._opened = 0, [], {}
-        return self._estimated(self._measurement()) if estimating else self._measurement()
+        return self._state()
 
-    def step(self, controls: Controls) -> Measurement:
+    def step(self, controls: Controls) -> State:
         network, session, meter = self._scenario.network, self._session, self._meter
         before = self._totals()
         self._incidents.begin(self._k)
@@ -189,13 +189,12 @@ class SumoPlant:
                 queues.append([session.halting(edge) for edge in self._upstream])
         self._k += 1
         assert abs(session.time - begin - self._scenario.step) < 1e-6
-        measurement = self._measurement()
+        state = self._state()
         after = self._totals()
         if self._estimator:
             self._estimator.step(
-                controls, self._detectors.observation(after["gateway_flow"] - before["gateway_flow"]))
-            measurement = self._estimated(measurement)
-        measurement = replace(measurement, problem=self._incidents.problem(estimating=self._estimator is not None))
+                controls, self._detectors.readings(after["gateway_flow"] - before["gateway_flow"]))
+        state = replace(state, problem=self._incidents.problem(estimating=self._estimator is not None))
         row = {key: after[key] - before[key] for key in after}
         with np.errstate(invalid="ignore"):
             speed = metres / vehicles
@@ -213,10 +212,15 @@ class SumoPlant:
             if gateway.signal in self._incidents.refused:
                 row["gateway_green"][n] = self._original_green[n]
         self._rows.append(row)
-        return measurement
+        return state
 
-    def completed(self) -> float:
-        return float(self._meter.arrivals.sum())
+    def observe(self) -> Observation | None:
+        """The estimate, where states are estimated."""
+        if self._estimator is None:
+            return None
+        return Observation(
+            step=self._k, time=self._k * self._scenario.step, accumulation=self._estimator.accumulation,
+            backlog=self._detectors.backlog())
 
     def close(self) -> None:
         self._end_session()
@@ -322,14 +326,10 @@ class SumoPlant:
                 green[n] = sum(lasting) / len(gateway.links) * self._scenario.step / cycle
         return green
 
-    def _measurement(self) -> Measurement:
-        return Measurement(
+    def _state(self) -> State:
+        return State(
             step=self._k, time=self._k * self._scenario.step, accumulation=self._meter.accumulation(self._k),
-            backlog=self._meter.backlog())
-
-    def _estimated(self, measurement: Measurement) -> Measurement:
-        return replace(
-            measurement, estimate=self._estimator.accumulation, estimated_backlog=self._detectors.backlog())
+            backlog=self._meter.backlog(), completed=float(self._meter.arrivals.sum()))
 
     def _sample(self) -> tuple[np.ndarray, np.ndarray]:
         """Vehicles (E,) [veh] and mean speed (E,) [m/s] by edge, now."""

@@ -12,7 +12,8 @@ from typing import Any
 
 from nmfd.controllers import registry
 from nmfd.errors import InputError
-from nmfd.model.scenario import Scenario, as_modelled, guided_model, with_model
+from nmfd.model.planning import PlanningModel, guided_model, planning_model, with_model
+from nmfd.model.scenario import Scenario
 
 ALONE = "no-control"  # the controller of a name that is only options
 FIXED, WEBSTER, ACTUATED, MAX_PRESSURE = "fixed", "webster", "actuated", "max-pressure"
@@ -81,21 +82,21 @@ def configured(name: str, tables: Iterable[str]) -> str:
     return max(fitting, key=lambda table: table.count("+"), default=controller)
 
 
-def modelled(scenario: Scenario, strategy: str, model: Path | None = None) -> Scenario:
-    """`scenario` with the regional model to predict the runs of `strategy` with: that with which its controller plans,
-    or, of one that guides routes and plans with none, that of guided drivers, if the network has one beside it.
+def planning_of(scenario: Scenario, strategy: str, model: Path | None = None) -> PlanningModel:
+    """What the runs of `strategy` are predicted with: the planning model of its controller, or, of one that guides
+    routes and plans with none, that of guided drivers, if the network has one beside it.
 
     model: the folder of a network, instead. Raises InputError.
     """
-    if model is not None:
-        return with_model(scenario, model)
     controller, variant = parse(strategy).controller, configured(strategy, scenario.controller_options)
     if registry.is_own(controller):
         variant, scenario = registry.configured_own(controller, scenario)
-    planned = as_modelled(scenario, variant)
-    if planned.network is scenario.network and registry.guides(controller) and (
+    if model is not None:
+        return with_model(planning_model(scenario), scenario, model)
+    planned = planning_model(scenario, variant)
+    if planned.network.folder == scenario.network.folder and registry.guides(controller) and (
             folder := guided_model(scenario.network)) is not None:
-        return with_model(scenario, folder)
+        return with_model(planned, scenario, folder)
     return planned
 
 

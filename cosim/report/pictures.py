@@ -15,7 +15,7 @@ from cosim.plant.settings import settings
 from cosim.report import figures
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, edge_shapes, load_city
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.studies import plots
 from nmfd.studies.benchmark import REFERENCE, draw_accumulations
@@ -64,7 +64,7 @@ def recorded(folder: Path, rows: pd.DataFrame, seed: int) -> dict[str, Result]:
     return {name: experiment.read_run(folder, name, seed) for name in ranked(rows) if name in there}
 
 
-def acts(result: Result, network: Network) -> bool:
+def acts(result: Result, network: RegionalModel) -> bool:
     """Whether a gateway was ever commanded to less than its original programme."""
     return bool((result.trajectory.perimeter[:, network.adjacency] < network.u_max - 1e-9).any())
 
@@ -142,7 +142,7 @@ def gateway_queues(path: Path, city: City, results: dict[str, Result], note: str
     plots.save(drawing, path)
 
 
-def perimeter(path: Path, city: City, network: Network, result: Result, note: str) -> None:
+def perimeter(path: Path, city: City, network: RegionalModel, result: Result, note: str) -> None:
     """Commanded u against green and flow: the boundaries that were closed most over time, and all in one cloud; no
     picture of a city without a signal under control."""
     trajectory, record = result.trajectory, result.record
@@ -172,7 +172,7 @@ def perimeter(path: Path, city: City, network: Network, result: Result, note: st
     plots.save(drawing, path)
 
 
-def splits(path: Path, network: Network, result: Result, note: str) -> None:
+def splits(path: Path, network: RegionalModel, result: Result, note: str) -> None:
     """Commanded theta against the shares that went there: the busiest choices over time, and all in one cloud; no
     picture where there is nothing to choose, as with two regions."""
     trajectory, crossings = result.trajectory, result.record["crossings"].astype(float)
@@ -262,7 +262,7 @@ def region_map(path: Path, scenario: Scenario, city: City) -> None:
                    Tables(quality=(), gateways=gateways), None)
 
 
-def outflows(path: Path, network: Network, results: dict[str, Result]) -> None:
+def outflows(path: Path, network: RegionalModel, results: dict[str, Result]) -> None:
     """The MFD of every region: of the regional model as a curve, in these runs as dots."""
     samples = []
     for region in range(network.regions):

@@ -8,6 +8,11 @@ from cosim.evaluation import statistics
 from cosim.report import pictures
 from nmfd.studies.benchmark import REFERENCE
 
+# Of decisions: column of summary.csv -> what is said of so many.
+WORDS = {
+    "solver_failures": "without an answer of the solver or policy", "fallbacks": "by a fallback",
+    "late_decisions": "late", "sensor_faults": "on a faulty measurement", "plant_faults": "in a faulty city"}
+
 
 def opening(name: str, steps: int, step: float, levels: int, rows: pd.DataFrame) -> str:
     """What was run: `steps` control intervals of `step` s."""
@@ -115,13 +120,12 @@ def _teleports(rows: pd.DataFrame) -> str:
 
 
 def _decisions(rows: pd.DataFrame) -> str:
-    failed = rows.groupby("controller", sort=False)["solver_failures"].sum()
-    late = rows.groupby("controller", sort=False)["late_decisions"].sum(min_count=1)
-    parts = [f"{name} {count:.0f} by a fallback" for name, count in failed.items() if count]
-    parts += [f"{name} {count:.0f} late" for name, count in late.items() if count > 0]
+    parts = [
+        f"{name} {count:.0f} {WORDS[column]}" for column in WORDS
+        for name, count in rows.groupby("controller", sort=False)[column].sum().items() if count]
     if parts:
         return f"Decisions that did not come as they should: {', '.join(parts)}; all runs together."
-    return "" if late.isna().any() else "Every decision came within its control interval, and none was a fallback."
+    return "Every decision came within its control interval, and none was a fallback."
 
 
 def _time(rows: pd.DataFrame, name: str) -> str:

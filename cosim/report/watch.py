@@ -13,16 +13,16 @@ from cosim.evaluation.simulate import Task, scenario_of
 from cosim.importing.layers import colour as region_colour
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
-from cosim.plant.strategy import configured, modelled, parse
+from cosim.plant.strategy import configured, parse, planning_of
 from cosim.sumo.net import City, Gateway, edge_shapes
 from cosim.sumo.session import LOST, Window
 from nmfd import closed_loop
 from nmfd.controllers import registry
 from nmfd.errors import InputError
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import run_folder
 from nmfd.runs.scratch import Scratch
-from nmfd.types import Controls, Measurement, Trajectory
+from nmfd.types import Controls, Observation, State, Trajectory
 
 CLOSED, HALF, OPEN, LEFT_ALONE = np.array([(214, 39, 40), (240, 190, 40), (44, 160, 44), (150, 150, 150)])
 MARK, BAND = 0.005, 0.012  # radius of a gateway's mark, half width of a region's band, as shares of the city's extent
@@ -76,7 +76,7 @@ def watch(
             additional=(drawn,), program=program)
         plant = SumoPlant(
             scenario, overrides=replace(settings(scenario), **strategy.overrides), window=window,
-            model=modelled(scenario, task.controller))
+            planning=planning_of(scenario, task.controller))
         shapes = edge_shapes(plant.city)
         drawn.write_text(layers_xml(plant.city, shapes))
         view.write_text(view_xml(shapes, delay))
@@ -94,25 +94,25 @@ def watch(
 class Painted:
     """A SUMO plant (nmfd.types.Plant) whose gateways are painted with every command."""
 
-    def __init__(self, plant: SumoPlant, network: Network):
+    def __init__(self, plant: SumoPlant, network: RegionalModel):
         self._plant, self._network = plant, network
         self._marked = marked(plant.city)
 
-    def reset(self, seed: int) -> Measurement:
-        measurement = self._plant.reset(seed)
+    def reset(self, seed: int) -> State:
+        state = self._plant.reset(seed)
         leaks = set(self._plant.leaks())
         self._controlled = {mark: gateway for mark, gateway in self._marked.items() if gateway not in leaks}
-        return measurement
+        return state
 
-    def step(self, controls: Controls) -> Measurement:
+    def step(self, controls: Controls) -> State:
         low, high = self._network.u_min, self._network.u_max
         self._plant.session.paint({
             mark: colour((controls.perimeter[g.source, g.target] - low) / (high - low))
             for mark, g in self._controlled.items()})
         return self._plant.step(controls)
 
-    def completed(self) -> float:
-        return self._plant.completed()
+    def observe(self) -> Observation | None:
+        return self._plant.observe()
 
     def close(self) -> None:
         self._plant.close()

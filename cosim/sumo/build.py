@@ -13,7 +13,7 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 from nmfd.errors import InputError
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import config
 from nmfd.runs.scratch import Scratch
 
@@ -70,7 +70,7 @@ class Recipe:
     left_green: int
 
 
-def ensure_built(network: Network) -> SumoFiles:
+def ensure_built(network: RegionalModel) -> SumoFiles:
     """The SUMO files of `network`, built first if they are missing or the recipe has changed.
 
     Raises InputError if network.toml has no [sumo] table, a key of it or a file it names is wrong, or netconvert fails.
@@ -96,7 +96,7 @@ def ensure_built(network: Network) -> SumoFiles:
     return files
 
 
-def _built(recipe_file: Path, network: Network) -> SumoFiles:
+def _built(recipe_file: Path, network: RegionalModel) -> SumoFiles:
     folder = recipe_file.parent / "build"
     files = SumoFiles(net_file=folder / f"{network.name}.net.xml", regions_csv=folder / "regions.csv")
     stamp_file = folder / f"{network.name}.stamp"

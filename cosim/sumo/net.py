@@ -11,7 +11,7 @@ import numpy as np
 
 from cosim.sumo.xml_files import BROKEN, opened
 from nmfd.errors import InputError
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 
 JAM_SPACING = 7.5  # m of lane per standing vehicle
 
@@ -116,7 +116,7 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
         signals={c.source: c.signal for c in links if c.signal})
 
 
-def check_adjacency(city: City, network: Network) -> None:
+def check_adjacency(city: City, network: RegionalModel) -> None:
     """InputError unless the gateways join exactly the regions that network.toml calls adjacent, both ways."""
     where = f"{network.folder}/network.toml: regions"
     joined = np.zeros((city.regions, city.regions), dtype=bool)

@@ -6,9 +6,8 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 from cosim.sumo.xml_files import BROKEN, opened
-from nmfd.errors import InputError
+from nmfd.errors import InputError, RunFailed
 from nmfd.runs.run_folder import run_name
-from nmfd.runs.workers import RunFailed
 
 # Kind -> ending of its file. The emissions of every vehicle in every step are gigabytes, unless compressed.
 KINDS = {

@@ -20,8 +20,7 @@ import traci
 
 from cosim.sumo.recorded_trips import BOUND
 from cosim.sumo.xml_files import file_list
-from nmfd.errors import InputError
-from nmfd.runs.workers import RunFailed
+from nmfd.errors import InputError, RunFailed
 
 REFUSALS = (libsumo.TraCIException, traci.TraCIException)  # of one order: the simulation goes on
 FATAL = (libsumo.FatalTraCIError, traci.FatalTraCIError)

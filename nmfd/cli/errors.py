@@ -4,8 +4,7 @@ import sys
 
 import click
 
-from nmfd.errors import InputError
-from nmfd.runs.workers import RunFailed
+from nmfd.errors import InputError, RunFailed
 
 
 class Interrupted(Exception):

@@ -59,9 +59,9 @@ def benchmark(
     names = controller_names(controllers)
     files = policy_files(policies, names)
 
+    from nmfd.api import load_scenario
     from nmfd.cli.progress import progress_line
-    from nmfd.faults import with_faults
-    from nmfd.model.scenario import load_scenario
+    from nmfd.model.scenario import with_faults
     from nmfd.runs import run_folder
     from nmfd.studies import benchmark as benchmarks
 
@@ -117,9 +117,9 @@ def train(
       nmfd train scenarios/economic_mpc --controller dpc-pcrg
       nmfd train scenarios/economic_mpc --controller dpc-pc --steps 200 --out mine.pt
     """
+    from nmfd.api import load_scenario
     from nmfd.cli.progress import progress_line
     from nmfd.controllers.dpc import rollout, training
-    from nmfd.model.scenario import load_scenario
 
     loaded = load_scenario(scenario)
     device = training.available(device)
@@ -174,7 +174,7 @@ def show(scenario: Path, out: Path | None) -> None:
     Example:
       nmfd show scenarios/economic_mpc --out figures
     """
-    from nmfd.model.scenario import load_scenario
+    from nmfd.api import load_scenario
     from nmfd.runs import files as disk
     from nmfd.studies import benchmark as benchmarks
 

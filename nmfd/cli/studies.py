@@ -46,8 +46,8 @@ def robustness(
     files = policy_files(policies, names)
     levels = _sigmas(sigmas)
 
+    from nmfd.api import load_scenario
     from nmfd.cli.progress import progress_line
-    from nmfd.model.scenario import load_scenario
     from nmfd.runs import run_folder
     from nmfd.studies import robustness as method
 
@@ -97,8 +97,8 @@ def adaptation(
     names = controller_names(controllers)
     files = policy_files(policies, names)
 
+    from nmfd.api import load_scenario
     from nmfd.cli.progress import progress_line
-    from nmfd.model.scenario import load_scenario
     from nmfd.runs import files as disk
     from nmfd.studies import adaptation as method
 
@@ -137,8 +137,9 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int |
       nmfd bound scenarios/economic_mpc --controller bound-pcrg
       nmfd bound scenarios/economic_mpc --controller bound-pc --from mpc-pc,dpc-pc
     """
+    from nmfd.api import load_scenario
     from nmfd.cli.progress import progress_line
-    from nmfd.model.scenario import load_scenario
+    from nmfd.controllers import open_loop
     from nmfd.studies import bound as method
 
     method.check(controller)
@@ -150,7 +151,7 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int |
     steps = iterations or method.ITERATIONS
     with progress_line(controller) as progress:
         plan = method.compute(loaded, controller, starts=names, iterations=steps, progress=progress)
-    method.write(plan, loaded, file)
+    open_loop.write(plan, loaded, file)
     for name, total in sorted(plan.totals.items(), key=lambda item: item[1]):
         click.echo(f"from {name}: {total:.5g} veh s" + (" (kept)" if name == plan.start else ""))
     click.echo(f"{plan.iterations} Adam steps" + ("" if plan.iterations == steps else ", interrupted"))
@@ -203,8 +204,8 @@ def ablation(
     """
     names, lengths = controller_names(controllers), whole_numbers("--horizons", horizons, "2,8")
 
+    from nmfd.api import load_scenario
     from nmfd.cli.progress import progress_line
-    from nmfd.model.scenario import load_scenario
     from nmfd.runs import run_folder
     from nmfd.studies import ablation as method
 

@@ -1,9 +1,11 @@
 """Controllers of one's own: `path/to/file.py:Class`, or an entry point of the group `nmfd.controllers`.
 
-The class is made with the scenario as its one argument and has `name`, `reset` and `act` (nmfd.types.Controller). What
-it returns is checked at every step. template.py beside this file is where to begin (`nmfd new-controller`).
+The class is made with the planning model (nmfd.model.planning) as its one argument and has `name`, `reset` and `act`
+(nmfd.types.Controller). What it returns is checked at every step. template.py beside this file is where to begin
+(`nmfd new-controller`).
 """
 
+import copy
 import hashlib
 import importlib.util
 import inspect
@@ -18,9 +20,11 @@ from types import ModuleType
 import numpy as np
 
 from nmfd.errors import InputError
-from nmfd.model.regional_model import Network
-from nmfd.model.scenario import Scenario, as_modelled
-from nmfd.types import Controls, Measurement
+from nmfd.model.planning import planning_model
+from nmfd.model.regional_model import RegionalModel
+from nmfd.model.scenario import Scenario
+from nmfd.runs.files import file_hash
+from nmfd.types import Controls, Observation, Status
 
 GROUP = "nmfd.controllers"
 FILE_AND_CLASS = re.compile(r"(?P<file>.+\.py):(?P<cls>[^\W\d]\w*)")
@@ -46,8 +50,6 @@ def check(name: str) -> None:
 
 def fingerprint(name: str) -> dict[str, object]:
     """What the runs of `name` depend on: its file, and the files that its class names in `files`, or its package."""
-    from nmfd.runs.files import file_hash
-
     if not is_file(name):
         point = entry_points()[name]
         return {"entry_point": point.value, "package": f"{point.dist.name} {point.dist.version}" if point.dist else ""}
@@ -70,24 +72,25 @@ def with_tables(scenario: Scenario) -> Scenario:
 
 def make(name: str, scenario: Scenario) -> "OwnController":
     """The controller `name`, tried once on an empty city. Raises InputError, on one line, for whatever is wrong."""
-    cls, scenario = _class(name), as_modelled(with_tables(scenario), table_name(name))
+    cls, planning = _class(name), planning_model(with_tables(scenario), table_name(name))
     try:
-        inspect.signature(cls).bind(scenario)
+        inspect.signature(cls).bind(planning)
     except TypeError as error:
         raise InputError(
-            f"{name}: expected a class that is made with one argument, the scenario, but {error}; write __init__(self, "
-            "scenario)") from None
+            f"{name}: expected a class that is made with one argument, the planning model, but {error}; write "
+            "__init__(self, planning)") from None
     except ValueError:  # of a class without a signature, such as one written in C
         pass
-    controller = _guarded(name, f"{cls.__name__}()", cls, scenario)
+    controller = _guarded(name, f"{cls.__name__}()", cls, planning)
     for method in ("reset", "act"):
         if not callable(getattr(controller, method, None)):
             raise InputError(
-                f"{name}: has no method {method}; a controller needs reset(self, seed=0) and act(self, measurement)")
-    own = OwnController(name, controller, scenario.network)
-    empty = np.zeros((scenario.network.regions,) * 2)
+                f"{name}: has no method {method}; a controller needs reset(self, seed=0) and act(self, observation)")
+    network = copy.deepcopy(scenario.network)
+    own = OwnController(name, controller, network)
+    empty = np.zeros((network.regions,) * 2)
     own.reset(0)
-    own.act(Measurement(step=0, time=0.0, accumulation=empty, backlog=empty.copy()))
+    own.act(Observation(step=0, time=0.0, accumulation=empty, backlog=empty.copy()))
     own.reset(0)
     return own
 
@@ -95,23 +98,27 @@ def make(name: str, scenario: Scenario) -> "OwnController":
 class OwnController:
     """A controller of the user's (nmfd.types.Controller) whose mistakes are InputErrors with file and line."""
 
-    def __init__(self, name: str, controller, network: Network):
+    def __init__(self, name: str, controller, network: RegionalModel):
         self._where, self._controller, self._network = name, controller, network
         self.name = name
 
     def reset(self, seed: int = 0) -> None:
         _guarded(self._where, "reset", self._controller.reset, seed)
 
-    def act(self, measurement: Measurement) -> Controls:
+    def act(self, observation: Observation) -> Controls:
         return checked(
-            _guarded(self._where, "act", self._controller.act, measurement), self._network, f"{self._where}: act")
+            _guarded(self._where, "act", self._controller.act, observation), self._network, f"{self._where}: act")
 
 
-def checked(controls: Controls, network: Network, where: str) -> Controls:
+def checked(controls: Controls, network: RegionalModel, where: str) -> Controls:
     """`controls` as float64 and with rounding errors removed. InputError for another type, shape or range."""
     if not isinstance(controls, Controls):
         raise InputError(f"{where}: expected nmfd.Controls, got {type(controls).__name__} instead; "
                          "return nmfd.Controls(perimeter=..., splits=None)")
+    if not isinstance(controls.status, Status):
+        raise InputError(
+            f"{where}: status: expected nmfd.Status, such as nmfd.Status.FALLBACK, got {controls.status!r} instead; "
+            "what is to be said of it goes into note")
     regions = network.regions
     perimeter = _array(controls.perimeter, (regions,) * 2, f"{where}: perimeter")
     perimeter = np.where(network.adjacency, perimeter, 0.0)
@@ -122,21 +129,22 @@ def checked(controls: Controls, network: Network, where: str) -> Controls:
                 f"{perimeter[i, h]:g} instead; use numpy.clip")
     perimeter = np.where(network.adjacency, np.clip(perimeter, network.u_min, network.u_max), 0.0)
     if controls.splits is None:
-        return Controls(perimeter=perimeter, splits=None, status=str(controls.status))
+        return Controls(perimeter=perimeter, splits=None, status=controls.status, note=str(controls.note))
     splits = _array(controls.splits, (regions,) * 3, f"{where}: splits")
     allowed = network.split_mask
     if (wrong := np.argwhere((splits < -ROUNDING) | (~allowed & (splits > ROUNDING)))).size:
         i, h, j = wrong[0]
         raise InputError(
             f"{where}: splits[{i}, {h}, {j}]: expected {'a share >= 0' if allowed[i, h, j] else '0 (no way)'}, got "
-            f"{splits[i, h, j]:g} instead; allowed is scenario.network.split_mask")
+            f"{splits[i, h, j]:g} instead; allowed is planning.network.split_mask")
     splits = np.where(allowed, np.maximum(splits, 0.0), 0.0)
     sums = splits.sum(axis=1)
     if (wrong := np.argwhere(allowed.any(axis=1) & (abs(sums - 1.0) > 100 * ROUNDING))).size:
         i, j = wrong[0]
         raise InputError(f"{where}: splits[{i}, :, {j}]: expected shares with sum 1, got {sums[i, j]:g} instead")
     return Controls(
-        perimeter=perimeter, splits=splits / np.where(sums > 0, sums, 1.0)[:, None, :], status=str(controls.status))
+        perimeter=perimeter, splits=splits / np.where(sums > 0, sums, 1.0)[:, None, :], status=controls.status,
+        note=str(controls.note))
 
 
 def _array(values, shape: tuple[int, ...], where: str) -> np.ndarray:

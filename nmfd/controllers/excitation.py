@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from nmfd.controllers.pi_gating import PiGating
-from nmfd.model.scenario import Scenario
+from nmfd.model.planning import PlanningModel
 from nmfd.runs import config
-from nmfd.types import Controls, Measurement
+from nmfd.types import Controls, Observation
 
 HOLD = (3, 9)            # control intervals between two draws, from and to
 SET_POINTS = (0.5, 1.3)  # of the middle one, of every protected region
@@ -26,19 +26,19 @@ class Probing:
         set_point: [veh], one per protected region, the middle of the set points; default the critical accumulation
     """
 
-    def __init__(self, scenario: Scenario, *, guidance: bool):
+    def __init__(self, planning: PlanningModel, *, guidance: bool):
         """InputError for a wrong option."""
         self.name = "probing-pcrg" if guidance else "probing-pc"
-        self._network, self._guidance, self._gating = scenario.network, guidance, None
-        where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-        options = config.Table(scenario.controller_options.get(self.name, {}), where, f"controllers.{self.name}.")
-        critical = tuple(scenario.network.mfds[region].critical for region in scenario.protected)
+        self._network, self._guidance, self._gating = planning.network, guidance, None
+        options = config.Table(
+            planning.controller_options.get(self.name, {}), planning.where, f"controllers.{self.name}.")
+        critical = tuple(planning.network.mfds[region].critical for region in planning.protected)
         middle = options.numbers("set_point", critical, length=len(critical))
         options.close()
         if middle:
-            self._gating = PiGating(replace(scenario, controller_options={PiGating.name: {"set_point": list(middle)}}))
+            self._gating = PiGating(replace(planning, controller_options={PiGating.name: {"set_point": list(middle)}}))
             self._gating.critical = np.array(middle)
-        self._open = np.where(scenario.network.adjacency, scenario.network.u_max, 0.0)
+        self._open = np.where(planning.network.adjacency, planning.network.u_max, 0.0)
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
@@ -46,11 +46,11 @@ class Probing:
         if self._gating is not None:
             self._gating.reset()
 
-    def act(self, measurement: Measurement) -> Controls:
+    def act(self, observation: Observation) -> Controls:
         if self._left == 0:
             self._draw()
         self._left -= 1
-        perimeter = self._open if self._gating is None else self._gating.act(measurement).perimeter
+        perimeter = self._open if self._gating is None else self._gating.act(observation).perimeter
         return Controls(perimeter=np.where(self._disturbed, self._by_lot, perimeter), splits=self._splits)
 
     def _draw(self) -> None:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from nmfd.model.scenario import Scenario
-from nmfd.types import Controls, Measurement
+from nmfd.model.planning import PlanningModel
+from nmfd.types import Controls, Observation
 
 
 class NoControl:
@@ -11,14 +11,14 @@ class NoControl:
 
     name = "no-control"
 
-    def __init__(self, scenario: Scenario):
-        network = scenario.network
+    def __init__(self, planning: PlanningModel):
+        network = planning.network
         self._controls = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None)
 
     def reset(self, seed: int = 0) -> None:
         pass
 
-    def act(self, measurement: Measurement) -> Controls:
+    def act(self, observation: Observation) -> Controls:
         return self._controls
 
 
@@ -27,6 +27,6 @@ class RouteGuidance(NoControl):
 
     name = "route-guidance"
 
-    def __init__(self, scenario: Scenario):
-        super().__init__(scenario)
-        self._controls = Controls(perimeter=self._controls.perimeter, splits=scenario.network.nominal_splits)
+    def __init__(self, planning: PlanningModel):
+        super().__init__(planning)
+        self._controls = Controls(perimeter=self._controls.perimeter, splits=planning.network.nominal_splits)

@@ -3,9 +3,9 @@
 import numpy as np
 
 from nmfd.errors import InputError
-from nmfd.model.scenario import Scenario
+from nmfd.model.planning import PlanningModel
 from nmfd.runs import config
-from nmfd.types import Controls, Measurement
+from nmfd.types import Controls, Observation
 
 # The defaults are moderate ones from the flat part of a sweep on the benchmark (kp 0 to 5, ki 0.01 to 0.1 1/s differ by
 # less than 2 % in total time spent). The error is a share of the critical accumulation, so that they carry over.
@@ -30,16 +30,16 @@ class PiGating:
 
     name = "pi-gating"
 
-    def __init__(self, scenario: Scenario):
+    def __init__(self, planning: PlanningModel):
         """InputError without a protected region, or for a wrong option."""
-        network = scenario.network
-        where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-        if not scenario.protected:
+        network = planning.network
+        if not planning.protected:
             raise InputError(
-                f"{where}: protected: pi-gating needs at least one protected region, got none; "
+                f"{planning.where}: protected: pi-gating needs at least one protected region, got none; "
                 f"add protected = [<region>, ...] with regions from 0 to {network.regions - 1}")
-        options = config.Table(scenario.controller_options.get(self.name, {}), where, f"controllers.{self.name}.")
-        self._regions = np.array(scenario.protected)
+        options = config.Table(
+            planning.controller_options.get(self.name, {}), planning.where, f"controllers.{self.name}.")
+        self._regions = np.array(planning.protected)
         self.critical = np.array([network.mfds[region].critical for region in self._regions])
         share = options.number("outflow_share", 1.0, low=0.1, high=1.0)
         default = tuple(network.mfds[region].reaching(share) for region in self._regions)
@@ -48,7 +48,7 @@ class PiGating:
             raise options.error("set_point", f"expected numbers above 0 [veh], got {list(set_point)} instead")
         self.set_point = np.array(set_point)
         self._kp = options.number("kp", KP, low=0.0)
-        self._ki = options.number("ki", KI, above=0.0) * scenario.step
+        self._ki = options.number("ki", KI, above=0.0) * planning.step
         options.close()
         self._open = np.where(network.adjacency, network.u_max, 0.0)
         self._entries = network.adjacency[:, self._regions]
@@ -59,8 +59,8 @@ class PiGating:
         self._gate = np.full(len(self._regions), self._bounds[1])
         self._before = None
 
-    def act(self, measurement: Measurement) -> Controls:
-        now = measurement.accumulation.sum(axis=1)[self._regions]
+    def act(self, observation: Observation) -> Controls:
+        now = observation.accumulation.sum(axis=1)[self._regions]
         before = now if self._before is None else self._before
         change = self._kp * (before - now) + self._ki * (self.set_point - now)
         self._gate = np.clip(self._gate + change / self.critical, *self._bounds)

@@ -1,93 +1,92 @@
-"""Controllers by name. The module behind a name is imported only when that controller is made.
+"""Controllers by name.
 
 Besides those here there are controllers of the user's own (nmfd.controllers.custom), by entry point or file.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from nmfd.controllers import custom, open_loop
+from nmfd.controllers.dpc import fallback, online, policy, training
+from nmfd.controllers.excitation import Probing
+from nmfd.controllers.mpc import controller as mpc
+from nmfd.controllers.no_control import NoControl, RouteGuidance
+from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
+from nmfd.model.planning import PlanningModel, planning_model
+from nmfd.model.scenario import Scenario
+from nmfd.runs import config
+from nmfd.runs.files import file_hash
+from nmfd.types import Controller
 
-if TYPE_CHECKING:  # `names` must answer without numpy, torch or casadi
-    from nmfd.model.scenario import Scenario
-    from nmfd.types import Controller
-
-
-def _no_control(scenario: Scenario) -> Controller:
-    from nmfd.controllers.no_control import NoControl
-
-    return NoControl(scenario)
-
-
-def _route_guidance(scenario: Scenario) -> Controller:
-    from nmfd.controllers.no_control import RouteGuidance
-
-    return RouteGuidance(scenario)
-
-
-def _pi_gating(scenario: Scenario) -> Controller:
-    from nmfd.controllers.pi_gating import PiGating
-
-    return PiGating(scenario)
-
-
-def _mpc_pc(scenario: Scenario) -> Controller:
-    from nmfd.controllers.mpc.controller import EconomicMpc
-
-    return EconomicMpc(scenario, guidance=False)
-
-
-def _mpc_pcrg(scenario: Scenario) -> Controller:
-    from nmfd.controllers.mpc.controller import EconomicMpc
-
-    return EconomicMpc(scenario, guidance=True)
-
-
-def _probing_pc(scenario: Scenario) -> Controller:
-    from nmfd.controllers.excitation import Probing
-
-    return Probing(scenario, guidance=False)
-
-
-def _probing_pcrg(scenario: Scenario) -> Controller:
-    from nmfd.controllers.excitation import Probing
-
-    return Probing(scenario, guidance=True)
-
-
-_WITHOUT_POLICY: dict[str, Callable[[Scenario], Controller]] = {
-    "no-control": _no_control,
-    "route-guidance": _route_guidance,
-    "pi-gating": _pi_gating,
-    "mpc-pc": _mpc_pc,
-    "mpc-pcrg": _mpc_pcrg,
-    "probing-pc": _probing_pc,
-    "probing-pcrg": _probing_pcrg,
-}
-# Whether the policy guides routes too. The same as training.NAMES, which cannot be read without importing torch.
-_WITH_POLICY = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
-# The policy that is watched.
-_GUARDED = {"dpc-pc-guarded": "dpc-pc", "dpc-pcrg-guarded": "dpc-pcrg"}
-# The policy that goes on learning.
-_ONLINE = {"dpc-pc-online": "dpc-pc", "dpc-pcrg-online": "dpc-pcrg"}
-# Whether the plan guides routes too. The same as bound.NAMES.
-_WITH_PLAN = {"bound-pc": False, "bound-pcrg": True}
 OWN = "own"  # the table in [controllers] that holds those of controllers of the user's own
 _OWN = re.compile(r".+\.py:\w+(?=\+|$)")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A controller that is built in.
+
+    make: of the planning model, and of the policy's file where there is one
+    guides: whether it may guide routes
+    policy: whose policy it reads, "" for none
+    checked: reads the options of a controller (its planning model, its name and variant), InputError; None: it has none
+    """
+
+    make: Callable[..., Controller]
+    guides: bool = False
+    policy: str = ""
+    checked: Callable[[PlanningModel, str, str], object] | None = None
+
+
+def _gating_options(planning: PlanningModel, name: str, variant: str) -> None:
+    if planning.protected:  # without a protected region gating cannot be made, and is not made
+        _ENTRIES[name].make(planning)
+
+
+def _mpc_options(planning: PlanningModel, name: str, variant: str) -> object:
+    return mpc.options(planning, name)
+
+
+def _training_options(planning: PlanningModel, name: str, variant: str) -> object:
+    return training.settings_of(planning, variant)
+
+
+def _online_options(planning: PlanningModel, name: str, variant: str) -> object:
+    return online.options(planning, name)
+
+
+_ENTRIES = {
+    "no-control": Entry(make=NoControl),
+    "route-guidance": Entry(make=RouteGuidance, guides=True),
+    "pi-gating": Entry(make=PiGating, checked=_gating_options),
+    "mpc-pc": Entry(make=partial(mpc.EconomicMpc, guidance=False), checked=_mpc_options),
+    "mpc-pcrg": Entry(make=partial(mpc.EconomicMpc, guidance=True), guides=True, checked=_mpc_options),
+    "probing-pc": Entry(make=partial(Probing, guidance=False), checked=_gating_options),
+    "probing-pcrg": Entry(make=partial(Probing, guidance=True), guides=True, checked=_gating_options),
+    **{name: Entry(make=partial(policy.load, guidance=guides), guides=guides, policy=name, checked=_training_options)
+       for name, guides in training.NAMES.items()},
+    "dpc-pc-guarded": Entry(make=partial(fallback.load, guidance=False), policy="dpc-pc"),
+    "dpc-pcrg-guarded": Entry(make=partial(fallback.load, guidance=True), guides=True, policy="dpc-pcrg"),
+    "dpc-pc-online": Entry(make=partial(online.load, guidance=False), policy="dpc-pc", checked=_online_options),
+    "dpc-pcrg-online": Entry(
+        make=partial(online.load, guidance=True), guides=True, policy="dpc-pcrg", checked=_online_options),
+    **{name: Entry(make=partial(open_loop.load, guidance=guides), guides=guides)
+       for name, guides in open_loop.NAMES.items()},
+}
+
+
 def names() -> tuple[str, ...]:
     """Every controller that is built in."""
-    return (*_WITHOUT_POLICY, *_WITH_POLICY, *_GUARDED, *_ONLINE, *_WITH_PLAN)
+    return tuple(_ENTRIES)
 
 
 def policy_names() -> tuple[str, ...]:
     """The controllers that need a trained policy."""
-    return (*_WITH_POLICY, *_GUARDED, *_ONLINE)
+    return tuple(name for name, entry in _ENTRIES.items() if entry.policy)
 
 
 def check(name: str) -> None:
@@ -98,80 +97,70 @@ def check(name: str) -> None:
 
 def split(name: str) -> tuple[str, list[str]]:
     """The controller of NAME+OPTION+..., and its options; the path of a controller in a file may hold a + too."""
-    custom = _OWN.match(name)
-    first, *rest = [custom[0], *name[custom.end():].split("+")[1:]] if custom else name.split("+")
+    own = _OWN.match(name)
+    first, *rest = [own[0], *name[own.end():].split("+")[1:]] if own else name.split("+")
     return first, rest
 
 
 def known(name: str) -> bool:
     """Whether `name` is a controller. InputError for a file that is not there."""
-    if name in names():
-        return True
-    from nmfd.controllers import custom
-
-    if custom.is_file(name):
+    if custom.is_file(name) and name not in _ENTRIES:
         custom.check(name)
         return True
-    return name in custom.entry_points()
+    return name in _ENTRIES or name in custom.entry_points()
 
 
 def choice() -> tuple[str, ...]:
     """Every controller that has a name of its own, built in or installed."""
-    from nmfd.controllers import custom
-
-    return (*names(), *(name for name in custom.entry_points() if name not in names()))
+    return (*_ENTRIES, *(name for name in custom.entry_points() if name not in _ENTRIES))
 
 
 def is_own(name: str) -> bool:
     """Whether `name`, which must be known, is a controller of the user's own."""
-    return name not in names()
+    return name not in _ENTRIES
 
 
 def guides(name: str) -> bool:
     """Whether the controller `name`, which must be known, may guide routes, as one of the user's own might."""
-    return is_own(name) or name == "route-guidance" or "-pcrg" in name
+    return is_own(name) or _ENTRIES[name].guides
 
 
 def configured_own(name: str, scenario: Scenario) -> tuple[str, Scenario]:
     """Of a controller of the user's own: the name of its table, and `scenario` with the tables of all such."""
-    from nmfd.controllers import custom
-
     return custom.table_name(name), custom.with_tables(scenario)
 
 
-def fingerprint(name: str, policy: Path | None) -> dict[str, object]:
+def fingerprint(name: str, file: Path | None) -> dict[str, object]:
     """What the runs of `name` depend on in files: its own source, or its `policy_path`."""
     if is_own(name):
-        from nmfd.controllers import custom
-
         return custom.fingerprint(name)
-    from nmfd.runs.files import file_hash
-
-    return {} if policy is None else {"policy_hash": file_hash(policy)}
+    return {} if file is None else {"policy_hash": file_hash(file)}
 
 
-def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Path | None:
-    """The policy or plan file that `make` would read: `policy`, or the scenario's own; None for a controller without.
+def policy_path(name: str, scenario: Scenario, file: Path | None = None) -> Path | None:
+    """The policy or plan that `make` would read: `file`, or the scenario's own; None for a controller without.
 
-    InputError for an unknown name, for a `policy` that the controller has no use for, and for a missing file.
+    InputError for an unknown name, for a `file` that the controller has no use for, and for a missing one.
     """
     variant, name = name, split(name)[0]
     check(name)
-    if name in _WITHOUT_POLICY or is_own(name):
-        if policy is not None:
+    planned = name in open_loop.NAMES
+    if is_own(name) or not (planned or _ENTRIES[name].policy):
+        if file is not None:
             raise InputError(
-                f"{policy}: controller {name} reads no policy; only {', '.join((*policy_names(), *_WITH_PLAN))} do: "
-                "leave it out")
+                f"{file}: controller {name} reads no policy; only {', '.join((*policy_names(), *open_loop.NAMES))} do: "
+                "omit it")
         return None
-    if policy is None and scenario.folder is None:
-        raise InputError(f"controller {name}: scenario {scenario.name} has no folder with policies; give a file")
-    kind, verb, suffix = ("plan", "compute", "npz") if name in _WITH_PLAN else ("policy", "train", "pt")
-    owner = _owner(variant)
-    path = scenario.folder / f"{owner}.{suffix}" if policy is None else Path(policy)
+    owner, (kind, verb, suffix) = _owner(variant), ("plan", "compute", "npz") if planned else ("policy", "train", "pt")
+    if file is None:
+        if scenario.folder is None:
+            raise InputError(f"controller {name}: scenario {scenario.name} has no folder with policies; give a file")
+        path, out = scenario.folder / f"{owner}.{suffix}", ""
+    else:
+        path, out = Path(file), f" --out {file}"
     if not path.is_file():
         scenario_text = "SCENARIO" if scenario.folder is None else scenario.folder
-        out = "" if policy is None else f" --out {path}"
-        command = f"nmfd {'bound' if kind == 'plan' else 'train'} {scenario_text} --controller {owner}{out}"
+        command = f"nmfd {'bound' if planned else 'train'} {scenario_text} --controller {owner}{out}"
         raise InputError(f"{path}: no such {kind} for {name}; {verb} one with: {command}")
     return path
 
@@ -179,41 +168,24 @@ def policy_path(name: str, scenario: Scenario, policy: Path | None = None) -> Pa
 def _owner(name: str) -> str:
     """Whose policy and options `name` uses."""
     name, rest = split(name)
-    return "+".join([{**_GUARDED, **_ONLINE}.get(name, name), *rest])
+    policy_of = "" if is_own(name) else _ENTRIES[name].policy
+    return "+".join([policy_of or name, *rest])
 
 
 def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Controller:
     """The controller `name` for `scenario`; `policy` is the file of a policy or plan instead of the scenario's own.
 
-    A name "NAME+..." stands for NAME with options and a policy of its own (nmfd.model.scenario.as_modelled). Raises
-    InputError as `policy_path` does, and what the controller itself finds wrong with its options or policy.
+    It is made from a planning model of its own, and shares no array with the scenario. A name "NAME+..." stands for
+    NAME with options and a policy of its own (nmfd.model.planning.planning_model). Raises InputError as `policy_path`
+    does, and what the controller itself finds wrong with its options or policy.
     """
-    from nmfd.model.scenario import as_modelled
-
-    path = policy_path(name, scenario, policy)
-    variant, name = name, split(name)[0]
-    if is_own(name):
-        from nmfd.controllers import custom
-
-        return custom.make(name, scenario)
-    scenario = as_modelled(scenario, _owner(variant))
-    if path is None:
-        return _WITHOUT_POLICY[name](scenario)
-    if name in _WITH_PLAN:
-        from nmfd.studies import bound
-
-        return bound.load(path, scenario, guidance=_WITH_PLAN[name])
-    if name in _GUARDED:
-        from nmfd.controllers.dpc import fallback
-
-        return fallback.load(path, scenario, guidance=_WITH_POLICY[_GUARDED[name]])
-    if name in _ONLINE:
-        from nmfd.controllers.dpc import online
-
-        return online.load(path, scenario, guidance=_WITH_POLICY[_ONLINE[name]])
-    from nmfd.controllers.dpc import policy as dpc
-
-    return dpc.load(path, scenario, guidance=_WITH_POLICY[name])
+    path, first = policy_path(name, scenario, policy), split(name)[0]
+    if is_own(first):
+        return custom.make(first, scenario)
+    if first in open_loop.NAMES:  # a plan knows what happens, and says for which scenario it was computed
+        return _ENTRIES[first].make(path, scenario)
+    planning = planning_model(scenario, _owner(name))
+    return _ENTRIES[first].make(planning) if path is None else _ENTRIES[first].make(path, planning)
 
 
 def check_options(scenario: Scenario) -> None:
@@ -222,39 +194,22 @@ def check_options(scenario: Scenario) -> None:
     An option of a controller that nobody runs today would else be found wrong in the middle of tomorrow's work. The
     networks of other models are read only where they are used.
     """
-    from dataclasses import replace
-
-    from nmfd.runs import config
-
     where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
     tables = config.Table(scenario.controller_options, where, "controllers.")
     for variant in scenario.controller_options:
+        table = tables.table(variant)
         if variant == OWN:  # checked by those controllers, if at all
-            tables.table(OWN)
             continue
-        table, name = tables.table(variant), split(variant)[0]
-        if name not in names():
+        name = split(variant)[0]
+        if name not in _ENTRIES:
             raise tables.error(variant, f"unknown controller; choose from {', '.join(names())}, or one of them with + "
                                "and the options of a strategy; that of a controller of your own is "
                                f"controllers.{OWN}.{variant}")
         table.text("model", None)
+        checked = _ENTRIES[name].checked
+        if checked is None:
+            table.close()
+            continue
         options = {**scenario.controller_options.get(name, {}), **table.raw()}
         options.pop("model", None)
-        custom = replace(scenario, controller_options=dict.fromkeys((name, variant), options))
-        if name.startswith("mpc-"):
-            from nmfd.controllers.mpc import controller
-
-            controller.options(custom, name)
-        elif name in _WITH_POLICY:
-            from nmfd.controllers.dpc import training
-
-            training.settings(custom, variant)
-        elif name in _ONLINE:
-            from nmfd.controllers.dpc import online
-
-            online.options(custom, name)
-        elif name in ("pi-gating", "probing-pc", "probing-pcrg"):
-            if scenario.protected:  # without a protected region gating cannot be made, and is not made
-                _WITHOUT_POLICY[name](custom)
-        else:
-            table.close()
+        checked(planning_model(replace(scenario, controller_options={name: options, variant: options})), name, variant)

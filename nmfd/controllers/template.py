@@ -10,7 +10,7 @@ is let into it. Replace what `act` does.
 
 import numpy as np
 
-from nmfd import Controls, Measurement, Scenario
+from nmfd import Controls, Observation, PlanningModel
 
 
 class MyController:
@@ -19,27 +19,27 @@ class MyController:
     # Files beside this one that the results depend on, such as weights: when they change, runs are done again.
     files = ()
 
-    def __init__(self, scenario: Scenario):
-        """Called once. Of use: scenario.step [s], .demand (T, R, R) [veh/s], .network (see help(nmfd.Network))."""
-        self.network = scenario.network
-        options = scenario.controller_options.get(self.name, {})
+    def __init__(self, planning: PlanningModel):
+        """Called once. See help(nmfd.PlanningModel): .step [s], .forecast (T, R, R) [veh/s], .network ..."""
+        self.network = planning.network
+        options = planning.controller_options.get(self.name, {})
         self.gain = options.get("gain", 2.0)  # [-]
         self.set_point = options.get("share", 0.9) * np.array([mfd.critical for mfd in self.network.mfds])  # [veh]
 
     def reset(self, seed: int = 0) -> None:
         """Called before every run: forget the last one. Random numbers must follow from `seed`."""
 
-    def act(self, measurement: Measurement) -> Controls:
+    def act(self, observation: Observation) -> Controls:
         """Called at every control interval.
 
-        measurement.accumulation: (R, R) [veh], [i, j] = in region i bound for j, as measured: with noise
-        measurement.backlog: (R, R) [veh], waiting outside to enter region i; measurement.step, .time [s]
+        observation.accumulation: (R, R) [veh], [i, j] = in region i bound for j, as measured: with noise
+        observation.backlog: (R, R) [veh], waiting outside to enter region i; observation.step, .time [s]
 
         perimeter: (R, R) [-], [i, h] = share of the flow from i to h that may pass, between u_min and u_max
         splits: (R, R, R) [-], [i, h, j] = share of the vehicles in i bound for j that go on to h, with sum 1 over h
             where network.split_mask allows any; None for no route guidance
         """
-        inside = measurement.accumulation.sum(axis=1)
+        inside = observation.accumulation.sum(axis=1)
         excess = np.maximum(inside - self.set_point, 0.0) / self.set_point
         opening = np.clip(self.network.u_max - self.gain * excess, self.network.u_min, self.network.u_max)
         perimeter = np.where(self.network.adjacency, opening, 0.0)  # [i, h]: the opening of h

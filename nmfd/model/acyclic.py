@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nmfd.model.dynamics import SCHEMES
-from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, Network
+from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 # Less than this share of theta left after removing h = g and h = o counts as nothing: what remains is then the
 # rounding of an optimiser or a softmax, and scaling it up to 1 would make a route of noise.
@@ -51,7 +51,7 @@ class Acyclic:
     storage: np.ndarray | None
 
 
-def build(network: Network) -> Acyclic:
+def build(network: RegionalModel) -> Acyclic:
     """All cells that can be reached from x_iiij, and their moves."""
     neighbours = [np.flatnonzero(row) for row in network.adjacency]
     cells: dict[tuple[int, int, int, int], int] = {}

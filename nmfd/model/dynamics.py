@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, Network
+from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class Parameters:
     storage: torch.Tensor | None = None
 
 
-def parameters(network: Network, *, dtype=torch.float64, device="cpu") -> Parameters:
+def parameters(network: RegionalModel, *, dtype=torch.float64, device="cpu") -> Parameters:
     def tensor(values):
         return None if values is None else torch.tensor(values, dtype=dtype, device=device)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, Network
+from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class Parameters:
     storage: ca.DM | None
 
 
-def parameters(network: Network) -> Parameters:
+def parameters(network: RegionalModel) -> Parameters:
     def column(name):
         return ca.DM([getattr(m, name) for m in network.mfds])
 

@@ -27,7 +27,7 @@ import torch
 from scipy.optimize import nnls
 
 from nmfd.model import dynamics
-from nmfd.model.scenario import Scenario
+from nmfd.model.planning import PlanningModel
 from nmfd.types import Controls
 
 # The three relative errors: standard deviation [-] (of the expansion it is `Instruments.detector_error`), and the time
@@ -63,7 +63,7 @@ class Instruments:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Observation:
+class Readings:
     """What was measured in one control interval; NaN where nothing was.
 
     accumulation: (R,) [veh], mean over the interval, expanded from the detectors to the region
@@ -95,9 +95,9 @@ class Belief:
 class Estimator:
     """The filter along one run: `step` once per control interval. `accumulation` (R, R) [veh] is the estimate."""
 
-    def __init__(self, scenario: Scenario, instruments: Instruments):
-        self._scenario, self._instruments = scenario, instruments
-        self._model = _Model(scenario, instruments)
+    def __init__(self, planning: PlanningModel, instruments: Instruments):
+        self._planning, self._instruments = planning, instruments
+        self._model = _Model(planning, instruments)
         self.reset()
 
     def reset(self) -> None:
@@ -107,18 +107,18 @@ class Estimator:
 
     @property
     def accumulation(self) -> np.ndarray:
-        regions = self._scenario.network.regions
+        regions = self._planning.network.regions
         return self.belief.mean[3 * regions :].reshape(regions, regions).copy()
 
-    def step(self, controls: Controls, observation: Observation) -> np.ndarray:
+    def step(self, controls: Controls, readings: Readings) -> np.ndarray:
         """The estimate at the end of the interval under `controls`; the forecast is the scenario's demand."""
-        demand = self._scenario.demand[min(self._k, self._scenario.steps - 1)]
-        splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
+        demand = self._planning.forecast[min(self._k, self._planning.steps - 1)]
+        splits = self._planning.network.nominal_splits if controls.splits is None else controls.splits
         # A detector that shows to the last digit what it showed twice before is stuck.
-        self._seen = [*self._seen[-2:], observation.accumulation]
+        self._seen = [*self._seen[-2:], readings.accumulation]
         stuck = np.ptp(self._seen, axis=0) == 0 if len(self._seen) == 3 else np.zeros(len(demand), dtype=bool)
-        loops = np.where(stuck & (observation.accumulation > 0), np.nan, observation.accumulation)
-        self.belief = self._model.advance(self.belief, demand, controls.perimeter, splits, observation, loops)
+        loops = np.where(stuck & (readings.accumulation > 0), np.nan, readings.accumulation)
+        self.belief = self._model.advance(self.belief, demand, controls.perimeter, splits, readings, loops)
         self._k += 1
         return self.accumulation
 
@@ -130,9 +130,9 @@ class _Model:
     the state at the end of an interval, and what is measured of it, jointly Gaussian. E: the boundaries (i, h).
     """
 
-    def __init__(self, scenario: Scenario, instruments: Instruments):
-        network, self._instruments = scenario.network, instruments
-        self._step, self._substeps = scenario.step, scenario.substeps
+    def __init__(self, planning: PlanningModel, instruments: Instruments):
+        network, self._instruments = planning.network, instruments
+        self._step, self._substeps = planning.step, planning.substeps
         self._parameters, self._probe_share = dynamics.parameters(network), instruments.probe_share
         regions = self._regions = network.regions
         cells = self._cells = regions**2
@@ -184,11 +184,11 @@ class _Model:
             mean=mean, covariance=torch.diag(torch.cat([self._spread**2, variance])).numpy(),
             probes=np.zeros((self._regions, self._regions)), surprise=np.nan)
 
-    def advance(self, belief: Belief, demand, perimeter, splits, observation: Observation, loops) -> Belief:
+    def advance(self, belief: Belief, demand, perimeter, splits, readings: Readings, loops) -> Belief:
         """The belief one control interval later. loops: (R,) [veh], the accumulations that are to be trusted."""
         z, covariance, leaving = self._predicted(belief, demand, perimeter, splits)
         mean, posterior, surprise = z[: self._states], covariance[: self._states, : self._states], np.nan
-        reading, expected, noise = self._readings(z, leaving, observation, loops)
+        reading, expected, noise = self._readings(z, leaving, readings, loops)
         there = np.flatnonzero(np.isfinite(reading))
         if len(there):
             ahead = self._rows(z, covariance)[there]
@@ -204,8 +204,8 @@ class _Model:
             uncertain = (spread.diagonal().numpy() > 10.0 * FLOOR)[measured].sum()
             surprise = float((whitened[measured, -1] ** 2).sum()) / max(int(uncertain), 1)
         posterior = (0.5 * (posterior + posterior.T)).numpy()
-        known = np.isfinite(observation.probes)
-        probes = np.where(known, observation.probes, np.maximum(z[self._probes].reshape(known.shape), 0.0))
+        known = np.isfinite(readings.probes)
+        probes = np.where(known, readings.probes, np.maximum(z[self._probes].reshape(known.shape), 0.0))
         lower = np.concatenate([np.full(self._x.start, -0.95), np.where(known, probes, 0.0).ravel()])
         mean = bounded(mean, posterior, lower)
         probes = np.minimum(probes, mean[self._x].reshape(known.shape))
@@ -285,7 +285,7 @@ class _Model:
         parts[0].diagonal()[self._cells : self._cells + self._regions] += self._half**2 @ moves / 3.0
         return torch.cat([torch.cat(parts[:2], dim=1), torch.cat([parts[1].T, parts[2]], dim=1)])
 
-    def _readings(self, z: np.ndarray, leaving: np.ndarray, observation: Observation, loops: np.ndarray) -> tuple:
+    def _readings(self, z: np.ndarray, leaving: np.ndarray, readings: Readings, loops: np.ndarray) -> tuple:
         """All readings (m,), NaN where there is none, their expectation and the variance of their own noise (m,).
 
         The last R^2 are no measurements, but keep a wrong model from going astray: that the probes are a share of the
@@ -305,11 +305,11 @@ class _Model:
             # a share of the links sees a share of the vehicles; the lasting part of the error is a state
             (loops, (1.0 + expansion) * mean,
              np.maximum(mean, 1.0) * (1.0 - share) / share + (known.detector_noise * mean) ** 2 + FLOOR),
-            (observation.crossings[here, to], counts,
+            (readings.crossings[here, to], counts,
              (1.0 - boundary) * (np.maximum(counts, 1.0) / boundary + COUNT_ERROR**2 * counts**2 / gateways) + FLOOR),
-            (observation.probes.ravel(), z[self._probes], cells),
-            (observation.probe_departures.ravel(), z[self._departures], cells),
-            (0.0 * observation.probes.ravel(), z[self._probes] - self._probe_share * z[self._x], thinning))
+            (readings.probes.ravel(), z[self._probes], cells),
+            (readings.probe_departures.ravel(), z[self._departures], cells),
+            (0.0 * readings.probes.ravel(), z[self._probes] - self._probe_share * z[self._x], thinning))
         return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
     def _rows(self, z: np.ndarray, matrix: torch.Tensor) -> torch.Tensor:

@@ -16,7 +16,8 @@ import torch
 
 from nmfd.model import dynamics
 from nmfd.model.mfd import Mfd
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
+from nmfd.threads import one_thread
 
 HORIZON = 10         # control intervals
 ITERATIONS = 600
@@ -47,7 +48,7 @@ class Observed:
 class _Model(torch.nn.Module):
     """`dynamics.Parameters` from free numbers: every choice of them is a valid network."""
 
-    def __init__(self, network: Network, runs: Sequence[Observed], step: float, fastest: float):
+    def __init__(self, network: RegionalModel, runs: Sequence[Observed], step: float, fastest: float):
         super().__init__()
 
         def free(values):
@@ -85,17 +86,17 @@ class _Model(torch.nn.Module):
         return RIDGE * ((self.exit_rates**2).mean() + (moved**2).mean())
 
 
+@one_thread()  # and sums are always in the same order
 def fit(
-    network: Network, runs: Sequence[Observed], *, step: float, substeps: int = 1, integrator: str = "euler",
+    network: RegionalModel, runs: Sequence[Observed], *, step: float, substeps: int = 1, integrator: str = "euler",
     iterations: int = ITERATIONS, seed: int = 0, progress: Callable[[int, int, str], None] | None = None,
-) -> Network:
+) -> RegionalModel:
     """`network` with the MFDs, exit rates, capacities and storage that predict `runs` best.
 
     The MFDs of `network` are where the search starts. Errors are scaled by their critical accumulations, one scale per
     region. The curve of every region falls in q and stays positive up to its jam accumulation, beyond which the outflow
     is constant, and step * q * exit rate <= 1 for the integration step: the result is always a valid network.
     """
-    torch.set_num_threads(1)  # the matrices are small: more threads only wait for one another, and sum in another order
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     model = _Model(network, runs, step, substeps / step)
@@ -144,7 +145,9 @@ def _huber(error: torch.Tensor) -> torch.Tensor:
     return torch.nn.functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
 
 
-def _network(network: Network, model: _Model, runs: Sequence[Observed], off_diagonal: torch.Tensor) -> Network:
+def _network(
+    network: RegionalModel, model: _Model, runs: Sequence[Observed], off_diagonal: torch.Tensor,
+) -> RegionalModel:
     """The fitted numbers, scaled such that the exit rates of a region are 1 on the average of its vehicles."""
     with torch.no_grad():
         p = model.parameters_of(off_diagonal)
@@ -161,7 +164,7 @@ def _network(network: Network, model: _Model, runs: Sequence[Observed], off_diag
 
 
 def prediction_errors(
-    network: Network, runs: Sequence[Observed], intervals: int, *, step: float, substeps: int = 1,
+    network: RegionalModel, runs: Sequence[Observed], intervals: int, *, step: float, substeps: int = 1,
     integrator: str = "euler",
 ) -> np.ndarray:
     """(N, R) [veh]: predicted minus observed accumulation, `intervals` ahead of every observed state of `runs`."""
@@ -180,7 +183,9 @@ def intervals_within(ahead: float, step: float, runs: Sequence[Observed]) -> int
     return min(max(1, round(ahead / step)), max(len(run.demand) for run in runs))
 
 
-def prediction_shares(network: Network, runs: Sequence[Observed], intervals: Sequence[int], **scheme) -> np.ndarray:
+def prediction_shares(
+    network: RegionalModel, runs: Sequence[Observed], intervals: Sequence[int], **scheme,
+) -> np.ndarray:
     """(len(intervals), R) [-]: RMSE of `prediction_errors`, as a share of the critical accumulation."""
     errors = [prediction_errors(network, runs, n, **scheme) for n in intervals]
     return np.sqrt([(error**2).mean(axis=0) for error in errors]) / [curve.critical for curve in network.mfds]

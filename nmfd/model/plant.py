@@ -6,7 +6,7 @@ import torch
 from nmfd import ledger
 from nmfd.model import acyclic, dynamics
 from nmfd.model.scenario import Scenario
-from nmfd.types import Controls, Measurement
+from nmfd.types import Controls, Observation, State
 
 
 class NmfdPlant:
@@ -17,13 +17,13 @@ class NmfdPlant:
         self._parameters = dynamics.parameters(scenario.network)
         self._demand = torch.from_numpy(scenario.demand)
 
-    def reset(self, seed: int) -> Measurement:
+    def reset(self, seed: int) -> State:
         """Empty network; the model is deterministic, `seed` changes nothing."""
         self._k, self._entered, self._ended = 0, 0.0, 0.0
         self._x = torch.zeros_like(self._demand[0])
-        return self._measurement()
+        return self._state()
 
-    def step(self, controls: Controls) -> Measurement:
+    def step(self, controls: Controls) -> State:
         demand = self._demand[self._k]
         splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
         self._x, ended = dynamics.advance_counted(
@@ -35,18 +35,19 @@ class NmfdPlant:
         ledger.check(
             self._k, self._k * self._scenario.step, entered=self._entered, ended=self._ended,
             inside=float(self._x.sum()), least=float(self._x.min()))
-        return self._measurement()
+        return self._state()
 
-    def completed(self) -> float:
-        return self._ended
+    def observe(self) -> Observation | None:
+        return None
 
     def close(self) -> None:
         pass
 
-    def _measurement(self) -> Measurement:
+    def _state(self) -> State:
         x = self._x.numpy()
-        return Measurement(
-            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=np.zeros_like(x))
+        return State(
+            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=np.zeros_like(x),
+            completed=self._ended)
 
 
 class AcyclicPlant:
@@ -56,11 +57,11 @@ class AcyclicPlant:
         self._scenario = scenario
         self._model = acyclic.build(scenario.network)
 
-    def reset(self, seed: int) -> Measurement:
+    def reset(self, seed: int) -> State:
         """Empty network; the model is deterministic, `seed` changes nothing."""
         self._k, self._entered, self._ended, self._forced = 0, 0.0, 0.0, 0.0
         self._x = np.zeros(len(self._model.region))
-        return self._measurement()
+        return self._state()
 
     @property
     def state(self) -> np.ndarray:
@@ -75,7 +76,7 @@ class AcyclicPlant:
         """
         return self._forced
 
-    def step(self, controls: Controls) -> Measurement:
+    def step(self, controls: Controls) -> State:
         scenario, model = self._scenario, self._model
         demand = scenario.demand[self._k]
         splits = scenario.network.nominal_splits if controls.splits is None else controls.splits
@@ -93,15 +94,16 @@ class AcyclicPlant:
         ledger.check(
             self._k, self._k * scenario.step, entered=self._entered, ended=self._ended, inside=float(self._x.sum()),
             least=float(self._x.min()))
-        return self._measurement()
+        return self._state()
 
-    def completed(self) -> float:
-        return self._ended
+    def observe(self) -> Observation | None:
+        return None
 
     def close(self) -> None:
         pass
 
-    def _measurement(self) -> Measurement:
+    def _state(self) -> State:
         x = acyclic.translate(self._model, self._x)
-        return Measurement(
-            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=np.zeros_like(x))
+        return State(
+            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=np.zeros_like(x),
+            completed=self._ended)

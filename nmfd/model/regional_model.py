@@ -24,7 +24,7 @@ LONGEST_NAME = 100   # characters: names become file names
 
 
 @dataclass(frozen=True, kw_only=True)
-class Network:
+class RegionalModel:
     """R regions, numbered from 0.
 
     name
@@ -114,7 +114,7 @@ def _hops(adjacency: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(hops), hops, -1).astype(int)
 
 
-def load_network(folder: Path | str) -> Network:
+def load_network(folder: Path | str) -> RegionalModel:
     """Read `folder`/network.toml.
 
     Raises InputError for a missing file, an unknown key, a wrong type or range, an adjacency that is not symmetric
@@ -159,7 +159,7 @@ def load_network(folder: Path | str) -> Network:
     _check_symmetry(adjacency, root)
     for i, regions in enumerate(barred):
         adjacency[i, list(regions)] = False
-    network = Network(
+    network = RegionalModel(
         name=name, region_names=tuple(names), positions=np.array(positions), adjacency=adjacency, mfds=tuple(mfds),
         u_min=u_min, u_max=u_max, own_splits=own_splits, folder=folder, **_boundaries(root, onward, boundaries))
     _check_graph(network, root)
@@ -195,7 +195,7 @@ def _boundary(row: config.Table, regions: int, adjacent: tuple[int, ...]) -> dic
 
 
 def _boundaries(root: config.Table, neighbours: list[tuple], rows: list[dict]) -> dict[str, np.ndarray | None]:
-    """The fields exit_rates, capacity and storage of Network; InputError where only some of the regions have one."""
+    """exit_rates, capacity and storage of RegionalModel; InputError where only some of the regions have one."""
     fields: dict[str, np.ndarray | None] = {}
     for key in rows[0]:
         given = [row[key] is not None for row in rows]
@@ -229,13 +229,13 @@ def _check_symmetry(adjacency: np.ndarray, root: config.Table) -> None:
                 "(no_way_to lists the adjacent regions into which no road leads)")
 
 
-def _check_graph(network: Network, root: config.Table) -> None:
+def _check_graph(network: RegionalModel, root: config.Table) -> None:
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
         raise root.error("regions", f"region {j} cannot be reached from region {i}; connect them with adjacent")
 
 
-def check_step(network: Network, step: float, where: str) -> None:
+def check_step(network: RegionalModel, step: float, where: str) -> None:
     """InputError unless forward Euler with `step` [s] keeps every accumulation non-negative (step * q <= 1)."""
     for region, mfd in enumerate(network.mfds):
         grid = np.linspace(0.0, mfd.jam, 2001)

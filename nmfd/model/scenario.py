@@ -1,24 +1,21 @@
 """Demand, noise, horizon: loaded from scenario.toml and checked."""
 
 import csv
-import functools
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from nmfd.controllers import registry
 from nmfd.errors import InputError
-from nmfd.model.regional_model import LONGEST_NAME, Network, check_step, load_network
+from nmfd.faults import Fault, parse
+from nmfd.model.regional_model import LONGEST_NAME, RegionalModel, check_step, load_network
 from nmfd.runs import config
 
 MOST_NUMBERS = 2 * 10**8  # of a demand table: more would not fit into memory
 LONGEST_STEP = 86_400.0   # s
-GUIDED = "guided"         # in a network's folder: that of the same city's model with guided drivers
-GUIDING = ("mpc-pcrg", "dpc-pcrg")  # beginnings of the names of the controllers that plan with it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +39,7 @@ class Scenario:
     """
 
     name: str
-    network: Network
+    network: RegionalModel
     step: float
     steps: int
     demand: np.ndarray
@@ -70,6 +67,20 @@ class Scenario:
         spread = self.forecast_error / np.sqrt(2.0)
         normal = random.standard_normal((1, *self.demand.shape[1:])) + random.standard_normal(self.demand.shape)
         return self.demand * np.exp(spread * normal - spread**2)
+
+
+    @cached_property
+    def ordered_faults(self) -> tuple[Fault, ...]:
+        """`faults`, parsed. InputError."""
+        where = "scenario.toml" if self.folder is None else self.folder / "scenario.toml"
+        return tuple(parse(text, f"{where}: faults", self.network.regions) for text in self.faults)
+
+
+def with_faults(scenario: Scenario, texts: Sequence[str]) -> Scenario:
+    """`scenario` with more faults, as the option --fault gives them. InputError."""
+    for text in texts:
+        parse(text, "--fault", scenario.network.regions)
+    return replace(scenario, faults=(*scenario.faults, *texts))
 
 
 def trapezoid(time: np.ndarray, *, start: float, peak: float, ramp_up: float, flat: float, ramp_down: float):
@@ -126,9 +137,11 @@ def _completed(content: dict, base: dict) -> dict:
     return {**base, **content, **both}
 
 
-def load_scenario(folder: Path | str) -> Scenario:
-    """Read `folder`/scenario.toml and its network, and check the options of every controller in it. Raises InputError;
-    the table [sumo] is left to cosim."""
+def read_scenario(folder: Path | str) -> Scenario:
+    """Read `folder`/scenario.toml and its network. Raises InputError.
+
+    The table [controllers] is left to the controllers (nmfd.controllers.registry.checked_scenario), [sumo] to cosim.
+    """
     folder = Path(folder)
     root = read_tables(folder)
     name = root.text("name", longest=LONGEST_NAME)
@@ -167,15 +180,8 @@ def load_scenario(folder: Path | str) -> Scenario:
         name=name, network=network, step=step, steps=steps, demand=factor * demand, measurement_std=measurement_std,
         integrator=integrator, substeps=substeps, protected=protected, controller_options=controller_options,
         demand_factor=factor, forecast_error=forecast_error, forecast_seed=forecast_seed, faults=ordered, folder=folder)
-    registry.check_options(scenario)
-    _check_faults(scenario)
+    _ = scenario.ordered_faults  # checked here, where the file is known
     return scenario
-
-
-def _check_faults(scenario: Scenario) -> None:
-    from nmfd import faults
-
-    faults.of(scenario)
 
 
 def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
@@ -209,46 +215,7 @@ def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
     return demand
 
 
-def guided_model(network: Network) -> Path | None:
-    """The folder of the same city's model with guided drivers, if there is one beside that of the drivers' own."""
-    folder = None if network.folder is None else network.folder / GUIDED
-    return folder if folder is not None and (folder / "network.toml").is_file() else None
-
-
-def as_modelled(scenario: Scenario, controller: str) -> Scenario:
-    """`scenario` with the regional model that `controller` plans with: the network that its option `model` names, or
-    else, where it guides routes, the one in the folder GUIDED of the scenario's network, if there is one.
-
-    Drivers who are guided, or who reroute by themselves, make another model of the same city. A controller "NAME+..."
-    is NAME with the options of [controllers."NAME+..."] over those of [controllers.NAME]. Raises InputError.
-    """
-    name, tables = controller.partition("+")[0], scenario.controller_options
-    options = {**tables.get(name, {}), **tables.get(controller, {})}
-    configured = replace(scenario, controller_options={**tables, name: options})
-    if "model" in options and scenario.folder is not None:
-        table = config.Table(options, scenario.folder / "scenario.toml", f"controllers.{controller}.")
-        folder = scenario.folder / table.text("model")
-        del options["model"]
-        return with_model(configured, folder, functools.partial(table.error, "model"))
-    if name.startswith(GUIDING) and (folder := guided_model(scenario.network)) is not None:
-        return with_model(configured, folder)
-    return configured
-
-
-def with_model(
-    scenario: Scenario, folder: Path, wrong: Callable[[str], InputError] | None = None,
-) -> Scenario:
-    """`scenario` with another regional model of the same city. wrong: the error that there is with it, of its words."""
-    model = load_network(folder)
-    if not np.array_equal(model.adjacency, scenario.network.adjacency):
-        error = f"network {model.name} has other regions or boundaries than {scenario.network.name}; identify one " \
-                "for the same city with 'cosim identify'"
-        raise wrong(error) if wrong else InputError(f"{folder / 'network.toml'}: {error}")
-    check_step(model, scenario.step / scenario.substeps, f"{model.folder}")
-    return replace(scenario, network=model)
-
-
-def _region(row: config.Table, key: str, network: Network) -> int:
+def _region(row: config.Table, key: str, network: RegionalModel) -> int:
     value = row.integer(key)
     if value >= network.regions:
         raise row.error(

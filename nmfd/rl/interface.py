@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nmfd.model.regional_model import Network
-from nmfd.types import Controls, Measurement
+from nmfd.closed_loop import noise_of, noisy
+from nmfd.model.regional_model import RegionalModel
+from nmfd.types import Controls, Observation
 
 LOGITS = 5.0  # actions in [-1, 1] times this are the logits of the split ratios: up to e^10 between two ways
 
@@ -24,7 +25,7 @@ class Interface:
     """
 
     def __init__(
-        self, network: Network, *, guidance: bool = False, metering: bool = False,
+        self, network: RegionalModel, *, guidance: bool = False, metering: bool = False,
         regions: Sequence[int] | None = None,
     ):
         self._network, self._guidance = network, guidance
@@ -54,9 +55,9 @@ class Interface:
             parts.append(accumulation.sum(axis=-1) / self._critical)
         return np.concatenate(parts, axis=-1, dtype=np.float32)
 
-    def observed(self, measurement: Measurement) -> np.ndarray:
+    def observed(self, observation: Observation) -> np.ndarray:
         """(observation_size,) of what a controller sees."""
-        return self.observation(measurement.accumulation, measurement.backlog)
+        return self.observation(observation.accumulation, observation.backlog)
 
     def perimeter(self, action: np.ndarray) -> np.ndarray:
         """(..., R, R) [-] of actions (..., action_size); u_max at the boundaries of other regions."""
@@ -82,7 +83,7 @@ class Interface:
         return Controls(perimeter=self.perimeter(action), splits=self.splits(action))
 
 
-def combined(parts: dict[int, Controls], network: Network) -> Controls:
+def combined(parts: dict[int, Controls], network: RegionalModel) -> Controls:
     """The controls of all regions: of each those of its own agent, without one an open perimeter and own ways."""
     perimeter, splits = np.where(network.adjacency, network.u_max, 0.0), network.nominal_splits.copy()
     for region, controls in parts.items():
@@ -101,13 +102,13 @@ class Episode:
         self.unit = sum(mfd.critical for mfd in scenario.network.mfds)  # [veh]
         self._state = None
 
-    def reset(self, seed: int) -> Measurement:
+    def reset(self, seed: int) -> Observation:
         """What the agent sees at the beginning."""
-        self._random = np.random.default_rng([seed, 0x6E6F6973])
+        self._random = noise_of(seed)
         self._state, self.steps = self._plant.reset(seed), 0
         return self._seen()
 
-    def step(self, controls: Controls) -> tuple[Measurement, np.ndarray, bool]:
+    def step(self, controls: Controls) -> tuple[Observation, np.ndarray, bool]:
         """What the agent sees next; vehicles (R,) [veh] in and before each region when the interval began; the end."""
         spent = (self._state.accumulation + self._state.backlog).sum(axis=1)
         self._state = self._plant.step(controls)
@@ -117,15 +118,14 @@ class Episode:
     @property
     def completed(self) -> float:
         """[veh]"""
-        return self._plant.completed()
+        return self._state.completed
 
     def close(self) -> None:
         if self._plant is not None:
             self._plant.close()
             self._plant = None
 
-    def _seen(self) -> Measurement:
-        from nmfd.closed_loop import what_is_seen
-
+    def _seen(self) -> Observation:
         noise = self.scenario.measurement_std * self._random.standard_normal(self._state.accumulation.shape)
-        return what_is_seen(self._state, noise)
+        told = self._plant.observe()
+        return noisy(self._state, noise) if told is None else told

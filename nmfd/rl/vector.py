@@ -1,5 +1,7 @@
 """Many scenarios at once on the regional model, in one batch of tensors."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import torch
@@ -8,6 +10,7 @@ from gymnasium.vector.utils import batch_space
 
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.model import dynamics
+from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.rl.interface import Interface
 
@@ -34,7 +37,7 @@ class NmfdVectorEnv(VectorEnv):
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.interface.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._rollout = Rollout(scenario, dtype=torch.float64)
+        self._rollout = Rollout(planning_model(replace(scenario, forecast_error=0.0)), dtype=torch.float64)
         self._spread, self._share = demand_spread, initial_share
         self._backlog = np.zeros((num_envs, scenario.network.regions, scenario.network.regions))
 

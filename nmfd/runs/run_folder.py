@@ -31,13 +31,14 @@ from nmfd.types import Trajectory
 COLUMNS = {
     "controller": str, "seed": int, "plant": str, "total_time_spent_veh_s": float, "final_accumulation_veh": float,
     "max_accumulation_veh": float, "completed_veh": float, "evaluation_time_s": float,
-    "control_step_ms_median": float, "control_step_ms_max": float, "solver_failures": int,
+    "control_step_ms_median": float, "control_step_ms_max": float, "solver_failures": int, "fallbacks": int,
+    "late_decisions": int, "sensor_faults": int, "plant_faults": int,
 }
 LOCK = ".lock"  # of a run folder
 PACKAGES = ("numpy", "torch", "casadi", "libsumo", "perimeter-cosim")
 # What NumPy raises for a file that is no .npz, cut off, changed, or without an array that it should have.
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-_ARRAYS = ("accumulation", "backlog", "completed", "perimeter", "splits")
+_ARRAYS = ("accumulation", "backlog", "completed", "observed", "observed_backlog", "perimeter", "splits", "status")
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
@@ -45,9 +46,9 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     with files.atomic(path) as temporary:
         np.savez_compressed(
             temporary, controller=np.array(trajectory.controller), plant=np.array(trajectory.plant),
-            seed=np.array(trajectory.seed), step=np.array(trajectory.step), status=np.array(trajectory.status),
-            **{name: getattr(trajectory, name) for name in _ARRAYS},
-            **({} if trajectory.estimate is None else {"estimate": trajectory.estimate}))
+            seed=np.array(trajectory.seed), step=np.array(trajectory.step),
+            estimated=np.array(trajectory.estimated), note=np.array(trajectory.note),
+            **{name: getattr(trajectory, name) for name in _ARRAYS})
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -56,9 +57,9 @@ def read_trajectory(path: Path) -> Trajectory:
         with np.load(path, allow_pickle=False) as file:
             return Trajectory(
                 controller=str(file["controller"]), plant=str(file["plant"]), seed=int(file["seed"]),
-                step=float(file["step"]), status=tuple(str(s) for s in file["status"]),
+                step=float(file["step"]), note=tuple(str(s) for s in file["note"]),
                 decision_time=np.full(len(file["status"]), math.nan), wall_time=math.nan,
-                estimate=file["estimate"] if "estimate" in file.files else None,
+                estimated=bool(file["estimated"]),
                 **{name: file[name] for name in _ARRAYS})
     except FileNotFoundError:
         raise InputError(f"{path}: no such trajectory; run it again") from None

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import wait
 from pathlib import Path
 
-from nmfd.errors import InputError
+from nmfd.errors import InputError, RunFailed
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,6 @@ class Failure:
 
     reason: str
     mistake: bool = False
-
-
-class RunFailed(Exception):
-    """Some runs ended in an error. The message names them in one line."""
 
 
 def ended(failures: Sequence[tuple[str, Failure]]) -> Exception:

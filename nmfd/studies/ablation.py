@@ -9,8 +9,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import torch
-
 from nmfd import closed_loop
 from nmfd.controllers import registry
 from nmfd.controllers.dpc import rollout, training
@@ -20,6 +18,7 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
 from nmfd.runs.scratch import Scratch
 from nmfd.runs.workers import Failure, ended
+from nmfd.studies import plots, plots_studies
 from nmfd.studies.benchmark import PLANTS, configuration, interval, results
 
 METHODS = {"alternating": True, "joint": False}
@@ -61,7 +60,6 @@ def drive_one(
     run: tuple[str, int], *, scenario: Scenario, plant: str, progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, list[dict]]:
     """The closed loop of one MPC, `run` = (controller, horizon), as a single row."""
-    torch.set_num_threads(1)
     controller = registry.make(run[0], with_horizon(scenario, *run))
     row = summary(closed_loop.run(PLANTS[plant](scenario), controller, scenario, seed=0, progress=progress))
     kept = {name: row[name] for name in HORIZON_COLUMNS if name in row}
@@ -154,8 +152,6 @@ def _run(row: Mapping) -> tuple[str, int]:
 
 def draw(folder: Path, rows: Mapping[str, Sequence[Mapping]]) -> Path:
     """training.png or horizon.png in `folder`, of the rows by csv file."""
-    from nmfd.studies import plots, plots_studies  # workers import this module, and none of them draws
-
     drawing = plots.figure(10.0, 4.4)
     if "training" in rows:
         left, right = drawing.subplots(1, 2, width_ratios=(2, 1))

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from nmfd import closed_loop
 from nmfd.controllers import registry
@@ -72,11 +71,10 @@ def run_one(
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
     """The row of `run` in adaptation.csv, on one thread."""
-    torch.set_num_threads(1)
     actual = changed(scenario, run.case)
     controller = registry.make(run.controller, scenario, policy=policies.get(run.controller))
     row = summary(closed_loop.run(PLANTS[plant](actual), controller, actual, seed=run.seed, progress=progress))
-    return {"case": run.case, "seed": run.seed, "controller": run.controller, "fallbacks": row["solver_failures"],
+    return {"case": run.case, "seed": run.seed, "controller": run.controller, "fallbacks": row["fallbacks"],
             **{name: row[name] for name in COLUMNS if name in row and name not in ("seed", "controller")}}
 
 

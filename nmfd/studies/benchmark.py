@@ -6,15 +6,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-import torch
 from scipy.special import stdtrit
 
 from nmfd import closed_loop, faults
 from nmfd.controllers import registry
+from nmfd.metrics import COUNTED
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
+from nmfd.studies import plots
 from nmfd.studies.text_table import aligned
 from nmfd.types import Plant, Trajectory
 
@@ -22,7 +23,8 @@ PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": 
 REFERENCE = "no-control"
 CAPTION = (
     "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against no-control; control: time of all\n"
-    "decisions of a run; step: median / longest decision; failures: decisions that were a fallback, all seeds")
+    "decisions of a run; step: median / longest decision; decisions of all seeds:\n" + "; ".join(
+        f"{heading}: {what}" for heading, what in COUNTED.values()))
 BOUND_CAPTION = "above bound: TTS against the bound with the same controls, perimeter alone (PC) or with routes (PCRG)"
 
 
@@ -31,7 +33,6 @@ def run_one(
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
     """The closed loop of `run` = (controller, seed), on one thread."""
-    torch.set_num_threads(1)
     name, seed = run
     controller = registry.make(name, scenario, policy=policies.get(name))
     trajectory = closed_loop.run(PLANTS[plant](scenario), controller, scenario, seed=seed, progress=progress)
@@ -76,7 +77,7 @@ def benchmark(
 def configuration(scenario: Scenario, controllers, plant: str, policies) -> tuple[dict, dict]:
     """What all runs have in common, and what each controller depends on besides. InputError for a fault that the
     regional model cannot have."""
-    faults.without_city(faults.of(scenario), f"{scenario.name}: faults")
+    faults.without_city(scenario.ordered_faults, f"{scenario.name}: faults")
     settings = {}
     for name in controllers:
         policy = registry.policy_path(name, scenario, policies.get(name))
@@ -129,8 +130,6 @@ def draw_accumulations(
 
     seed: shown instead of the mean over seeds; title: above both pictures.
     """
-    from nmfd.studies import plots  # workers import this module, and none of them draws
-
     drawing = plots.figure(8.0, 4.6)
     ax = plots.total_accumulation(drawing.subplots(), trajectories, seed)
     drawing.suptitle(title, fontsize="medium")
@@ -147,8 +146,6 @@ def draw_accumulations(
 
 def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
     """Spawn matrix, region map and MFDs of `scenario`, as png files in `folder`."""
-    from nmfd.studies import plots
-
     network = scenario.network
     drawing = plots.figure(11.0, 4.8)
     left, right = drawing.subplots(1, 2)
@@ -186,7 +183,8 @@ def table(rows: Sequence[Mapping]) -> str:
     tts = {name: [row["total_time_spent_veh_s"] for row in group] for name, group in groups.items()}
     with_bound = any(name in tts for name in ("bound-pc", "bound-pcrg"))
     lines = [["controller", "seeds", "TTS [veh s]", "change", *["above bound"] * with_bound, "final [veh]",
-              "max [veh]", "completed [veh]", "control [s]", "step [ms]", "failures"]]
+              "max [veh]", "completed [veh]", "control [s]", "step [ms]",
+              *(heading for heading, _ in COUNTED.values())]]
     for name, group in groups.items():
         def mean(column, group=group):
             return statistics.fmean(row[column] for row in group)
@@ -204,7 +202,7 @@ def table(rows: Sequence[Mapping]) -> str:
             f"{mean('max_accumulation_veh'):,.0f}",
             f"{mean('completed_veh'):,.0f}", f"{mean('evaluation_time_s'):.3g}",
             f"{mean('control_step_ms_median'):.3g} / {max(row['control_step_ms_max'] for row in group):.3g}",
-            str(sum(row["solver_failures"] for row in group))])
+            *(str(sum(row[column] for row in group)) for column in COUNTED)])
     return "\n".join([*aligned(lines), CAPTION, *[BOUND_CAPTION] * with_bound])
 
 

@@ -7,61 +7,23 @@ be possible, not one that is proven to be the least.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
 from nmfd import closed_loop
 from nmfd.controllers import registry
+from nmfd.controllers.open_loop import NAMES, Plan
 from nmfd.errors import InputError
 from nmfd.model import dynamics
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
-from nmfd.runs.files import atomic
-from nmfd.runs.run_folder import scenario_hash
-from nmfd.types import Controls, Measurement
+from nmfd.threads import one_thread
 
-NAMES = {"bound-pc": False, "bound-pcrg": True}  # whether routes are guided too
 ITERATIONS = 1500
 LEARNING_RATE = 0.15    # of Adam, on logits; falls along a cosine
 INSIDE = 0.02           # a start is moved this far into the admissible set: on its edge there is no gradient
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """Controls of all T intervals, fixed in advance.
-
-    perimeter: (T, R, R) [-], [k, i, h] = u_ih
-    splits: (T, R, R, R) [-], [k, i, h, j] = theta_ihj; None without route guidance
-    start: the name of the start that it was descended from
-    totals: start -> total time spent [veh s] that its descent ended at
-    iterations: Adam steps done
-    """
-
-    perimeter: np.ndarray
-    splits: np.ndarray | None
-    start: str
-    totals: Mapping[str, float]
-    iterations: int
-
-
-class OpenLoop:
-    """A plan as a controller (nmfd.types.Controller): what is measured changes nothing."""
-
-    def __init__(self, plan: Plan):
-        self.name, self._plan = "bound-pc" if plan.splits is None else "bound-pcrg", plan
-
-    def reset(self, seed: int = 0) -> None:
-        pass
-
-    def act(self, measurement: Measurement) -> Controls:
-        splits = self._plan.splits
-        return Controls(
-            perimeter=self._plan.perimeter[measurement.step],
-            splits=None if splits is None else splits[measurement.step])
 
 
 def check(name: str) -> None:
@@ -79,7 +41,6 @@ def compute(
     starts: controllers with the same action set or a smaller one; default PI gating and the scenario's own policies
     """
     check(name)
-    torch.set_num_threads(1)
     guidance = NAMES[name]
     begin = neutral_starts(scenario.network, scenario.steps, guidance=guidance)
     for controller in _usual_starts(scenario, guidance) if starts is None else starts:
@@ -98,7 +59,7 @@ def _usual_starts(scenario: Scenario, guidance: bool) -> list[str]:
         scenario.folder is not None and (scenario.folder / f"{name}.pt").is_file())]
 
 
-def neutral_starts(network: Network, steps: int, *, guidance: bool) -> dict[str, tuple]:
+def neutral_starts(network: RegionalModel, steps: int, *, guidance: bool) -> dict[str, tuple]:
     """Perimeter (T, R, R) and splits (T, R, R, R) that know nothing: everything open, and everything in the middle."""
     mask = network.split_mask
     even = mask / np.maximum(mask.sum(axis=1, keepdims=True), 1)
@@ -111,6 +72,7 @@ def neutral_starts(network: Network, steps: int, *, guidance: bool) -> dict[str,
             "middle": constant(0.5 * (network.u_min + network.u_max), even)}
 
 
+@one_thread()
 def solve(
     scenario: Scenario, starts: Mapping[str, tuple], *, guidance: bool, iterations: int = ITERATIONS,
     learning_rate: float = LEARNING_RATE, progress: Callable[[int, int, str], None] | None = None,
@@ -159,7 +121,7 @@ def solve(
 class _Controls:
     """Admissible controls of T intervals and B plans from logits: a scaled sigmoid and a masked softmax."""
 
-    def __init__(self, network: Network, steps: int, starts, *, guidance: bool):
+    def __init__(self, network: RegionalModel, steps: int, starts, *, guidance: bool):
         mask = torch.tensor(network.split_mask)
         self._adjacency = torch.tensor(network.adjacency, dtype=torch.float64)
         self._mask, self._bounds = mask.double(), (network.u_min, network.u_max)
@@ -187,7 +149,7 @@ class _Controls:
 
 
 def _total_time_spent(scenario: Scenario, parameters, demand, perimeter, splits) -> torch.Tensor:
-    """TTS (B,) [veh s] of plans from the empty network (design.md, section 2)."""
+    """TTS (B,) [veh s] of plans from the empty network by the definition of nmfd.metrics."""
     x = demand.new_zeros(perimeter.shape[1], *demand.shape[1:])
     states = [x]
     for k in range(scenario.steps - 1):
@@ -196,44 +158,3 @@ def _total_time_spent(scenario: Scenario, parameters, demand, perimeter, splits)
             substeps=scenario.substeps)
         states.append(x)
     return scenario.step * torch.stack(states).sum((0, -2, -1))
-
-
-def model_hash(scenario: Scenario) -> str:
-    """A fingerprint of all that a plan depends on: runs.scenario_hash without controllers and measurement noise."""
-    return scenario_hash(replace(scenario, controller_options={}, protected=(), measurement_std=0.0))
-
-
-def write(plan: Plan, scenario: Scenario, path: Path) -> None:
-    """`plan` as an .npz file without pickles, with the fingerprint of its scenario; atomically."""
-    splits = {} if plan.splits is None else {"splits": plan.splits}
-    with atomic(path) as temporary:
-        np.savez_compressed(
-            temporary, scenario=np.array(scenario.name), model=np.array(model_hash(scenario)),
-            perimeter=plan.perimeter, start=np.array(plan.start), names=np.array(list(plan.totals)),
-            totals=np.array(list(plan.totals.values())), iterations=np.array(plan.iterations), **splits)
-
-
-def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
-    """What `write` wrote; InputError if it is none, of another scenario, or of the other action set."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            content = {name: file[name] for name in file.files}
-        plan = Plan(
-            perimeter=content["perimeter"], splits=content.get("splits"), start=str(content["start"]),
-            totals=dict(zip(content["names"].tolist(), content["totals"].tolist(), strict=True)),
-            iterations=int(content["iterations"]))
-        model = str(content["model"])
-    except Exception:
-        raise InputError(f"{path}: is no plan; compute one with 'nmfd bound'") from None
-    if model != model_hash(scenario):
-        raise InputError(f"{path}: was computed for another demand or network than {scenario.name}'s; compute it again "
-                         "with 'nmfd bound'")
-    if (plan.splits is not None) != guidance:
-        wanted, other = ("with", "without") if guidance else ("without", "with")
-        raise InputError(f"{path}: is a plan {other} route guidance, expected one {wanted}; choose another file")
-    return plan
-
-
-def load(path: Path, scenario: Scenario, *, guidance: bool) -> OpenLoop:
-    """The plan in `path` as the controller "bound-pc" or "bound-pcrg"; InputError as `read`."""
-    return OpenLoop(read(path, scenario, guidance=guidance))

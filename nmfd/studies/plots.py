@@ -17,7 +17,7 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator, MultipleLocator, StrMethodFormatter
 
 from nmfd.model.mfd import Mfd
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import atomic
 from nmfd.types import Trajectory
@@ -112,7 +112,7 @@ def total_accumulation(ax: Axes, trajectories: Sequence[Trajectory], seed: int |
 
 
 def region_accumulation(
-    ax: Axes, network: Network, region: int, trajectories: Sequence[Trajectory], seed: int | None = None,
+    ax: Axes, network: RegionalModel, region: int, trajectories: Sequence[Trajectory], seed: int | None = None,
 ) -> Axes:
     """Accumulation of one region over time, over its green band (within 10 % of maximum outflow) and red zone.
 
@@ -133,9 +133,9 @@ def region_accumulation(
     return ax
 
 
-def region_estimate(ax: Axes, network: Network, region: int, trajectory: Trajectory) -> Axes:
+def region_estimate(ax: Axes, network: RegionalModel, region: int, trajectory: Trajectory) -> Axes:
     """Accumulation of one region over time, and the estimate of it that the controller saw."""
-    estimate = replace(trajectory, accumulation=trajectory.estimate, plant="estimate")
+    estimate = replace(trajectory, accumulation=trajectory.observed, plant="estimate")
     return region_accumulation(ax, network, region, [trajectory, estimate])
 
 
@@ -171,7 +171,7 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> 
     return ax
 
 
-def region_map(ax: Axes, network: Network) -> Axes:
+def region_map(ax: Axes, network: RegionalModel) -> Axes:
     """Regions as discs at their positions, with the boundaries that vehicles may cross."""
     positions = network.positions
     apart = [np.linalg.norm(positions[i] - positions[h]) for i, h in _pairs(network.adjacency)]
@@ -289,6 +289,6 @@ def _pairs(adjacency: np.ndarray):
     return np.argwhere(np.triu(adjacency | adjacency.T))
 
 
-def _region_title(network: Network, region: int) -> str:
+def _region_title(network: RegionalModel, region: int) -> str:
     name = network.region_names[region]
     return f"region {region}" if name == str(region) else f"{region} {name}"

@@ -10,8 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
-
 from nmfd import closed_loop
 from nmfd.controllers import registry
 from nmfd.metrics import summary
@@ -19,6 +17,7 @@ from nmfd.model.demand_noise import perturbed
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
 from nmfd.runs.workers import Failure, ended
+from nmfd.studies import plots, plots_studies
 from nmfd.studies.benchmark import PLANTS, REFERENCE, configuration, interval, results
 from nmfd.studies.text_table import aligned
 
@@ -43,7 +42,6 @@ def run_one(
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
     """The row of `run` in robustness.csv, on one thread."""
-    torch.set_num_threads(1)
     actual = perturbed(scenario, run.sigma, run.scenario, where=where)
     controller = registry.make(run.controller, scenario, policy=policies.get(run.controller))
     row = summary(closed_loop.run(PLANTS[plant](actual), controller, actual, seed=run.scenario, progress=progress))
@@ -51,7 +49,7 @@ def run_one(
         "sigma_veh_per_s": run.sigma, "scenario": run.scenario, "controller": run.controller,
         "trips_veh": float(actual.step * actual.demand.sum()),
         "total_time_spent_veh_s": row["total_time_spent_veh_s"],
-        "final_accumulation_veh": row["final_accumulation_veh"], "fallbacks": row["solver_failures"]}
+        "final_accumulation_veh": row["final_accumulation_veh"], "fallbacks": row["fallbacks"]}
 
 
 def robustness(
@@ -132,8 +130,6 @@ def trips(rows: Sequence[Mapping]) -> dict[float, float]:
 
 def draw(folder: Path, rows: Sequence[Mapping]) -> Path:
     """Improvement and trips over sigma, as robustness.png in `folder`."""
-    from nmfd.studies import plots, plots_studies  # workers import this module, and none of them draws
-
     drawing = plots.figure(8.0, 6.4)
     upper, lower = drawing.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     plots_studies.improvement(upper, {name: improvements(rows, name) for name in compared(rows)})

@@ -16,16 +16,21 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
+from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy
 from nmfd.controllers.mpc import edge_model
+from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.errors import InputError
 from nmfd.model.mfd import Mfd
-from nmfd.model.regional_model import Network
-from nmfd.model.scenario import Scenario
+from nmfd.model.planning import PlanningModel
+from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files, run_folder
 from nmfd.runs.workers import Failure, outcomes
+from nmfd.studies import plots, plots_scaling
 from nmfd.studies.text_table import aligned
-from nmfd.types import Controller, Measurement
+from nmfd.threads import one_thread
+from nmfd.types import Controller, Observation, Status
 
 BENCHMARK_MFD = Mfd(a=4.133e-11, b=-8.282e-7, c=0.0042, jam=10_000.0)
 SPREAD = 0.2            # every region's speed and size is drawn from 1 +- SPREAD times the benchmark's
@@ -39,7 +44,8 @@ COLUMNS = {
     "peak_memory_mib": float}
 CAPTION = (
     "time per decision: median / longest of the decisions after the first; set-up: network, controller and policy;\n"
-    "memory: peak of the whole process, Python and its libraries included; unsolved: decisions whose status is not ok")
+    "memory: peak of the whole process, Python and its libraries included; unsolved: decisions that were a\n"
+    "failure or a fallback")
 
 
 class Case(NamedTuple):
@@ -63,7 +69,7 @@ def positions(family: str, regions: int) -> np.ndarray:
     return points[np.lexsort((around, np.round((points**2).sum(axis=1), 6)))[:regions]]
 
 
-def network(family: str, regions: int, seed: int = 0) -> Network:
+def network(family: str, regions: int, seed: int = 0) -> RegionalModel:
     """A network of the family ("complete" or "hexagonal") with random MFDs."""
     random, where = np.random.default_rng([seed, regions]), positions(family, regions)
     apart = np.linalg.norm(where[:, None] - where, axis=2)
@@ -72,12 +78,12 @@ def network(family: str, regions: int, seed: int = 0) -> Network:
     for speed, size in random.uniform(1.0 - SPREAD, 1.0 + SPREAD, (regions, 2)):
         base = BENCHMARK_MFD
         mfds.append(Mfd(a=base.a * speed / size**2, b=base.b * speed / size, c=base.c * speed, jam=base.jam * size))
-    return Network(
+    return RegionalModel(
         name=f"{family}-{regions}", region_names=tuple(map(str, range(regions))), positions=where,
         adjacency=near & ~np.eye(regions, dtype=bool), mfds=tuple(mfds), u_min=0.1, u_max=0.9)
 
 
-def initial_state(network: Network, load: str, seed: int = 0) -> np.ndarray:
+def initial_state(network: RegionalModel, load: str, seed: int = 0) -> np.ndarray:
     """(R, R) [veh]: every x_ij from [0, 100), as published; or every region between empty and 20 % above its jam."""
     random = np.random.default_rng([seed, network.regions, 1])
     x = random.uniform(0.0, 100.0, (network.regions, network.regions))
@@ -87,35 +93,26 @@ def initial_state(network: Network, load: str, seed: int = 0) -> np.ndarray:
     return x * (filled / x.sum(axis=1))[:, None]
 
 
-def maker(name: str) -> Callable[[Scenario], Controller]:
-    """What makes the controller, with all that it imports; an untrained policy is in the place of a trained one."""
+def made(name: str, planning: PlanningModel) -> Controller:
+    """The controller; an untrained policy is in the place of a trained one."""
     if name.startswith("mpc"):
-        from nmfd.controllers.mpc.controller import EconomicMpc
-
-        return partial(EconomicMpc, guidance=CONTROLLERS[name])
-    import torch
-
-    from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy
-
-    torch.set_num_threads(1)
+        return EconomicMpc(planning, guidance=CONTROLLERS[name])
     torch.manual_seed(0)
-    architecture = Architecture(guidance=CONTROLLERS[name], sparse=True)
-    return lambda scenario: DpcController(Policy(scenario.network, architecture))
+    return DpcController(Policy(planning.network, Architecture(guidance=CONTROLLERS[name], sparse=True)))
 
 
+@one_thread()
 def run_one(case: Case, *, memory_gib: float) -> dict:
     """The row of `case` in scaling.csv: ten control intervals on the regional model, on one thread.
 
     Raises MemoryError above `memory_gib`, which is set for the whole process.
     """
     resource.setrlimit(resource.RLIMIT_DATA, (int(memory_gib * 2**30), resource.getrlimit(resource.RLIMIT_DATA)[1]))
-    make = maker(case.controller)
     begin = time.perf_counter()
     city = network(case.family, case.regions)
-    scenario = Scenario(
+    chosen = made(case.controller, PlanningModel(
         name=city.name, network=city, step=INTERVAL, steps=INTERVALS,
-        demand=np.zeros((INTERVALS, case.regions, case.regions)))
-    chosen = make(scenario)
+        forecast=np.zeros((INTERVALS, case.regions, case.regions))))
     set_up = time.perf_counter() - begin
     # The model by its turns: with its dense splits a trajectory of 256 regions would take gigabytes.
     model = edge_model.build(city, np.arange(case.regions), guidance=True)
@@ -123,17 +120,17 @@ def run_one(case: Case, *, memory_gib: float) -> dict:
     times, unsolved = [], 0
     chosen.reset()
     for k in range(INTERVALS):
-        seen = Measurement(step=k, time=INTERVAL * k, accumulation=x, backlog=np.zeros_like(x))
+        seen = Observation(step=k, time=INTERVAL * k, accumulation=x, backlog=np.zeros_like(x))
         begin = time.perf_counter()
         controls = chosen.act(seen)
         times.append(time.perf_counter() - begin)
-        unsolved += controls.status != "ok"
+        unsolved += controls.status != Status.OK
         splits = city.nominal_splits if controls.splits is None else controls.splits
         x = edge_model.advance(
             model, x.ravel(), 0.0, controls.perimeter[tuple(model.edges.T)], splits[tuple(model.turns.T)], INTERVAL,
         )[0].reshape(x.shape)
     return {
-        **case._asdict(), "status": "ok" if not unsolved else controls.status, "set_up_s": set_up,
+        **case._asdict(), "status": "ok" if not unsolved else controls.note, "set_up_s": set_up,
         "first_decision_s": times[0], "median_decision_s": statistics.median(times[1:]),
         "longest_decision_s": max(times[1:]), "unsolved_decisions": unsolved,
         "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if _mac() else 2**10)}
@@ -211,8 +208,6 @@ def _check(controllers: Sequence[str], family: str, load: str, regions: Sequence
 
 def draw(folder: Path, rows: Sequence[Mapping]) -> Path:
     """Time per decision and memory over the regions, one column per family and load, as scaling.png in `folder`."""
-    from nmfd.studies import plots, plots_scaling  # workers import this module, and none of them draws
-
     kinds = list(dict.fromkeys((row["family"], row["load"]) for row in rows))
     drawing = plots.figure(1.2 + 4.4 * len(kinds), 6.4)
     axes = drawing.subplots(2, len(kinds), squeeze=False, sharex="col", sharey="row", height_ratios=(3, 2))

@@ -8,7 +8,7 @@ import torch
 
 from nmfd.controllers.dpc.policy import Policy
 from nmfd.model import dynamics_casadi as model
-from nmfd.model.regional_model import Network
+from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 
 
@@ -86,7 +86,7 @@ def dpc(policy: Policy) -> Callable:
     return decide
 
 
-def euler(network: Network, x: np.ndarray, demand: np.ndarray, u: np.ndarray, theta: np.ndarray, step: float):
+def euler(network: RegionalModel, x: np.ndarray, demand: np.ndarray, u: np.ndarray, theta: np.ndarray, step: float):
     """x (R, R) [veh] after `step` [s], from the equations of design.md, section 2, term by term."""
     regions, neighbours = network.regions, [np.flatnonzero(row) for row in network.adjacency]
     q = [float(mfd.rate(x[i].sum())) for i, mfd in enumerate(network.mfds)]

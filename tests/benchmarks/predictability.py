@@ -20,7 +20,7 @@ import sumo
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, load_city
 from cosim.sumo.trips import write_trips
-from nmfd.model.scenario import load_scenario
+from nmfd.api import load_scenario
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "grid7_peak"
 AHEAD = (90, 900)  # s

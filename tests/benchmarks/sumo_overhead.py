@@ -23,8 +23,9 @@ import torch
 from cosim.plant.plant import SumoPlant
 from cosim.sumo.session import Session
 from nmfd import closed_loop
+from nmfd.api import load_scenario
 from nmfd.controllers import registry
-from nmfd.model.scenario import Scenario, load_scenario
+from nmfd.model.scenario import Scenario
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "grid7_peak"
 FIRST = 12  # control interval from which the demand is taken: it flows from the beginning

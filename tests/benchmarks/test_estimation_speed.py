@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from nmfd.api import load_scenario
 from nmfd.model.estimation import Estimator, Instruments, Observation
+from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import load_scenario
 from nmfd.types import Controls
 
 SCENARIO = load_scenario(Path(__file__).parents[2] / "scenarios" / "grid7_peak")
@@ -25,7 +26,7 @@ def one_thread():
 def test_estimator_step(benchmark):
     network, plant = SCENARIO.network, NmfdPlant(SCENARIO)
     inner = network.adjacency
-    estimator = Estimator(SCENARIO, Instruments(
+    estimator = Estimator(planning_model(SCENARIO), Instruments(
         detector_share=np.full(7, 0.3), detector_error=np.full(7, 0.3), detector_noise=np.full(7, 0.3),
         counted_share=np.where(inner, 0.3, 0.0),
         counted_gateways=np.where(inner, 2, 0), probe_share=0.1))

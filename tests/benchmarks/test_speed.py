@@ -11,15 +11,17 @@ import plain
 import pytest
 import torch
 
+from nmfd.api import load_scenario
 from nmfd.closed_loop import run
 from nmfd.controllers import registry
 from nmfd.controllers.dpc.policy import load_policy
 from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.controllers.no_control import NoControl
+from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import Scenario, load_scenario
+from nmfd.model.scenario import Scenario
 from nmfd.studies import scaling
-from nmfd.types import Measurement
+from nmfd.types import Observation, Status
 
 SCENARIO = load_scenario(Path(__file__).parents[2] / "scenarios" / "economic_mpc")
 KINDS = pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
@@ -37,12 +39,13 @@ def one_thread():
 @pytest.fixture(scope="module")
 def seen():
     """Measurements of a run without control."""
-    trajectory = run(NmfdPlant(SCENARIO), NoControl(SCENARIO), replace(SCENARIO, steps=WHEN[-1] + 1), seed=0)
+    controller, short = NoControl(planning_model(SCENARIO)), replace(SCENARIO, steps=WHEN[-1] + 1)
+    trajectory = run(NmfdPlant(SCENARIO), controller, short, seed=0)
     return [measurement(trajectory.accumulation[k], k) for k in WHEN]
 
 
 def measurement(x, k=0):
-    return Measurement(step=k, time=30.0 * k, accumulation=x, backlog=np.zeros_like(x))
+    return Observation(step=k, time=30.0 * k, accumulation=x, backlog=np.zeros_like(x))
 
 
 def forecast(scenario, k):
@@ -61,8 +64,8 @@ def random_city(family, regions):
 
 def compare(scenario, measured, guidance):
     """Total time spent over the horizon [veh s] by our MPC, by plain IPOPT, and whether that converged."""
-    controller, k = EconomicMpc(scenario, guidance=guidance), measured.step
-    assert controller.act(measured).status == "ok"
+    controller, k = EconomicMpc(planning_model(scenario), guidance=guidance), measured.step
+    assert controller.act(measured).status == Status.OK
     perimeter, splits, solved = plain.mpc(scenario, guidance=guidance)(
         np.maximum(measured.accumulation, 0.0), forecast(scenario, k))
     rows = [controller.admissible.decision(u, theta) for u, theta in zip(perimeter, splits, strict=True)]
@@ -86,7 +89,7 @@ def test_mpc_has_the_optimum_of_plain_ipopt_in_random_cities(family, regions, gu
 
 
 def test_the_plain_model_is_the_model():
-    trajectory = run(NmfdPlant(SCENARIO), NoControl(SCENARIO), replace(SCENARIO, steps=30), seed=0)
+    trajectory = run(NmfdPlant(SCENARIO), NoControl(planning_model(SCENARIO)), replace(SCENARIO, steps=30), seed=0)
     x = trajectory.accumulation[0]
     for k in range(30):
         x = plain.euler(SCENARIO.network, x, SCENARIO.demand[k], trajectory.perimeter[k], trajectory.splits[k], 30.0)
@@ -112,7 +115,7 @@ class TestMpc:
         benchmark(lambda: [decide(m.accumulation, forecast(SCENARIO, m.step)) for m in seen])
 
     def test_ours(self, benchmark, seen, guidance):
-        controller = EconomicMpc(SCENARIO, guidance=guidance)
+        controller = EconomicMpc(planning_model(SCENARIO), guidance=guidance)
 
         def decide():
             for measured in seen:
@@ -132,7 +135,7 @@ class TestMpcOfManyRegions:
 
     def test_ours(self, benchmark, guidance, regions):
         scenario, measured = random_city("complete", regions)
-        controller = EconomicMpc(scenario, guidance=guidance)
+        controller = EconomicMpc(planning_model(scenario), guidance=guidance)
 
         def decide():
             controller.reset()
@@ -155,7 +158,7 @@ class TestDpc:
 @pytest.mark.benchmark(group="closed loop without control, 240 intervals of 7 regions")
 class TestClosedLoop:
     def test_plain(self, benchmark):
-        controls = NoControl(SCENARIO).act(measurement(np.zeros((7, 7))))
+        controls = NoControl(planning_model(SCENARIO)).act(measurement(np.zeros((7, 7))))
         theta = SCENARIO.network.nominal_splits
 
         def loop():
@@ -166,4 +169,4 @@ class TestClosedLoop:
         benchmark(loop)
 
     def test_ours(self, benchmark):
-        benchmark(lambda: run(NmfdPlant(SCENARIO), NoControl(SCENARIO), SCENARIO, seed=0))
+        benchmark(lambda: run(NmfdPlant(SCENARIO), NoControl(planning_model(SCENARIO)), SCENARIO, seed=0))

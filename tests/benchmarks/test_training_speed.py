@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from nmfd.api import load_scenario
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.rollout import Rollout, compiled_step
-from nmfd.model.scenario import load_scenario
+from nmfd.model.planning import planning_model
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "economic_mpc"
 
@@ -20,7 +21,7 @@ def test_gradient_of_a_rollout(benchmark, compiled):
     torch.set_num_threads(1)
     torch.manual_seed(0)
     scenario = load_scenario(SCENARIO)
-    rollout, policy = Rollout(scenario), Policy(scenario.network, Architecture(guidance=True))
+    rollout, policy = Rollout(planning_model(scenario)), Policy(scenario.network, Architecture(guidance=True))
     step = compiled_step(rollout.step) if compiled else None
 
     def gradient():

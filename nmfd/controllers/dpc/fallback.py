@@ -14,8 +14,8 @@ from nmfd.controllers.dpc.policy import DpcController, Policy, check_guidance, l
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
 from nmfd.model import dynamics
-from nmfd.model.scenario import Scenario
-from nmfd.types import Controls, Measurement
+from nmfd.model.planning import PlanningModel
+from nmfd.types import Controls, Observation, Status
 
 # Added to the variance of every normalised state: 2 % of the critical accumulation is no departure, even in an entry
 # that was always empty in training.
@@ -46,20 +46,20 @@ class Guarded:
 
     Outside: the Mahalanobis distance of the measured state from the training states is beyond its limit, the last
     predictions missed by more than MOST_ERROR, or the total time spent over the next LOOK_AHEAD intervals of the
-    regional model, from the measured state under the scenario's demand, is more than MOST_LOSS above that without
+    regional model, from the measured state under the forecast demand, is more than MOST_LOSS above that without
     control. PI gating starts anew with an open perimeter when it takes over, and hands back after PATIENCE intervals
     inside.
     """
 
-    def __init__(self, policy: Policy, states: dict[str, torch.Tensor], scenario: Scenario):
-        self._policy, self._fallback, self._network = DpcController(policy), PiGating(scenario), policy
+    def __init__(self, policy: Policy, states: dict[str, torch.Tensor], planning: PlanningModel):
+        self._policy, self._fallback, self._network = DpcController(policy), PiGating(planning), policy
         self.name = f"{self._policy.name}-guarded"
         self._scale = policy.scale.numpy().astype(float)
         self._mean, self._precision = states["mean"].numpy(), states["precision"].numpy()
         self._limit = float(states["limit"])
-        self._scenario, network = scenario, scenario.network
+        self._planning, network = planning, planning.network
         self._model = dynamics.parameters(network, dtype=torch.float32)
-        self._demand = torch.tensor(scenario.demand, dtype=torch.float32)
+        self._demand = torch.tensor(planning.forecast, dtype=torch.float32)
         self._open = torch.tensor(np.where(network.adjacency, network.u_max, 0.0), dtype=torch.float32)
         self._own = torch.tensor(network.nominal_splits, dtype=torch.float32)
         self.reset()
@@ -84,8 +84,8 @@ class Guarded:
         far = (accumulation / self._scale).ravel() - self._mean
         return float(np.sqrt(far @ self._precision @ far)) / self._limit
 
-    def act(self, measurement: Measurement) -> Controls:
-        problem = self._problem(measurement)
+    def act(self, observation: Observation) -> Controls:
+        problem = self._problem(observation)
         if problem:
             if self._left == 0:
                 self._fallback.reset()
@@ -93,32 +93,33 @@ class Guarded:
         elif self._left > 0:
             self._left -= 1
         if self._left == 0:
-            controls = self._policy.act(measurement)
+            controls = self._policy.act(observation)
         else:
             reason = problem or f"inside again for {PATIENCE - self._left} of {PATIENCE} intervals"
             controls = replace(
-                self._fallback.act(measurement), status=f"guard: {reason}, pi-gating in control")
-        self._predict(measurement, controls)
+                self._fallback.act(observation), status=Status.FALLBACK,
+                note=f"guard: {reason}, pi-gating in control")
+        self._predict(observation, controls)
         return controls
 
-    def _problem(self, measurement: Measurement) -> str | None:
+    def _problem(self, observation: Observation) -> str | None:
         """Why the policy is not to be trusted now."""
         if self._predicted is not None:
-            missed = (measurement.accumulation.sum(axis=1) - self._predicted) / self._scale[:, 0]
+            missed = (observation.accumulation.sum(axis=1) - self._predicted) / self._scale[:, 0]
             self._error = MEMORY * self._error + (1.0 - MEMORY) * float((missed**2).mean())
-        if (distance := self.distance(measurement.accumulation)) > 1.0:
+        if (distance := self.distance(observation.accumulation)) > 1.0:
             return f"state at {distance:.2f} of the limit"
         if (error := self._error**0.5) > MOST_ERROR:
             return f"predictions miss by {100 * error:.0f} % of the critical accumulation"
-        if (loss := self.foreseen_loss(measurement)) > MOST_LOSS:
+        if (loss := self.foreseen_loss(observation)) > MOST_LOSS:
             return f"expected to take {100 * loss:.0f} % more time than no control"
         return None
 
-    def foreseen_loss(self, measurement: Measurement) -> float:
+    def foreseen_loss(self, observation: Observation) -> float:
         """By how much the policy is expected to exceed the total time spent without control, as a share of it [-]."""
-        start = torch.from_numpy(np.maximum(measurement.accumulation, 0.0)).float()
+        start = torch.from_numpy(np.maximum(observation.accumulation, 0.0)).float()
         x, total = start.expand(2, -1, -1), torch.zeros(2)
-        first = min(measurement.step, len(self._demand) - 1)
+        first = min(observation.step, len(self._demand) - 1)
         with torch.inference_mode():
             for demand in self._demand[first : first + LOOK_AHEAD]:
                 perimeter, splits = self._network(x[0])
@@ -129,30 +130,30 @@ class Guarded:
         policy, none = total.tolist()
         return policy / max(none, 1.0) - 1.0
 
-    def _predict(self, measurement: Measurement, controls: Controls) -> None:
+    def _predict(self, observation: Observation, controls: Controls) -> None:
         splits = self._own if controls.splits is None else torch.from_numpy(controls.splits).float()
-        demand = self._demand[min(measurement.step, len(self._demand) - 1)]
+        demand = self._demand[min(observation.step, len(self._demand) - 1)]
         with torch.inference_mode():
             x = self._advance(
-                torch.from_numpy(measurement.accumulation).float(), demand,
+                torch.from_numpy(observation.accumulation).float(), demand,
                 torch.from_numpy(controls.perimeter).float(), splits)
         self._predicted = x.sum(-1).numpy().astype(float)
 
     def _advance(self, x, demand, perimeter, splits) -> torch.Tensor:
-        scenario = self._scenario
+        planning = self._planning
         return dynamics.advance(
-            self._model, x, demand, perimeter, splits, scenario.step, integrator=scenario.integrator,
-            substeps=scenario.substeps)
+            self._model, x, demand, perimeter, splits, planning.step, integrator=planning.integrator,
+            substeps=planning.substeps)
 
 
-def load(path: Path, scenario: Scenario, *, guidance: bool) -> Guarded:
+def load(path: Path, planning: PlanningModel, *, guidance: bool) -> Guarded:
     """The policy in `path`, guarded. InputError as dpc.load, and if the file holds no statistics of its training."""
-    policy, content = load_policy(path, scenario.network)
+    policy, content = load_policy(path, planning.network)
     check_guidance(policy, path, guidance)
     if "states" not in content:
         raise InputError(f"{path}: holds no statistics of its training states; train it again with 'nmfd train'")
     try:
-        return Guarded(policy, content["states"], scenario)
+        return Guarded(policy, content["states"], planning)
     except (KeyError, TypeError, AttributeError, RuntimeError):
         raise InputError(
             f"{path}: states: are damaged or of another version; train it again with 'nmfd train'") from None

@@ -15,9 +15,9 @@ import torch
 from nmfd.controllers.dpc.policy import DpcController, Policy, check_guidance, load_policy
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.model import dynamics
-from nmfd.model.scenario import Scenario
+from nmfd.model.planning import PlanningModel
 from nmfd.runs import config
-from nmfd.types import Controls, Measurement
+from nmfd.types import Controls, Observation
 
 MEMORY = 0.97  # of what was seen, per control interval: half is forgotten after 23
 TRUST = 1.0    # how much the nominal model weighs: as one interval with 1 % of the critical accumulations flowing
@@ -34,11 +34,11 @@ class ModelEstimate:
     demand, outflow: (R,) [-]
     """
 
-    def __init__(self, scenario: Scenario):
-        self._scenario, self._regions = scenario, scenario.network.regions
-        self._parameters = dynamics.parameters(scenario.network)
-        self._splits = torch.from_numpy(scenario.network.nominal_splits)
-        flowing = 0.01 * np.mean([mfd.critical for mfd in scenario.network.mfds])
+    def __init__(self, planning: PlanningModel):
+        self._planning, self._regions = planning, planning.network.regions
+        self._parameters = dynamics.parameters(planning.network)
+        self._splits = torch.from_numpy(planning.network.nominal_splits)
+        flowing = 0.01 * np.mean([mfd.critical for mfd in planning.network.mfds])
         self._prior = TRUST * flowing**2 * np.eye(2 * self._regions)
         self.reset()
 
@@ -59,7 +59,7 @@ class ModelEstimate:
 
     def _contributions(self, before: np.ndarray, planned: np.ndarray, controls: Controls) -> np.ndarray:
         """(2 R, R, R) [veh]: what the demand of each origin and the outflow of each region add to x in an interval."""
-        step, regions = self._scenario.step, self._regions
+        step, regions = self._planning.step, self._regions
         x = torch.from_numpy(np.maximum(before, 0.0))
         splits = self._splits if controls.splits is None else torch.from_numpy(controls.splits)
         completions, transfers = (flow.numpy() for flow in dynamics.flows(
@@ -73,10 +73,9 @@ class ModelEstimate:
         return parts
 
 
-def options(scenario: Scenario, name: str) -> tuple[int, int, float, int]:
+def options(planning: PlanningModel, name: str) -> tuple[int, int, float, int]:
     """look_ahead, iterations, learning_rate and rollouts (OnlineDpc) in the table of `name`. Raises InputError."""
-    where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-    table = config.Table(scenario.controller_options.get(name, {}), where, f"controllers.{name}.")
+    table = config.Table(planning.controller_options.get(name, {}), planning.where, f"controllers.{name}.")
     found = (
         table.integer("look_ahead", 80, low=1), table.integer("iterations", 2, low=0),
         table.number("learning_rate", 3e-4, above=0.0), table.integer("rollouts", 4, low=1))
@@ -97,14 +96,14 @@ class OnlineDpc:
     demand, outflow: (R,) [-], the present estimate
     """
 
-    def __init__(self, policy: Policy, scenario: Scenario):
+    def __init__(self, policy: Policy, planning: PlanningModel):
         self.name = f"dpc-{'pcrg' if policy.architecture.guidance else 'pc'}-online"
-        self._look_ahead, self._iterations, self._learning_rate, self._count = options(scenario, self.name)
-        self._scenario, self._frozen = scenario, policy.eval()
-        self._rollout = Rollout(scenario)
+        self._look_ahead, self._iterations, self._learning_rate, self._count = options(planning, self.name)
+        self._planning, self._frozen = planning, policy.eval()
+        self._rollout = Rollout(planning)
         self._nominal = self._rollout.parameters
-        self._estimate = ModelEstimate(scenario)
-        self._spread = 0.02 * np.array([[mfd.critical] for mfd in scenario.network.mfds])
+        self._estimate = ModelEstimate(planning)
+        self._spread = 0.02 * np.array([[mfd.critical] for mfd in planning.network.mfds])
         self.reset()
 
     @property
@@ -125,8 +124,8 @@ class OnlineDpc:
         self._generator = torch.Generator().manual_seed(seed)
         self._last: tuple[np.ndarray, Controls, int] | None = None
 
-    def act(self, measurement: Measurement) -> Controls:
-        seen, k = measurement.accumulation, measurement.step
+    def act(self, observation: Observation) -> Controls:
+        seen, k = observation.accumulation, observation.step
         if self._last is not None:
             before, controls, step = self._last
             self._estimate.update(before, seen, self._planned(step), controls)
@@ -138,7 +137,7 @@ class OnlineDpc:
             start = torch.from_numpy(np.maximum(seen, 0.0)).float().unsqueeze(0)
             spent = [float(self._rollout.total_time_spent(policy, start, demand[:, :1], self._generator))
                      for policy in (self._tuned, self._frozen)]
-        controls = self._controllers[0 if spent[0] <= spent[1] else 1].act(measurement)
+        controls = self._controllers[0 if spent[0] <= spent[1] else 1].act(observation)
         self._last = seen, controls, k
         return controls
 
@@ -154,7 +153,7 @@ class OnlineDpc:
 
     def _planned(self, step: int) -> np.ndarray:
         """(R, R) [veh/s] in interval `step`; nothing after the end."""
-        forecast = self._scenario.forecast
+        forecast = self._planning.forecast
         return forecast[step] if step < len(forecast) else np.zeros_like(forecast[0])
 
     def _forecast(self, step: int) -> torch.Tensor:
@@ -167,13 +166,13 @@ class OnlineDpc:
         """The rollouts follow the estimated outflows, as far as the integration step allows."""
         p = self._nominal
         fastest = p.c if p.exit_rates is None else p.c * p.exit_rates.amax(-1)
-        most = 1.0 / (fastest * self._scenario.step / self._scenario.substeps)
+        most = 1.0 / (fastest * self._planning.step / self._planning.substeps)
         factor = torch.minimum(torch.from_numpy(self._estimate.outflow).float(), most)
         self._rollout.parameters = replace(p, a=factor * p.a, b=factor * p.b, c=factor * p.c)
 
 
-def load(path: Path, scenario: Scenario, *, guidance: bool) -> OnlineDpc:
+def load(path: Path, planning: PlanningModel, *, guidance: bool) -> OnlineDpc:
     """The policy in `path`, fine-tuned as it drives. InputError as dpc.load."""
-    policy, _ = load_policy(path, scenario.network)
+    policy, _ = load_policy(path, planning.network)
     check_guidance(policy, path, guidance)
-    return OnlineDpc(policy, scenario)
+    return OnlineDpc(policy, planning)

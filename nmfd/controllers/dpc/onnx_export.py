@@ -14,11 +14,11 @@ import numpy as np
 import torch
 
 from nmfd.controllers.dpc.policy import Policy, load_policy
-from nmfd.errors import InputError
+from nmfd.errors import InputError, RunFailed
 from nmfd.extras import need
-from nmfd.model.scenario import Scenario, as_modelled, load_scenario
+from nmfd.model.planning import PlanningModel, planning_model
+from nmfd.model.scenario import read_scenario
 from nmfd.runs.files import atomic
-from nmfd.runs.workers import RunFailed
 
 OPSET = 18
 TOLERANCE = 1e-5  # [-], of every output against torch: float32, summed in another order
@@ -36,12 +36,12 @@ def export(policy_file: Path, out: Path, scenario_folder: Path | None = None) ->
     the extra `onnx`, and RunFailed, with nothing written, should the graph compute something else than the policy.
     """
     need("nmfd export", "onnx", *MODULES)
-    scenario, content = _scenario(policy_file, scenario_folder)
-    policy, _ = load_policy(policy_file, scenario.network)
+    planning, content = _planning(policy_file, scenario_folder)
+    policy, _ = load_policy(policy_file, planning.network)
     policy.eval()
     with atomic(out) as temporary:
         _write(policy, temporary)
-        _describe(temporary, scenario, str(content["configuration"].get("controller", "dpc")))
+        _describe(temporary, planning, str(content["configuration"].get("controller", "dpc")))
         difference = largest_difference(policy, temporary)
         if not difference <= TOLERANCE:
             raise RunFailed(f"{out}: the graph differs from the policy by {difference:.2g}, more than {TOLERANCE:g}")
@@ -50,8 +50,8 @@ def export(policy_file: Path, out: Path, scenario_folder: Path | None = None) ->
         "samples": SAMPLES, "difference": difference}
 
 
-def _scenario(policy_file: Path, folder: Path | None) -> tuple[Scenario, dict]:
-    """The scenario with the model that the policy was trained on, and the checkpoint."""
+def _planning(policy_file: Path, folder: Path | None) -> tuple[PlanningModel, dict]:
+    """The planning model that the policy was trained on, and the checkpoint."""
     try:
         content = torch.load(policy_file, map_location="cpu", weights_only=True)
         name = str(content["configuration"].get("controller", ""))
@@ -61,7 +61,7 @@ def _scenario(policy_file: Path, folder: Path | None) -> tuple[Scenario, dict]:
         raise InputError(f"{policy_file}: is not a policy file; train one with 'nmfd train'") from None
     if folder is None and not (policy_file.parent / "scenario.toml").is_file():
         raise InputError(f"{policy_file}: lies in no scenario's folder; say for which it was trained with --scenario")
-    return as_modelled(load_scenario(policy_file.parent if folder is None else folder), name), content
+    return planning_model(read_scenario(policy_file.parent if folder is None else folder), name), content
 
 
 def _write(policy: Policy, path: Path) -> None:
@@ -90,15 +90,15 @@ class _Outputs(torch.nn.Module):
         return perimeter if splits is None else (perimeter, splits)
 
 
-def _describe(path: Path, scenario: Scenario, controller: str) -> None:
+def _describe(path: Path, planning: PlanningModel, controller: str) -> None:
     """What the graph is for, as ONNX metadata."""
     import onnx
 
     model = onnx.load(path)
-    network = scenario.network
+    network = planning.network
     onnx.helper.set_model_props(model, {
         "controller": controller, "network": network.name, "network_hash": network.hash, "u_min": f"{network.u_min:g}",
-        "u_max": f"{network.u_max:g}", "control_interval_s": f"{scenario.step:g}", "units": "accumulation [veh], "
+        "u_max": f"{network.u_max:g}", "control_interval_s": f"{planning.step:g}", "units": "accumulation [veh], "
         "[i, j] = in region i bound for j; perimeter [-], [i, h] = u_ih; splits [-], [i, h, j] = theta_ihj"})
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, path)

@@ -14,9 +14,9 @@ import torch
 from torch import nn
 
 from nmfd.errors import InputError
-from nmfd.model.regional_model import Network
-from nmfd.model.scenario import Scenario
-from nmfd.types import Controls, Measurement
+from nmfd.model.planning import PlanningModel
+from nmfd.model.regional_model import RegionalModel
+from nmfd.types import Controls, Observation, Status
 
 FORMAT = 1
 WIDEST, DEEPEST = 10_000, 100  # units per layer, layers: of a policy that fits into memory
@@ -71,7 +71,7 @@ class Policy(nn.Module):
     scale: (R, 1) [veh], the normalisation of the state: the critical accumulation of each region.
     """
 
-    def __init__(self, network: Network, architecture: Architecture):
+    def __init__(self, network: RegionalModel, architecture: Architecture):
         super().__init__()
         regions, width = network.regions, architecture.width
         self.architecture, self.regions = architecture, regions
@@ -140,9 +140,9 @@ class DpcController:
     def reset(self, seed: int = 0) -> None:
         pass
 
-    def act(self, measurement: Measurement) -> Controls:
+    def act(self, observation: Observation) -> Controls:
         with torch.inference_mode():
-            x = torch.from_numpy(measurement.accumulation.astype(np.float32))
+            x = torch.from_numpy(observation.accumulation.astype(np.float32))
             perimeter, splits = self._policy.listed(x)
         perimeter = perimeter.numpy()
         if self.fault == "policy-nan":
@@ -152,7 +152,9 @@ class DpcController:
             sums = splits.sum(axis=1, keepdims=True)
         # The sum is finite if every number is: they are bounded unless they are NaN.
         if not math.isfinite(perimeter.sum()) or (splits is not None and not math.isfinite(sums.sum())):
-            return Controls(perimeter=self._u_max, splits=None, status="dpc: policy returned NaN, perimeter opened")
+            return Controls(
+                perimeter=self._u_max, splits=None, status=Status.SOLVER_FAILURE | Status.FALLBACK,
+                note="dpc: policy returned NaN, perimeter opened")
         if splits is not None:
             splits /= np.maximum(sums, 1e-9)  # float32 sums miss 1 by 1e-7; those of j = i are 0
         return Controls(perimeter=self._full(perimeter), splits=None if splits is None else self._full(splits))
@@ -170,7 +172,7 @@ class DpcController:
         return full
 
 
-def checkpoint(policy: Policy, network: Network, configuration: Mapping, states: Mapping | None = None) -> dict:
+def checkpoint(policy: Policy, network: RegionalModel, configuration: Mapping, states: Mapping | None = None) -> dict:
     """What a policy file holds: weights with the normalisation, architecture, network hash, configuration.
 
     states: of nmfd.controllers.dpc.fallback.statistics, where the policy is to be guarded
@@ -182,7 +184,7 @@ def checkpoint(policy: Policy, network: Network, configuration: Mapping, states:
         "weights": {key: value.detach().cpu().clone() for key, value in policy.state_dict().items()}}
 
 
-def load_policy(path: Path, network: Network) -> tuple[Policy, dict]:
+def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
     """The policy in `path` and its whole checkpoint. InputError if it is none, or was trained for another network.
 
     No code of the file is executed (weights_only).
@@ -220,8 +222,8 @@ def check_guidance(policy: Policy, path: Path, guidance: bool) -> None:
         raise InputError(f"{path}: is a {has} policy, not {wanted}; choose --controller {has} or another file")
 
 
-def load(path: Path, scenario: Scenario, *, guidance: bool) -> DpcController:
+def load(path: Path, planning: PlanningModel, *, guidance: bool) -> DpcController:
     """The controller in the policy file `path`; InputError if it does not fit the scenario's network or the name."""
-    policy, _ = load_policy(path, scenario.network)
+    policy, _ = load_policy(path, planning.network)
     check_guidance(policy, path, guidance)
     return DpcController(policy)

@@ -11,7 +11,7 @@ import torch
 from nmfd.controllers.dpc.policy import Policy
 from nmfd.model import dynamics
 from nmfd.model.demand_noise import entries
-from nmfd.model.scenario import Scenario
+from nmfd.model.planning import PlanningModel
 
 
 class Rollout:
@@ -20,16 +20,16 @@ class Rollout:
     Random numbers are drawn on the CPU, so that they are the same on every device.
     """
 
-    def __init__(self, scenario: Scenario, dtype=torch.float32, device="cpu", detour_cost: float = 0.0):
+    def __init__(self, planning: PlanningModel, dtype=torch.float32, device="cpu", detour_cost: float = 0.0):
         """detour_cost: what a vehicle loses that is guided off the drivers' own split ratios [s]"""
         def tensor(values):
             return torch.tensor(values, dtype=dtype, device=device)
 
-        network = scenario.network
+        network = planning.network
         self.detour_cost = detour_cost
-        self.scenario, self.dtype, self.device = scenario, dtype, torch.device(device)
+        self.planning, self.dtype, self.device = planning, dtype, torch.device(device)
         self.parameters = self._nominal = dynamics.parameters(network, dtype=dtype, device=device)
-        self.demand = tensor(scenario.demand)
+        self.demand = tensor(planning.forecast)
         self.nominal_splits = tensor(network.nominal_splits)
         self.jam = tensor([m.jam for m in network.mfds])
         self.bound = (self.demand.sum((0, 1)) > 0).to(dtype)
@@ -75,7 +75,7 @@ class Rollout:
 
             wide, high = scale * factor(regions), factor(regions, share=0.5)
             # The integration step stays short enough: no rate rises above the largest that the network was checked for.
-            high = high.clamp(max=1.0 / (self._fastest() * self.scenario.step / self.scenario.substeps))
+            high = high.clamp(max=1.0 / (self._fastest() * self.planning.step / self.planning.substeps))
             p = replace(
                 p, a=high * p.a / wide**2, b=high * p.b / wide, c=high * p.c, jam=wide * p.jam,
                 capacity=None if p.capacity is None else p.capacity * factor(regions, regions, share=0.5),
@@ -97,7 +97,7 @@ class Rollout:
             return demand
         everywhere = (torch.arange(demand.shape[1]) % 2 == 1) & (noise_all > 0)
         sigma = level * torch.where(everywhere, noise_all, noise)
-        pairs, every = (torch.tensor(entries(self.scenario.demand, where)[0]) for where in ("pairs", "all"))
+        pairs, every = (torch.tensor(entries(self.planning.forecast, where)[0]) for where in ("pairs", "all"))
         sigma = sigma[:, None, None] * torch.where(everywhere[:, None, None], every, pairs)
         normal = torch.randn(demand.shape, generator=generator, dtype=self.dtype)
         return (demand + (normal * sigma).to(self.device)).clamp(min=0.0)
@@ -107,7 +107,7 @@ class Rollout:
         perimeter, splits = policy(x + noise)
         return dynamics.advance(
             self.parameters, x, demand, perimeter, self.nominal_splits if splits is None else splits,
-            self.scenario.step, integrator=self.scenario.integrator, substeps=self.scenario.substeps)
+            self.planning.step, integrator=self.planning.integrator, substeps=self.planning.substeps)
 
     def states(self, policy: Policy, x, demand, generator, step=None) -> tuple[torch.Tensor, torch.Tensor]:
         """The states (T, B, R, R) [veh] under `policy` from x (B, R, R), and what it saw of them through the noise.
@@ -115,7 +115,7 @@ class Rollout:
         step: what to use instead of `self.step`, such as its compiled form
         """
         noise = torch.randn(demand.shape, generator=generator, dtype=self.dtype).to(self.device)
-        noise *= self.scenario.measurement_std
+        noise *= self.planning.measurement_std
         states = [x]
         for k in range(demand.shape[0] - 1):
             states.append((step or self.step)(policy, states[-1], demand[k], noise[k]))
@@ -128,7 +128,7 @@ class Rollout:
         vehicles = exact.sum((0, -2, -1))
         if self.detour_cost and policy.architecture.guidance:
             vehicles = vehicles + self.detour_cost * self._diverted(exact, policy(seen)[1]).sum((0, -2, -1))
-        return self.scenario.step * vehicles
+        return self.planning.step * vehicles
 
     def _diverted(self, x: torch.Tensor, splits: torch.Tensor) -> torch.Tensor:
         """Vehicles (..., R, R) [veh/s] that leave a region another way than by the drivers' own split ratios."""

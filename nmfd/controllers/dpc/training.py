@@ -17,12 +17,13 @@ from nmfd.controllers.dpc import fallback
 from nmfd.controllers.dpc.policy import ACTIVATIONS, DEEPEST, WIDEST, Architecture, Policy, checkpoint
 from nmfd.controllers.dpc.rollout import Rollout, compiled_step
 from nmfd.controllers.pi_gating import PiGating
-from nmfd.errors import InputError
-from nmfd.model.regional_model import Network
-from nmfd.model.scenario import Scenario, as_modelled
+from nmfd.errors import InputError, RunFailed
+from nmfd.model.planning import PlanningModel, planning_model
+from nmfd.model.regional_model import RegionalModel
+from nmfd.model.scenario import Scenario
 from nmfd.runs import config
 from nmfd.runs.files import atomic, locked, sweep
-from nmfd.runs.workers import RunFailed
+from nmfd.threads import one_thread
 
 VALIDATE_EVERY = 20  # Adam steps
 MOST_STEPS = 10**7
@@ -87,7 +88,7 @@ class Training:
 def settings(scenario: Scenario, controller: str, steps: int | None = None) -> Training:
     """The training settings of `controller` in `scenario`, checked; `steps` overrides.
 
-    controller: one of NAMES, or "NAME+..." if the scenario has a table of that name (nmfd.model.scenario.as_modelled)
+    controller: one of NAMES, or "NAME+..." if the scenario has a table of that name (planning_model)
     """
     name, variant, _ = controller.partition("+")
     if name not in NAMES:
@@ -96,11 +97,15 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         raise InputError(
             f"--controller: {controller!r} needs a table [controllers.\"{controller}\"] in {scenario.folder}/"
             f"scenario.toml that says what is different from {name}; add one, or train {name}")
-    scenario = as_modelled(scenario, controller)
+    return settings_of(planning_model(scenario, controller), controller, steps)
+
+
+def settings_of(planning: PlanningModel, controller: str, steps: int | None = None) -> Training:
+    """As `settings`, of the table [controllers.NAME] as it is in `planning`."""
+    name = controller.partition("+")[0]
     default = Training(noise=ROBUST_NOISE if name.endswith("-robust") else 0.0)
     table = config.Table(
-        scenario.controller_options.get(name, {}), scenario.folder / "scenario.toml" if scenario.folder else
-        Path("scenario"), f"controllers.{controller}.")
+        planning.controller_options.get(name, {}), planning.where, f"controllers.{controller}.")
     chosen = Training(
         width=table.integer("width", default.width, low=1, high=WIDEST),
         layers=table.integer("layers", default.layers, low=1, high=DEEPEST),
@@ -121,7 +126,7 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         from_no_control=table.flag("from_no_control", default.from_no_control),
         from_gating=table.flag("from_gating", default.from_gating))
     table.close()
-    if chosen.from_gating and not scenario.protected:
+    if chosen.from_gating and not planning.protected:
         raise table.error("from_gating", "expected a scenario with protected regions; name them, or leave it out")
     if chosen.from_gating and chosen.from_no_control:
         raise table.error("from_gating", "a policy cannot begin as both, a gate and no control; leave one out")
@@ -135,6 +140,7 @@ def available(device: str) -> str:
     return "cuda" if device == "auto" and torch.cuda.is_available() else device.replace("auto", "cpu")
 
 
+@one_thread()
 def train(
     scenario: Scenario, controller: str, *, seed: int, out: Path, steps: int | None = None, resume: bool = False,
     device: str = "cpu", compiled: bool = False, progress: Callable[[int, int, str], None] | None = None,
@@ -148,20 +154,19 @@ def train(
     weights differ by rounding.
     """
     chosen = settings(scenario, controller, steps)
-    scenario = as_modelled(scenario, controller)
+    planning = planning_model(scenario, controller)
     configuration = {
-        "controller": controller, "scenario": scenario.name, "seed": seed, "compiled": compiled, **asdict(chosen)}
-    torch.set_num_threads(1)  # the matrices are small: more threads only wait for one another
+        "controller": controller, "scenario": planning.name, "seed": seed, "compiled": compiled, **asdict(chosen)}
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     guidance = NAMES[controller.partition("+")[0]]
     architecture = Architecture(
         width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=guidance)
-    policy = Policy(scenario.network, architecture)
+    policy = Policy(planning.network, architecture)
     if chosen.from_no_control:
-        begin_as_no_control(policy, scenario.network)
+        begin_as_no_control(policy, planning.network)
     policy = policy.to(device)
-    rollout = Rollout(scenario, device=device, detour_cost=chosen.detour_cost)
+    rollout = Rollout(planning, device=device, detour_cost=chosen.detour_cost)
     if chosen.from_gating and not resume:
         begin_as_gate(policy, rollout, generator)
     advance = compiled_step(rollout.step) if compiled else rollout.step
@@ -201,7 +206,7 @@ def train(
                     best = score
                     states = fallback.statistics(visited(policy, rollout, chosen, seed))
                     _write(checkpoint(
-                        policy, scenario.network, {**configuration, "validation_veh_s": best}, states), out)
+                        policy, planning.network, {**configuration, "validation_veh_s": best}, states), out)
                 if not last:
                     _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
             if progress:
@@ -213,7 +218,7 @@ def train(
     return out
 
 
-def begin_as_no_control(policy: Policy, network: Network) -> None:
+def begin_as_no_control(policy: Policy, network: RegionalModel) -> None:
     """Let `policy` hardly depend on the state, with nearly open gateways and nearly the drivers' own split ratios."""
     with torch.no_grad():
         policy.perimeter_decoder.weight.mul_(WEAK)
@@ -226,8 +231,8 @@ def begin_as_no_control(policy: Policy, network: Network) -> None:
 
 def begin_as_gate(policy: Policy, rollout: Rollout, generator: torch.Generator) -> None:
     """Let `policy` close the entries of every protected region as this fills, half at the set point of pi-gating."""
-    network, protected = rollout.scenario.network, list(rollout.scenario.protected)
-    set_point = torch.tensor(PiGating(rollout.scenario).set_point, dtype=rollout.dtype, device=rollout.device)
+    network, protected = rollout.planning.network, list(rollout.planning.protected)
+    set_point = torch.tensor(PiGating(rollout.planning).set_point, dtype=rollout.dtype, device=rollout.device)
     counts = rollout.parameters.adjacency.expand(GATE_BATCH, -1, -1)
     optimizer = torch.optim.Adam(policy.parameters(), lr=GATE_RATE)
     for _ in range(GATE_STEPS):

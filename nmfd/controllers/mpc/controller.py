@@ -16,16 +16,17 @@ import numpy as np
 from nmfd.controllers.mpc.edge_model import Turns, build, vehicle_steps, vehicles_at_stake
 from nmfd.controllers.mpc.projected_gradient import AT_REST, Minimum, minimise
 from nmfd.controllers.pi_gating import PiGating
-from nmfd.model.regional_model import Network
-from nmfd.model.scenario import Scenario
+from nmfd.model.planning import PlanningModel
+from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import config
-from nmfd.types import Controls, Measurement
+from nmfd.types import Controls, Observation, Status
 
 ROUNDING = 0.005    # of the smallest jam accumulation: over which the solver sees the kink of the MFD there rounded off
 # The solver stops when, to first order, no admissible plan can save more than this share of the total time spent. A
 # tenth changes the benchmark's total time spent by less than 1 %, either way. At its limits it may stop at ACCEPTABLE.
 TOLERANCE = 1e-6
 ACCEPTABLE = 1e-5
+FAILED = Status.SOLVER_FAILURE | Status.FALLBACK
 FEW = 5.0           # veh: added to the vehicles that a control decides on, where these scale the solver's steps
 
 
@@ -44,14 +45,13 @@ class Options:
     time_limit: float
 
 
-def options(scenario: Scenario, name: str) -> Options:
+def options(planning: PlanningModel, name: str) -> Options:
     """The options of controller `name`, checked; InputError for an unknown key or a wrong value."""
-    where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-    table = config.Table(scenario.controller_options.get(name, {}), where, f"controllers.{name}.")
+    table = config.Table(planning.controller_options.get(name, {}), planning.where, f"controllers.{name}.")
     chosen = Options(
         horizon=table.integer("horizon", 8, low=2, high=1000),
         max_iterations=table.integer("max_iterations", 1000),
-        time_limit=table.number("time_limit", scenario.step, above=0.0))
+        time_limit=table.number("time_limit", planning.step, above=0.0))
     table.close()
     return chosen
 
@@ -62,7 +62,7 @@ class Admissible:
     Without guidance theta is the nominal one.
     """
 
-    def __init__(self, network: Network, model: Turns, *, guidance: bool):
+    def __init__(self, network: RegionalModel, model: Turns, *, guidance: bool):
         self._network, self._model, self._guidance = network, model, guidance
         self._edges = len(model.edges)
         unused = np.setdiff1d(np.arange(network.regions), model.destinations)
@@ -126,7 +126,7 @@ class Admissible:
 
 
 class EconomicMpc:
-    """Economic MPC on the scenario's own regional model and demand (nmfd.types.Controller).
+    """Economic MPC on a regional model and a forecast of the demand (nmfd.types.Controller).
 
     The solver starts from its last plan, moved on by one interval, or from no control where that is better. Where it
     stops short of its tolerance, the status says why; the best plan that it has found, which is never worse than the
@@ -136,26 +136,26 @@ class EconomicMpc:
     count as 0.
     """
 
-    def __init__(self, scenario: Scenario, *, guidance: bool):
+    def __init__(self, planning: PlanningModel, *, guidance: bool):
         """InputError for a wrong option."""
         self.name = "mpc-pcrg" if guidance else "mpc-pc"
-        self.options = options(scenario, self.name)
-        network, horizon = scenario.network, self.options.horizon
-        used = np.flatnonzero(scenario.forecast.sum(axis=(0, 1)) > 0)
+        self.options = options(planning, self.name)
+        network, horizon = planning.network, self.options.horizon
+        used = np.flatnonzero(planning.forecast.sum(axis=(0, 1)) > 0)
         self._used = used if len(used) else np.arange(network.regions)
-        self._demand, self._step, self._steps = scenario.forecast, scenario.step, scenario.steps
+        self._demand, self._step, self._steps = planning.forecast, planning.step, planning.steps
         # With one Euler step per interval, the last controls move vehicles that the horizon does not see arrive.
-        blind = scenario.integrator == "euler" and scenario.substeps == 1
+        blind = planning.integrator == "euler" and planning.substeps == 1
         self._moves = horizon - 1 if blind else horizon
         self._model = build(network, self._used, guidance=guidance)
         rounded = replace(self._model, rounding=ROUNDING * min(mfd.jam for mfd in network.mfds))
-        scheme: dict = {"step": scenario.step, "substeps": scenario.substeps, "integrator": scenario.integrator}
+        scheme: dict = {"step": planning.step, "substeps": planning.substeps, "integrator": planning.integrator}
         self._exact: Callable = partial(vehicle_steps, self._model, **scheme)
         self._rounded: Callable = partial(vehicle_steps, rounded, gradient=True, **scheme)
         self._at_stake: Callable = partial(vehicles_at_stake, self._model, **scheme)
         self.admissible = Admissible(network, self._model, guidance=guidance)
         self._open = self.admissible.open(self._moves)
-        self._gating = PiGating(scenario) if scenario.protected else None
+        self._gating = PiGating(planning) if planning.protected else None
         self.fault: str | None = None  # injected (nmfd.faults)
         self.reset()
 
@@ -163,53 +163,55 @@ class EconomicMpc:
         self._plan, self._left = self._open, 0  # left: intervals of the plan that are still to come
         self._gates = False  # PI gating is in control
 
-    def act(self, measurement: Measurement) -> Controls:
-        start, demand = self.forecast(measurement)
+    def act(self, observation: Observation) -> Controls:
+        start, demand = self.forecast(observation)
         last = np.concatenate([self._plan[1:], self._plan[-1:]]) if self._left else self._open
         if self._left and self._exact(start, demand, self._open)[0] < self._exact(start, demand, last)[0]:
             last = self._open
         try:
             found = self._solve(start, demand, last)
         except (ArithmeticError, ValueError, RuntimeError) as error:  # of NumPy and SciPy, LinAlgError too
-            return self._without(measurement, last, f"solver failed ({type(error).__name__})")
+            return self._without(observation, last, f"solver failed ({type(error).__name__})")
         known = np.isfinite(found.gap)
         solved = found.reason is None or (known and found.gap <= ACCEPTABLE * found.value)
         if not solved and (found.point is last or not known) and found.reason != AT_REST:
-            return self._without(measurement, last, found.reason)
+            return self._without(observation, last, found.reason)
         self._plan, self._left, self._gates = found.point, self._moves - 1, False
-        return self._first(status="ok" if solved else f"{found.reason}: best plan so far used")
+        return self._first() if solved else self._first(
+            Status.SOLVER_FAILURE, f"{found.reason}: best plan so far used")
 
-    def _without(self, measurement: Measurement, last: np.ndarray, reason: str) -> Controls:
+    def _without(self, observation: Observation, last: np.ndarray, reason: str) -> Controls:
         """The controls of an interval for which no plan was found."""
         self._plan = last
         if self._left:
             self._left -= 1
-            return self._first(status=f"{reason}: last plan used")
-        if self._gating is None or not np.isfinite(measurement.accumulation).all():
-            return replace(self._first(), status=f"{reason}: perimeter opened, nominal splits")
+            return self._first(FAILED, f"{reason}: last plan used")
+        if self._gating is None or not np.isfinite(observation.accumulation).all():
+            return self._first(FAILED, f"{reason}: perimeter opened, nominal splits")
         if not self._gates:
             self._gating.reset()
         self._gates = True
         _, splits = self.admissible.controls(self._open[0])
-        return replace(self._gating.act(measurement), splits=splits, status=f"{reason}: pi-gating in control")
+        return replace(
+            self._gating.act(observation), splits=splits, status=FAILED, note=f"{reason}: pi-gating in control")
 
-    def _first(self, status: str = "ok") -> Controls:
+    def _first(self, status: Status = Status.OK, note: str = "") -> Controls:
         """The first interval of the plan."""
         perimeter, splits = self.admissible.controls(self._plan[0])
-        return Controls(perimeter=perimeter, splits=splits, status=status)
+        return Controls(perimeter=perimeter, splits=splits, status=status, note=note)
 
     def cost(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> float:
         """Total time spent over the horizon [veh s] by the exact model, under a plan (moves, E + V)."""
         return self._step * self._exact(start, demand, plan)[0]
 
-    def forecast(self, measurement: Measurement) -> tuple[np.ndarray, np.ndarray]:
+    def forecast(self, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
         """The cells (C,) [veh] now and the demand (horizon, C) [veh/s] of them, as edge_model numbers them."""
-        first, horizon = min(measurement.step, self._steps), self.options.horizon
+        first, horizon = min(observation.step, self._steps), self.options.horizon
         known = self._demand[first:first + horizon]
         demand = np.zeros((horizon, *known.shape[1:]))
         demand[:len(known)] = known
-        demand[0] += measurement.backlog / self._step
-        start = np.maximum(measurement.accumulation, 0.0)[:, self._used].ravel()
+        demand[0] += observation.backlog / self._step
+        start = np.maximum(observation.accumulation, 0.0)[:, self._used].ravel()
         return start, demand[:, :, self._used].reshape(horizon, -1)
 
     def _solve(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> Minimum:

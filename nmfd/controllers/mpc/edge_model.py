@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, Network
+from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 # Weights of the slopes of an explicit Runge-Kutta scheme, and where each slope but the first is taken, in steps along
 # the slope before it.
@@ -50,7 +50,7 @@ class Turns:
     rounding: float
 
 
-def build(network: Network, destinations: np.ndarray, *, guidance: bool) -> Turns:
+def build(network: RegionalModel, destinations: np.ndarray, *, guidance: bool) -> Turns:
     """The turns of vehicles bound for `destinations` (J,): all possible ones with guidance, else the nominal ones."""
     regions, count = network.regions, len(destinations)
     in_use = np.isin(np.arange(regions), destinations)
