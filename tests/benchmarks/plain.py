@@ -87,7 +87,7 @@ def dpc(policy: Policy) -> Callable:
 
 
 def euler(network: RegionalModel, x: np.ndarray, demand: np.ndarray, u: np.ndarray, theta: np.ndarray, step: float):
-    """x (R, R) [veh] after `step` [s], from the equations of design.md, section 2, term by term."""
+    """x (R, R) [veh] after `step` [s], from the equations of nmfd.model.dynamics, term by term."""
     regions, neighbours = network.regions, [np.flatnonzero(row) for row in network.adjacency]
     q = [float(mfd.rate(x[i].sum())) for i, mfd in enumerate(network.mfds)]
     change = demand.copy()

@@ -1,0 +1,83 @@
+"""The decisions of economic MPC by IPOPT, on the formulation as it is published: the reference of our own solver.
+
+Multiple shooting on the CasADi twin of the regional model (nmfd.model.dynamics_casadi): every x_ij, u_ih and theta_ihj
+of every interval is a variable, the dynamics are constraints, and MUMPS factorises the whole horizon at every step. Two
+orders of magnitude slower than projected_gradient; `solver = "ipopt"` in the options of an MPC chooses it.
+"""
+
+import casadi as ca
+import numpy as np
+
+from nmfd.model import dynamics_casadi as model
+from nmfd.model.planning import PlanningModel
+
+UNIT = 1000.0  # veh: the accumulations of the solver, for its scaling
+
+
+class Ipopt:
+    """Minimises the vehicles in the network, summed over the ends of `horizon` intervals."""
+
+    def __init__(
+        self, planning: PlanningModel, *, guidance: bool, horizon: int, iterations: int = 200,
+        seconds: float | None = None,
+    ):
+        """iterations: at most; seconds: deadline of a decision [s], none if None"""
+        network = planning.network
+        self._network, self._horizon, self._guidance = network, horizon, guidance
+        self._edges, self._turns = np.argwhere(network.adjacency), np.argwhere(network.split_mask & guidance)
+        regions, p = network.regions, model.parameters(network)
+        start, demand = ca.SX.sym("start", regions, regions), ca.SX.sym("demand", regions, regions * horizon)
+        variables, constraints, total, x = [], [], 0.0, start
+        for k in range(horizon):
+            u, theta = ca.SX.sym(f"u{k}", len(self._edges)), ca.SX.sym(f"theta{k}", len(self._turns))
+            splits, sums = self._splits(theta)
+            after = ca.SX.sym(f"x{k}", regions, regions)
+            moved = model.advance(
+                p, UNIT * x, demand[:, k * regions:(k + 1) * regions], self._perimeter(u), splits, planning.step,
+                integrator=planning.integrator, substeps=planning.substeps)
+            constraints += [*sums, ca.vec(ca.densify(moved) / UNIT - after)]
+            total, x = total + ca.sum1(ca.vec(after)), after
+            variables += [u, theta, ca.vec(after)]
+        edges, turns, cells = len(self._edges), len(self._turns), regions**2
+        self._lower = np.tile([network.u_min] * edges + [0.0] * (turns + cells), horizon)
+        self._upper = np.tile([network.u_max] * edges + [1.0] * turns + [np.inf] * cells, horizon)
+        limits = {"max_iter": iterations} | ({} if seconds is None else {"max_wall_time": seconds})
+        self._solver = ca.nlpsol("mpc", "ipopt", {
+            "x": ca.vertcat(*variables), "p": ca.vertcat(ca.vec(start), ca.vec(demand)), "f": total,
+            "g": ca.vertcat(*constraints)},
+            {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", **limits}})
+
+    def solve(self, state: np.ndarray, demand: np.ndarray) -> tuple[np.ndarray, np.ndarray, str | None]:
+        """u (H, R, R) [-], theta (H, R, R, R) [-], and why IPOPT stopped short of convergence, or None.
+
+        state: (R, R) [veh]; demand: (H, R, R) [veh/s]
+        """
+        network, regions, horizon = self._network, self._network.regions, self._horizon
+        guess = np.concatenate([
+            np.full(len(self._edges), network.u_max), network.nominal_splits[tuple(self._turns.T)],
+            state.T.ravel() / UNIT])
+        answer = self._solver(
+            x0=np.tile(guess, horizon), p=np.concatenate([state.T.ravel() / UNIT, *(d.T.ravel() for d in demand)]),
+            lbx=self._lower, ubx=self._upper, lbg=0.0, ubg=0.0)["x"].full().reshape(horizon, -1)
+        stats, edges, turns = self._solver.stats(), self._edges, self._turns
+        perimeter, splits = np.zeros((horizon, regions, regions)), np.tile(network.nominal_splits, (horizon, 1, 1, 1))
+        perimeter[:, edges[:, 0], edges[:, 1]] = answer[:, :len(edges)]
+        splits[:, turns[:, 0], turns[:, 1], turns[:, 2]] = answer[:, len(edges):len(edges) + len(turns)]
+        return perimeter, splits, None if stats["success"] else f"IPOPT: {stats['return_status']}"
+
+    def _perimeter(self, u: ca.SX) -> ca.SX:
+        perimeter = ca.SX(*self._network.adjacency.shape)
+        for n, (i, h) in enumerate(self._edges.tolist()):
+            perimeter[i, h] = u[n]
+        return perimeter
+
+    def _splits(self, theta: ca.SX) -> tuple[list[ca.SX], list[ca.SX]]:
+        """R matrices (R, R), and what must be 0 for their shares to have the sum 1."""
+        regions = self._network.regions
+        if not self._guidance:
+            return [ca.SX(rows) for rows in model.splits_list(self._network.nominal_splits)], []
+        splits = [ca.SX(regions, regions) for _ in range(regions)]
+        for n, (i, h, j) in enumerate(self._turns.tolist()):
+            splits[i][h, j] = theta[n]
+        return splits, [
+            ca.sum1(splits[i][:, j]) - 1.0 for i in range(regions) for j in range(regions) if i != j]
