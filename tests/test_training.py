@@ -1,6 +1,7 @@
 """What a training draws, descends and keeps: every number from its definition, on a scenario of two regions."""
 
 import math
+import shutil
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import tiny
 import torch
 
 from nmfd.api import load_scenario
+from nmfd.controllers.dpc import rollout as rollout_module
 from nmfd.controllers.dpc import training
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.rollout import Rollout
@@ -118,6 +120,62 @@ def test_noise_on_the_demand(scenario, generator):
     assert both[:, 1::2].std(dim=(0, 1)).flatten().tolist() == pytest.approx([4.0] * 4, rel=0.05)
     empty = rollout.perturb(0.0 * demand, torch.ones(4000, dtype=torch.float64), 2.0, 0.0, generator)
     assert empty.min() == 0.0 and empty.max() > 0.0
+
+
+def test_models_are_drawn_around_the_nominal_one(scenario, generator):
+    """The accumulation axis by exp(0.2 n), the outflow by half of that, n cut at two deviations."""
+    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
+    nominal = rollout.parameters
+    rollout.draw_model(8000, 0.2, generator, scale=0.5)
+    p = rollout.parameters
+    wide, high = torch.log(p.jam / nominal.jam / 0.5), torch.log(p.c / nominal.c)
+    for factor, most in ((wide, 0.4), (high, 0.2)):
+        assert factor.min().item() == pytest.approx(-most) and factor.max().item() == pytest.approx(most)
+        assert factor.mean().item() == pytest.approx(0.0, abs=0.01)
+    assert torch.corrcoef(torch.stack([wide[:, 0], wide[:, 1], high[:, 0]])).triu(1).abs().max() < 0.05
+    assert p.capacity is None and p.storage is None
+
+
+@pytest.mark.parametrize("rates", [None, 1.5], ids=["one rate", "exit rates"])
+def test_no_drawn_model_is_too_fast_for_the_step(scenario, generator, rates):
+    """A free rate of 0.9 per integration step, half of the draws above it: all above 1 are cut down to 1."""
+    fastest = 0.9 / scenario.step * scenario.substeps
+    network = replace(
+        scenario.network, exit_rates=None if rates is None else np.array([[1.0, rates], [rates, 0.5]]),
+        mfds=tuple(replace(m, c=fastest / (rates or 1.0)) for m in scenario.network.mfds))
+    rollout = Rollout(planning_model(replace(scenario, network=network)), dtype=torch.float64)
+    rollout.draw_model(500, 0.8, generator)
+    drawn = rollout.parameters.c * (rates or 1.0) * scenario.step / scenario.substeps
+    assert drawn.max().item() == pytest.approx(1.0) and drawn.min() < 0.6
+    assert 0.2 < (drawn > 0.999).double().mean() < 0.6
+
+
+@pytest.mark.parametrize("rates", [1.0, 2.0])
+def test_half_of_the_moved_shares_are_diverted(scenario, rates):
+    """100 vehicles leave at 0.003 / s; own shares are all to 1, theta sends 0.4 of them elsewhere."""
+    network = replace(scenario.network, exit_rates=np.full((2, 2), rates),
+                      mfds=tuple(replace(m, a=0.0, b=0.0, c=0.003) for m in scenario.network.mfds))
+    rollout = Rollout(planning_model(replace(scenario, network=network)), dtype=torch.float64)
+    x = torch.zeros(1, 2, 2, dtype=torch.float64)
+    x[0, 0, 1] = 100.0
+    own, theta = torch.zeros(2, 1, 2, 2, 2, dtype=torch.float64)
+    own[0, 0, 1, 1], theta[0, 0, 1, 1], theta[0, 0, 0, 1] = 1.0, 0.6, 0.4
+    rollout.nominal_splits = own[0]
+    diverted = rollout._diverted(x, theta)
+    assert diverted[0, 0, 1].item() == diverted.sum() == pytest.approx(0.4 * 0.003 * 100.0 * rates)
+
+
+def test_compilation_is_tried_out_where_there_is_a_compiler(monkeypatch):
+    asked = []
+    monkeypatch.setattr(rollout_module, "compiled_step", lambda step: lambda x: asked.append(step(x).tolist()))
+    monkeypatch.setenv("CXX", "my-compiler")
+    monkeypatch.setattr(shutil, "which", lambda name: name if name == "my-compiler" else None)
+    assert rollout_module.can_compile() and asked == [[-1.0]]
+    monkeypatch.delenv("CXX")
+    assert not rollout_module.can_compile() and len(asked) == 1
+    monkeypatch.setattr(shutil, "which", lambda name: name)
+    monkeypatch.setattr(rollout_module, "compiled_step", lambda step: step / 0)
+    assert not rollout_module.can_compile()
 
 
 def test_the_total_time_spent_is_that_of_the_states(scenario, generator):
