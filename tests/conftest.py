@@ -4,6 +4,7 @@ import os
 import sys
 
 import pytest
+from xdist.workermanage import NodeManager
 
 sys.dont_write_bytecode = False  # else every process rewrites the asserts of all files anew, for 6 s
 # Here and in the commands that tests call: workers must not fight for cores. Torch reads it when it is imported.
@@ -17,6 +18,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--no-skips", action="store_true", help="a skipped test fails, unless a GPU or a real city is missing")
     parser.addoption(
         "--may-skip", action="append", default=[*ALLOWED], metavar="REASON", help="nor does it fail for this reason")
+
+
+def pytest_keyboard_interrupt() -> None:
+    NodeManager.EXIT_TIMEOUT = 0.1  # s, that workers have to end: they are in the middle of a test; usually it is 10 s
 
 
 def _fail_if_skipped(report: pytest.TestReport | pytest.CollectReport, config: pytest.Config) -> None:
