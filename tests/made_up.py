@@ -3,14 +3,16 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import trajectories
 
-from cosim.evaluation import evaluate, experiment
+from cosim.evaluation import evaluate, experiment, statistics
 from cosim.evaluation.simulate import FACTS, Result, scenario_of
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import load_city
 from nmfd.api import load_scenario
+from nmfd.runs.run_folder import COLUMNS
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
 STEPS = 5
@@ -62,3 +64,11 @@ def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1
         evaluate.evaluate(evaluate.Evaluation(
             scenario=SCENARIO, controllers=controllers, seeds=seeds, levels=levels, steps=STEPS, out=out))
     return out
+
+
+def rows_of(values: dict[tuple[float, str], dict[int, float]]) -> pd.DataFrame:
+    """(level, controller) -> seed -> TTS; everything else is 1 or empty."""
+    blank = {name: 1.0 for name in (*COLUMNS, *FACTS)} | dict.fromkeys(("teleports", *statistics.COUNTED), 0)
+    return pd.DataFrame([
+        blank | {"demand": level, "controller": name, "seed": seed, statistics.TTS: tts}
+        for (level, name), seeds in values.items() for seed, tts in seeds.items()])

@@ -8,9 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import trajectories
-from click.testing import CliRunner
+from commands import cosim
 
-from cosim.cli.main import main
 from cosim.evaluation import evaluate, experiment
 from cosim.evaluation.simulate import FACTS, Result
 from cosim.plant.record import Record
@@ -27,10 +26,6 @@ def change(file: Path, pattern: str, new: str) -> None:
     text, count = re.subn(pattern, new, file.read_text(), count=1)
     assert count == 1
     file.write_text(text)
-
-
-def cosim(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 @pytest.fixture
@@ -151,7 +146,7 @@ def test_a_small_evaluation_in_sumo(city, tmp_path):
     file.write_text(re.sub(r"ramp_up = [\d.]+", "ramp_up = 60.0", file.read_text()))
     change(file, r"outflow_share = [\d.]+", "set_point = [20.0]")
     out = tmp_path / "out"
-    arguments = ("evaluate", city, "--controllers", "no-control,pi-gating", "--seeds", "2", "--steps", "3", "--workers",
+    arguments = ("evaluate", city, "--controllers", "no-control,pi-gating", "--seeds", "2", "--steps", "2", "--workers",
                  "1", "--out", out)
     result = cosim(*arguments)
     assert result.exit_code == 0, result.output + str(result.exception)

@@ -15,7 +15,7 @@ import pytest
 import tiny
 import tiny_city
 import torch
-from click.testing import CliRunner
+from commands import call
 
 import cosim.cli.main
 import nmfd.cli.main
@@ -39,10 +39,6 @@ from nmfd.runs import run_folder
 from nmfd.types import Controls, Observation
 
 MAINS = {"nmfd": nmfd.cli.main.main, "cosim": cosim.cli.main.main}
-
-
-def call(program, *arguments):
-    return CliRunner().invoke(MAINS[program], [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")

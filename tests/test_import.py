@@ -11,9 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import tiny_city
-from click.testing import CliRunner
+from commands import cosim, error_line, good
 
-from cosim.cli.main import main
 from cosim.importing import level
 from cosim.importing.case import read_case
 from cosim.importing.demand import read_traffic
@@ -27,21 +26,6 @@ from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.types import Controls
-
-
-def cosim(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
-def good(result):
-    assert result.exit_code == 0, result.output + result.stderr + str(result.exception)
-    return result.stdout
-
-
-def error_line(result):
-    assert result.exit_code == 2, result.output + str(result.exception)
-    assert result.stderr.startswith("cosim: error: ") and result.stderr.count("\n") == 1, result.stderr
-    return result.stderr
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_actuate import MIN_GREEN, check
+from signal_rules import MIN_GREEN, check
 
 from cosim.plant.guidance import shifted
 from cosim.plant.plant import SumoPlant
@@ -196,7 +196,7 @@ def test_compliance_zero_reroutes_nobody(scenario, plant_of):
 
 def test_guided_vehicles_are_asked_again(scenario, plant_of):
     """The ledger is checked at every step; who was told something else counts for the last only."""
-    plant = plant_of()
+    plant, scenario = plant_of(), replace(scenario, steps=2)
     _, once = drive(plant, scenario, guidance=True)
     plant.close()
     asked = plant_of(guidance_period=5.0)
@@ -209,7 +209,7 @@ def test_guided_vehicles_are_asked_again(scenario, plant_of):
 
 def test_same_seed_same_city(scenario, plant_of):
     plant = plant_of()
-    runs = [drive(plant, scenario, seed=seed, guidance=True) for seed in (3, 3, 4)]
+    runs = [drive(plant, replace(scenario, steps=2), seed=seed, guidance=True) for seed in (3, 3, 4)]
     final = [measurements[-1].accumulation.tolist() for measurements, _ in runs]
     assert final[0] == final[1] != final[2]
     assert (runs[0][1].gateway_flow == runs[1][1].gateway_flow).all()
