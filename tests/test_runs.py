@@ -116,7 +116,8 @@ def test_a_folder_of_an_older_version_says_what_to_run(tmp_path, plant, command)
         (tmp_path / "manifest.json").write_text(json.dumps({
             "configuration": {"plant": plant}, "controllers": {"no-control": {}, "pi-gating": {}},
             "sessions": [{"scenario_folder": "scenarios/x"}]}))
-    for use in (lambda: run_folder.read_trajectory(tmp_path / "no-control-0.nc"), lambda: opened(tmp_path).__enter__()):
+    for use in (lambda: run_folder.read_trajectory(tmp_path / "no-control-0.nc"), lambda: opened(tmp_path).__enter__(),
+                lambda: run_folder.read_summary(tmp_path / "summary.csv")):
         with pytest.raises(InputError, match=f"older version .*; delete it and run again: {command}$"):
             use()
 
