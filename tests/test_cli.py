@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from click.testing import CliRunner
+from commands import nmfd
 
 from nmfd import closed_loop
-from nmfd.cli.main import main
 from nmfd.controllers import registry
 from nmfd.controllers.dpc import rollout, training
 from nmfd.controllers.pi_gating import PiGating
@@ -26,10 +25,6 @@ COLUMNS = (
     "controller,seed,plant,total_time_spent_veh_s,final_accumulation_veh,max_accumulation_veh,completed_veh,"
     "evaluation_time_s,control_step_ms_median,control_step_ms_max,solver_failures,fallbacks,"
     "late_decisions,sensor_faults,plant_faults")
-
-
-def nmfd(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 @pytest.fixture

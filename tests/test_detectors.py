@@ -89,8 +89,9 @@ def test_all_links_and_all_probes_see_everything(scenario):
     seen = []
     try:
         state, controller = plant.reset(3), PiGating(planning_model(scenario))
-        readings = plant._detectors.readings
-        plant._detectors.readings = lambda flow: (seen.append(readings(flow)), seen[-1])[1]
+        detectors = plant._sensing._estimation._detectors
+        readings = detectors.readings
+        detectors.readings = lambda flow: (seen.append(readings(flow)), seen[-1])[1]
         for _ in range(scenario.steps):
             before, state = state, plant.step(controller.act(plant.observe()))
         estimate = plant.observe()
@@ -150,7 +151,7 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
     scenario = scenario_of(tasks[0])
     found = simulate(tasks[0]).trajectory
     for model, same in zip(models, (True, False), strict=True):
-        plant = SumoPlant(scenario, overrides=replace(settings(scenario), measurement="estimate"),
+        plant = SumoPlant(scenario, overrides=settings(scenario).changed(measurement="estimate"),
                           planning=replace(planning_model(scenario), network=model))
         try:
             again = closed_loop.run(plant, registry.make("route-guidance", scenario), scenario, seed=3)

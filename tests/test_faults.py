@@ -15,7 +15,7 @@ import pytest
 import tiny
 import tiny_city
 import torch
-from click.testing import CliRunner
+from commands import call
 
 import cosim.cli.main
 import nmfd.cli.main
@@ -39,10 +39,6 @@ from nmfd.runs import run_folder
 from nmfd.types import Controls, Observation
 
 MAINS = {"nmfd": nmfd.cli.main.main, "cosim": cosim.cli.main.main}
-
-
-def call(program, *arguments):
-    return CliRunner().invoke(MAINS[program], [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -258,7 +254,7 @@ def city(tmp_path_factory):
 def in_sumo(city, *ordered, perimeter=None, watch=None, **changed):
     """The measurements and the record of a run with these faults; watch(plant) is called when it begins."""
     scenario = replace(city, faults=ordered)
-    plant = SumoPlant(scenario, overrides=replace(settings(scenario), **changed))
+    plant = SumoPlant(scenario, overrides=settings(scenario).changed(**changed))
     opened = np.where(city.network.adjacency, city.network.u_max if perimeter is None else perimeter, 0.0)
     try:
         states = [plant.reset(0)]

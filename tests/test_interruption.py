@@ -17,10 +17,8 @@ import pytest
 import tiny
 import tiny_city
 import torch
-from click.testing import CliRunner
+from commands import MAINS, call, good, killed
 
-import cosim.cli.main
-import nmfd.cli.main
 from cosim.plant.plant import SumoPlant
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc import training
@@ -29,49 +27,6 @@ from nmfd.runs import files, run_folder, scratch, workers
 from nmfd.runs.files import TEMPORARY
 from nmfd.runs.run_folder import LOCK
 from nmfd.runs.scratch import Scratch, sweep
-
-MAINS = {"nmfd": nmfd.cli.main.main, "cosim": cosim.cli.main.main}
-
-
-def call(program, *arguments):
-    return CliRunner().invoke(MAINS[program], [str(argument) for argument in arguments])
-
-
-def good(result):
-    assert result.exit_code == 0, result.output + repr(result.exception)
-    return result
-
-
-def killed(*command, write: int | None = None, behind: bool = False, after: float = 60.0) -> bool:
-    """Run a command in a forked process that is killed: beside its `write`-th write, or after so many seconds.
-
-    behind: when that write has got its name, else just before. False if it ended before.
-    """
-    child = os.fork()
-    if child == 0:
-        with suppress(BaseException):
-            writes, replace = [0], os.replace
-
-            def replace_or_die(source, target):
-                writes[0] += 1
-                if behind and writes[0] == write:
-                    replace(source, target)
-                if writes[0] == write:
-                    os.kill(os.getpid(), signal.SIGKILL)
-                replace(source, target)
-
-            os.replace = replace_or_die
-            call(*command)
-        os._exit(0)
-    deadline = time.monotonic() + after
-    while time.monotonic() < deadline:
-        ended, status = os.waitpid(child, os.WNOHANG)
-        if ended:
-            return os.WIFSIGNALED(status)
-        time.sleep(0.005)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return True
 
 
 def everything_readable(folder: Path) -> None:

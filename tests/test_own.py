@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import tiny
 from click.testing import CliRunner
+from commands import nmfd
 
 import cosim.cli.main
 from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.cli.main import main
 from nmfd.controllers import custom, registry
 from nmfd.controllers.template import MyController
 from nmfd.errors import InputError
@@ -31,10 +31,6 @@ class Mine:
     def act(self, measurement):
         return Controls(perimeter=np.full(self.shape, 0.5, dtype=np.float32), splits=None)
 """
-
-
-def nmfd(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 @pytest.fixture

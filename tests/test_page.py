@@ -10,26 +10,15 @@ from html.parser import HTMLParser
 import made_up
 import pandas as pd
 import pytest
-from click.testing import CliRunner
-from test_tables import rows_of
+from commands import cosim, error_line
+from made_up import rows_of
 
-from cosim.cli.main import main
 from cosim.evaluation import results
 from cosim.evaluation import statistics as tables
 from cosim.report import html, markup, summary_text
 
 VOID = {"meta", "link", "img", "br"}
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-
-
-def cosim(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
-def error_line(result):
-    assert result.exit_code == 2, result.output + str(result.exception)
-    assert result.stderr.startswith("cosim: error: ") and result.stderr.count("\n") == 1, result.stderr
-    return result.stderr
 
 
 class Page(HTMLParser):

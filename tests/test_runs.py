@@ -11,28 +11,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trajectories
 import xarray as xr
+from trajectories import trajectory
 
 from cosim.plant.record import Record
 from nmfd import quantities
 from nmfd.cli.progress import ProgressLine, progress_line
 from nmfd.errors import InputError
 from nmfd.runs import files, run_folder, workers
-from nmfd.types import Status, Trajectory
+from nmfd.types import Trajectory
 
 ROOT = Path(__file__).parents[1]
 CONFIGURATION = {"scenario": "x", "step": 30.0, "protected": (1, 2)}
-
-
-def trajectory(controller="no-control", seed=0, steps=4):
-    rng = np.random.default_rng(seed)
-    return trajectories.made(
-        controller=controller, plant="nmfd", seed=seed, step=30.0, accumulation=rng.random((steps + 1, 2, 2)),
-        backlog=np.zeros((steps + 1, 2, 2)), completed=np.arange(steps + 1.0), perimeter=rng.random((steps, 2, 2)),
-        splits=rng.random((steps, 2, 2, 2)), decision_time=rng.random(steps), note=("",) * (steps - 1) + ("no",),
-        status=np.array([0] * (steps - 1) + [(Status.SOLVER_FAILURE | Status.FALLBACK).value]),
-        wall_time=1.0)
 
 
 def opened(path, *, controllers=("no-control",), seeds=(0,), settings=None):

@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 import trajectories
 from click.testing import CliRunner
-from test_interruption import killed
+from commands import killed
 
 from cosim.cli.main import main
 from cosim.evaluation import dask_worker, sweeps

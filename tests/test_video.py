@@ -3,9 +3,9 @@
 import made_up
 import numpy as np
 import pytest
+from commands import cosim, error_line
 from matplotlib.colors import to_rgb
 from PIL import Image
-from test_page import cosim, error_line
 
 from cosim.evaluation import results as finished
 from cosim.evaluation.experiment import read_run

@@ -4,7 +4,7 @@ import numpy as np
 
 from cosim.plant.record import Record
 from nmfd.quantities import quantities
-from nmfd.types import Trajectory
+from nmfd.types import Status, Trajectory
 
 
 def made(**fields) -> Trajectory:
@@ -21,3 +21,13 @@ def record(steps: int, *, regions: int, gateways: int = 3, edges: int = 5) -> di
     sizes, random = {"interval": steps, "gateway": gateways, "edge": edges}, np.random.default_rng(0)
     return {name: random.random([sizes.get(axis, regions) for axis in about["dimensions"]])
             for name, about in quantities(Record).items()}
+
+
+def trajectory(controller="no-control", seed=0, steps=4):
+    rng = np.random.default_rng(seed)
+    return made(
+        controller=controller, plant="nmfd", seed=seed, step=30.0, accumulation=rng.random((steps + 1, 2, 2)),
+        backlog=np.zeros((steps + 1, 2, 2)), completed=np.arange(steps + 1.0), perimeter=rng.random((steps, 2, 2)),
+        splits=rng.random((steps, 2, 2, 2)), decision_time=rng.random(steps), note=("",) * (steps - 1) + ("no",),
+        status=np.array([0] * (steps - 1) + [(Status.SOLVER_FAILURE | Status.FALLBACK).value]),
+        wall_time=1.0)

@@ -13,9 +13,9 @@ import pandas as pd
 from cosim.evaluation import estimation_errors
 from cosim.evaluation.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.plant import incidents
-from cosim.plant.plant import own_vehicles
+from cosim.plant.launch import own_vehicles
 from cosim.plant.record import Record
-from cosim.plant.settings import Settings, settings
+from cosim.plant.settings import FILES, Settings, settings
 from cosim.plant.strategy import MAX_PRESSURE, configured, parse
 from cosim.sumo import outputs
 from cosim.sumo.build import ensure_built
@@ -179,13 +179,9 @@ def _plain(chosen: Settings, folder: Path | None) -> dict:
 
     Only these, so that a new kind of setting does not make old runs another city's.
     """
-    usual, found = vars(Settings()), {}
-    for key, value in vars(chosen).items():
-        if value != usual[key]:
-            found[key] = list(value) if isinstance(value, tuple) else value
-            if key in ("routes", "background", "additional"):
-                found[key] = [disk.file_hash(folder / name) for name in value]
-    return found
+    found = chosen.model_dump(mode="json", exclude_defaults=True)
+    hashes = {key: [disk.file_hash(folder / name) for name in found[key]] for key in FILES if key in found}
+    return {**found, **hashes}
 
 
 def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress) -> Iterator[tuple]:

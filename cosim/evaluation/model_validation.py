@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import torch
 
 from cosim.evaluation import mfd_bands
 from cosim.evaluation.simulate import Result
@@ -56,8 +57,6 @@ def predict(scenario: Scenario, result: Result) -> Trajectory:
 
 def predict_next(scenario: Scenario, result: Result, intervals: int = 1) -> np.ndarray:
     """(T + 1 - intervals, R) [veh]: accumulations `intervals` ahead of every recorded state, by the regional model."""
-    import torch
-
     trajectory, steps = result.trajectory, len(result.trajectory.perimeter)
     x = torch.from_numpy(trajectory.accumulation[: steps + 1 - intervals])
     demand = torch.from_numpy(result.record["departures"] / scenario.step)

@@ -4,6 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cosim.plant.actuation import Actuation
+from cosim.plant.guidance import Guide
+from cosim.plant.meter import Meter
+from cosim.plant.sampling import StreetMeans
 from nmfd.quantities import quantity
 
 
@@ -35,3 +39,36 @@ class Record:
     teleports: np.ndarray = quantity("interval", unit="1", text="vehicles that SUMO took out of a jam")
     guided: np.ndarray = quantity(
         "interval", "region", "next_region", "destination", unit="veh", text="reroutes by route guidance")
+
+
+class Recorder:
+    """Adds up a record: `add` at the end of every control interval."""
+
+    def __init__(self, meter: Meter, guide: Guide, actuation: Actuation):
+        self._meter, self._guide, self._actuation = meter, guide, actuation
+        self._rows: list[dict[str, np.ndarray]] = []
+        self._before = self._totals()
+
+    def add(self, streets: StreetMeans) -> None:
+        """streets: means of the interval that has just ended; all else is what was added since the last call"""
+        totals = self._totals()
+        added = {key: total - self._before[key] for key, total in totals.items()}
+        self._rows.append({
+            **added, "gateway_green": self._actuation.as_shown(added["gateway_green"]),
+            "gateway_original_green": self._actuation.original_green,
+            "production": streets.production, "mean_accumulation": streets.accumulation,
+            "edge_vehicles": streets.vehicles.astype(np.float16),  # to 0.1 % and as small as an integer
+            "gateway_queue": streets.queue, "gateway_queue_max": streets.queue_max})
+        self._before = totals
+
+    def record(self) -> Record:
+        """Of all control intervals so far."""
+        return Record(**{key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]})
+
+    def _totals(self) -> dict[str, np.ndarray]:
+        meter = self._meter
+        return {
+            "departures": meter.departures.copy(), "arrivals": meter.arrivals.copy(),
+            "crossings": meter.crossings.copy(), "teleports": np.array(meter.teleports),
+            "guided": self._guide.realised.copy(), "gateway_flow": meter.gateway_flow(),
+            "gateway_green": self._actuation.green_time()}

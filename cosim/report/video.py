@@ -6,6 +6,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
+from matplotlib import animation, rc_context
 
 from cosim.evaluation.experiment import read_run
 from cosim.evaluation.results import Finished, Level
@@ -117,8 +118,6 @@ def scene(city: City, results: dict[str, Result], title: str) -> tuple:
 @contextmanager
 def _writer(path: Path, rate: int):
     """matplotlib's writer for the suffix of `path`. Raises InputError."""
-    from matplotlib import animation, rc_context
-
     if path.suffix == ".gif":
         yield animation.PillowWriter(fps=rate)
     elif path.suffix == ".mp4":
@@ -136,7 +135,7 @@ def ffmpeg() -> str | None:
     program = shutil.which("ffmpeg")
     if program is None:
         with suppress(ImportError, RuntimeError):
-            import imageio_ffmpeg
+            import imageio_ffmpeg  # of an extra: not there for everybody
 
             program = imageio_ffmpeg.get_ffmpeg_exe()
     return program
