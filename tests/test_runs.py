@@ -44,7 +44,7 @@ def test_trajectory_round_trip_and_same_bytes(tmp_path):
 
 def test_the_same_run_gives_the_same_bytes_at_another_time(tmp_path, monkeypatch):
     """HDF5 can keep times of its objects."""
-    more = quantities.variables(Record, made_up_record())
+    more = quantities.variables(Record, trajectories.record(4, regions=2))
     run_folder.write_trajectory(tmp_path / "a.nc", trajectory(), more)
     time.sleep(1.1)
     run_folder.write_trajectory(tmp_path / "b.nc", trajectory(), more)
@@ -52,15 +52,8 @@ def test_the_same_run_gives_the_same_bytes_at_another_time(tmp_path, monkeypatch
     assert hashlib.sha256(first).digest() == hashlib.sha256(second).digest()
 
 
-def made_up_record(steps=4):
-    """One array of a record in SUMO for each: 2 regions, 3 gateways, 5 edges."""
-    sizes = {"interval": steps, "gateway": 3, "edge": 5}
-    return {name: np.random.default_rng(0).random([sizes.get(axis, 2) for axis in about["dimensions"]])
-            for name, about in quantities.quantities(Record).items()}
-
-
 def test_xarray_opens_a_run_with_names_and_units(tmp_path):
-    original, record = replace(trajectory(), estimated=True), made_up_record()
+    original, record = replace(trajectory(), estimated=True), trajectories.record(4, regions=2)
     run_folder.write_trajectory(tmp_path / "a.nc", original, quantities.variables(Record, record))
     with xr.open_dataset(tmp_path / "a.nc") as data:
         assert dict(data.sizes) == {
@@ -106,7 +99,8 @@ def test_a_folder_of_an_older_version_says_what_to_run(tmp_path, plant, command)
         (tmp_path / "manifest.json").write_text(json.dumps({
             "configuration": {"plant": plant}, "controllers": {"no-control": {}, "pi-gating": {}},
             "sessions": [{"scenario_folder": "scenarios/x"}]}))
-    for use in (lambda: run_folder.read_trajectory(tmp_path / "no-control-0.nc"), lambda: opened(tmp_path).__enter__()):
+    for use in (lambda: run_folder.read_trajectory(tmp_path / "no-control-0.nc"), lambda: opened(tmp_path).__enter__(),
+                lambda: run_folder.read_summary(tmp_path / "summary.csv")):
         with pytest.raises(InputError, match=f"older version .*; delete it and run again: {command}$"):
             use()
 
