@@ -43,6 +43,8 @@ def result(task, city) -> Result:
         "gateway_green": original * (0.7 if acts else 1.0), "gateway_original_green": original,
         "gateway_flow": random.uniform(0.0, 9.0, (steps, gateways)),
         "gateway_queue": random.uniform(0.0, 9.0, (steps, gateways)),
+        "gateway_queue_max": np.full((steps, gateways), 9), "teleports": np.zeros(steps, dtype=int),
+        "production": random.uniform(0.0, 9.0, (steps, regions)), "mean_accumulation": np.ones((steps, regions)),
         "guided": crossings * guides}
     facts = {name: random.uniform(0.1, 100.0) for name in FACTS} | {
         "controller": task.controller, "seed": task.seed, "trips": 600, "late_decisions": 0,
@@ -59,7 +61,6 @@ def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(experiment, "outcomes", lambda function, todo, workers, *, fresh: (
             (task, result(task, city)) for task in todo))
-        patch.setattr(evaluate.pictures, "draw_all", lambda *_: None)
         evaluate.evaluate(evaluate.Evaluation(
             scenario=SCENARIO, controllers=controllers, seeds=seeds, levels=levels, steps=STEPS, out=out))
     return out

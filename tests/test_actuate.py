@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from signal_rules import MIN_GREEN, PHASES, SINGLE, check, runs
 
-from cosim.plant.perimeter import YELLOW, Actuator, GatewaySignal, _apportion, yellow_time
+from cosim.plant.perimeter import YELLOW, GatewaySignal, GatewaySignals, _apportion, yellow_time
 from cosim.plant.strategy import MODES
 from cosim.sumo.session import Phase, Programme
 
@@ -184,7 +184,7 @@ def test_the_actuator_commands_all_signals_and_shows_what_is_due():
             return f"{self.signal} at {now:g}"
 
     signals, shown = [Noted("a", 0.0), Noted("b", 5.0)], []
-    actuator = Actuator(signals, lambda signal, state: shown.append((signal, state)))
+    actuator = GatewaySignals(signals, lambda signal, state: shown.append((signal, state)))
     actuator.command(np.full((1, 1), 0.25), {"b": [3]})
     assert [signal.commands for signal in signals] == [[([[0.25]], ())], [([[0.25]], (3,))]]
     for now in (0.0, 1.0, 5.0 - 1e-9, 9.0, 10.0):

@@ -142,7 +142,7 @@ def test_a_table_of_a_controller_that_is_misspelt(tmp_path, name):
     text, out = f'{tiny.SCENARIO}\n[controllers."{name}"]\nx = 1\n', tmp_path / "out"
     scenario = tiny.write(tmp_path, scenario=text)
     line = check("nmfd", "benchmark", scenario, "--controllers", "no-control", "--out", out, out=out)
-    assert f"controllers.{name}: unknown controller; choose from " in line
+    assert f"controllers.{name}: unknown controller; did you mean " in line and "?; choose from " in line
 
 
 def test_a_table_of_a_controller_of_the_users_own_is_his_business(tmp_path):

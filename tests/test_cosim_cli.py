@@ -61,7 +61,7 @@ def test_strategies_run_and_are_filed_under_their_names(small, tmp_path, strateg
     text = good(cosim("run", small, "--controller", strategy, *other, "--steps", STEPS, "--out", out))
     facts = pd.read_csv(out / "sumo.csv")
     assert set(pd.read_csv(out / "summary.csv")["controller"]) == set(facts["controller"]) == names
-    assert all(name in text and (out / f"{name}-0.record.npz").is_file() for name in names)
+    assert all(name in text and (out / f"{name}-0.nc").is_file() for name in names)
     assert (facts["signals_left_alone"] == 0).all()
     good(cosim("compare", out, "--controller", strategy))
 

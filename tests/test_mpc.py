@@ -194,3 +194,16 @@ def test_benchmark_row(guidance, most):
     row = summary(run(NmfdPlant(SCENARIO), EconomicMpc(planning_model(SCENARIO), guidance=guidance), SCENARIO, seed=0))
     assert row["total_time_spent_veh_s"] < most
     assert row["solver_failures"] == 0
+
+
+@pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
+def test_ipopt_is_the_reference_solver(states, guidance):
+    """The published formulation, in the place of our solver: as good a plan from the same state, to a thousandth."""
+    ours = EconomicMpc(planning_model(SCENARIO), guidance=guidance)
+    reference = EconomicMpc(planning_model(with_options(solver="ipopt")), guidance=guidance)
+    costs = []
+    for controller in (ours, reference):
+        assert controller.act(states[20]).status == Status.OK
+        start, demand = controller.forecast(states[20])
+        costs.append(controller.cost(start, demand, controller._plan))
+    assert costs[1] == pytest.approx(costs[0], rel=1e-3)

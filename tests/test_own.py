@@ -89,7 +89,7 @@ def test_processes_and_sumo_take_it(place):
         "run", "scenarios/peak", "--controller", "mine.py:Mine+max-pressure", "--steps", "2", "--out", "out"])
     assert done.exit_code == 0 and "mine.py:Mine+max-pressure" in done.output, done.output
     name = run_folder.run_name("mine.py:Mine+max-pressure", 0)
-    trajectory = run_folder.read_trajectory(place / "out" / f"{name}.npz")
+    trajectory = run_folder.read_trajectory(place / "out" / f"{name}.nc")
     assert (trajectory.perimeter[trajectory.perimeter > 0] == 0.5).all()
     benchmark = nmfd("benchmark", "scenario", "--controllers", "mine.py:Mine", "--seeds", 2, "--workers", 2)
     assert benchmark.exit_code == 0, benchmark.output

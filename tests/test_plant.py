@@ -9,6 +9,7 @@ from signal_rules import MIN_GREEN, check
 
 from cosim.plant.guidance import shifted
 from cosim.plant.plant import SumoPlant
+from cosim.plant.sampling import StreetSampler
 from cosim.plant.settings import Settings
 from cosim.sumo.session import Session
 from nmfd.api import load_scenario
@@ -91,7 +92,7 @@ def test_open_gateways_leave_sumo_alone(scenario, plant_of):
         plant.reset(1)
         if not actuated:
             plant.session.set_signal_state = None  # would fail if anything were played
-            plant._actuator._signals.clear()
+            plant._actuation._controls.clear()
         states = []
         step = plant.session.step
         plant.session.step = lambda step=step, states=states, session=plant.session: (
@@ -119,19 +120,21 @@ def test_ledger_and_crossings_balance(scenario, plant_of, guidance):
 def test_the_samples_are_those_of_every_edge(scenario, plant_of):
     """Both while there are fewer vehicles than edges, and later."""
     plant, asked = plant_of(), []
-    sample = plant._sample
+    plant.reset(1)
+    sampler = StreetSampler(plant.session, plant.city)
 
     def compared():
-        counts, speeds = sample()
-        asked.append(len(plant._travelled()))
+        counts, speeds = sampler.present()
+        asked.append(len(sampler.travelled()))
         session, edges = plant.session, plant.city.edges
         assert counts.tolist() == [session.vehicle_count(edge) for edge in edges]
         assert speeds.tolist() == [
             session.mean_speed(edge) if n else 0.0 for edge, n in zip(edges, counts, strict=True)]
-        return counts, speeds
 
-    plant._sample = compared
-    drive(plant, replace(scenario, steps=2))
+    for _ in range(18):
+        for _ in range(10):
+            plant.session.step()
+        compared()
     assert 0 < min(asked) < max(asked) == len(plant.city.edges)
 
 
@@ -139,7 +142,7 @@ def test_ledger_notices_a_lost_vehicle(scenario, plant_of):
     plant = plant_of()
     plant.reset(1)
     plant.step(random_controls(scenario, np.random.default_rng(0)))
-    plant._meter.departures[0, 4] += 1
+    plant._sensing.meter.departures[0, 4] += 1
     message = r"control step 2, 180 s: \d+ vehicles are in the city, but \d+ departures minus \d+ arrivals"
     with pytest.raises(LedgerError, match=message):
         plant.step(random_controls(scenario, np.random.default_rng(0)))

@@ -229,7 +229,8 @@ def test_webster_in_sumo_and_under_perimeter_control(scenario, plant_of):
     plant = plant_of(signals="webster")
     plant.reset(1)
     plans = {name: plant.session.programme(name) for name in plant.session.signals()}
-    file = plant._signal_plan([])[0]
+    command = plant.session.command
+    file = command[command.index("--additional-files") + 1]
     for logic in ElementTree.parse(file).getroot():  # a later offset is a later beginning
         programme = plans[logic.get("id")]
         assert programme.position == -float(logic.get("offset")) % programme.cycle
@@ -278,6 +279,6 @@ def test_the_same_drivers_reroute(scenario, plant_of):
 
 
 def test_a_city_without_fixed_signals(scenario, monkeypatch):
-    monkeypatch.setattr("cosim.plant.plant.read_signals", lambda *_: ([], ["c11"]))
+    monkeypatch.setattr("cosim.plant.programmes.read_signals", lambda *_: ([], ["c11"]))
     with pytest.raises(InputError, match="sumo.signals: webster needs fixed-time signals"):
         SumoPlant(scenario, overrides=Settings(signals="webster"))
