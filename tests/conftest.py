@@ -2,6 +2,7 @@
 
 import os
 import sys
+from pathlib import Path
 
 import pytest
 from xdist.workermanage import NodeManager
@@ -18,6 +19,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--no-skips", action="store_true", help="a skipped test fails, unless a GPU or a real city is missing")
     parser.addoption(
         "--may-skip", action="append", default=[*ALLOWED], metavar="REASON", help="nor does it fail for this reason")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """The city that most tests drive is built once, before workers copy it."""
+    grid7 = Path(__file__).parents[1] / "networks" / "grid7"
+    if not hasattr(session.config, "workerinput") and not session.config.option.collectonly and not (
+            grid7 / "build").is_dir():
+        from cosim.sumo.build import ensure_built  # here, because it takes a second, and is needed once
+        from nmfd.model.regional_model import load_network
+
+        ensure_built(load_network(grid7))
 
 
 def pytest_keyboard_interrupt() -> None:

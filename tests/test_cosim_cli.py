@@ -5,6 +5,7 @@ import re
 import shutil
 from pathlib import Path
 
+import copies
 import numpy as np
 import pandas as pd
 import pytest
@@ -18,7 +19,6 @@ from nmfd.model.regional_model import load_network
 from nmfd.runs.run_folder import COLUMNS
 
 ROOT = Path(__file__).parents[1]
-GRID = ROOT / "networks" / "grid7"
 STEPS = "3"
 
 
@@ -26,8 +26,7 @@ STEPS = "3"
 def small(tmp_path_factory):
     """A copy of grid7_peak and its network, so that tests may change them, with the peak at the beginning."""
     folder = tmp_path_factory.mktemp("small")
-    for network in (GRID, GRID.with_name("grid7_guided")):
-        shutil.copytree(network, folder / "networks" / network.name)
+    copies.grid7(folder)
     source = ROOT / "scenarios" / "grid7_peak" / "scenario.toml"
     text = re.sub(r"ramp_up = [\d.]+", "ramp_up = 90.0", source.read_text())
     text = text.replace("steps = 64", "steps = 80")
@@ -110,7 +109,7 @@ def test_identify_writes_a_network_that_loads(small, tmp_path):
     shutil.copytree(folder, tmp_path / "city")
     scenario, network = tmp_path / "city" / "scenarios" / "small", tmp_path / "city" / "networks" / "grid7"
     text = (scenario / "scenario.toml").read_text()
-    (scenario / "scenario.toml").write_text(text.replace("steps = 80", "steps = 4"))
+    (scenario / "scenario.toml").write_text(text.replace("steps = 80", "steps = 7"))
     before = load_network(network)
     out = tmp_path / "identify"
     good(cosim("identify", scenario, "--levels", "1.0", "--seeds", "2", "--iterations", "5", "--out", out))

@@ -1,10 +1,10 @@
 """Controllers of one's own: the template, files and entry points, in both command lines, and one line per mistake."""
 
 import re
-import shutil
 from importlib import metadata
 from pathlib import Path
 
+import copies
 import numpy as np
 import pytest
 import tiny
@@ -84,9 +84,7 @@ def test_it_has_a_table_of_its_own(place):
 
 def test_processes_and_sumo_take_it(place):
     (place / "mine.py").write_text(GOOD)
-    shutil.copytree(ROOT / "networks" / "grid7", place / "networks" / "grid7")
-    shutil.copytree(ROOT / "scenarios" / "grid7_peak", place / "scenarios" / "peak",
-                    ignore=shutil.ignore_patterns("reference"))
+    copies.peak(place)
     done = CliRunner().invoke(cosim.cli.main.main, [
         "run", "scenarios/peak", "--controller", "mine.py:Mine+max-pressure", "--steps", "2", "--out", "out"])
     assert done.exit_code == 0 and "mine.py:Mine+max-pressure" in done.output, done.output

@@ -9,6 +9,7 @@ import subprocess
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import copies
 import numpy as np
 import pytest
 from commands import cosim, error_line
@@ -29,7 +30,7 @@ XVFB = shutil.which("Xvfb")
 def task(tmp_path_factory):
     """Two control intervals of grid7 with the peak at the beginning and a gate that closes early."""
     folder = tmp_path_factory.mktemp("watch")
-    shutil.copytree(ROOT / "networks" / "grid7", folder / "networks" / "grid7")
+    copies.grid7(folder)
     text = (ROOT / "scenarios" / "grid7_peak" / "scenario.toml").read_text()
     text = re.sub(r"ramp_up = [\d.]+", "ramp_up = 60.0", text)
     text, count = re.subn(r"outflow_share = [\d.]+", "set_point = [20.0]", text, count=1)
