@@ -85,7 +85,7 @@ def benchmark(
         frames.write(
             out, [run_folder.read_trajectory(out / f"{name}.npz") for name in names], {"summary": pd.DataFrame(rows)})
     click.echo(f"{loaded.name}, {plant} plant, {loaded.steps} control intervals of {loaded.step:g} s")
-    click.echo(benchmarks.table(rows))
+    click.echo(benchmarks.summary_table(rows))
     click.echo(f"Written to {out}")
 
 
