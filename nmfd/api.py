@@ -84,7 +84,7 @@ def benchmark(
     scenario = _loaded(scenario)
     return benchmarks.benchmark(
         scenario, list(controllers), range(seeds) if isinstance(seeds, int) else list(seeds), plant,
-        out=run_folder.default_folder(scenario) if out is None else Path(out),
+        out=run_folder.default_folder(scenario.name) if out is None else Path(out),
         policies={name: Path(file) for name, file in (policies or {}).items()}, workers=workers, progress=progress)
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nmfd.errors import InputError
+from nmfd.errors import InputError, did_you_mean
 from nmfd.types import Controller, Controls, Observation, Status
 
 # Kind -> what its value is, or None. Of the measurements, of what computes the controls, and of the city.
@@ -44,9 +44,10 @@ def parse(text: str, where: str, regions: int) -> Fault:
     """The fault that `text` orders. InputError, which begins with `where`."""
     match = FORM.fullmatch(text)
     if match is None or match["kind"] not in KINDS:
+        hint = did_you_mean(re.split("[:@]", text)[0], KINDS)
         raise InputError(
             f"{where}: expected KIND[:VALUE][@FROM-TO] with a kind out of {', '.join(KINDS)}, got {text[:60]!r} "
-            "instead")
+            f"instead{hint}")
     kind, value = match["kind"], match["value"]
     begin, end = int(match["begin"] or 0), int(match["end"] or 10**9)
     unit = KINDS[kind]

@@ -1,13 +1,16 @@
 """What plants, controllers and the closed loop hand to one another."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Flag
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from nmfd.quantities import quantity, variables
+
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray as xr
 
 
 class Status(Flag):
@@ -121,16 +124,7 @@ class Trajectory:
 
     controller, plant, seed
     step: control interval [s]
-    accumulation: (T+1, R, R) [veh]
-    backlog: (T+1, R, R) [veh]
-    completed: (T+1,) [veh], cumulative
-    observed: (T+1, R, R) [veh], the accumulation as the controller was given it; the last one it would have been
-    observed_backlog: (T+1, R, R) [veh], the same of the backlog
     estimated: whether what was observed is an estimate of the plant's own instruments
-    perimeter: (T, R, R) [-]
-    splits: (T, R, R, R) [-]; the nominal splits where there was no route guidance
-    decision_time: (T,) [s], wall time of `Controller.act`
-    status: (T,) int, nmfd.types.Status of every decision; note: T strings, the same in words, "" if OK
     wall_time: of the whole loop [s]
     """
 
@@ -138,18 +132,50 @@ class Trajectory:
     plant: str
     seed: int
     step: float
-    accumulation: np.ndarray
-    backlog: np.ndarray
-    completed: np.ndarray
-    observed: np.ndarray
-    observed_backlog: np.ndarray
     estimated: bool
-    perimeter: np.ndarray
-    splits: np.ndarray
-    decision_time: np.ndarray
-    status: np.ndarray
-    note: tuple[str, ...] = field(repr=False)
     wall_time: float
+    accumulation: np.ndarray = quantity("time", "region", "destination", unit="veh", text="vehicles inside")
+    backlog: np.ndarray = quantity("time", "region", "destination", unit="veh", text="vehicles waiting to enter")
+    completed: np.ndarray = quantity("time", unit="veh", text="trips ended, cumulative")
+    observed: np.ndarray = quantity(
+        "time", "region", "destination", unit="veh",
+        text="vehicles inside as the controller was given them; the last as it would have been")
+    observed_backlog: np.ndarray = quantity(
+        "time", "region", "destination", unit="veh", text="vehicles waiting to enter as the controller was given them")
+    perimeter: np.ndarray = quantity(
+        "interval", "region", "next_region", unit="1",
+        text="share of the desired transfer flow that may pass; 0 between regions that are not adjacent")
+    splits: np.ndarray = quantity(
+        "interval", "region", "next_region", "destination", unit="1",
+        text="share of the vehicles that heads for the next region; nominal where there was no route guidance")
+    decision_time: np.ndarray = quantity("interval", unit="s", text="wall time of Controller.act; not in files")
+    status: np.ndarray = quantity(
+        "interval", unit="1", text="what was not as it should be with the decision, 0 if nothing (nmfd.types.Status)",
+        attributes={"flag_masks": [kind.value for kind in Status],
+                    "flag_meanings": " ".join(str(kind.name).lower() for kind in Status)})
+    note: tuple[str, ...] = quantity("interval", unit="", text="the status in words", repr=False)
+
+    @property
+    def variables(self) -> dict[str, tuple]:
+        """The arrays and their times as xarray.Dataset takes them: name -> (dimensions, array, attributes)."""
+        times = self.step * np.arange(len(self.accumulation))
+        return {
+            "time": ("time", times, {"long_name": "time since the start", "units": "s"}),
+            "interval": ("interval", times[:-1], {"long_name": "beginning of the interval", "units": "s"}),
+            **variables(Trajectory, vars(self))}
+
+    @property
+    def labels(self) -> dict[str, str | int | float]:
+        """What run this is: controller, plant, seed, step [s] and estimated (0 or 1)."""
+        return {
+            "controller": self.controller, "plant": self.plant, "seed": self.seed, "step": self.step,
+            "estimated": int(self.estimated)}
+
+    def to_dataset(self) -> "xr.Dataset":
+        """Everything but `wall_time`, with named dimensions, times in seconds, and units as attributes."""
+        import xarray as xr  # with the pandas under it half a second of the start-up, which few commands need
+
+        return xr.Dataset(self.variables, attrs=self.labels)
 
     def to_frame(self) -> "pd.DataFrame":
         """The states as a table: one row per time and pair of regions, (T+1) R R rows.
@@ -157,8 +183,7 @@ class Trajectory:
         Columns controller, plant, seed; time_s; region, destination (x_ij: in region i, bound for j);
         accumulation_veh; backlog_veh (waiting to enter region i).
         """
-        return self._table(self.accumulation, ("region", "destination"), {
-            "accumulation_veh": self.accumulation, "backlog_veh": self.backlog})
+        return self._table({"time": "time_s", "accumulation": "accumulation_veh", "backlog": "backlog_veh"})
 
     def controls_frame(self) -> "pd.DataFrame":
         """The perimeter controls as a table: one row per control interval and pair of regions, T R R rows.
@@ -166,12 +191,11 @@ class Trajectory:
         Columns controller, plant, seed; time_s, when the interval begins; region, next_region (u_ih: from i to h);
         perimeter [-]; 0 between regions that are not adjacent.
         """
-        return self._table(self.perimeter, ("region", "next_region"), {"perimeter": self.perimeter})
+        return self._table({"interval": "time_s", "perimeter": "perimeter"})
 
-    def _table(self, like: np.ndarray, axes: tuple[str, ...], values: dict[str, np.ndarray]) -> "pd.DataFrame":
-        import pandas as pd
-
-        interval, *regions = (index.ravel() for index in np.indices(like.shape))
-        return pd.DataFrame({
-            "controller": self.controller, "plant": self.plant, "seed": self.seed, "time_s": self.step * interval,
-            **dict(zip(axes, regions, strict=True)), **{name: array.ravel() for name, array in values.items()}})
+    def _table(self, columns: dict[str, str]) -> "pd.DataFrame":
+        data = self.to_dataset()
+        rows = data[[name for name in columns if name in data.data_vars]].to_dataframe().reset_index()
+        for place, name in enumerate(("controller", "plant", "seed")):
+            rows.insert(place, name, getattr(self, name))
+        return rows.rename(columns=columns)

@@ -3,14 +3,16 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import trajectories
 
-from cosim.evaluation import evaluate, experiment
+from cosim.evaluation import evaluate, experiment, statistics
 from cosim.evaluation.simulate import FACTS, Result, scenario_of
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import load_city
 from nmfd.api import load_scenario
+from nmfd.runs.run_folder import COLUMNS
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
 STEPS = 5
@@ -41,6 +43,8 @@ def result(task, city) -> Result:
         "gateway_green": original * (0.7 if acts else 1.0), "gateway_original_green": original,
         "gateway_flow": random.uniform(0.0, 9.0, (steps, gateways)),
         "gateway_queue": random.uniform(0.0, 9.0, (steps, gateways)),
+        "gateway_queue_max": np.full((steps, gateways), 9), "teleports": np.zeros(steps, dtype=int),
+        "production": random.uniform(0.0, 9.0, (steps, regions)), "mean_accumulation": np.ones((steps, regions)),
         "guided": crossings * guides}
     facts = {name: random.uniform(0.1, 100.0) for name in FACTS} | {
         "controller": task.controller, "seed": task.seed, "trips": 600, "late_decisions": 0,
@@ -57,7 +61,14 @@ def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(experiment, "outcomes", lambda function, todo, workers, *, fresh: (
             (task, result(task, city)) for task in todo))
-        patch.setattr(evaluate.pictures, "draw_all", lambda *_: None)
         evaluate.evaluate(evaluate.Evaluation(
             scenario=SCENARIO, controllers=controllers, seeds=seeds, levels=levels, steps=STEPS, out=out))
     return out
+
+
+def rows_of(values: dict[tuple[float, str], dict[int, float]]) -> pd.DataFrame:
+    """(level, controller) -> seed -> TTS; everything else is 1 or empty."""
+    blank = {name: 1.0 for name in (*COLUMNS, *FACTS)} | dict.fromkeys(("teleports", *statistics.COUNTED), 0)
+    return pd.DataFrame([
+        blank | {"demand": level, "controller": name, "seed": seed, statistics.TTS: tts}
+        for (level, name), seeds in values.items() for seed, tts in seeds.items()])

@@ -2,9 +2,8 @@
 
 import pytest
 import tiny
-from click.testing import CliRunner
+from commands import nmfd
 
-from nmfd.cli.main import main
 from nmfd.controllers.dpc import training
 from nmfd.runs import files
 from nmfd.studies import ablation, plots, plots_studies
@@ -13,10 +12,6 @@ from nmfd.studies import ablation, plots, plots_studies
 @pytest.fixture
 def folder(tmp_path):
     return tiny.write(tmp_path, network=tiny.row_network(3))
-
-
-def nmfd(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 @pytest.fixture

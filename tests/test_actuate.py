@@ -1,20 +1,12 @@
 """Perimeter commands on signals: yellow, minimum green, no new conflicts, the original programme at u_max."""
 
-import itertools
-
 import numpy as np
 import pytest
+from signal_rules import MIN_GREEN, PHASES, SINGLE, check, runs
 
-from cosim.plant.perimeter import YELLOW, Actuator, GatewaySignal, _apportion, yellow_time
+from cosim.plant.perimeter import YELLOW, GatewaySignal, GatewaySignals, _apportion, yellow_time
 from cosim.plant.strategy import MODES
 from cosim.sumo.session import Phase, Programme
-
-MIN_GREEN = 5.0
-
-# Two crossing streets with a left-turn tail; link 1 is a gateway in both phases of its street, link 3 turns on a g that
-# never ends, and the green of link 4 runs over the end of the cycle.
-PHASES = [("GGrgG", 30), ("yGrgG", 3), ("rGrgy", 6), ("ryrgr", 3), ("rrGgr", 40), ("rrygr", 3), ("rrrgG", 5)]
-SINGLE = [("Gr", 42), ("yr", 3), ("rG", 4), ("rG", 38), ("ry", 3)]
 
 
 def programme(phases, position=0.0):
@@ -33,35 +25,6 @@ def play(phases, movements, mode, commands, *, position=0.0, interval=90):
             shown = signal.update(float(second))
         states.append(shown)
     return states
-
-
-def runs(states, link):
-    """[(character class, seconds)] of one link: G for any green."""
-    text = "".join("G" if s[link] in "Gg" else s[link] for s in states)
-    return [(key, len(list(group))) for key, group in itertools.groupby(text)]
-
-
-def check(states, phases, min_green=MIN_GREEN):
-    """What must hold under any command; the first and the last run of every link may be cut off by the simulation."""
-    together = {
-        pair for state, _ in phases
-        for pair in itertools.combinations([n for n, c in enumerate(state) if c in "Gg"], 2)}
-    for state in set(states):
-        for pair in itertools.combinations([n for n, c in enumerate(state) if c in "Gg"], 2):
-            assert pair in together, f"{state} shows {pair} green together"
-    originals = [s for s, d in phases for _ in range(int(d))] * 3
-    for link in range(len(phases[0][0])):
-        least = min([length for c, length in runs(originals, link)[1:-1] if c == "G"], default=min_green)
-        yellow = [length for c, length in runs(originals, link)[1:-1] if c == "y"]
-        sequence = runs(states, link)
-        for (before, _), (after, _) in itertools.pairwise(sequence):
-            assert (before, after) != ("G", "r"), f"link {link} goes from green to red without yellow"
-            assert (before, after) != ("r", "y"), f"link {link} goes from red to yellow"
-        for n, (shown, length) in enumerate(sequence[1:-1], start=1):
-            if shown == "G":
-                assert length >= min(min_green, least), f"link {link} is green for {length} s"
-            if shown == "y" and yellow and sequence[n - 1][0] == "G":
-                assert length >= min(yellow), f"link {link} is yellow for {length} s"
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -221,7 +184,7 @@ def test_the_actuator_commands_all_signals_and_shows_what_is_due():
             return f"{self.signal} at {now:g}"
 
     signals, shown = [Noted("a", 0.0), Noted("b", 5.0)], []
-    actuator = Actuator(signals, lambda signal, state: shown.append((signal, state)))
+    actuator = GatewaySignals(signals, lambda signal, state: shown.append((signal, state)))
     actuator.command(np.full((1, 1), 0.25), {"b": [3]})
     assert [signal.commands for signal in signals] == [[([[0.25]], ())], [([[0.25]], (3,))]]
     for now in (0.0, 1.0, 5.0 - 1e-9, 9.0, 10.0):

@@ -72,8 +72,8 @@ def test_run_and_benchmark_agree_with_the_command_line(tmp_path):
         "benchmark", str(folder), "--controllers", "pi-gating", "--seeds", "2", "--out", str(out)])
     assert done.exit_code == 0, done.output
     trajectory = nmfd.run(folder, "pi-gating", seed=1)
-    nmfd.write_trajectory(tmp_path / "same.npz", trajectory)
-    assert (tmp_path / "same.npz").read_bytes() == (out / "pi-gating-1.npz").read_bytes()
+    nmfd.write_trajectory(tmp_path / "same.nc", trajectory)
+    assert (tmp_path / "same.nc").read_bytes() == (out / "pi-gating-1.nc").read_bytes()
     rows = nmfd.benchmark(folder, ["pi-gating"], seeds=2, out=out)
     assert rows == run_folder.read_summary(out / "summary.csv") and nmfd.summary_table(rows) in done.output
 

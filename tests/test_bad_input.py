@@ -18,10 +18,9 @@ import pytest
 import tiny
 import tiny_city
 import torch
-from click.testing import CliRunner
+from commands import call, good
 
-import cosim.cli.main
-import nmfd.cli.main
+from cosim.sumo.recorded_trips import read_originals
 from nmfd import closed_loop
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc import training
@@ -30,7 +29,6 @@ from nmfd.model.regional_model import load_network
 from nmfd.studies import benchmark
 
 ROOT = Path(__file__).parents[1]
-MAINS = {"nmfd": nmfd.cli.main.main, "cosim": cosim.cli.main.main}
 HEXAGON, ECONOMIC = ROOT / "networks" / "hexagon7", ROOT / "scenarios" / "economic_mpc"
 GRID, PEAK = ROOT / "networks" / "grid7", ROOT / "scenarios" / "grid7_peak"
 
@@ -53,7 +51,7 @@ def check(program: str, *arguments, names: str = "", out: Path) -> str:
     """The line that `program` answers with, and that there is nothing else; `names` is in it."""
     there = out.exists()
     try:
-        result = CliRunner().invoke(MAINS[program], [str(argument) for argument in arguments])
+        result = call(program, *arguments)
         left = not there and out.exists()
     finally:
         if not there:
@@ -65,17 +63,9 @@ def check(program: str, *arguments, names: str = "", out: Path) -> str:
     return result.stderr
 
 
-def every(cases, test) -> int:
-    """Run `test` for all (what is wrong, content); fail with all that failed. Returns how many there were."""
-    failed, count = [], 0
-    for what, content in cases:
-        count += 1
-        try:
-            test(content)
-        except (AssertionError, Accepted) as error:
-            failed.append(f"{what}: {type(error).__name__} {str(error)[:300]!a}")
-    assert not failed, "\n".join([f"{len(failed)} of {count}:", *failed])
-    return count
+def params(cases):
+    """pytest's parameters of (what is wrong, content), under what is wrong."""
+    return [pytest.param(content, id=re.sub(r"[^!-~]+", " ", what)[:80].strip()) for what, content in cases]
 
 
 def toml_cases(text: str, seed: int, required=()):
@@ -85,68 +75,66 @@ def toml_cases(text: str, seed: int, required=()):
     yield from corruptions.cut(text.encode(), seed)
 
 
-def test_every_key_of_a_scenario(tmp_path):
-    text = (ECONOMIC / "scenario.toml").read_text().replace("../../networks", str(ROOT / "networks"))
-    file, out = tmp_path / "scenario.toml", tmp_path / "out"
-    required = [("", key) for key in ("name", "network", "step", "steps")] + [
-        ("demand", key) for key in ("from", "to", "start", "peak", "ramp_up", "flat", "ramp_down")]
+SCENARIO_TEXT = (ECONOMIC / "scenario.toml").read_text().replace("../../networks", str(ROOT / "networks"))
+SCENARIO_KEYS = [("", key) for key in ("name", "network", "step", "steps")] + [
+    ("demand", key) for key in ("from", "to", "start", "peak", "ramp_up", "flat", "ramp_down")]
+NETWORKS = {
+    source.name: (source / "network.toml").read_text().replace("../grid7", str(GRID))
+    for source in (HEXAGON, GRID.with_name("grid7_guided"))}
+NETWORK_KEYS = [("", "name"), ("perimeter", "min"), ("mfd", "a"), ("regions", "adjacent"), ("regions.mfd", "jam")]
+CITY_TEXT = (PEAK / "scenario.toml").read_text().replace("../../networks", str(ROOT / "networks"))
+RECIPE = (GRID / "city.toml").read_text()
+RECIPE_CASES = [
+    *toml_cases(RECIPE, 4, [("centre", "x"), ("signals", "cycle")]),
+    *((f"regions {old!r} to {new!r}", RECIPE.replace(old, new, 1).encode()) for old, new in (
+        ("0 0 0 0 0 1", "0 0 0 0 9 1"), ("2 2 2 . . .", "2 2 2 . ."), ("2 2 2 . . .", "2 2 2 3 . ."),
+        ("0 0 0", "0 . 0")))]
 
-    def test(content):
-        file.write_bytes(content)
-        names = "" if b"xxx" in content else "scenario.toml"  # the network that it names is missing
-        check("nmfd", "benchmark", tmp_path, "--controllers", "no-control", "--out", out, names=names, out=out)
 
-    assert every(toml_cases(text, 1, required), test) > 300
+@pytest.mark.parametrize("content", params(toml_cases(SCENARIO_TEXT, 1, SCENARIO_KEYS)))
+def test_every_key_of_a_scenario(tmp_path, content):
+    (tmp_path / "scenario.toml").write_bytes(content)
+    out = tmp_path / "out"
+    names = "" if b"xxx" in content else "scenario.toml"  # the network that it names is missing
+    check("nmfd", "benchmark", tmp_path, "--controllers", "no-control", "--out", out, names=names, out=out)
 
 
-@pytest.mark.parametrize("source", [HEXAGON, GRID.with_name("grid7_guided")], ids=lambda path: path.name)
-def test_every_key_of_a_network(tmp_path, source):
-    text = (source / "network.toml").read_text().replace("../grid7", str(GRID))
+@pytest.mark.parametrize("case", params(
+    (f"{name} {what}", (what, content)) for name, text in NETWORKS.items()
+    for what, content in toml_cases(text, 2, NETWORK_KEYS)))
+def test_every_key_of_a_network(tmp_path, case):
+    what, content = case
     scenario, out = tmp_path / "scenario", tmp_path / "out"
     shutil.copytree(ECONOMIC, scenario, ignore=shutil.ignore_patterns("*.pt", "*.npz", "reference"))
     toml = scenario / "scenario.toml"
     toml.write_text(toml.read_text().replace("../../networks/hexagon7", str(tmp_path)))
-    required = [("", "name"), ("perimeter", "min"), ("mfd", "a"), ("regions", "adjacent"), ("regions.mfd", "jam")]
-
-    def test(case):
-        what, content = case
-        (tmp_path / "network.toml").write_bytes(content)
-        program, *command = ["cosim", "run", "--controller"] if what.startswith("sumo.") else [
-            "nmfd", "benchmark", "--controllers"]
-        names = "" if "xxx" in what else "network.toml"  # the recipe that it names is missing
-        check(program, *command, "no-control", scenario, "--out", out, names=names, out=out)
-
-    assert every(((case[0], case) for case in toml_cases(text, 2, required)), test) > 100
+    (tmp_path / "network.toml").write_bytes(content)
+    program, *command = ["cosim", "run", "--controller"] if what.startswith("sumo.") else [
+        "nmfd", "benchmark", "--controllers"]
+    names = "" if "xxx" in what else "network.toml"  # the recipe that it names is missing
+    check(program, *command, "no-control", scenario, "--out", out, names=names, out=out)
 
 
-def test_every_key_of_a_sumo_table(tmp_path):
-    text = (PEAK / "scenario.toml").read_text().replace("../../networks", str(ROOT / "networks"))
+@pytest.mark.parametrize("content", params(case for case in toml_cases(CITY_TEXT, 3) if "sumo." in case[0]))
+def test_every_key_of_a_sumo_table(tmp_path, content):
     file, out = tmp_path / "scenario.toml", tmp_path / "out"
-
-    def test(content):
-        file.write_bytes(content)
-        check("cosim", "run", tmp_path, "--controller", "no-control", "--out", out, names=file.name, out=out)
-
-    cases = [case for case in toml_cases(text, 3) if "sumo." in case[0]]
-    assert every(cases, test) > 70
+    file.write_bytes(content)
+    check("cosim", "run", tmp_path, "--controller", "no-control", "--out", out, names=file.name, out=out)
 
 
-def test_every_key_of_a_recipe(tmp_path):
+@pytest.mark.parametrize("content", params(RECIPE_CASES))
+def test_every_key_of_a_recipe(tmp_path, content):
     shutil.copytree(GRID, tmp_path / "network", ignore=shutil.ignore_patterns("build"))
     file, out = tmp_path / "network" / "city.toml", tmp_path / "out"
-    text = file.read_text()
-    scenario = tmp_path / "scenario.toml"
-    scenario.write_text((PEAK / "scenario.toml").read_text().replace("../../networks/grid7\"", "network\""))
+    file.write_bytes(content)
+    (tmp_path / "scenario.toml").write_text(CITY_TEXT.replace(str(GRID), "network"))
+    check("cosim", "run", tmp_path, "--controller", "no-control", "--out", out, names=file.name, out=out)
+    assert not (file.parent / "build").exists()
 
-    def test(content):
-        file.write_bytes(content)
-        check("cosim", "run", tmp_path, "--controller", "no-control", "--out", out, names=file.name, out=out)
-        assert not (file.parent / "build").exists()
 
-    changes = (("0 0 0 0 0 1", "0 0 0 0 9 1"), ("2 2 2 . . .", "2 2 2 . ."), ("2 2 2 . . .", "2 2 2 3 . ."),
-               ("0 0 0", "0 . 0"))
-    pictures = [(f"regions {old!r} -> {new!r}", text.replace(old, new, 1).encode()) for old, new in changes]
-    assert every([*toml_cases(text, 4, [("centre", "x"), ("signals", "cycle")]), *pictures], test) > 80
+def test_there_are_hundreds_of_them():
+    cases = [list(toml_cases(text, 0)) for text in (SCENARIO_TEXT, *NETWORKS.values(), CITY_TEXT, RECIPE)]
+    assert all(len(found) > 80 for found in cases) and sum(map(len, cases)) > 700
 
 
 @pytest.mark.parametrize("name", ["pi_gating", "pi-gatin", "dcp-pc", "dpc-pc-robst", "pi-gatng+max-pressure"])
@@ -154,7 +142,7 @@ def test_a_table_of_a_controller_that_is_misspelt(tmp_path, name):
     text, out = f'{tiny.SCENARIO}\n[controllers."{name}"]\nx = 1\n', tmp_path / "out"
     scenario = tiny.write(tmp_path, scenario=text)
     line = check("nmfd", "benchmark", scenario, "--controllers", "no-control", "--out", out, out=out)
-    assert f"controllers.{name}: unknown controller; choose from " in line
+    assert f"controllers.{name}: unknown controller; did you mean " in line and "?; choose from " in line
 
 
 def test_a_table_of_a_controller_of_the_users_own_is_his_business(tmp_path):
@@ -188,76 +176,81 @@ def saved(content) -> bytes:
     return out.getvalue()
 
 
-def policies(content: dict, whole: bytes):
-    draw = random.Random(5)
-    yield "empty", b""
-    yield "text", b"no policy"
-    yield "pickled code", pickle.dumps(Evil())
-    yield "pickled code in torch's format", saved(Evil())
-    yield "pickled code among the weights", saved({**content, "weights": {"scale": Evil()}})
-    for share in (0.1, 0.5, 0.9, 0.99):
-        yield f"cut at {share}", whole[: int(share * len(whole))]
-    for _ in range(10):
-        at = draw.randrange(len(whole) // 4)
-        yield f"noise from {at}", whole[:at] + draw.randbytes(len(whole) - at)
-    for key in ("format", "network_hash", "network", "architecture", "weights"):
-        if key != "network":
-            yield f"{key} missing", saved({name: value for name, value in content.items() if name != key})
-        for value in (None, 17, "x", [1], {}):
-            if key != "network":
-                yield f"{key} = {value}", saved({**content, key: value})
-    for key, value in (("width", 10**9), ("width", -1), ("width", "4"), ("layers", 10**9), ("layers", 0),
-                       ("activation", "sine"), ("guidance", True), ("depth", 3), ("sparse", [])):
-        yield f"architecture {key} = {value}", saved(
-            {**content, "architecture": {**content["architecture"], key: value}})
-    for key in content["weights"]:
-        yield f"weight {key} missing", saved(
-            {**content, "weights": {k: v for k, v in content["weights"].items() if k != key}})
-        yield f"weight {key} of another shape", saved(
-            {**content, "weights": {**content["weights"], key: torch.zeros(3, 3, 3)}})
-    for value in ([1, 2], "x", torch.zeros(3), 5.0):
-        yield f"only {value}", saved(value)
-    yield "a plan", npz(perimeter=np.zeros(3))
+# What a policy file holds besides: name -> the file, from its content and its bytes. None of it may be executed.
+WEIGHTS = ("scale", "backbone.0.weight", "backbone.0.bias", "backbone.2.weight", "backbone.2.bias",
+           "perimeter_decoder.weight", "perimeter_decoder.bias")
+POLICIES = {
+    "empty": lambda content, whole: b"",
+    "text": lambda content, whole: b"no policy",
+    "pickled code": lambda content, whole: pickle.dumps(Evil()),
+    "pickled code in torch's format": lambda content, whole: saved(Evil()),
+    "pickled code among the weights": lambda content, whole: saved({**content, "weights": {"scale": Evil()}}),
+    "a plan": lambda content, whole: npz(perimeter=np.zeros(3)),
+    **{f"cut at {share}": lambda content, whole, share=share: whole[: int(share * len(whole))]
+       for share in (0.1, 0.5, 0.9, 0.99)},
+    **{f"noise {seed}": lambda content, whole, seed=seed: noisy(whole, random.Random(seed)) for seed in range(10)},
+    **{f"{key} missing": lambda content, whole, key=key: saved(without(content, key))
+       for key in ("format", "network_hash", "architecture", "weights")},
+    **{f"{key} = {value}": lambda content, whole, key=key, value=value: saved({**content, key: value})
+       for key in ("format", "network_hash", "architecture", "weights") for value in (None, 17, "x", [1], {})},
+    **{f"architecture {key} = {value}": lambda content, whole, key=key, value=value: saved(
+        {**content, "architecture": {**content["architecture"], key: value}})
+       for key, value in (("width", 10**9), ("width", -1), ("width", "4"), ("layers", 10**9), ("layers", 0),
+                          ("activation", "sine"), ("guidance", True), ("depth", 3), ("sparse", []))},
+    **{f"weight {key} missing": lambda content, whole, key=key: saved(
+        {**content, "weights": without(content["weights"], key)}) for key in WEIGHTS},
+    **{f"weight {key} of another shape": lambda content, whole, key=key: saved(
+        {**content, "weights": {**content["weights"], key: torch.zeros(3, 3, 3)}}) for key in WEIGHTS},
+    **{f"only {value}": lambda content, whole, value=value: saved(value) for value in ([1, 2], "x", 5.0)},
+    "only a tensor": lambda content, whole: saved(torch.zeros(3))}
 
 
-def test_policies(tmp_path, policy, monkeypatch):
+def without(table: dict, key: str) -> dict:
+    return {name: value for name, value in table.items() if name != key}
+
+
+def noisy(whole: bytes, draw: random.Random) -> bytes:
+    """Noise from somewhere in the first quarter on."""
+    at = draw.randrange(len(whole) // 4)
+    return whole[:at] + draw.randbytes(len(whole) - at)
+
+
+def test_the_weights_of_a_policy(policy):
+    assert set(policy[0]["weights"]) == set(WEIGHTS)
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_policies(tmp_path, policy, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     scenario, file, out = tiny.write(tmp_path), tmp_path / "p.pt", tmp_path / "out"
-
-    def test(content):
-        file.write_bytes(content)
-        check("nmfd", "benchmark", scenario, "--controllers", "dpc-pc", "--policy", f"dpc-pc={file}", "--out", out,
-              names=file.name, out=out)
-        assert not Path("executed").exists()
-
-    assert every(policies(*policy), test) > 50
+    file.write_bytes(POLICIES[name](*policy))
+    check("nmfd", "benchmark", scenario, "--controllers", "dpc-pc", "--policy", f"dpc-pc={file}", "--out", out,
+          names=file.name, out=out)
+    assert not Path("executed").exists()
 
 
-def test_policies_for_the_guard(tmp_path, policy):
+@pytest.mark.parametrize("states", [None, {}, 5, [1], {"mean": 1}, "no limit"], ids=str)
+def test_policies_for_the_guard(tmp_path, policy, states):
     scenario, file, out = tiny.write(tmp_path), tmp_path / "p.pt", tmp_path / "out"
     content, _ = policy
-
-    def test(states):
-        file.write_bytes(saved({**content, "states": states}))
-        check("nmfd", "benchmark", scenario, "--controllers", "dpc-pc-guarded", "--policy", f"dpc-pc-guarded={file}",
-              "--out", out, names=file.name, out=out)
-
-    every([(str(states), states) for states in (None, {}, 5, [1], {"mean": 1}, {**content["states"], "limit": None})],
-          test)
+    file.write_bytes(saved(
+        {**content, "states": {**content["states"], "limit": None} if states == "no limit" else states}))
+    check("nmfd", "benchmark", scenario, "--controllers", "dpc-pc-guarded", "--policy", f"dpc-pc-guarded={file}",
+          "--out", out, names=file.name, out=out)
 
 
-def test_plans(tmp_path):
+PLANS = {
+    "empty": lambda: b"", "text": lambda: b"x", "other arrays": lambda: npz(a=np.zeros(3)),
+    "pickle": lambda: pickle.dumps(Evil()), "objects": lambda: npz(perimeter=np.array([{}], dtype=object)),
+    "a zip": lambda: zipped(), "torch": lambda: saved({"configuration": {}}), "torch list": lambda: saved([1])}
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_plans(tmp_path, name):
     scenario, out = tiny.write(tmp_path), tmp_path / "out"
     plan = scenario / "bound-pc.npz"
-    cases = [("empty", b""), ("text", b"x"), ("other arrays", npz(a=np.zeros(3))), ("pickle", pickle.dumps(Evil())),
-             ("objects", npz(perimeter=np.array([{}], dtype=object))), ("a zip", zipped()),
-             ("torch", saved({"configuration": {}})), ("torch list", saved([1]))]
-
-    def replay(content):
-        plan.write_bytes(content)
-        check("nmfd", "benchmark", scenario, "--controllers", "bound-pc", "--out", out, names=str(plan), out=out)
-
-    every(cases, replay)
+    plan.write_bytes(PLANS[name]())
+    check("nmfd", "benchmark", scenario, "--controllers", "bound-pc", "--out", out, names=str(plan), out=out)
 
 
 def zipped() -> bytes:
@@ -278,32 +271,33 @@ DEMANDS = {
     "fraction": "interval,from,to,veh_s\n0.5,0,1,1\n", "zeros": "\0\0\0", "quote": 'interval,from,to,veh_s\n"0,0,1,1\n'}
 
 
-def test_demand_files(tmp_path):
+@pytest.mark.parametrize("content", params(DEMANDS.items()))
+def test_demand_files(tmp_path, content):
     scenario, out = tiny.write(tmp_path), tmp_path / "out"
     file = scenario / "demand.csv"
     (scenario / "scenario.toml").write_text('demand_file = "demand.csv"\n' + tiny.SCENARIO.split("[[demand]]")[0])
-
-    def test(content):
-        file.write_text(content)
-        check("nmfd", "show", scenario, "--out", out, names=file.name, out=out)
-
-    every(DEMANDS.items(), test)
+    file.write_text(content)
+    check("nmfd", "show", scenario, "--out", out, names=file.name, out=out)
 
 
-def test_results_of_another_program(tmp_path):
+MANIFESTS = {
+    "empty": "", "cut": "{", "a list": "[]", "null": "null", "a number": "5", "nested": "[" * 5000,
+    "no table": '{"configuration": 1, "controllers": {}, "sessions": []}',
+    "no list": '{"configuration": {}, "controllers": {}, "sessions": 1}',
+    "no controllers": '{"configuration": {}, "sessions": []}'}
+
+
+@pytest.mark.parametrize("program", ["nmfd", "cosim"])
+@pytest.mark.parametrize("text", params(MANIFESTS.items()))
+def test_results_of_another_program(tmp_path, text, program):
     """A run folder whose files were damaged is not written to and not taken for finished."""
-    scenario, out = tiny.write(tmp_path), tmp_path / "out"
-    manifests = ["", "{", "[]", "null", "5", '{"configuration": 1, "controllers": {}, "sessions": []}', "[" * 5000,
-                 '{"configuration": {}, "controllers": {}, "sessions": 1}', '{"configuration": {}, "sessions": []}']
+    out = tmp_path / "out"
     out.mkdir()
-    for number, text in enumerate(manifests):
-        (out / "manifest.json").write_text(text)
-        for program, command in (("nmfd", ["benchmark", scenario, "--controllers", "no-control", "--out", out]),
-                                 ("cosim", ["compare", out])):
-            result = CliRunner().invoke(MAINS[program], [str(a) for a in command])
-            assert result.exit_code == 2 and result.stderr.count("\n") == 1, (number, result.stderr, result.exception)
-            assert "manifest.json" in result.stderr
-        assert [path.name for path in out.iterdir()] == ["manifest.json"]
+    (out / "manifest.json").write_text(text)
+    command = ["compare", out] if program == "cosim" else [
+        "benchmark", tiny.write(tmp_path), "--controllers", "no-control", "--out", out]
+    check(program, *command, names="manifest.json", out=out)
+    assert [path.name for path in out.iterdir()] == ["manifest.json"]
 
 
 @pytest.fixture(scope="module")
@@ -312,9 +306,7 @@ def city(tmp_path_factory):
     folder = tmp_path_factory.mktemp("city")
     config = tiny_city.city(folder)
     project = tmp_path_factory.mktemp("project")
-    result = CliRunner().invoke(MAINS["cosim"], [
-        "import", str(config), "--regions", "3", "--out", str(project / "networks" / "tiny")])
-    assert result.exit_code == 0, result.output
+    good(call("cosim", "import", config, "--regions", 3, "--out", project / "networks" / "tiny"))
     return project
 
 
@@ -337,102 +329,97 @@ REGIONS = {
     "columns": "edge,region\nA0A1\n", "digits": f"edge,region\nA0A1,{'1' * 5000}\n", "zeros": "\0" * 10}
 
 
-def test_regions(copied):
+@pytest.mark.parametrize("content", params(REGIONS.items()))
+def test_regions(copied, content):
     file = copied / "networks" / "tiny" / "regions.csv"
     whole = file.read_text()
+    file.write_text(whole + whole.splitlines()[1] + "\n" if content is None else content)
+    run_city(copied, names=file.name)
 
-    def test(content):
-        file.write_text(whole + whole.splitlines()[1] + "\n" if content is None else content)
-        run_city(copied, names=file.name)
 
-    every(REGIONS.items(), test)
-    lines = whole.splitlines()
-    file.write_text("\n".join(lines[:-1]) + "\n")
+def test_an_edge_without_a_region(copied):
+    file = copied / "networks" / "tiny" / "regions.csv"
+    file.write_text("\n".join(file.read_text().splitlines()[:-1]) + "\n")
     run_city(copied, names="has no region")
 
 
-def nets(whole: str):
-    draw = random.Random(7)
-    yield "empty", ""
-    yield "no XML", "city"
-    yield "another root", "<routes/>"
-    yield "no edges", "<net></net>"
-    yield "encoding", "<?xml version='1.0' encoding='utf-77'?><net/>"
-    for attribute in ("length", "speed"):
-        for value in ("0", "-5", "nan", "inf", "fast", ""):
-            yield f"{attribute} = {value}", re.sub(rf'( {attribute})="[^"]+"', rf'\1="{value}"', whole, count=1)
-        yield f"{attribute} missing", re.sub(rf' {attribute}="[^"]+"', "", whole, count=1)
-    for attribute in ("from", "to", "fromLane", "toLane"):
-        yield f"connection {attribute} missing", re.sub(
-            rf'(<connection[^>]*?) {attribute}="[^"]+"', r"\1", whole, count=1)
-    yield "via", re.sub(r' via="[^"]+"', ' via=":nowhere_0_0"', whole, count=1)
-    yield "link index", re.sub(r' linkIndex="[^"]+"', ' linkIndex="x"', whole, count=1)
-    yield "phase", re.sub(r'<phase duration="[^"]+"', '<phase duration="long"', whole, count=1)
-    yield "state", re.sub(r'(<phase [^>]*) state="[^"]+"', r"\1", whole, count=1)
-    yield "offset", re.sub(r'(<tlLogic [^>]*) offset="[^"]+"', r'\1 offset="late"', whole, count=1)
-    yield "edge id", re.sub(r'<edge id="A0A1"', "<edge", whole, count=1)
-    for _ in range(5):
-        at = draw.randrange(200, len(whole) - 200)
-        yield f"cut at {at}", whole[:at]
+# What is wrong -> the file from the whole one: what to replace by what once, or another text altogether.
+NETS = {
+    "empty": "", "no XML": "city", "another root": "<routes/>", "no edges": "<net></net>",
+    "encoding": "<?xml version='1.0' encoding='utf-77'?><net/>",
+    **{f"{attribute} = {value}": (rf'( {attribute})="[^"]+"', rf'\1="{value}"')
+       for attribute in ("length", "speed") for value in ("0", "-5", "nan", "inf", "fast", "")},
+    **{f"{attribute} missing": (rf' {attribute}="[^"]+"', "") for attribute in ("length", "speed")},
+    **{f"connection {attribute} missing": (rf'(<connection[^>]*?) {attribute}="[^"]+"', r"\1")
+       for attribute in ("from", "to", "fromLane", "toLane")},
+    "via": (r' via="[^"]+"', ' via=":nowhere_0_0"'), "link index": (r' linkIndex="[^"]+"', ' linkIndex="x"'),
+    "phase": (r'<phase duration="[^"]+"', '<phase duration="long"'),
+    "state": (r'(<phase [^>]*) state="[^"]+"', r"\1"),
+    "offset": (r'(<tlLogic [^>]*) offset="[^"]+"', r'\1 offset="late"'),
+    "edge id": (r'<edge id="A0A1"', "<edge"),
+    **{f"cut at {share}": share for share in (0.01, 0.3, 0.5, 0.8, 0.99)}}
+DAMAGES = {
+    "cut gzip": lambda whole, packed: packed[: len(packed) // 2], "no gzip": lambda whole, packed: whole,
+    "noise": lambda whole, packed: packed[:20] + bytes(99)}
 
 
-def test_networks_of_sumo(copied):
+def changed(whole: str, change) -> str:
+    match change:
+        case (old, new):
+            return re.sub(old, new, whole, count=1)
+        case float():
+            return whole[: int(change * len(whole))]
+    return change
+
+
+@pytest.mark.parametrize("change", params(NETS.items()))
+def test_networks_of_sumo(copied, change):
     file = copied / "networks" / "tiny" / "city.net.xml.gz"
-    whole = gzip.decompress(file.read_bytes()).decode()
-
-    def test(content):
-        file.write_bytes(content if isinstance(content, bytes) else gzip.compress(content.encode()))
-        run_city(copied, names=file.name)
-
-    packed = gzip.compress(whole.encode())
-    broken = [("cut gzip", packed[: len(packed) // 2]), ("no gzip", whole.encode()), ("noise", packed[:20] + bytes(99))]
-    assert every([*nets(whole), *broken], test) > 30
+    file.write_bytes(gzip.compress(changed(gzip.decompress(file.read_bytes()).decode(), change).encode()))
+    run_city(copied, names=file.name)
 
 
-def routes(whole: str):
-    first = re.search(r'<(?:vehicle|trip)[^>]*id="([^"]+)"', whole)[1]
-    yield "empty", ""
-    yield "no XML", "routes"
-    yield "another root", "<net/>"
-    yield "cut", whole[: len(whole) // 2]
-    yield "a flow", "<routes><flow id='f' begin='0' end='9' number='3' from='A0A1' to='A1A2'/></routes>"
-    for value in ("-5", "nan", "inf", "triggered", "soon", ""):
-        yield f"depart = {value}", re.sub(r'depart="[^"]+"', f'depart="{value}"', whole, count=1)
-    yield "no depart", re.sub(r' depart="[^"]+"', "", whole, count=1)
-    yield "no id", whole.replace(f' id="{first}"', "", 1)
-    yield "id twice", re.sub(r' id="[^"]+"', f' id="{first}"', whole)
-    yield "unknown edge", re.sub(r'(edges|from)="\w+', r'\1="nowhere', whole, count=1)
-    yield "unknown end", "<routes><trip id='t' depart='700' from='A0A1' to='nowhere'/></routes>"
-    yield "unknown way", "<routes><trip id='t' depart='700' from='A0A1' to='D1D2' via='nowhere'/></routes>"
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_network_of_sumo(copied, damage):
+    file = copied / "networks" / "tiny" / "city.net.xml.gz"
+    whole = gzip.decompress(file.read_bytes())
+    file.write_bytes(DAMAGES[damage](whole, gzip.compress(whole)))
+    run_city(copied, names=file.name)
 
 
-def test_route_files(copied):
+ROUTES = {
+    "empty": "", "no XML": "routes", "another root": "<net/>", "cut": 0.5,
+    "a flow": "<routes><flow id='f' begin='0' end='9' number='3' from='A0A1' to='A1A2'/></routes>",
+    **{f"depart = {value}": (r'depart="[^"]+"', f'depart="{value}"')
+       for value in ("-5", "nan", "inf", "triggered", "soon", "")},
+    "no depart": (r' depart="[^"]+"', ""),
+    "no id": (r'(<(?:vehicle|trip)[^>]*?) id="[^"]+"', r"\1"),
+    "id twice": None,
+    "unknown edge": (r'(edges|from)="\w+', r'\1="nowhere'),
+    "unknown end": "<routes><trip id='t' depart='700' from='A0A1' to='nowhere'/></routes>",
+    "unknown way": "<routes><trip id='t' depart='700' from='A0A1' to='D1D2' via='nowhere'/></routes>"}
+
+
+@pytest.mark.parametrize("name", ROUTES)
+def test_route_files(copied, name):
     file = copied / "scenarios" / "tiny" / "vehicles.rou.xml.gz"
     whole = gzip.decompress(file.read_bytes()).decode()
-
-    def test(content):
-        file.write_bytes(gzip.compress(content.encode()))
-        run_city(copied, names="vehicles.rou.xml.gz" if "nowhere" not in content else "nowhere")
-
-    every(routes(whole), test)
+    content = re.sub(r' id="[^"]+"', ' id="same"', whole) if name == "id twice" else changed(whole, ROUTES[name])
+    file.write_bytes(gzip.compress(content.encode()))
+    run_city(copied, names="nowhere" if "unknown" in name else file.name)
 
 
+@pytest.mark.parametrize("damage", ["empty", "no gzip", "no XML", "cut"])
 @pytest.mark.parametrize("name", ["background.rou.xml.gz", "city.add.xml.gz"])
-def test_other_files_of_sumo(copied, name):
+def test_other_files_of_sumo(copied, name, damage):
     file = copied / "scenarios" / "tiny" / name
-
-    def test(content):
-        file.write_bytes(content)
-        run_city(copied, names=name)
-
-    every([("empty", b""), ("no gzip", b"<routes/>"), ("no XML", gzip.compress(b"x")),
-           ("cut", file.read_bytes()[:50])], test)
+    file.write_bytes({
+        "empty": b"", "no gzip": b"<routes/>", "no XML": gzip.compress(b"x"), "cut": file.read_bytes()[:50]}[damage])
+    run_city(copied, names=name)
 
 
 def test_unsorted_routes_are_sorted(copied):
     """What SUMO would refuse is no mistake here: vehicles are sorted by departure."""
-    from cosim.sumo.recorded_trips import read_originals
-
     file = copied / "scenarios" / "tiny" / "vehicles.rou.xml.gz"
     root = gzip.decompress(file.read_bytes()).decode()
     vehicles = [ElementTree.tostring(vehicle, encoding="unicode") for vehicle in ElementTree.fromstring(root)]
@@ -575,30 +562,27 @@ def lines(program: str):
             yield [*words, alternative]
 
 
-@pytest.mark.parametrize("program", LINES)
-def test_command_lines(tmp_path, program, city, monkeypatch):
+@pytest.mark.parametrize("program, words", [
+    pytest.param(program, words, id=" ".join([program, *words])[:80]) for program in LINES for words in lines(program)])
+def test_command_lines(tmp_path, program, words, city, monkeypatch):
     monkeypatch.chdir(tmp_path)
     places = {"s": tiny.write(tmp_path / "tiny"), "g": PEAK, "none": tmp_path / "none", "out": tmp_path / "out",
               "net": city / "networks" / "tiny" / "city.net.xml.gz"}
     before = sorted(tmp_path.rglob("*"))
-
-    def test(words):
-        filled = [word.format(**places) for word in words]
-        if program == "nmfd" and filled[0] in ("benchmark", "show", "robustness", "ablation") and "--out" not in filled:
-            filled += ["--out", str(places["out"])]
-        check(program, *filled, out=places["out"])
-        assert sorted(tmp_path.rglob("*")) == before
-
-    assert every([(" ".join(words)[:150], words) for words in lines(program)], test) > 60
+    filled = [word.format(**places) for word in words]
+    if program == "nmfd" and filled[0] in ("benchmark", "show", "robustness", "ablation") and "--out" not in filled:
+        filled += ["--out", str(places["out"])]
+    check(program, *filled, out=places["out"])
+    assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("call", [
+@pytest.mark.parametrize("words", [
     ["nmfd", "benchmark", "{s}", "--controllers", "none"], ["nmfd", "show", "{none}"], ["cosim", "run", "{none}"],
-    ["cosim", "compare", "{none}"]])
-def test_the_same_in_a_process_of_its_own(tmp_path, call):
+    ["cosim", "compare", "{none}"]], ids=" ".join)
+def test_the_same_in_a_process_of_its_own(tmp_path, words):
     """CliRunner is not the shell: status and stderr are those of a process."""
     places = {"s": tiny.write(tmp_path), "none": tmp_path / "none"}
-    program, *arguments = call
+    program, *arguments = words
     done = subprocess.run(
         [sys.executable, "-m", program, *(a.format(**places) for a in arguments)], capture_output=True,
         text=True, cwd=tmp_path)

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
-from click.testing import CliRunner
+from commands import nmfd
 
 from nmfd import closed_loop
 from nmfd.api import load_scenario
-from nmfd.cli.main import main
 from nmfd.controllers import open_loop, registry
 from nmfd.controllers.no_control import NoControl
 from nmfd.controllers.pi_gating import PiGating
@@ -31,10 +30,6 @@ def folder(tmp_path):
 @pytest.fixture
 def scenario(folder):
     return load_scenario(folder)
-
-
-def nmfd(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 def closed(scenario, controller):

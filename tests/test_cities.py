@@ -9,10 +9,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import sumo
-from click.testing import CliRunner
+from commands import cosim
 from tiny_city import driven
 
-from cosim.cli.main import main
 from cosim.importing.quality import pieces
 from cosim.importing.streets import read_streets
 from nmfd.api import load_scenario
@@ -21,10 +20,6 @@ GAMES = Path(sumo.SUMO_HOME) / "tools" / "game"
 CITIES = Path(os.environ.get("CITIES", Path(__file__).parents[2] / "shared" / "cities"))
 REAL = {"bologna": ("bologna/run.sumocfg", 4), "ingolstadt": ("ingolstadt21/ingolstadt21.sumocfg", 3),
         "luxembourg": ("luxembourg/luxembourg.net.xml.gz", 6)}
-
-
-def cosim(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def check(folder: Path, name: str, intervals: int) -> None:
@@ -62,7 +57,7 @@ def test_demos_of_sumo(tmp_path, name, expected):
 def test_real_cities(tmp_path, name):
     source, count = REAL[name]
     if not (CITIES / source).is_file():
-        pytest.skip(f"{CITIES / source} is not there")
+        pytest.skip(f"no real city: {CITIES / source} is not there")
     peak = ("--demand", "peak", "--level", "0.05") if name == "luxembourg" else ()
     result = cosim("import", CITIES / source, "--regions", count, "--method", "geometric", "--no-run", *peak, "--out",
                    tmp_path / "networks" / name)

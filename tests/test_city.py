@@ -143,7 +143,7 @@ def test_wrong_recipes_give_one_line(tmp_path):
     path = tmp_path / "grid7" / "city.toml"
     good = path.read_text()
     for old, new, message in (
-            ("speed =", "sped =", "centre.speed: missing"),
+            ("speed =", "sped =", "centre.sped: unknown key; did you mean speed"),
             ("0 0 0 0 0 1 1 1 1", "0 0 0 0 0 1 1 1 9", r"expected a region from 0 to 6 .* got '9'"),
             ("cycle = 90", "cycle = 90\nwrong = 1", "signals.wrong: unknown key")):
         path.write_text(good.replace(old, new, 1))

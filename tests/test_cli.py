@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from click.testing import CliRunner
+from commands import nmfd
 
 from nmfd import closed_loop
-from nmfd.cli.main import main
 from nmfd.controllers import registry
 from nmfd.controllers.dpc import rollout, training
 from nmfd.controllers.pi_gating import PiGating
@@ -26,10 +25,6 @@ COLUMNS = (
     "controller,seed,plant,total_time_spent_veh_s,final_accumulation_veh,max_accumulation_veh,completed_veh,"
     "evaluation_time_s,control_step_ms_median,control_step_ms_max,solver_failures,fallbacks,"
     "late_decisions,sensor_faults,plant_faults")
-
-
-def nmfd(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 @pytest.fixture
@@ -46,7 +41,7 @@ def timeless(folder):
     """The rows of summary.csv without what differs from run to run, and the bytes of every trajectory."""
     rows = [{key: value for key, value in row.items() if key not in TIMES} for row in run_folder.read_summary(
         folder / "summary.csv")]
-    return rows, {path.name: path.read_bytes() for path in folder.glob("*.npz")}
+    return rows, {path.name: path.read_bytes() for path in folder.glob("*.nc")}
 
 
 def commands(package):
@@ -102,13 +97,13 @@ def test_benchmark_writes_a_run_folder(benchmark_command, tmp_path):
     assert manifest["sessions"][0]["seeds"] == [0, 1] and manifest["sessions"][0]["versions"]["torch"]
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "summary.csv", "manifest.json", "total_accumulation.png", "region_accumulation.png", "spawn_matrix.png",
-        "region_map.png", "mfd.png", "no-control-0.npz", "no-control-1.npz", "pi-gating-0.npz", "pi-gating-1.npz"}
+        "region_map.png", "mfd.png", "no-control-0.nc", "no-control-1.nc", "pi-gating-0.nc", "pi-gating-1.nc"}
 
 
 def test_trajectories_of_the_folder_agree_with_the_summary(benchmark_command, tmp_path):
     nmfd(*benchmark_command, "--plant", "acyclic")
     for row in run_folder.read_summary(tmp_path / "out" / "summary.csv"):
-        trajectory = run_folder.read_trajectory(tmp_path / "out" / f"{row['controller']}-{row['seed']}.npz")
+        trajectory = run_folder.read_trajectory(tmp_path / "out" / f"{row['controller']}-{row['seed']}.nc")
         assert trajectory.plant == row["plant"] == "acyclic"
         assert 30.0 * trajectory.accumulation[:-1].sum() == pytest.approx(row["total_time_spent_veh_s"], rel=1e-12)
         assert np.all(trajectory.accumulation >= 0)

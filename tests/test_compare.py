@@ -13,8 +13,6 @@ from cosim.evaluation.identify import (
     as_it_was,
     fit_table,
     nearly_empty,
-    network_toml,
-    own_splits,
     samples_of,
     static_model,
     unreached,
@@ -24,6 +22,8 @@ from cosim.evaluation.simulate import Result
 from cosim.plant.strategy import planning_of
 from nmfd.api import load_scenario
 from nmfd.model import dynamics, mfd
+from nmfd.model.identification import observed_split_ratios
+from nmfd.model.model_file import network_toml
 from nmfd.model.regional_model import load_network
 
 ROOT = Path(__file__).parents[1]
@@ -109,18 +109,17 @@ def test_outflow_samples_lie_on_the_mfd(scenario, result):
 
 def test_own_splits_are_the_crossings_shares(scenario, result):
     network = scenario.network
-    found = own_splits(network, [result.record])
-    assert found[0, 6] == {3: 1.0}
-    mixed = {"crossings": result.record["crossings"].copy()}
-    mixed["crossings"][:, 0, 1, 6] = mixed["crossings"][:, 0, 3, 6] / 3.0
-    assert own_splits(network, [mixed])[0, 6] == pytest.approx({1: 0.25, 3: 0.75})
+    crossings = result.record["crossings"].sum(axis=0)
+    assert observed_split_ratios(network, crossings)[0, 6] == {3: 1.0}
+    crossings[0, 1, 6] = crossings[0, 3, 6] / 3.0
+    assert observed_split_ratios(network, crossings)[0, 6] == pytest.approx({1: 0.25, 3: 0.75})
 
 
 def test_network_file_comes_back_the_same(scenario, result, tmp_path):
     network = scenario.network
-    mixed = {"crossings": result.record["crossings"].copy()}
-    mixed["crossings"][:, 0, 1, 6] = mixed["crossings"][:, 0, 3, 6] / 3.0
-    network = replace(network, own_splits=own_splits(network, [mixed]))
+    crossings = result.record["crossings"].sum(axis=0)
+    crossings[0, 1, 6] = crossings[0, 3, 6] / 3.0
+    network = replace(network, own_splits=observed_split_ratios(network, crossings))
     for kind in (network, tiny.limited(network)):
         text = network_toml(kind, {"recipe": "city.toml"}, "a test")
         (tmp_path / "network.toml").write_text(text)

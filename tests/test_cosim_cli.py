@@ -9,9 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from click.testing import CliRunner
+from commands import cosim, error_line, good
 
-from cosim.cli.main import main
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
 from nmfd.model.planning import planning_model
@@ -21,15 +20,6 @@ from nmfd.runs.run_folder import COLUMNS
 ROOT = Path(__file__).parents[1]
 GRID = ROOT / "networks" / "grid7"
 STEPS = "3"
-
-
-def cosim(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
-def good(result):
-    assert result.exit_code == 0, result.output + str(result.exception)
-    return result.stdout
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +62,7 @@ def test_strategies_run_and_are_filed_under_their_names(small, tmp_path, strateg
     text = good(cosim("run", small, "--controller", strategy, *other, "--steps", STEPS, "--out", out))
     facts = pd.read_csv(out / "sumo.csv")
     assert set(pd.read_csv(out / "summary.csv")["controller"]) == set(facts["controller"]) == names
-    assert all(name in text and (out / f"{name}-0.record.npz").is_file() for name in names)
+    assert all(name in text and (out / f"{name}-0.nc").is_file() for name in names)
     assert (facts["signals_left_alone"] == 0).all()
     good(cosim("compare", out, "--controller", strategy))
 
@@ -120,20 +110,14 @@ def test_identify_writes_a_network_that_loads(small, tmp_path):
     shutil.copytree(folder, tmp_path / "city")
     scenario, network = tmp_path / "city" / "scenarios" / "small", tmp_path / "city" / "networks" / "grid7"
     text = (scenario / "scenario.toml").read_text()
-    (scenario / "scenario.toml").write_text(text.replace("steps = 80", "steps = 7"))
+    (scenario / "scenario.toml").write_text(text.replace("steps = 80", "steps = 4"))
     before = load_network(network)
     out = tmp_path / "identify"
-    good(cosim("identify", scenario, "--levels", "1.0", "--seeds", "2", "--iterations", "20", "--out", out))
+    good(cosim("identify", scenario, "--levels", "1.0", "--seeds", "2", "--iterations", "5", "--out", out))
     after = load_network(network)
     assert after.hash != before.hash and (after.adjacency == before.adjacency).all()
     assert after.own_splits and all(mfd.problem() is None for mfd in after.mfds)
     assert len(pd.read_csv(out / "samples.csv")) > 40 and (out / "mfd.png").is_file()
-
-
-def error_line(result):
-    assert result.exit_code == 2, result.output + str(result.exception)
-    assert result.stderr.startswith("cosim: error: ") and result.stderr.count("\n") == 1, result.stderr
-    return result.stderr
 
 
 @pytest.mark.parametrize("old, new, expected", [

@@ -89,8 +89,9 @@ def test_all_links_and_all_probes_see_everything(scenario):
     seen = []
     try:
         state, controller = plant.reset(3), PiGating(planning_model(scenario))
-        readings = plant._detectors.readings
-        plant._detectors.readings = lambda flow: (seen.append(readings(flow)), seen[-1])[1]
+        detectors = plant._sensing._estimation._detectors
+        readings = detectors.readings
+        detectors.readings = lambda flow: (seen.append(readings(flow)), seen[-1])[1]
         for _ in range(scenario.steps):
             before, state = state, plant.step(controller.act(plant.observe()))
         estimate = plant.observe()
@@ -150,7 +151,7 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
     scenario = scenario_of(tasks[0])
     found = simulate(tasks[0]).trajectory
     for model, same in zip(models, (True, False), strict=True):
-        plant = SumoPlant(scenario, overrides=replace(settings(scenario), measurement="estimate"),
+        plant = SumoPlant(scenario, overrides=settings(scenario).changed(measurement="estimate"),
                           planning=replace(planning_model(scenario), network=model))
         try:
             again = closed_loop.run(plant, registry.make("route-guidance", scenario), scenario, seed=3)
@@ -163,9 +164,9 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
 def test_same_seed_same_bytes(scenario, run, tmp_path):
     again = drive(scenario, measurement="estimate")
     for name, trajectory in (("a", run), ("b", again)):
-        run_folder.write_trajectory(tmp_path / f"{name}.npz", trajectory)
-    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    assert (run_folder.read_trajectory(tmp_path / "a.npz").observed == run.observed).all()
+        run_folder.write_trajectory(tmp_path / f"{name}.nc", trajectory)
+    assert (tmp_path / "a.nc").read_bytes() == (tmp_path / "b.nc").read_bytes()
+    assert (run_folder.read_trajectory(tmp_path / "a.nc").observed == run.observed).all()
 
 
 def test_table_and_picture(scenario, run, tmp_path):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from tiny import random_controls
 
 from nmfd.model import dynamics, dynamics_casadi
 from nmfd.model.mfd import Mfd
@@ -20,21 +21,12 @@ LIMITED = tiny.limited(NETWORK)
 KINDS = pytest.mark.parametrize("network", [NETWORK, LIMITED], ids=["published", "limited"])
 
 
-def random_controls(random, network=NETWORK, batch=()):
-    """Admissible perimeter (*batch, R, R) and splits (*batch, R, R, R)."""
-    shape = (*batch, network.regions, network.regions)
-    perimeter = random.uniform(network.u_min, network.u_max, shape) * network.adjacency
-    splits = random.uniform(size=(*shape, network.regions)) ** 3 * network.split_mask
-    sums = splits.sum(axis=-2, keepdims=True)
-    return perimeter, splits / np.where(sums > 0, sums, 1.0)
-
-
 def random_tensors(seed, *, filling, batch=()):
     """State, demand, perimeter, splits; regions hold up to `filling` [veh]."""
     random = np.random.default_rng(seed)
     x = random.uniform(size=(*batch, 7, 7)) * random.uniform(0.0, filling / 3.5, (*batch, 7, 1))
     demand = random.uniform(0.0, 3.0, (*batch, 7, 7))
-    return tuple(torch.from_numpy(array) for array in (x, demand, *random_controls(random, batch=batch)))
+    return tuple(torch.from_numpy(array) for array in (x, demand, *random_controls(random, NETWORK, batch)))
 
 
 def one_region(mfd):
@@ -145,7 +137,7 @@ def test_torch_and_casadi_agree(integrator, substeps, network):
     random = np.random.default_rng(6)
     p, x, twin, most = dynamics_casadi.parameters(network), torch.zeros(7, 7, dtype=torch.float64), ca.DM(7, 7), 0.0
     for _ in range(120):
-        demand, (perimeter, splits) = random.uniform(0.0, 2.0, (7, 7)), random_controls(random)
+        demand, (perimeter, splits) = random.uniform(0.0, 2.0, (7, 7)), random_controls(random, NETWORK)
         kwargs = {"integrator": integrator, "substeps": substeps}
         x = dynamics.advance(
             dynamics.parameters(network), x, *(torch.from_numpy(array) for array in (demand, perimeter, splits)), STEP,

@@ -1,4 +1,4 @@
-"""The benchmark scenario gives the figures of design.md, section 3."""
+"""The benchmark scenario gives the published figures, as far as they are matched."""
 
 from dataclasses import replace
 from pathlib import Path

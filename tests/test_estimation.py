@@ -240,3 +240,101 @@ def test_bounded_moves_what_correlates():
     np.testing.assert_allclose(bounded(np.array([-2.0, 12.0]), np.eye(2), np.zeros(2)), [0.0, 12.0], atol=1e-3)
     inside = np.array([3.0, 4.0])
     assert bounded(inside, covariance, np.zeros(2)) is inside
+
+
+def readings(known, *, mean=40.0, expansion=0.1, crossings=9.0, x=25.0, probes=10.0, leaving=2.0):
+    """Expectations and variances of the readings of one kind each, where all regions and boundaries are alike."""
+    model = estimation._Model(planning_model(SCENARIO), known)
+    z = np.zeros(model._size)
+    z[model._expansion], z[model._x], z[model._mean] = expansion, x, mean
+    z[model._crossings], z[model._probes], z[model._departures] = crossings, probes, 3.0
+    observation = Readings(
+        accumulation=np.full(REGIONS, 1.0), crossings=np.full((REGIONS, REGIONS), 2.0),
+        probes=np.full((REGIONS, REGIONS), 3.0), probe_departures=np.full((REGIONS, REGIONS), 4.0))
+    columns = model._readings(z, np.full(REGIONS**2, leaving), observation, observation.accumulation)
+    ends = np.cumsum([REGIONS, len(model._boundaries), REGIONS**2, REGIONS**2])
+    kinds = [np.split(column, ends) for column in columns]
+    assert all(np.ptp(part) == 0 for kind in kinds for part in kind)
+    return [[float(part[0]) for part in kind] for kind in kinds]
+
+
+def test_what_the_readings_are_and_are_expected_to_be():
+    read, expected, _ = readings(equipped(probes=0.1))
+    assert read == [1.0, 2.0, 3.0, 4.0, 0.0]
+    assert expected == pytest.approx([1.1 * 40.0, 9.0, 10.0, 3.0, 10.0 - 0.1 * 25.0])
+
+
+def test_the_noise_of_every_kind_of_reading():
+    """Detectors on a share s of the links see a binomial part; so do counts, besides their own error; probes are seen
+    exactly; and are a binomial share of the vehicles, as long as the same ones are there."""
+    loops, counts, probes, departures, share = readings(equipped(detectors=0.25, probes=0.1, error=0.2))[2]
+    floor = estimation.FLOOR
+    assert loops == pytest.approx(40.0 * 3.0 + (0.2 * 40.0) ** 2 + floor)
+    assert counts == pytest.approx(0.75 * (9.0 / 0.25 + estimation.COUNT_ERROR**2 * 81.0 / 2.0) + floor)
+    assert probes == departures == floor
+    kept = np.exp(-max(2.0 / 25.0, SCENARIO.step / estimation.MEMORY))
+    assert share == pytest.approx(0.1 * 0.9 * 25.0 * (1.0 + kept) / (1.0 - kept) + floor)
+    assert readings(equipped(probes=0.1), leaving=50.0)[2][4] < share  # they are others every time
+
+
+def test_with_everything_seen_readings_are_exact():
+    """Of less than one vehicle, the noise is that of one."""
+    assert readings(equipped(detectors=1.0, probes=1.0, error=0.0))[2] == pytest.approx([estimation.FLOOR] * 5)
+    low = readings(equipped(detectors=0.5, error=0.0), mean=0.2, crossings=0.2)[2]
+    assert low[0] == pytest.approx(1.0 + estimation.FLOOR) and low[1] == pytest.approx(
+        0.5 * (2.0 + estimation.COUNT_ERROR**2 * 0.04 / 2.0) + estimation.FLOOR)
+
+
+def test_probes_move_as_a_share_of_the_vehicles():
+    """What arrives, less what leaves, less the ends of trips: with a share of one, what dynamics changes."""
+    random = np.random.default_rng(1)
+    x = torch.from_numpy(random.uniform(0.0, 50.0, (1, REGIONS, REGIONS)))
+    controls = torch.from_numpy(OPEN.perimeter), torch.from_numpy(NETWORK.nominal_splits)
+    ends, transfers = dynamics.flows(dynamics.parameters(NETWORK), x, *controls)
+    change = estimation._moved(torch.ones_like(x), ends, transfers)
+    after = dynamics.euler(dynamics.parameters(NETWORK), x, torch.zeros_like(x), *controls, 1.0)
+    torch.testing.assert_close(change, after - x)
+    torch.testing.assert_close(estimation._moved(0.25 * torch.ones_like(x), ends, transfers), 0.25 * change)
+
+
+def test_probes_that_are_not_seen_go_on_with_the_vehicles():
+    """Seen once, then never again: they stay a share of what is there."""
+    estimator, crowd = Estimator(planning_model(SCENARIO), equipped(probes=0.5)), Crowd(0, equipped(probes=0.5))
+    for k in range(10):
+        estimator.step(OPEN, crowd.step(k))
+    before = estimator.belief.probes.sum(), estimator.accumulation.sum()
+    for _ in range(3):
+        estimator.step(OPEN, nothing())
+    share = estimator.belief.probes.sum() / estimator.accumulation.sum()
+    assert share == pytest.approx(before[0] / before[1], abs=0.08)
+    assert (estimator.belief.probes <= estimator.accumulation + 1e-9).all()
+
+
+def test_a_detector_is_stuck_at_its_third_same_reading():
+    """Two may be chance, and an empty street shows 0 for ever."""
+    taken, model = [], Estimator(planning_model(SCENARIO), equipped())
+    advance = model._model.advance
+    model._model.advance = lambda belief, demand, perimeter, splits, observation, loops: taken.append(
+        loops[:3].tolist()) or advance(belief, demand, perimeter, splits, observation, loops)
+    for first in (7.0, 7.0, 7.0, 7.0, 8.0):
+        accumulation = np.full(REGIONS, np.nan)
+        accumulation[:3] = first, 0.0, 10.0 + len(taken)
+        model.step(OPEN, replace(nothing(), accumulation=accumulation))
+    assert [np.isnan(first) for first, _, _ in taken] == [False, False, True, True, False]
+    assert [rest for _, *rest in taken] == [[0.0, 10.0 + k] for k in range(5)]
+
+
+def test_one_vehicle_changes_what_it_should():
+    """A turn leaves one cell for another; departures and ends of trips change one; each counts half in the mean."""
+    model = estimation._Model(planning_model(SCENARIO), equipped())
+    vehicle, probe = model._effects()
+    cells, turns = REGIONS**2, int(NETWORK.split_mask.sum())
+    place, half, crossing = np.split(vehicle, [cells, cells + REGIONS])
+    assert place[:, :turns].sum() == 0 and (np.abs(place[:, :turns]).sum(axis=0) == 2).all()
+    assert (place[:, turns : turns + REGIONS].sum(axis=0) == -1).all()
+    assert (place[:, turns + REGIONS :].sum(axis=0) == 1).all()
+    np.testing.assert_array_equal(half, 0.5 * place.reshape(REGIONS, REGIONS, -1).sum(axis=1))
+    assert (crossing[:, :turns].sum(axis=0) == 1).all() and not crossing[:, turns:].any()
+    np.testing.assert_array_equal(probe[:cells], place)
+    assert probe[cells:].sum() == cells and (probe[cells:, turns + REGIONS :] == np.eye(cells)).all()
+

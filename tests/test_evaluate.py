@@ -8,12 +8,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import trajectories
-from click.testing import CliRunner
+from commands import cosim
 
-from cosim.cli.main import main
 from cosim.evaluation import evaluate, experiment
 from cosim.evaluation.simulate import FACTS, Result
+from cosim.plant.record import Record
+from cosim.report import pictures
 from nmfd.errors import InputError
+from nmfd.quantities import quantities
 from nmfd.runs.workers import Failure
 
 ROOT = Path(__file__).parents[1]
@@ -24,10 +26,6 @@ def change(file: Path, pattern: str, new: str) -> None:
     text, count = re.subn(pattern, new, file.read_text(), count=1)
     assert count == 1
     file.write_text(text)
-
-
-def cosim(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 @pytest.fixture
@@ -48,7 +46,6 @@ def ran(monkeypatch):
             yield task, Failure("SUMO fell over") if (task.controller, task.seed) in failing else made_up(task)
 
     monkeypatch.setattr(experiment, "outcomes", outcomes)
-    monkeypatch.setattr(evaluate.pictures, "draw_all", lambda *_: None)
     return tasks, failing
 
 
@@ -58,7 +55,8 @@ def made_up(task) -> Result:
         backlog=np.zeros((3, 7, 7)), completed=np.zeros(3), perimeter=np.ones((2, 7, 7)),
         splits=np.zeros((2, 7, 7, 7)), decision_time=np.zeros(2), wall_time=1.0)
     facts = {name: 0 for name in FACTS} | {"controller": task.controller, "seed": task.seed}
-    return Result(trajectory=trajectory, record={"departures": np.zeros(1)}, facts=facts)
+    record = {name: np.zeros([2] + [7] * (len(about["dimensions"]) - 1)) for name, about in quantities(Record).items()}
+    return Result(trajectory=trajectory, record=record, facts=facts)
 
 
 def evaluation(city, tmp_path, *, controllers=("no-control", "pi-gating"), seeds=(2000, 2001), **others):
@@ -148,7 +146,7 @@ def test_a_small_evaluation_in_sumo(city, tmp_path):
     file.write_text(re.sub(r"ramp_up = [\d.]+", "ramp_up = 60.0", file.read_text()))
     change(file, r"outflow_share = [\d.]+", "set_point = [20.0]")
     out = tmp_path / "out"
-    arguments = ("evaluate", city, "--controllers", "no-control,pi-gating", "--seeds", "2", "--steps", "3", "--workers",
+    arguments = ("evaluate", city, "--controllers", "no-control,pi-gating", "--seeds", "2", "--steps", "2", "--workers",
                  "1", "--out", out)
     result = cosim(*arguments)
     assert result.exit_code == 0, result.output + str(result.exception)
@@ -158,16 +156,16 @@ def test_a_small_evaluation_in_sumo(city, tmp_path):
     level = out / "demand-1"
     for picture in ("total_accumulation", "region_accumulation", "link_densities", "gateway_queues", "perimeter"):
         assert (level / f"{picture}.png").stat().st_size > 10_000
-    assert max(path.stat().st_size for path in level.glob("*.record.npz")) < 1_000_000
-    before = {path: path.read_bytes() for path in level.glob("*.npz")}
+    assert max(path.stat().st_size for path in level.glob("*.nc")) < 1_000_000
+    before = {path: path.read_bytes() for path in level.glob("*.nc")}
     assert cosim(*arguments).exit_code == 0
-    assert before == {path: path.read_bytes() for path in level.glob("*.npz")}
+    assert before == {path: path.read_bytes() for path in level.glob("*.nc")}
 
 
 def test_titles_name_the_most_teleports():
     rows = pd.DataFrame([{"controller": f"c{n}", "teleports": 0} for n in (1, 2)])
-    assert evaluate.pictures.teleports(rows) == "no teleport in any run"
+    assert pictures.teleports(rows) == "no teleport in any run"
     rows = pd.DataFrame([{"controller": name, "teleports": count} for name, count in (
         ("a", 1), ("b", 9), ("c", 4), ("d", 0), ("b", 2))])
-    assert evaluate.pictures.teleports(rows) == "teleports: b 11, c 4, others fewer"
-    assert evaluate.pictures.teleports(rows[rows["controller"] != "a"]) == "teleports: b 11, c 4"
+    assert pictures.teleports(rows) == "teleports: b 11, c 4, others fewer"
+    assert pictures.teleports(rows[rows["controller"] != "a"]) == "teleports: b 11, c 4"

@@ -15,7 +15,7 @@ import pytest
 import tiny
 import tiny_city
 import torch
-from click.testing import CliRunner
+from commands import call
 
 import cosim.cli.main
 import nmfd.cli.main
@@ -39,10 +39,6 @@ from nmfd.runs import run_folder
 from nmfd.types import Controls, Observation
 
 MAINS = {"nmfd": nmfd.cli.main.main, "cosim": cosim.cli.main.main}
-
-
-def call(program, *arguments):
-    return CliRunner().invoke(MAINS[program], [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -229,7 +225,7 @@ def test_ordered_in_the_scenario_or_on_the_command_line(tmp_path):
         summary = run_folder.read_summary(tmp_path / out / "summary.csv")
         rows = {row["controller"]: row["solver_failures"] for row in summary}
         assert rows == {"mpc-pc": 3, "no-control": 0}
-    assert (tmp_path / "a" / "mpc-pc-0.npz").read_bytes() == (tmp_path / "b" / "mpc-pc-0.npz").read_bytes()
+    assert (tmp_path / "a" / "mpc-pc-0.nc").read_bytes() == (tmp_path / "b" / "mpc-pc-0.nc").read_bytes()
     result = call(*command, tmp_path / "a")
     assert result.exit_code == 0  # the same scenario and faults
     (folder / "scenario.toml").write_text(tiny.SCENARIO)
@@ -258,7 +254,7 @@ def city(tmp_path_factory):
 def in_sumo(city, *ordered, perimeter=None, watch=None, **changed):
     """The measurements and the record of a run with these faults; watch(plant) is called when it begins."""
     scenario = replace(city, faults=ordered)
-    plant = SumoPlant(scenario, overrides=replace(settings(scenario), **changed))
+    plant = SumoPlant(scenario, overrides=settings(scenario).changed(**changed))
     opened = np.where(city.network.adjacency, city.network.u_max if perimeter is None else perimeter, 0.0)
     try:
         states = [plant.reset(0)]
@@ -423,10 +419,10 @@ def test_a_full_disk(tmp_path):
     command = ("nmfd", "benchmark", folder, "--controllers", "no-control", "--out", out, "--seeds")
     assert call(*command, 1).exit_code == 0
     before = {path.name: path.read_bytes() for path in out.iterdir()}
-    trajectory = len(before["no-control-0.npz"])
+    trajectory = len(before["no-control-0.nc"])
     status, stderr = with_limit(trajectory // 2, *command, 2)
     assert status == 2 and re.fullmatch(
-        rf"nmfd: error: .*/out/[\w.-]+: {os.strerror(errno.EFBIG)}\n", stderr), stderr
+        r"nmfd: error: .*/out/no-control-1.nc: cannot be written \(.*\); is the disk full\?\n", stderr), stderr
     after = {path.name: path.read_bytes() for path in out.iterdir()}
     assert {name: after[name] for name in before if name != "manifest.json"} == {
         name: content for name, content in before.items() if name != "manifest.json"}

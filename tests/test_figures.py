@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_runs import trajectory
+from trajectories import trajectory
 
 from cosim.report import figures
 from nmfd.studies import plots

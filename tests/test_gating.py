@@ -89,8 +89,9 @@ def test_reset_forgets():
 
 @pytest.mark.parametrize("options, problem", [
     ({"kP": 1.0}, "kP: unknown key"), ({"ki": 0.0}, "ki: expected a number above 0"),
-    ({"kp": -1.0}, "kp: expected a number in"), ({"set_point": [1.0, 2.0]}, "set_point: expected a list of 1 numbers"),
-    ({"set_point": [-5.0]}, "set_point: expected numbers above 0")])
+    ({"kp": -1.0}, "kp: expected a number from 0 up"),
+    ({"set_point": [1.0, 2.0]}, "set_point: expected a list of 1 numbers"),
+    ({"set_point": [-5.0]}, "set_point: expected a list of numbers above 0")])
 def test_wrong_options(options, problem):
     with pytest.raises(InputError, match=f"controllers.pi-gating.{problem}") as caught:
         PiGating(planning_model(with_options(**options)))

@@ -11,9 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import tiny_city
-from click.testing import CliRunner
+from commands import cosim, error_line, good
 
-from cosim.cli.main import main
 from cosim.importing import level
 from cosim.importing.case import read_case
 from cosim.importing.demand import read_traffic
@@ -27,21 +26,6 @@ from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.types import Controls
-
-
-def cosim(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
-def good(result):
-    assert result.exit_code == 0, result.output + result.stderr + str(result.exception)
-    return result.stdout
-
-
-def error_line(result):
-    assert result.exit_code == 2, result.output + str(result.exception)
-    assert result.stderr.startswith("cosim: error: ") and result.stderr.count("\n") == 1, result.stderr
-    return result.stderr
 
 
 @pytest.fixture(scope="module")
@@ -207,7 +191,7 @@ def test_signals_that_are_left_alone(config, tmp_path):
 
 def test_mesoscopic_keeps_the_ledger(imported):
     scenario = replace(load_scenario(imported[0] / "scenarios" / "tiny"), steps=4)
-    plant = SumoPlant(scenario, overrides=replace(settings(scenario), mesoscopic=True))
+    plant = SumoPlant(scenario, overrides=settings(scenario).changed(mesoscopic=True))
     try:
         plant.reset(0)
         for _ in range(scenario.steps):
@@ -221,7 +205,7 @@ def test_mesoscopic_keeps_the_ledger(imported):
 def test_mesoscopic_has_no_lanes(imported, key, value):
     scenario = load_scenario(imported[0] / "scenarios" / "tiny")
     with pytest.raises(InputError, match=f"sumo.{key}: {value} .* has no lanes"):
-        SumoPlant(scenario, overrides=replace(settings(scenario), mesoscopic=True, **{key: value}))
+        SumoPlant(scenario, overrides=settings(scenario).changed(mesoscopic=True, **{key: value}))
 
 
 def test_options_and_includes_of_the_user_count(config, tmp_path):
@@ -265,7 +249,7 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
     assert 2.0 * 75 / 900 <= flows["B1C1", "C1D1"] < 2.0 * 120 / 900   # the flow straight on, of trips
     assert all(b in city.successors[a] for a, b in flows)
     for plan in ("max-pressure", "webster", "actuated"):
-        plant = SumoPlant(scenario, overrides=replace(settings(scenario), signals=plan))
+        plant = SumoPlant(scenario, overrides=settings(scenario).changed(signals=plan))
         try:
             plant.reset(0)
             for _ in range(2):
@@ -360,7 +344,7 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
                       tmp_path / "loading"))
     assert "Drivers who go their own ways:" in text and "Drivers who are guided:" in text
     assert f"Written to {network / 'guided' / 'network.toml'}" in text
-    assert (tmp_path / "loading" / "guided" / "level-2" / "probing-pcrg-1000.npz").is_file()
+    assert (tmp_path / "loading" / "guided" / "level-2" / "probing-pcrg-1000.nc").is_file()
     loaded = load_scenario(scenario)
     guided = planning_model(loaded, "dpc-pcrg").network
     assert guided.hash != loaded.network.hash and guided.own_splits == loaded.network.own_splits

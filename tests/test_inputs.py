@@ -3,18 +3,13 @@
 import pytest
 import tiny
 import torch
-from click.testing import CliRunner
+from commands import nmfd
 
-from nmfd.cli.main import main
 from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
 from nmfd.model.regional_model import load_network
 
 TO_1 = "to = 1"
 BENCHMARK = ["benchmark", "{scenario}", "--out", "{out}", "--controllers"]
-
-
-def nmfd(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 def assert_one_line(result, *fragments):
@@ -83,7 +78,7 @@ def check_file_error(scenario, command, fragments):
     assert not out.exists()
 
 
-@pytest.mark.parametrize("arguments, fragment", [
+@pytest.mark.parametrize("arguments, fragment", [pytest.param(*case, id=" ".join(case[0])[:80]) for case in (
     (["benchmark", "{tmp}/none", "--controllers", "no-control"], "none/scenario.toml: no such file"),
     (["show", "{tmp}/none"], "none/scenario.toml: no such file"),
     ([*BENCHMARK, "none"], "controller 'none' is unknown; choose from no-control, route-guidance, pi-gating, mpc-pc"),
@@ -107,7 +102,7 @@ def check_file_error(scenario, command, fragments):
     (["train", "{scenario}", "--controller", "dpc-pc", "--steps", "0"], "'--steps': 0 is not in the range"),
     (["show", "{scenario}", "--out", "/dev/null/x"], "/dev/null/x: Not a directory"),
     (["benchmark", "{scenario}", "--controllers", "no-control", "--out", "/dev/null/x"], "/dev/null/x"),
-])
+)])
 def test_command_line_errors(tmp_path, arguments, fragment):
     scenario, out = tiny.write(tmp_path), tmp_path / "out"
     result = nmfd(*[a.format(scenario=scenario, out=out, tmp=tmp_path) for a in arguments])
@@ -115,29 +110,38 @@ def test_command_line_errors(tmp_path, arguments, fragment):
     assert {path.name for path in tmp_path.iterdir()} == {"network", "scenario"}
 
 
-def test_policy_errors(tmp_path):
-    scenario, out = tiny.write(tmp_path / "two"), tmp_path / "out"
-    other = tiny.write(tmp_path / "three", network=tiny.row_network(3)).parent / "network"
-    networks = {"own": load_network(scenario.parent / "network"), "other": load_network(other)}
-    for name, network in networks.items():
-        torch.save(checkpoint(Policy(network, Architecture(width=4)), network, {}), tmp_path / f"{name}.pt")
-    (tmp_path / "text.pt").write_text("no policy")
-    torch.save({"weights": 1}, tmp_path / "damaged.pt")
-    for name, file, fragment in (
-            ("dpc-pc", "other.pt", "was trained for network 'row3'"), ("dpc-pc", "text.pt", "is not a policy file"),
-            ("dpc-pc", "damaged.pt", "is damaged or of another version"), ("dpc-pc", "none.pt", "no such policy"),
-            ("dpc-pcrg", "own.pt", "is a dpc-pc policy, not dpc-pcrg")):
-        result = nmfd("benchmark", scenario, "--controllers", f"no-control,{name}", "--out", out, "--policy",
-                      f"{name}={tmp_path / file}")
-        assert_one_line(result, f"{tmp_path / file}: ", fragment)
-        assert not out.exists()
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory):
+    """The folder of a scenario with two regions, and of policies for it, for another network, and for none."""
+    folder = tmp_path_factory.mktemp("policies")
+    scenario = tiny.write(folder / "two")
+    other = tiny.write(folder / "three", network=tiny.row_network(3)).parent / "network"
+    for name, network in (("own", scenario.parent / "network"), ("other", other)):
+        network = load_network(network)
+        torch.save(checkpoint(Policy(network, Architecture(width=4)), network, {}), folder / f"{name}.pt")
+    (folder / "text.pt").write_text("no policy")
+    torch.save({"weights": 1}, folder / "damaged.pt")
+    return scenario, folder
+
+
+@pytest.mark.parametrize("name, file, fragment", [
+    ("dpc-pc", "other.pt", "was trained for network 'row3'"), ("dpc-pc", "text.pt", "is not a policy file"),
+    ("dpc-pc", "damaged.pt", "is damaged or of another version"), ("dpc-pc", "none.pt", "no such policy"),
+    ("dpc-pcrg", "own.pt", "is a dpc-pc policy, not dpc-pcrg")],
+    ids=["of another network", "text", "damaged", "missing", "of another controller"])
+def test_policy_errors(tmp_path, policies, name, file, fragment):
+    scenario, folder = policies
+    result = nmfd("benchmark", scenario, "--controllers", f"no-control,{name}", "--out", tmp_path / "out", "--policy",
+                  f"{name}={folder / file}")
+    assert_one_line(result, f"{folder / file}: ", fragment)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("content, fragment", [
     ({"notes.txt": "mine"}, "is not empty and holds no manifest.json"),
     ({"manifest.json": "{"}, "manifest.json: is no manifest of a run"),
     ({"manifest.json": "[]"}, "manifest.json: is no manifest of a run"),
-])
+], ids=["a file", "cut off", "a list"])
 def test_a_folder_with_something_else_is_left_alone(tmp_path, content, fragment):
     scenario, out = tiny.write(tmp_path), tmp_path / "out"
     out.mkdir()

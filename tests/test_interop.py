@@ -30,10 +30,10 @@ def test_outputs_of_sumo_agree_with_ours_and_are_made_up_for(peak, tmp_path):
     out = tmp_path / "out"
     command = (peak, "--controller", "pi-gating+actuated", "--steps", "4", "--out", out)
     assert cosim_run(*command).exit_code == 0
-    before = (out / "pi-gating+actuated-0.npz").read_bytes()
+    before = (out / "pi-gating+actuated-0.nc").read_bytes()
     done = cosim_run(*command, "--sumo-output", "tripinfo,summary,edgedata,emission", "--parquet")
     assert done.exit_code == 0, done.output + str(done.exception)
-    assert (out / "pi-gating+actuated-0.npz").read_bytes() == before  # the outputs change nothing
+    assert (out / "pi-gating+actuated-0.nc").read_bytes() == before  # the outputs change nothing
     facts = pd.read_csv(out / "sumo.csv").iloc[0]
     name = "pi-gating+actuated-0."
     trips = ElementTree.parse(out / f"{name}tripinfo.xml").getroot()

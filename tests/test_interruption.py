@@ -1,7 +1,6 @@
 """kill -9 at any moment: what was finished stays, nothing half-written counts, and the same command goes on to the same
 bytes. Commands run in forked processes, which kill themselves beside a write, or are killed after a while."""
 
-import fcntl
 import json
 import os
 import random
@@ -18,61 +17,16 @@ import pytest
 import tiny
 import tiny_city
 import torch
-from click.testing import CliRunner
+from commands import MAINS, call, good, killed
 
-import cosim.cli.main
-import nmfd.cli.main
 from cosim.plant.plant import SumoPlant
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc import training
 from nmfd.errors import InputError
-from nmfd.runs import files, run_folder, workers
+from nmfd.runs import files, run_folder, scratch, workers
 from nmfd.runs.files import TEMPORARY
 from nmfd.runs.run_folder import LOCK
 from nmfd.runs.scratch import Scratch, sweep
-
-MAINS = {"nmfd": nmfd.cli.main.main, "cosim": cosim.cli.main.main}
-
-
-def call(program, *arguments):
-    return CliRunner().invoke(MAINS[program], [str(argument) for argument in arguments])
-
-
-def good(result):
-    assert result.exit_code == 0, result.output + repr(result.exception)
-    return result
-
-
-def killed(*command, write: int | None = None, behind: bool = False, after: float = 60.0) -> bool:
-    """Run a command in a forked process that is killed: beside its `write`-th write, or after so many seconds.
-
-    behind: when that write has got its name, else just before. False if it ended before.
-    """
-    child = os.fork()
-    if child == 0:
-        with suppress(BaseException):
-            writes, replace = [0], os.replace
-
-            def replace_or_die(source, target):
-                writes[0] += 1
-                if behind and writes[0] == write:
-                    replace(source, target)
-                if writes[0] == write:
-                    os.kill(os.getpid(), signal.SIGKILL)
-                replace(source, target)
-
-            os.replace = replace_or_die
-            call(*command)
-        os._exit(0)
-    deadline = time.monotonic() + after
-    while time.monotonic() < deadline:
-        ended, status = os.waitpid(child, os.WNOHANG)
-        if ended:
-            return os.WIFSIGNALED(status)
-        time.sleep(0.005)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return True
 
 
 def everything_readable(folder: Path) -> None:
@@ -85,12 +39,12 @@ def everything_readable(folder: Path) -> None:
         json.loads((folder / "manifest.json").read_text())
     if (folder / "summary.csv").exists():
         for row in run_folder.read_summary(folder / "summary.csv"):
-            trajectory = run_folder.read_trajectory(folder / f"{row['controller']}-{row['seed']}.npz")
+            trajectory = run_folder.read_trajectory(folder / f"{row['controller']}-{row['seed']}.nc")
             assert trajectory.accumulation.sum() * trajectory.step > 0
 
 
 def arrays(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.glob("*.npz")}
+    return {path.name: path.read_bytes() for path in folder.glob("*.nc")}
 
 
 def interrupted(file: Path, *command, after: float) -> tuple[int, str]:
@@ -222,7 +176,7 @@ def test_a_run_in_sumo_killed_starts_again_from_its_beginning(city, tmp_path):
         killed(*command, out, **kill)
         everything_readable(out)
     good(call(*command, out))
-    assert arrays(out) == arrays(tmp_path / "whole") and len(arrays(out)) == 2
+    assert arrays(out) == arrays(tmp_path / "whole") and len(arrays(out)) == 1
     assert not [path for path in out.iterdir() if path.name.startswith(".")]
 
 
@@ -359,7 +313,7 @@ def test_arrays_of_a_run_hold_no_times(tmp_path):
     for name in ("a", "b"):
         good(call("nmfd", "benchmark", scenario, "--controllers", "mpc-pc", "--out", tmp_path / name))
     assert arrays(tmp_path / "a") == arrays(tmp_path / "b")
-    assert np.isnan(run_folder.read_trajectory(tmp_path / "a" / "mpc-pc-0.npz").decision_time).all()
+    assert np.isnan(run_folder.read_trajectory(tmp_path / "a" / "mpc-pc-0.nc").decision_time).all()
 
 
 def test_scratch_folders_of_killed_processes_go_at_the_next_start(tmp_path, monkeypatch, city):
@@ -383,14 +337,15 @@ def test_scratch_folders_of_killed_processes_go_at_the_next_start(tmp_path, monk
 
 def test_what_is_made_while_others_look_for_old_folders_stays(tmp_path, monkeypatch):
     """A folder that was taken for an old one before it was locked is made anew."""
-    flock = fcntl.flock
+    acquire = scratch.FileLock.acquire
 
-    def swept_before(file, operation):
-        monkeypatch.setattr(fcntl, "flock", flock)
+    def swept_before(lock):
+        monkeypatch.setattr(scratch.FileLock, "acquire", acquire)
+        Path(lock.lock_file).touch()
         sweep(tmp_path, "x-")
-        flock(file, operation)
+        return acquire(lock)
 
-    monkeypatch.setattr(fcntl, "flock", swept_before)
+    monkeypatch.setattr(scratch.FileLock, "acquire", swept_before)
     with Scratch("x-", where=tmp_path) as folder:
         sweep(tmp_path, "x-")
         assert list(tmp_path.iterdir()) == [folder]

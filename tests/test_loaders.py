@@ -119,16 +119,16 @@ def network(tmp_path_factory):
 
 
 @examples
-@given(content=st.binary(max_size=300), kind=st.sampled_from(["npz", "pt", "csv", "xml", "xml.gz", "toml"]))
+@given(content=st.binary(max_size=300), kind=st.sampled_from(["nc", "pt", "csv", "xml", "xml.gz", "toml"]))
 def test_any_bytes(tmp_path, network, content, kind):
     file = tmp_path / f"file.{kind}"
-    magic = {"npz": b"PK\x03\x04", "pt": b"PK\x03\x04", "xml.gz": b"\x1f\x8b\x08\x00"}.get(kind, b"")
+    magic = {"nc": b"\x89HDF\r\n\x1a\n", "pt": b"PK\x03\x04", "xml.gz": b"\x1f\x8b\x08\x00"}.get(kind, b"")
     for bytes_ in (content, magic + content):
         file.write_bytes(bytes_)
         (tmp_path / "n").mkdir(exist_ok=True)
         (tmp_path / "n" / "network.toml").write_bytes(bytes_)
         loaders = {
-            "npz": [run_folder.read_trajectory], "pt": [lambda path: load_policy(path, network)],
+            "nc": [run_folder.read_trajectory], "pt": [lambda path: load_policy(path, network)],
             "csv": [run_folder.read_summary, lambda path: load_city(tmp_path / "none.net.xml", path, 2)],
             "xml": [read_originals_of, lambda path: load_city(path, tmp_path / "none.csv", 2)],
             "xml.gz": [read_originals_of, lambda path: load_city(path, tmp_path / "none.csv", 2)],

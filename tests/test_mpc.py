@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from test_dynamics import random_controls
+from tiny import random_controls
 
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
@@ -65,7 +65,7 @@ def test_no_random_plan_nearby_or_far_is_better(states, guidance, k):
     forecast, plan = controller.forecast(states[k]), controller._plan
     best = controller.cost(*forecast, plan)
     for _ in range(300):
-        other = np.stack([controller.admissible.decision(*random_controls(random)) for _ in plan])
+        other = np.stack([controller.admissible.decision(*random_controls(random, NETWORK)) for _ in plan])
         if not guidance:
             other[:, len(controller._model.edges):] = plan[:, len(controller._model.edges):]
         share = 10.0 ** random.uniform(-3.0, 0.0)
@@ -97,7 +97,7 @@ def test_the_plan_costs_what_the_regional_model_says(states, guidance):
         start, demand = controller.forecast(states[20])
         random = np.random.default_rng(7)
         plan = controller.admissible.project(np.stack([
-            controller.admissible.decision(*random_controls(random)) for _ in range(controller._moves)]))
+            controller.admissible.decision(*random_controls(random, NETWORK)) for _ in range(controller._moves)]))
         p, x, total = dynamics.parameters(NETWORK), torch.from_numpy(states[20].accumulation), 0.0
         for k in range(8):
             perimeter, splits = controller.admissible.controls(plan[min(k, len(plan) - 1)])
@@ -194,3 +194,16 @@ def test_benchmark_row(guidance, most):
     row = summary(run(NmfdPlant(SCENARIO), EconomicMpc(planning_model(SCENARIO), guidance=guidance), SCENARIO, seed=0))
     assert row["total_time_spent_veh_s"] < most
     assert row["solver_failures"] == 0
+
+
+@pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
+def test_ipopt_is_the_reference_solver(states, guidance):
+    """The published formulation, in the place of our solver: as good a plan from the same state, to a thousandth."""
+    ours = EconomicMpc(planning_model(SCENARIO), guidance=guidance)
+    reference = EconomicMpc(planning_model(with_options(solver="ipopt")), guidance=guidance)
+    costs = []
+    for controller in (ours, reference):
+        assert controller.act(states[20]).status == Status.OK
+        start, demand = controller.forecast(states[20])
+        costs.append(controller.cost(start, demand, controller._plan))
+    assert costs[1] == pytest.approx(costs[0], rel=1e-3)

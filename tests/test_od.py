@@ -7,9 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import tiny_city
-from click.testing import CliRunner
+from commands import cosim
 
-from cosim.cli.main import main
 from cosim.importing.case import read_case
 from cosim.importing.demand import read_traffic
 from cosim.importing.od import read_od, trips
@@ -56,10 +55,6 @@ def net(tmp_path_factory):
     folder = tmp_path_factory.mktemp("od")
     (folder / "zones.taz.xml").write_text(ZONES)
     return tiny_city.network(folder)
-
-
-def cosim(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 @pytest.mark.parametrize("name, text", [("a.xml", RELATIONS), ("a.od", O_FORMAT), ("a.fma", V_FORMAT)])

@@ -6,20 +6,15 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from click.testing import CliRunner
+from commands import nmfd
 
 from nmfd.api import load_scenario
-from nmfd.cli.main import main
 from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint, load_policy
 from nmfd.model.regional_model import load_network
 
 ROOT = Path(__file__).parents[1]
 onnxruntime = pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
 pytest.importorskip("onnxscript")
-
-
-def nmfd(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 def test_a_committed_policy(tmp_path):

@@ -5,10 +5,9 @@ import re
 import numpy as np
 import pytest
 import tiny_city
-from click.testing import CliRunner
+from commands import cosim
 from tiny_city import driven
 
-from cosim.cli.main import main
 from cosim.importing.case import read_case
 from cosim.importing.demand import read_traffic
 from cosim.importing.importer import left_alone
@@ -24,10 +23,6 @@ from nmfd.errors import InputError
 
 FLOW = '<flow id="f" begin="0" end="600" number="60" from="A1B1" to="C1D1"/>'
 FAST = ("--method", "geometric", "--no-run")
-
-
-def cosim(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import tiny
 from click.testing import CliRunner
+from commands import nmfd
 
 import cosim.cli.main
 from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.cli.main import main
 from nmfd.controllers import custom, registry
 from nmfd.controllers.template import MyController
 from nmfd.errors import InputError
@@ -31,10 +31,6 @@ class Mine:
     def act(self, measurement):
         return Controls(perimeter=np.full(self.shape, 0.5, dtype=np.float32), splits=None)
 """
-
-
-def nmfd(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 @pytest.fixture
@@ -95,7 +91,7 @@ def test_processes_and_sumo_take_it(place):
         "run", "scenarios/peak", "--controller", "mine.py:Mine+max-pressure", "--steps", "2", "--out", "out"])
     assert done.exit_code == 0 and "mine.py:Mine+max-pressure" in done.output, done.output
     name = run_folder.run_name("mine.py:Mine+max-pressure", 0)
-    trajectory = run_folder.read_trajectory(place / "out" / f"{name}.npz")
+    trajectory = run_folder.read_trajectory(place / "out" / f"{name}.nc")
     assert (trajectory.perimeter[trajectory.perimeter > 0] == 0.5).all()
     benchmark = nmfd("benchmark", "scenario", "--controllers", "mine.py:Mine", "--seeds", 2, "--workers", 2)
     assert benchmark.exit_code == 0, benchmark.output

@@ -10,26 +10,15 @@ from html.parser import HTMLParser
 import made_up
 import pandas as pd
 import pytest
-from click.testing import CliRunner
-from test_tables import rows_of
+from commands import cosim, error_line
+from made_up import rows_of
 
-from cosim.cli.main import main
 from cosim.evaluation import results
 from cosim.evaluation import statistics as tables
 from cosim.report import html, summary_text
 
 VOID = {"meta", "link", "img", "br"}
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-
-
-def cosim(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
-def error_line(result):
-    assert result.exit_code == 2, result.output + str(result.exception)
-    assert result.stderr.startswith("cosim: error: ") and result.stderr.count("\n") == 1, result.stderr
-    return result.stderr
 
 
 class Page(HTMLParser):
@@ -207,8 +196,7 @@ def test_error_lines(evaluation, tmp_path, name, arguments, expected):
 
 DAMAGED = {
     "runs.csv": "is no table of runs", "demand-1/sumo.csv": "is no table of runs", "demand-1/summary.csv": "delete",
-    "demand-1/manifest.json": "is no manifest of runs", "demand-1/pi-gating-2000.npz": "is no trajectory",
-    "demand-1/pi-gating-2000.record.npz": "is no record"}
+    "demand-1/manifest.json": "is no manifest of runs", "demand-1/pi-gating-2000.nc": "is no run"}
 
 
 @pytest.mark.parametrize("name, expected", DAMAGED.items())
@@ -217,7 +205,7 @@ def test_damaged_files_are_one_line(evaluation, tmp_path, blind, name, expected)
     folder = tmp_path / "runs"
     shutil.copytree(evaluation, folder, ignore=shutil.ignore_patterns("demand-0.8", "report.html"))
     whole = (folder / name).read_bytes()
-    contents = [b"\0\xff\xfe" * 100, whole[: len(whole) // 2]] if name.endswith((".npz", ".json")) else [
+    contents = [b"\0\xff\xfe" * 100, whole[: len(whole) // 2]] if name.endswith((".nc", ".json")) else [
         b"", b"\0\xff\xfe" * 100, b"a,b\n1,2\n"]
     for content in contents:
         (folder / name).write_bytes(content)

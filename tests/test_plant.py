@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_actuate import MIN_GREEN, check
+from signal_rules import MIN_GREEN, check
 
 from cosim.plant.guidance import shifted
 from cosim.plant.plant import SumoPlant
+from cosim.plant.sampling import StreetSampler
 from cosim.plant.settings import Settings
 from cosim.sumo.session import Session
 from nmfd.api import load_scenario
@@ -91,7 +92,7 @@ def test_open_gateways_leave_sumo_alone(scenario, plant_of):
         plant.reset(1)
         if not actuated:
             plant.session.set_signal_state = None  # would fail if anything were played
-            plant._actuator._signals.clear()
+            plant._actuation._controls.clear()
         states = []
         step = plant.session.step
         plant.session.step = lambda step=step, states=states, session=plant.session: (
@@ -119,19 +120,21 @@ def test_ledger_and_crossings_balance(scenario, plant_of, guidance):
 def test_the_samples_are_those_of_every_edge(scenario, plant_of):
     """Both while there are fewer vehicles than edges, and later."""
     plant, asked = plant_of(), []
-    sample = plant._sample
+    plant.reset(1)
+    sampler = StreetSampler(plant.session, plant.city)
 
     def compared():
-        counts, speeds = sample()
-        asked.append(len(plant._travelled()))
+        counts, speeds = sampler.present()
+        asked.append(len(sampler.travelled()))
         session, edges = plant.session, plant.city.edges
         assert counts.tolist() == [session.vehicle_count(edge) for edge in edges]
         assert speeds.tolist() == [
             session.mean_speed(edge) if n else 0.0 for edge, n in zip(edges, counts, strict=True)]
-        return counts, speeds
 
-    plant._sample = compared
-    drive(plant, replace(scenario, steps=2))
+    for _ in range(18):
+        for _ in range(10):
+            plant.session.step()
+        compared()
     assert 0 < min(asked) < max(asked) == len(plant.city.edges)
 
 
@@ -139,7 +142,7 @@ def test_ledger_notices_a_lost_vehicle(scenario, plant_of):
     plant = plant_of()
     plant.reset(1)
     plant.step(random_controls(scenario, np.random.default_rng(0)))
-    plant._meter.departures[0, 4] += 1
+    plant._sensing.meter.departures[0, 4] += 1
     message = r"control step 2, 180 s: \d+ vehicles are in the city, but \d+ departures minus \d+ arrivals"
     with pytest.raises(LedgerError, match=message):
         plant.step(random_controls(scenario, np.random.default_rng(0)))
@@ -193,7 +196,7 @@ def test_compliance_zero_reroutes_nobody(scenario, plant_of):
 
 def test_guided_vehicles_are_asked_again(scenario, plant_of):
     """The ledger is checked at every step; who was told something else counts for the last only."""
-    plant = plant_of()
+    plant, scenario = plant_of(), replace(scenario, steps=2)
     _, once = drive(plant, scenario, guidance=True)
     plant.close()
     asked = plant_of(guidance_period=5.0)
@@ -206,7 +209,7 @@ def test_guided_vehicles_are_asked_again(scenario, plant_of):
 
 def test_same_seed_same_city(scenario, plant_of):
     plant = plant_of()
-    runs = [drive(plant, scenario, seed=seed, guidance=True) for seed in (3, 3, 4)]
+    runs = [drive(plant, replace(scenario, steps=2), seed=seed, guidance=True) for seed in (3, 3, 4)]
     final = [measurements[-1].accumulation.tolist() for measurements, _ in runs]
     assert final[0] == final[1] != final[2]
     assert (runs[0][1].gateway_flow == runs[1][1].gateway_flow).all()

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
-from test_dynamics import random_controls
+from tiny import random_controls
 
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
@@ -46,7 +46,7 @@ def test_conservation_and_non_negativity_under_random_controls(make, network):
     for k in range(scenario.steps):
         ended += scenario.step * completions(network, measured.accumulation)
         entered += scenario.step * scenario.demand[k].sum()
-        perimeter, splits = random_controls(random)
+        perimeter, splits = random_controls(random, network)
         measured = plant.step(Controls(perimeter=perimeter, splits=splits))
         assert measured.accumulation.min() >= 0.0
         assert abs(entered - ended - measured.accumulation.sum()) <= 1e-6
@@ -61,7 +61,7 @@ def test_non_negative_with_other_integrators(make, integrator, substeps):
     plant = make(scenario)
     plant.reset(0)
     for _ in range(60):
-        perimeter, splits = random_controls(random)
+        perimeter, splits = random_controls(random, SCENARIO.network)
         assert plant.step(Controls(perimeter=perimeter, splits=splits)).accumulation.min() >= 0.0
 
 
@@ -82,7 +82,8 @@ def test_no_control_forces_no_move():
 
 
 def test_the_acyclic_plant_is_fast():
-    plant, (perimeter, splits) = AcyclicPlant(SCENARIO), random_controls(np.random.default_rng(4))
+    plant, (perimeter, splits) = AcyclicPlant(SCENARIO), random_controls(
+        np.random.default_rng(4), SCENARIO.network)
     plant.reset(0)
     begin = time.process_time()
     for _ in range(SCENARIO.steps):
@@ -102,7 +103,8 @@ def test_no_way_leads_back_to_the_origin_or_the_previous_region():
 
 
 def test_shares_sum_to_one_and_are_theta_renormalised():
-    model, (_, splits) = acyclic.build(SCENARIO.network), random_controls(np.random.default_rng(5))
+    model, (_, splits) = acyclic.build(SCENARIO.network), random_controls(
+        np.random.default_rng(5), SCENARIO.network)
     theta, forced = acyclic.shares(model, splits)
     sums = np.bincount(model.move_from, theta, minlength=len(model.region))
     np.testing.assert_allclose(sums, model.region != model.destination, atol=1e-12)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_runs import trajectory
+from trajectories import trajectory
 
 from nmfd.api import load_scenario
 from nmfd.controllers import registry

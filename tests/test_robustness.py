@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from click.testing import CliRunner
+from commands import nmfd
 
 from nmfd import closed_loop
 from nmfd.api import load_scenario
-from nmfd.cli.main import main
 from nmfd.controllers import registry
 from nmfd.controllers.dpc import fallback, training
 from nmfd.controllers.dpc import policy as dpc
@@ -36,10 +35,6 @@ def folder(tmp_path):
 @pytest.fixture
 def scenario(folder):
     return load_scenario(folder)
-
-
-def nmfd(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 @pytest.mark.parametrize("where", WHERE)

@@ -1,31 +1,29 @@
 """Run folders: nothing half-written, resumable, the same bytes; and the processes that fill them."""
 
+import ast
+import hashlib
 import io
 import json
 import os
 import termios
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-import trajectories
+import xarray as xr
+from trajectories import trajectory
 
+from cosim.plant.record import Record
+from nmfd import quantities
 from nmfd.cli.progress import progress_line
 from nmfd.errors import InputError
 from nmfd.runs import files, run_folder, workers
-from nmfd.types import Status
+from nmfd.types import Trajectory
 
+ROOT = Path(__file__).parents[1]
 CONFIGURATION = {"scenario": "x", "step": 30.0, "protected": (1, 2)}
-
-
-def trajectory(controller="no-control", seed=0, steps=4):
-    rng = np.random.default_rng(seed)
-    return trajectories.made(
-        controller=controller, plant="nmfd", seed=seed, step=30.0, accumulation=rng.random((steps + 1, 2, 2)),
-        backlog=np.zeros((steps + 1, 2, 2)), completed=np.arange(steps + 1.0), perimeter=rng.random((steps, 2, 2)),
-        splits=rng.random((steps, 2, 2, 2)), decision_time=rng.random(steps), note=("",) * (steps - 1) + ("no",),
-        status=np.array([0] * (steps - 1) + [(Status.SOLVER_FAILURE | Status.FALLBACK).value]),
-        wall_time=1.0)
 
 
 def opened(path, *, controllers=("no-control",), seeds=(0,), settings=None):
@@ -35,22 +33,111 @@ def opened(path, *, controllers=("no-control",), seeds=(0,), settings=None):
 
 def test_trajectory_round_trip_and_same_bytes(tmp_path):
     original = trajectory()
-    run_folder.write_trajectory(tmp_path / "a.npz", original)
-    run_folder.write_trajectory(tmp_path / "b.npz", replace(original, decision_time=2 * original.decision_time))
-    back = run_folder.read_trajectory(tmp_path / "a.npz")
-    for name in (
-            "accumulation", "backlog", "completed", "observed", "observed_backlog", "perimeter", "splits", "status"):
+    run_folder.write_trajectory(tmp_path / "a.nc", original)
+    run_folder.write_trajectory(tmp_path / "b.nc", replace(original, decision_time=2 * original.decision_time))
+    back = run_folder.read_trajectory(tmp_path / "a.nc")
+    for name in ("accumulation", "backlog", "completed", "observed", "observed_backlog", "perimeter", "splits"):
         np.testing.assert_array_equal(getattr(back, name), getattr(original, name))
     assert (back.controller, back.plant, back.seed, back.step) == ("no-control", "nmfd", 0, 30.0)
-    assert back.note == original.note
-    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert back.note == original.note and back.estimated is False and (back.status == original.status).all()
+    assert (tmp_path / "a.nc").read_bytes() == (tmp_path / "b.nc").read_bytes()
+
+
+def test_the_same_run_gives_the_same_bytes_at_another_time(tmp_path, monkeypatch):
+    """HDF5 can keep times of its objects."""
+    more = quantities.variables(Record, made_up_record())
+    run_folder.write_trajectory(tmp_path / "a.nc", trajectory(), more)
+    time.sleep(1.1)
+    run_folder.write_trajectory(tmp_path / "b.nc", trajectory(), more)
+    first, second = ((tmp_path / name).read_bytes() for name in ("a.nc", "b.nc"))
+    assert hashlib.sha256(first).digest() == hashlib.sha256(second).digest()
+
+
+def made_up_record(steps=4):
+    """One array of a record in SUMO for each: 2 regions, 3 gateways, 5 edges."""
+    sizes = {"interval": steps, "gateway": 3, "edge": 5}
+    return {name: np.random.default_rng(0).random([sizes.get(axis, 2) for axis in about["dimensions"]])
+            for name, about in quantities.quantities(Record).items()}
+
+
+def test_xarray_opens_a_run_with_names_and_units(tmp_path):
+    original, record = replace(trajectory(), estimated=True), made_up_record()
+    run_folder.write_trajectory(tmp_path / "a.nc", original, quantities.variables(Record, record))
+    with xr.open_dataset(tmp_path / "a.nc") as data:
+        assert dict(data.sizes) == {
+            "time": 5, "interval": 4, "region": 2, "destination": 2, "next_region": 2, "gateway": 3, "edge": 5}
+        assert data.attrs == {"controller": "no-control", "plant": "nmfd", "seed": 0, "step": 30.0, "estimated": 1}
+        assert set(data.data_vars) == {*quantities.quantities(Trajectory), *record} - {"decision_time"}
+        for name, values in data.variables.items():
+            assert values.attrs["long_name"] and ("units" in values.attrs or name == "note"), name
+        assert tuple(data["note"].values) == original.note == ("", "", "", "no")
+        assert list(data["status"].values) == [0, 0, 0, 3]  # a solver failure and a fallback
+        assert data["status"].attrs["flag_meanings"] == "solver_failure fallback sensor_fault plant_fault"
+        assert list(data["status"].attrs["flag_masks"]) == [1, 2, 4, 8]
+        assert list(data["time"].values) == [0.0, 30.0, 60.0, 90.0, 120.0] and data["time"].attrs["units"] == "s"
+        assert float(data["accumulation"].sel(time=60.0, region=1, destination=0)) == original.accumulation[2, 1, 0]
+        for name, values in record.items():
+            np.testing.assert_array_equal(data[name].values, values)
+    assert run_folder.read_trajectory(tmp_path / "a.nc").estimated is True
+
+
+@pytest.mark.parametrize("page, kind", [("nmfd/runs/README.md", Trajectory), ("cosim/plant/record.md", Record)])
+def test_the_pages_list_what_is_in_a_file(page, kind):
+    assert quantities.reference(kind) in (ROOT / page).read_text()
+
+
+def test_the_tables_of_a_run_row_by_row():
+    run = trajectory()
+    states, controls = run.to_frame(), run.controls_frame()
+    assert list(states.columns) == [
+        "controller", "plant", "seed", "time_s", "region", "destination", "accumulation_veh", "backlog_veh"]
+    assert list(controls.columns) == ["controller", "plant", "seed", "time_s", "region", "next_region", "perimeter"]
+    for n, (k, i, j) in enumerate(np.ndindex(5, 2, 2)):
+        assert tuple(states.loc[n]) == ("no-control", "nmfd", 0, 30.0 * k, i, j, run.accumulation[k, i, j], 0.0)
+    assert (controls["perimeter"] == run.perimeter.ravel()).all() and controls["time_s"].max() == 90.0
+
+
+@pytest.mark.parametrize("plant, command", [
+    ("nmfd", "nmfd benchmark scenarios/x, with no-control, pi-gating"),
+    ("sumo", "cosim run, evaluate or sweep scenarios/x, with no-control, pi-gating"),
+    (None, "the command that made it")])
+def test_a_folder_of_an_older_version_says_what_to_run(tmp_path, plant, command):
+    (tmp_path / "no-control-0.npz").write_bytes(b"PK")
+    if plant:
+        (tmp_path / "manifest.json").write_text(json.dumps({
+            "configuration": {"plant": plant}, "controllers": {"no-control": {}, "pi-gating": {}},
+            "sessions": [{"scenario_folder": "scenarios/x"}]}))
+    for use in (lambda: run_folder.read_trajectory(tmp_path / "no-control-0.nc"), lambda: opened(tmp_path).__enter__()):
+        with pytest.raises(InputError, match=f"older version .*; delete it and run again: {command}$"):
+            use()
 
 
 @pytest.mark.parametrize("content", [b"", b"nonsense", b"PK\x03\x04 cut off"])
 def test_a_file_that_is_no_trajectory(tmp_path, content):
-    (tmp_path / "a.npz").write_bytes(content)
-    with pytest.raises(InputError, match="a.npz: is no trajectory"):
-        run_folder.read_trajectory(tmp_path / "a.npz")
+    (tmp_path / "a.nc").write_bytes(content)
+    with pytest.raises(InputError, match="a.nc: is no run"):
+        run_folder.read_trajectory(tmp_path / "a.nc")
+
+
+def test_a_run_that_was_cut_off_anywhere(tmp_path):
+    run_folder.write_trajectory(tmp_path / "a.nc", trajectory())
+    whole = (tmp_path / "a.nc").read_bytes()
+    for length in [*range(0, len(whole), len(whole) // 20), len(whole) - 1]:
+        (tmp_path / "a.nc").write_bytes(whole[:length])
+        with pytest.raises(InputError, match="a.nc: is no run"):
+            run_folder.read_trajectory(tmp_path / "a.nc")
+
+
+def test_a_netcdf_file_of_somebody_else(tmp_path):
+    xr.Dataset({"temperature": ("time", np.ones(3))}).to_netcdf(tmp_path / "a.nc", engine="netcdf4")
+    with pytest.raises(InputError, match="a.nc: is no run"):
+        run_folder.read_trajectory(tmp_path / "a.nc")
+
+
+def test_no_module_of_one_system_is_imported_at_the_top_of_a_file():
+    found = [(path.name, name.name) for folder in ("nmfd", "cosim") for path in (ROOT / folder).rglob("*.py")
+             for line in ast.parse(path.read_text()).body if isinstance(line, ast.Import) for name in line.names]
+    assert len(found) > 100 and not [pair for pair in found if pair[1] in ("fcntl", "grp", "pwd", "resource")]
 
 
 def test_atomic_leaves_the_old_file_and_nothing_else_when_writing_fails(tmp_path):

@@ -5,16 +5,11 @@ import math
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import nmfd
 
-from nmfd.cli.main import main
 from nmfd.runs import files
 from nmfd.runs.workers import Failure, outcomes
 from nmfd.studies import scaling
-
-
-def nmfd(*arguments):
-    return CliRunner().invoke(main, ["scaling", *(str(a) for a in arguments)])
 
 
 @pytest.mark.parametrize("family, degree", [("complete", 18), ("hexagonal", 6)])

@@ -7,17 +7,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_actuate import MIN_GREEN, PHASES, SINGLE, check
+from signal_rules import CROSS, MIN_GREEN, check, cross, signal
 
-from cosim.plant.max_pressure import Junction, Roads, transition
+from cosim.plant.max_pressure import Roads
 from cosim.plant.offsets import offsets
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import Settings
 from cosim.plant.webster import LOST, SATURATION, optimised, plan
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import gateway_room_taken, load_city
-from cosim.sumo.session import Phase
-from cosim.sumo.signals import Link, Signal, read_signals
+from cosim.sumo.signals import Link, read_signals
 from cosim.sumo.trips import make_trips
 from cosim.sumo.turning_flows import turning_flows
 from nmfd.api import load_scenario
@@ -25,17 +24,6 @@ from nmfd.errors import InputError
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
-CROSS = [("Gr", 30), ("yr", 3), ("rG", 30), ("ry", 3)]
-
-
-def signal(phases, links=(), name="s"):
-    return Signal(id=name, offset=0.0, phases=tuple(Phase(duration=d, state=s) for s, d in phases), links=tuple(links))
-
-
-def cross(name="s"):
-    """Two streets, one lane each."""
-    return signal(CROSS, (Link(index=0, from_edge="a", lane=0, to_edge="b"),
-                          Link(index=1, from_edge="c", lane=0, to_edge="d")), name)
 
 
 def street(**after):
@@ -114,32 +102,6 @@ def test_signals_that_are_not_simple_are_left_alone(city, tmp_path):
     assert others == ["c11"] and [s.offset for s in simple if s.id == "c12"] == [7.0]
 
 
-@pytest.mark.parametrize("phases", [PHASES, SINGLE, CROSS])
-def test_every_way_between_stages_is_safe(phases):
-    """Random switching: yellow after green, the minimum green, nothing green together that never was."""
-    random = np.random.default_rng(2)
-    junction, states = Junction(signal(phases), 0.0, min_green=MIN_GREEN), []
-    for second in range(1500):
-        if second >= junction.next_change:
-            junction.advance(float(second))
-        if junction.may_switch(float(second)) and random.random() < 0.3:
-            other = int(random.integers(junction.stages))
-            if other != junction.stage:
-                junction.switch(other, float(second))
-        states.append(junction.state)
-    assert len(set(states)) > 3
-    check(states, phases, MIN_GREEN)
-
-
-def test_the_programme_s_own_way_is_kept():
-    phases = signal(SINGLE).phases
-    assert [p.state for p in transition(phases, 0, 2)] == ["yr"]
-    phases = signal([("GGr", 20), ("yyr", 4), ("rrr", 2), ("rrG", 20), ("rry", 3), ("Grr", 9), ("yrr", 3)]).phases
-    assert [(p.state, p.duration) for p in transition(phases, 0, 3)] == [("yyr", 4), ("rrr", 2)]
-    assert [(p.state, p.duration) for p in transition(phases, 0, 5)] == [("Gyr", 4), ("Grr", 2)]
-    assert transition(phases, 5, 0) == [Phase(duration=3, state="yrr")]
-
-
 def test_pressure_is_upstream_minus_downstream(city, scenario):
     """A queue gives its stage the pressure; the same queue behind the junction takes it away; shares add up."""
     simple, _ = read_signals(city)
@@ -161,42 +123,6 @@ def test_pressure_is_upstream_minus_downstream(city, scenario):
     held = roads.weights.toarray().clip(min=0.0).sum(axis=0)  # a vehicle before a signal is counted once
     before = [lane for lane, total in zip(roads.lanes, held, strict=True) if total > 0]
     assert len(before) > 300 and held[held > 0] == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("phases", [PHASES, SINGLE, CROSS])
-def test_rationed_green(phases):
-    """Random switching and commands: all is safe; no cycle has more green than its ration; u_max rations nothing."""
-    random, links = np.random.default_rng(3), (0, 1)
-    junction = Junction(signal(phases), 0.0, {link: (0, 1) for link in links}, min_green=MIN_GREEN)
-    cycle, states, budgets = int(sum(d for _, d in phases)), [], []
-    for second in range(40 * cycle):
-        now = float(second)
-        if second % cycle == 0:
-            share = 1.0 if second >= 30 * cycle else float(random.uniform())
-            junction.command(np.full((2, 2), share))
-            budgets.append(np.inf if share == 1.0 else MIN_GREEN + share * (cycle - MIN_GREEN))
-        if now >= junction.next_change - 1e-6:
-            junction.advance(now)
-        if junction.may_switch(now) and random.random() < 0.1:
-            junction.switch((junction.stage + 1) % junction.stages, now)
-        states.append(junction.state)
-    check(states, phases, MIN_GREEN)
-    green = np.array([[state[link] in "Gg" for link in links] for state in states]).reshape(40, cycle, 2).sum(axis=1)
-    assert (green <= np.ceil(np.array(budgets))[:, None]).all()
-    limited = np.isfinite(budgets)
-    assert (green[limited] >= np.array(budgets)[limited, None] - 1.0).any()  # rations are used up somewhere
-    assert junction.green_time(40.0 * cycle) == {link: green[:, n].sum() for n, link in enumerate(links)}
-
-
-@pytest.mark.parametrize("min_green", [2.0, 9.0])
-def test_the_minimum_green_is_that_of_the_settings(min_green):
-    """A stage lasts so long, and so much green has a gateway whose ration is the least."""
-    held = Junction(signal(CROSS), 0.0, {0: (0, 1)}, min_green=min_green)
-    held.command(np.zeros((2, 2)))
-    assert held.may_switch(min_green) and not held.may_switch(min_green - 1.0)
-    while held.next_change < 66.0:
-        held.advance(held.next_change)
-    assert held.green_time(66.0) == {0: min_green}
 
 
 def test_perimeter_control_over_max_pressure(scenario, plant_of):
@@ -303,7 +229,8 @@ def test_webster_in_sumo_and_under_perimeter_control(scenario, plant_of):
     plant = plant_of(signals="webster")
     plant.reset(1)
     plans = {name: plant.session.programme(name) for name in plant.session.signals()}
-    file = plant._signal_plan([])[0]
+    command = plant.session.command
+    file = command[command.index("--additional-files") + 1]
     for logic in ElementTree.parse(file).getroot():  # a later offset is a later beginning
         programme = plans[logic.get("id")]
         assert programme.position == -float(logic.get("offset")) % programme.cycle
@@ -352,6 +279,6 @@ def test_the_same_drivers_reroute(scenario, plant_of):
 
 
 def test_a_city_without_fixed_signals(scenario, monkeypatch):
-    monkeypatch.setattr("cosim.plant.plant.read_signals", lambda *_: ([], ["c11"]))
+    monkeypatch.setattr("cosim.plant.programmes.read_signals", lambda *_: ([], ["c11"]))
     with pytest.raises(InputError, match="sumo.signals: webster needs fixed-time signals"):
         SumoPlant(scenario, overrides=Settings(signals="webster"))

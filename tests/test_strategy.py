@@ -1,7 +1,5 @@
 """Strategies by name."""
 
-from dataclasses import fields
-
 import pytest
 
 from cosim.plant.settings import Settings
@@ -29,7 +27,7 @@ def test_what_a_name_means(name, controller, overrides):
 
 
 def test_every_controller_and_option_is_a_strategy():
-    names = {field.name for field in fields(Settings)}
+    names = set(Settings.model_fields)
     for controller in registry.names():
         assert parse(controller).controller == controller
     for option in OPTIONS:

@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 import trajectories
 from click.testing import CliRunner
-from test_interruption import killed
+from commands import killed
 
 from cosim.cli.main import main
 from cosim.evaluation import dask_worker, sweeps
@@ -218,7 +218,7 @@ def test_two_dask_workers_one_killed_in_mid_run(peak, tmp_path):
     # The same code and the same bytes as here.
     here = sweep(peak, "--controllers", "no-control", "--steps", 1, "--workers", 1, "--out", tmp_path / "here")
     assert here.exit_code == 0
-    name = Path("demand-1") / "no-control-0.npz"
+    name = Path("demand-1") / "no-control-0.nc"
     assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 
 

@@ -4,18 +4,9 @@ import math
 
 import pandas as pd
 import pytest
+from made_up import rows_of
 
 from cosim.evaluation import statistics
-from cosim.evaluation.simulate import FACTS
-from nmfd.runs.run_folder import COLUMNS
-
-
-def rows_of(values: dict[tuple[float, str], dict[int, float]]) -> pd.DataFrame:
-    """(level, controller) -> seed -> TTS; everything else is 1 or empty."""
-    blank = {name: 1.0 for name in (*COLUMNS, *FACTS)} | {"teleports": 0, "fallbacks": "", "solver_failures": 0}
-    return pd.DataFrame([
-        blank | {"demand": level, "controller": name, "seed": seed, statistics.TTS: tts}
-        for (level, name), seeds in values.items() for seed, tts in seeds.items()])
 
 
 def test_paired_interval_of_a_worked_example():

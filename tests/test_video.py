@@ -3,13 +3,14 @@
 import made_up
 import numpy as np
 import pytest
+from commands import cosim, error_line
 from matplotlib.colors import to_rgb
 from PIL import Image
-from test_page import cosim, error_line
 
 from cosim.evaluation import results as finished
 from cosim.evaluation.experiment import read_run
 from cosim.report import figures, video
+from nmfd.runs.run_folder import read_trajectory, write_trajectory
 
 
 @pytest.fixture(scope="module")
@@ -84,14 +85,13 @@ def test_error_lines(folder, tmp_path, monkeypatch, arguments, expected):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_record_without_densities_says_so(folder, tmp_path):
-    path = folder / "demand-1" / "no-control-2000.record.npz"
+def test_a_run_without_its_record_says_so(folder, tmp_path):
+    """As one of the regional model is."""
+    path = folder / "demand-1" / "no-control-2000.nc"
     before = path.read_bytes()
-    with np.load(path) as record:
-        rest = {name: record[name] for name in record.files if name != "edge_vehicles"}
-    np.savez(path, **rest)
+    write_trajectory(path, read_trajectory(path))
     try:
         line = error_line(cosim("video", folder, "--controller", "no-control", "--out", tmp_path / "x.gif"))
     finally:
         path.write_bytes(before)
-    assert "no-control-2000.record.npz: holds no link densities" in line
+    assert "no-control-2000.nc: is no run" in line and "departures" in line

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_page import cosim, error_line
+from commands import cosim, error_line
 
 from cosim.evaluation.simulate import Task, simulate
 from cosim.plant.plant import SumoPlant

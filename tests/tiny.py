@@ -69,3 +69,12 @@ def limited(network: RegionalModel, *, seed: int = 0) -> RegionalModel:
         network, exit_rates=random.uniform(0.5, 1.5, shape),
         capacity=random.uniform(0.1, 0.6, shape) * most * network.adjacency,
         storage=random.uniform(0.8, 1.6, network.regions) * np.array([m.jam for m in network.mfds]))
+
+
+def random_controls(random, network, batch=()):
+    """Admissible perimeter (*batch, R, R) and splits (*batch, R, R, R)."""
+    shape = (*batch, network.regions, network.regions)
+    perimeter = random.uniform(network.u_min, network.u_max, shape) * network.adjacency
+    splits = random.uniform(size=(*shape, network.regions)) ** 3 * network.split_mask
+    sums = splits.sum(axis=-2, keepdims=True)
+    return perimeter, splits / np.where(sums > 0, sums, 1.0)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nmfd.types import Trajectory
+from nmfd.types import Status, Trajectory
 
 
 def made(**fields) -> Trajectory:
@@ -12,3 +12,13 @@ def made(**fields) -> Trajectory:
         "observed": fields["accumulation"], "observed_backlog": fields["backlog"], "estimated": False,
         "decision_time": np.zeros(steps), "status": np.zeros(steps, dtype=int), "note": ("",) * steps, "wall_time": 1.0}
     return Trajectory(**usual | fields)
+
+
+def trajectory(controller="no-control", seed=0, steps=4):
+    rng = np.random.default_rng(seed)
+    return made(
+        controller=controller, plant="nmfd", seed=seed, step=30.0, accumulation=rng.random((steps + 1, 2, 2)),
+        backlog=np.zeros((steps + 1, 2, 2)), completed=np.arange(steps + 1.0), perimeter=rng.random((steps, 2, 2)),
+        splits=rng.random((steps, 2, 2, 2)), decision_time=rng.random(steps), note=("",) * (steps - 1) + ("no",),
+        status=np.array([0] * (steps - 1) + [(Status.SOLVER_FAILURE | Status.FALLBACK).value]),
+        wall_time=1.0)

@@ -1,4 +1,8 @@
-"""The commands report, video and watch of `cosim`. Heavy modules are imported inside them."""
+"""The commands report, video and watch of `cosim`.
+
+What brings numpy, pandas, torch or libsumo is imported inside the commands, so that the help answers at once: in 0.1 s
+instead of 3 s.
+"""
 
 from pathlib import Path
 
@@ -6,6 +10,7 @@ import click
 
 from cosim.cli.options import CONTROLLER_HELP
 from nmfd.cli.options import COUNT, FILE, FOLDER, LEVEL, SEED, Positive
+from nmfd.cli.progress import progress_line
 from nmfd.errors import InputError
 
 
@@ -24,9 +29,8 @@ def report(folders: tuple[Path, ...], out: Path | None, reference: str | None, s
       cosim report runs/grid7_peak-evaluate
       cosim report runs/monday runs/tuesday --out both.html
     """
-    from cosim.evaluation import results
+    from cosim.evaluation import results  # heavy
     from cosim.report import html
-    from nmfd.cli.progress import progress_line
 
     found = [results.read(folder, scenario) for folder in folders]
     known = {name for run in found for name in run.rows["controller"]}
@@ -61,9 +65,8 @@ def video(
       cosim video runs/gating --controller pi-gating --against no-control
       cosim video runs/grid7_peak-evaluate --controller max-pressure --seed 2001 --out film.mp4
     """
-    from cosim.evaluation import results
+    from cosim.evaluation import results  # heavy
     from cosim.report import video
-    from nmfd.cli.progress import progress_line
 
     run = results.read(folder, scenario)
     level = run.level(demand)
@@ -97,9 +100,8 @@ def watch(
     Example:
       cosim watch scenarios/grid7_peak --controller pi-gating
     """
-    from cosim.evaluation.simulate import Task
+    from cosim.evaluation.simulate import Task  # heavy
     from cosim.report import watch
-    from nmfd.cli.progress import progress_line
     from nmfd.metrics import summary
 
     task = Task(

@@ -1,4 +1,8 @@
-"""The commands run and compare of `cosim`. Heavy modules are imported inside them."""
+"""The commands run and compare of `cosim`.
+
+What brings numpy, pandas, torch or libsumo is imported inside the commands, so that the help answers at once: in 0.1 s
+instead of 3 s.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +12,7 @@ import click
 from cosim.cli.options import CONTROLLER_HELP, tell
 from nmfd.cli.errors import Interrupted
 from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, fault_option
+from nmfd.cli.progress import progress_line
 from nmfd.errors import InputError
 
 
@@ -43,7 +48,7 @@ def run(
       cosim run scenarios/grid7_peak --controller pi-gating --sumo-output tripinfo,edgedata --parquet
       cosim run scenarios/grid7_peak --controller dpc-pc --fault missing:3@20-30 --fault closed:c33-c34@10-40
     """
-    from cosim.plant import strategy
+    from cosim.plant import strategy  # heavy
     from cosim.sumo import outputs as outputs
 
     kinds = outputs.parse(sumo_output) if sumo_output is not None else ()
@@ -51,7 +56,7 @@ def run(
     for name in names:
         strategy.parse(name)
 
-    from cosim.evaluation import estimation_errors, experiment
+    from cosim.evaluation import estimation_errors, experiment  # heavy
     from cosim.evaluation.simulate import Task
 
     tasks = [
@@ -61,9 +66,9 @@ def run(
     out, rows = _experiment(tasks, out, kinds)
     click.echo(experiment.overview_table(rows))
     if parquet:
-        from nmfd.runs import frames
+        from nmfd.runs import frames, run_folder  # heavy
 
-        frames.write(out, experiment.trajectories(out), {"summary": rows})
+        frames.write(out, run_folder.trajectories(out), {"summary": rows})
     if (out / "estimation.csv").is_file():
         import pandas as pd
 
@@ -97,7 +102,7 @@ def compare(
       cosim compare runs/gating --controller pi-gating --seed 3
       cosim compare runs/grid7_peak-evaluate
     """
-    from cosim.evaluation import experiment, model_validation
+    from cosim.evaluation import experiment, model_validation  # heavy
     from cosim.evaluation.simulate import Task, scenario_of
     from cosim.plant import strategy
     from nmfd.runs import run_folder
@@ -141,7 +146,7 @@ def compare(
 
 def _foresight(target: Path, model: Path | None) -> None:
     """All runs of a folder against the regional models."""
-    from cosim.evaluation import prediction_error, results
+    from cosim.evaluation import prediction_error, results  # heavy
 
     found = prediction_error.foresee(results.read(target), model)
     prediction_error.write_foresights(target / "foresight.csv", found)
@@ -151,15 +156,12 @@ def _foresight(target: Path, model: Path | None) -> None:
 
 def _experiment(tasks: list, out: Path | None, sumo_output: tuple[str, ...] = ()) -> tuple:
     """The run folder of the tasks, and its overview; SUMO's own outputs of these kinds are in it."""
-    from dataclasses import replace
-
-    from cosim.evaluation import experiment
+    from cosim.evaluation import experiment  # heavy
     from cosim.sumo.outputs import paths
     from nmfd.api import load_scenario
-    from nmfd.cli.progress import progress_line
     from nmfd.runs import run_folder
 
-    out = run_folder.default_folder(load_scenario(tasks[0].scenario)) if out is None else out
+    out = run_folder.default_folder(load_scenario(tasks[0].scenario).name) if out is None else out
     tasks = [replace(task, sumo_output=paths(sumo_output, out, task.controller, task.seed)) for task in tasks]
     try:
         with progress_line("cosim") as progress:

@@ -23,7 +23,7 @@ def outcomes(address: str, tasks: Sequence[Task]) -> Iterator[tuple[Task, Result
     client = connect(address)
     futures = {}
     try:
-        from distributed import as_completed
+        from distributed import as_completed  # of an extra, which `connect` has asked for
 
         run = partial(dask_worker.run, folder=os.getcwd())
         futures = {client.submit(run, task, pure=False): task for task in tasks}
@@ -46,7 +46,7 @@ def outcomes(address: str, tasks: Sequence[Task]) -> Iterator[tuple[Task, Result
 def connect(address: str):
     """A distributed.Client. Raises InputError."""
     need("--scheduler", "dask", "distributed")
-    from distributed import Client
+    from distributed import Client  # of an extra: not there for everybody
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what went wrong is in the outcomes
     try:

@@ -9,6 +9,7 @@ import pandas as pd
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_columns
+from nmfd.studies import plots
 from nmfd.types import Trajectory
 
 COLUMNS = (
@@ -46,10 +47,7 @@ def write_errors(folder: Path, network: RegionalModel, trajectories: Sequence[Tr
     rows = pd.DataFrame([row for trajectory in estimated for row in errors(network, trajectory)], columns=COLUMNS)
     if not estimated:
         return rows
-    from nmfd.studies import plots
-
-    with files.atomic(folder / "estimation.csv") as temporary:
-        rows.to_csv(temporary, index=False)
+    files.write_text(folder / "estimation.csv", rows.to_csv(index=False))
     for trajectory in estimated:
         path = folder / f"estimate-{run_folder.run_name(trajectory.controller, trajectory.seed)}.png"
         if not path.exists():

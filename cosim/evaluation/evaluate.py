@@ -1,9 +1,9 @@
-"""The evaluation: controllers x seeds x demand levels in SUMO, paired by seed, with tables and figures.
+"""The evaluation: controllers x seeds x demand levels in SUMO, paired by seed, with tables.
 
     <folder>/demand-<level>/    the run folder of a demand level (cosim.evaluation.experiment)
     <folder>/evaluate.md, evaluate.csv, pairs.csv, runs.csv    the tables (statistics), new after every run; in the
         first,  at the end, why (explain)
-    pictures of a level in its folder, those across levels here (cosim.report.pictures)
+    what is drawn of a level lies in its folder, what is drawn across levels here (cosim.report.pictures)
 """
 
 import re
@@ -15,7 +15,6 @@ import pandas as pd
 
 from cosim.evaluation import experiment, explain, statistics
 from cosim.evaluation.simulate import Task
-from cosim.report import pictures
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.runs import files
@@ -72,7 +71,6 @@ def evaluate(
         scenario = load_scenario(evaluation.scenario)
         why = explain.text(level_folders(out), scenario.network, rows)
         files.write_text(out / "evaluate.md", statistics.markdown(table, evaluation.reference) + "\n" + why)
-        pictures.draw_all(out, level_folders(out), scenario, rows)
     if failures and table.empty and all(failure.mistake for _, failure in failures):
         raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])
     return table, [f"{experiment.label(task)}: {failure.reason}" for task, failure in failures]

@@ -13,8 +13,9 @@ import pandas as pd
 from cosim.evaluation import estimation_errors
 from cosim.evaluation.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.plant import incidents
-from cosim.plant.plant import own_vehicles
-from cosim.plant.settings import Settings, settings
+from cosim.plant.launch import own_vehicles
+from cosim.plant.record import Record
+from cosim.plant.settings import FILES, Settings, settings
 from cosim.plant.strategy import MAX_PRESSURE, configured, parse
 from cosim.sumo import outputs
 from cosim.sumo.build import ensure_built
@@ -26,12 +27,12 @@ from nmfd.errors import InputError
 from nmfd.metrics import COUNTED
 from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
+from nmfd.quantities import quantities, variables
 from nmfd.runs import files as disk
 from nmfd.runs import run_folder
 from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
 from nmfd.studies.benchmark import REFERENCE, draw_accumulations, interval
-from nmfd.types import Trajectory
 
 # Of loading runs: whether they guide routes, and so depend on the drivers' own split ratios.
 LOADING = {"probing-pc": False, "probing-pcrg": True, "route-guidance": True}
@@ -50,7 +51,7 @@ def experiment(
     """
     zipped = any(kind == outputs.ZIPPED for task in tasks for kind, _ in task.sumo_output)
     failures = perform([(out, task) for task in tasks], workers=workers, fresh=zipped, progress=progress, tell=tell)
-    if (out / "summary.csv").is_file() and (kept := trajectories(out)):
+    if (out / "summary.csv").is_file() and (kept := run_folder.trajectories(out)):
         scenario = scenario_of(tasks[0])
         draw_accumulations(out, scenario, kept)
         estimation_errors.write_errors(out, scenario.network, kept)
@@ -96,7 +97,7 @@ def perform(
                 path, configuration=configuration, controllers=controllers,
                 order=[(task.controller, task.seed) for task in tasks], renew=tell,
                 session={"scenario_folder": str(tasks[0].scenario), "workers": workers}))
-        there = {path: _finished(folder) for path, folder in folders.items()}
+        there = {path: folder.finished for path, folder in folders.items()}
         todo = [task for task in where if (task.controller, task.seed) not in there[where[task]] or not all(
             file.is_file() for _, file in task.sumo_output)]
         found = _outcomes(todo, workers, fresh, progress) if source is None else _reported(source, todo, progress)
@@ -107,9 +108,8 @@ def perform(
                     failed(task, outcome.reason)
                 continue
             folder = folders[where[task]]
-            write_record(record_path(folder.path, task.controller, task.seed), outcome)
             _write_facts(folder, outcome)
-            folder.add(outcome.trajectory)
+            folder.add(outcome.trajectory, variables(Record, outcome.record))
             if kept:
                 kept()
     return failures
@@ -180,17 +180,9 @@ def _plain(chosen: Settings, folder: Path | None) -> dict:
 
     Only these, so that a new kind of setting does not make old runs another city's.
     """
-    usual, found = vars(Settings()), {}
-    for key, value in vars(chosen).items():
-        if value != usual[key]:
-            found[key] = list(value) if isinstance(value, tuple) else value
-            if key in ("routes", "background", "additional"):
-                found[key] = [disk.file_hash(folder / name) for name in value]
-    return found
-
-
-def _finished(folder: run_folder.RunFolder) -> set[tuple[str, int]]:
-    return {run for run in folder.finished if record_path(folder.path, *run).is_file()}
+    found = chosen.model_dump(mode="json", exclude_defaults=True)
+    hashes = {key: [disk.file_hash(folder / name) for name in found[key]] for key in FILES if key in found}
+    return {**found, **hashes}
 
 
 def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress) -> Iterator[tuple]:
@@ -217,35 +209,12 @@ def _reported(source, todo: Sequence[Task], progress) -> Iterator[tuple]:
         yield task, outcome
 
 
-def record_path(folder: Path, controller: str, seed: int) -> Path:
-    return folder / f"{run_folder.run_name(controller, seed)}.record.npz"
-
-
-def write_record(path: Path, result: Result) -> None:
-    """The fields of cosim.plant.record.Record, atomically."""
-    with disk.atomic(path) as temporary:
-        np.savez_compressed(temporary, **result.record)
-
-
 def read_run(folder: Path, controller: str, seed: int) -> Result:
     """A finished run of the run folder. Raises InputError."""
-    path = record_path(folder, controller, seed)
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            record = {name: file[name] for name in file.files}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such run; choose a controller and seed of {folder / 'sumo.csv'}") from None
-    except run_folder.DAMAGED as error:
-        raise InputError(f"{path}: is no record of a run ({error}); delete it and run again") from None
-    trajectory = run_folder.read_trajectory(folder / f"{run_folder.run_name(controller, seed)}.npz")
-    return Result(trajectory=trajectory, record=record, facts={})
-
-
-def trajectories(folder: Path) -> list[Trajectory]:
-    """The finished runs of the run folder. Raises InputError."""
-    return [
-        run_folder.read_trajectory(folder / f"{run_folder.run_name(row['controller'], row['seed'])}.npz")
-        for row in run_folder.read_summary(folder / "summary.csv")]
+    with run_folder.opened(run_folder.run_path(folder, controller, seed)) as file:
+        return Result(
+            trajectory=run_folder.trajectory_in(file), record={name: file[name][...] for name in quantities(Record)},
+            facts={})
 
 
 def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
@@ -253,8 +222,7 @@ def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
     rows = read_facts(path) if path.is_file() else pd.DataFrame(columns=FACTS)
     same = (rows["controller"] == result.facts["controller"]) & (rows["seed"] == result.facts["seed"])
     rows = pd.DataFrame([*rows[~same].to_dict("records"), result.facts], columns=FACTS)
-    with disk.atomic(path) as temporary:
-        rows.to_csv(temporary, index=False)
+    disk.write_text(path, rows.to_csv(index=False))
 
 
 def overview(folder: Path) -> pd.DataFrame:

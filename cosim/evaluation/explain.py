@@ -46,9 +46,8 @@ def load(network: RegionalModel, trajectories: Sequence[Trajectory], records: It
     states = [trajectory.accumulation.sum(axis=2) / critical for trajectory in trajectories]
     started, came = np.zeros(network.regions), np.zeros(network.regions)
     for record in records:
-        if {"departures", "crossings"} <= record.keys() and record["crossings"].ndim == 4:
-            started += record["departures"].sum(axis=(0, 2))
-            came += record["crossings"].sum(axis=(0, 1, 3))
+        started += record["departures"].sum(axis=(0, 2))
+        came += record["crossings"].sum(axis=(0, 1, 3))
     with np.errstate(invalid="ignore"):
         inside = started / (started + came)
     return Load(
@@ -78,8 +77,7 @@ def deeds(network: RegionalModel, trajectories: Sequence[Trajectory], records: I
     held = [(t.perimeter[:, network.adjacency] < limit).mean() for t in trajectories]
     guided, trips = 0.0, 0.0
     for record in records:
-        if {"guided", "departures"} <= record.keys():
-            guided, trips = guided + record["guided"].sum(), trips + record["departures"].sum()
+        guided, trips = guided + record["guided"].sum(), trips + record["departures"].sum()
     return Deeds(held=float(np.mean(held)), guided=float(guided / max(trips, 1.0)))
 
 
@@ -111,7 +109,7 @@ def at(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame) -
 
 def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Trajectory], Iterable[Mapping]]:
     """Trajectories and records of one controller."""
-    return ([run_folder.read_trajectory(folder / f"{run_folder.run_name(name, seed)}.npz") for seed in seeds],
+    return ([run_folder.read_trajectory(run_folder.run_path(folder, name, seed)) for seed in seeds],
             (experiment.read_run(folder, name, seed).record for seed in seeds))
 
 

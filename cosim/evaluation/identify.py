@@ -6,9 +6,8 @@ runs by prediction error (nmfd.model.identification).
 """
 
 import csv
-import io
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,15 +19,14 @@ from cosim.evaluation.simulate import Result, Task
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model import identification, mfd
-from nmfd.model.identification import Observed
+from nmfd.model.identification import Observed, observed_split_ratios
+from nmfd.model.model_file import network_toml
 from nmfd.model.planning import GUIDED, GUIDING
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files
-from nmfd.runs.config import quoted
 from nmfd.runs.workers import ended
 
-FEWEST = 30.0   # vehicles that must have crossed before their split ratios count
 SAMPLES = 10    # of a region: with fewer it is as good as empty, and keeps the MFD that it has
 AHEAD = 900.0   # s, of the longer prediction that is judged
 BINS = 12       # of accumulation, for the hysteresis
@@ -156,7 +154,8 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
         for region, cloud in enumerate(samples)))
     if guided:  # what theta is compared with stays what it is for the plant (cosim.plant.guidance)
         return network
-    return replace(network, own_splits=own_splits(network, [result.record for result in results]))
+    crossings = sum(result.record["crossings"].sum(axis=0) for result in results)
+    return replace(network, own_splits=observed_split_ratios(network, crossings))
 
 
 def samples_of(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, np.ndarray]]:
@@ -193,17 +192,6 @@ def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[in
 def own_points(cloud: dict[str, np.ndarray]) -> np.ndarray:
     """(n, 2): the samples that the region's own MFD explains."""
     return np.concatenate([points for label, points in cloud.items() if label != HELD_UP])
-
-
-def own_splits(network: RegionalModel, records: Sequence[dict]) -> dict[tuple[int, int], dict[int, float]]:
-    """(i, j) -> {h: share}: by which neighbour h the vehicles in i bound for j went on in fact."""
-    crossings = sum(record["crossings"].sum(axis=0) for record in records) * network.split_mask
-    found = {}
-    for i, j in np.argwhere(crossings.sum(axis=1) >= FEWEST):
-        shares = crossings[i, :, j] / crossings[i, :, j].sum()
-        kept = {int(h): round(float(shares[h]), 4) for h in np.flatnonzero(shares >= 0.005)}
-        found[int(i), int(j)] = {h: share / sum(kept.values()) for h, share in kept.items()}
-    return found
 
 
 def hysteresis(cloud: dict[str, np.ndarray]) -> float:
@@ -267,49 +255,10 @@ def prediction_table(network: RegionalModel, held_out: Sequence[Observed], schem
 
 def _sumo_table(folder: Path, target: Path) -> dict[str, str]:
     """The table [sumo] of the network in `folder`, its paths seen from `target`."""
-    table = config.read(folder / "network.toml").raw_table("sumo")
+    table = config.read(folder / "network.toml").get("sumo", {})
     return {
         key: os.path.relpath(folder / value, target) if key in PATHS and isinstance(value, str) else value
         for key, value in table.items()}
-
-
-def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) -> str:
-    """network.toml of `network` with this table [sumo]."""
-    out = io.StringIO()
-    out.write(f"# {comment}\nname = {quoted(network.name)}\n\n")
-    out.write(f"[perimeter]\nmin = {network.u_min:g}\nmax = {network.u_max:g}\n")
-    if sumo:
-        out.write("\n[sumo]\n" + "".join(f"{key} = {quoted(value)}\n" for key, value in sumo.items()))
-    for region in range(network.regions):
-        x, y = network.positions[region]
-        adjacent = np.flatnonzero((network.adjacency | network.adjacency.T)[region])
-        one_way = ", ".join(str(h) for h in adjacent if not network.adjacency[region, h])
-        barred = f"no_way_to = [{one_way}]\n" if one_way else ""
-        neighbours = ", ".join(str(h) for h in adjacent)
-        curve = network.mfds[region]
-        out.write(
-            f'\n[[regions]]\nname = {quoted(network.region_names[region])}\nposition = [{x:.6g}, {y:.6g}]\n'
-            f"adjacent = [{neighbours}]\n{barred}{_options(network, region)}\n"
-            f"[regions.mfd]\na = {curve.a:.6g}\nb = {curve.b:.6g}\nc = {curve.c:.6g}\n"
-            f"jam = {curve.jam:.6g}\n")
-    for (i, j), shares in sorted(network.own_splits.items()):
-        via = ", ".join(str(h) for h in shares)
-        share = ", ".join(f"{value:.4f}" for value in shares.values())
-        out.write(f"\n[[own_splits]]\nregion = {i}\ndestination = {j}\nnext = [{via}]\nshare = [{share}]\n")
-    return out.getvalue()
-
-
-def _options(network: RegionalModel, region: int) -> str:
-    """exit_rates, capacity and storage of one region, as far as the network has them."""
-    lines = ""
-    if network.exit_rates is not None:
-        lines += f"exit_rates = [{', '.join(f'{value:.4g}' for value in network.exit_rates[region])}]\n"
-    if network.capacity is not None:
-        passing = network.capacity[region, network.adjacency[region]]
-        lines += (
-            f"capacity = [{', '.join(f'{value:.4g}' for value in passing)}]\n"
-            f"storage = {network.storage[region]:.6g}\n")
-    return lines
 
 
 def _write_samples(path: Path, samples: Sequence[dict]) -> None:

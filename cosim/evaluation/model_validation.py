@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import torch
 
 from cosim.evaluation import mfd_bands
 from cosim.evaluation.simulate import Result
@@ -57,8 +58,6 @@ def predict(scenario: Scenario, result: Result) -> Trajectory:
 
 def predict_next(scenario: Scenario, result: Result, intervals: int = 1) -> np.ndarray:
     """(T + 1 - intervals, R) [veh]: accumulations `intervals` ahead of every recorded state, by the regional model."""
-    import torch
-
     trajectory, steps = result.trajectory, len(result.trajectory.perimeter)
     x = torch.from_numpy(trajectory.accumulation[: steps + 1 - intervals])
     demand = torch.from_numpy(result.record["departures"] / scenario.step)
@@ -162,8 +161,7 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
     predicted = predict(scenario, result)
     rows = pd.DataFrame(errors(scenario, result, predicted), columns=COLUMNS)
     name = run_folder.run_name(result.trajectory.controller, result.trajectory.seed)
-    with files.atomic(folder / f"compare-{name}.csv") as temporary:
-        rows.to_csv(temporary, index=False)
+    files.write_text(folder / f"compare-{name}.csv", rows.to_csv(index=False))
     drawing, axes = plots.panels(scenario.network.regions + 1)
     for region, ax in enumerate(axes[:-1]):
         plots.region_accumulation(ax, scenario.network, region, [result.trajectory, predicted])

@@ -90,5 +90,4 @@ def write_foresights(path: Path, foresights: Sequence[Foresight]) -> None:
         (one.demand, one.controller, one.runs, one.model, region, one.critical[region], one.most[region],
          one.errors[0, region], one.ahead, one.errors[1, region])
         for one in foresights for region in range(len(one.critical))]
-    with files.atomic(path) as temporary:
-        pd.DataFrame(rows, columns=COLUMNS).to_csv(temporary, index=False, float_format="%.6g")
+    files.write_text(path, pd.DataFrame(rows, columns=COLUMNS).to_csv(index=False, float_format="%.6g"))

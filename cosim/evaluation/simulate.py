@@ -9,10 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
+from cosim.evaluation import estimation_errors, run_metrics
+from cosim.plant.plant import SumoPlant
+from cosim.plant.settings import settings
 from cosim.plant.strategy import Strategy, configured, parse, planning_of
+from cosim.sumo import outputs as sumo_output
+from nmfd import closed_loop, metrics
 from nmfd.api import load_scenario
+from nmfd.controllers import registry
 from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import Scenario, with_faults
+from nmfd.runs import files as disk
+from nmfd.runs import run_folder
 from nmfd.types import Controller, Trajectory
 
 # Columns of sumo.csv, beside those of summary.csv.
@@ -68,8 +76,6 @@ def scenario_of(task: Task) -> Scenario:
 
 def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> Result:
     """Run `task` in this process, which must hold no other SUMO session. Raises InputError."""
-    from nmfd.controllers import registry
-
     begin = time.perf_counter()
     scenario, strategy = scenario_of(task), parse(task.controller)
     controller = registry.make(configured(task.controller, scenario.controller_options), scenario, policy=task.policy)
@@ -89,19 +95,11 @@ def drive(
     only if all goes well; planning: what states are estimated with, if not the scenario itself.
     Raises InputError.
     """
-    from cosim.evaluation import run_metrics
-    from cosim.plant.plant import SumoPlant
-    from cosim.plant.settings import settings
-    from cosim.sumo import outputs as sumo_output
-    from nmfd import closed_loop, metrics
-    from nmfd.runs import files as disk
-    from nmfd.runs import run_folder
-
     begin = time.perf_counter() if begin is None else begin
     with ExitStack() as stack:
         files = {kind: stack.enter_context(disk.atomic(path)) for kind, path in (outputs or {}).items()}
         plant = SumoPlant(
-            scenario, overrides=replace(settings(scenario), **strategy.overrides), outputs=files,
+            scenario, overrides=settings(scenario).changed(**strategy.overrides), outputs=files,
             planning=planning)
         stack.callback(plant.close)
         trajectory = run_folder.labelled(
@@ -129,7 +127,5 @@ def _estimation(scenario: Scenario, trajectory: Trajectory) -> dict[str, float]:
     """Errors of the estimate, over all regions; NaN where the controller saw the exact state."""
     if not trajectory.estimated:
         return {"estimate_rmse_share": math.nan, "estimate_cell_rmse_veh": math.nan}
-    from cosim.evaluation import estimation_errors
-
     whole = estimation_errors.errors(scenario.network, trajectory)[-1]
     return {"estimate_rmse_share": whole["rmse_share"], "estimate_cell_rmse_veh": whole["cell_rmse_veh"]}

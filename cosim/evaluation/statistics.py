@@ -179,7 +179,6 @@ def write_tables(folder: Path, rows: pd.DataFrame, reference: str | None = None)
     """evaluate.csv, evaluate.md, pairs.csv and runs.csv in `folder`; returns `statistics`."""
     table = statistics(rows, reference)
     for name, content in (("runs.csv", rows), ("evaluate.csv", table), ("pairs.csv", pairs(rows))):
-        with files.atomic(folder / name) as temporary:
-            content.to_csv(temporary, index=False)
+        files.write_text(folder / name, content.to_csv(index=False))
     files.write_text(folder / "evaluate.md", markdown(table, reference))
     return table

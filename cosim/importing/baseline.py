@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import sumo
 
 from cosim.importing.streets import Streets
 from cosim.sumo.xml_files import file_list, read_xml
@@ -115,8 +116,6 @@ def run_baseline(
 
 def run_sumo(program: str, *arguments: str, where: str) -> None:
     """Run one of SUMO's programs. Raises InputError with the first line of its complaint."""
-    import sumo
-
     done = subprocess.run(
         [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments], capture_output=True, text=True, check=False)
     if done.returncode:

@@ -22,7 +22,7 @@ def scenario_of(target: Path) -> Path:
 
 def _is_on(file: Path, network: Path) -> bool:
     try:
-        name = config.read(file).text("network", None)
+        name = config.read(file).get("network")
     except InputError:
         return False
-    return bool(name) and (file.parent / name).resolve() == network.resolve()
+    return isinstance(name, str) and (file.parent / name).resolve() == network.resolve()

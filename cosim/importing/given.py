@@ -5,6 +5,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
+from matplotlib.path import Path as Outline
 
 from cosim.importing.layers import area
 from cosim.importing.streets import Streets
@@ -70,8 +71,6 @@ def _assign(labels: np.ndarray, streets: Streets, edge: str, region: int, where:
 
 def _polygons(streets: Streets, path: Path) -> np.ndarray:
     """An edge is in the region in which its middle lies; the smallest polygon counts where several do."""
-    from matplotlib.path import Path as Outline
-
     labels, regions, found = np.full(len(streets.edges), -1), {}, []
     for polygon in read_xml(path).iter("poly"):
         region = regions.setdefault(polygon.get("id", "").partition(".")[0], len(regions))

@@ -4,6 +4,7 @@ import io
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from cosim.importing.streets import Streets
@@ -45,8 +46,6 @@ def polygons_xml(streets: Streets, regions: np.ndarray, names: tuple[str, ...]) 
 
 def outlines(streets: Streets, regions: np.ndarray) -> list[list[np.ndarray]]:
     """Rings (n, 2) [m] round every region, the largest first: the places nearer to its streets than to others'."""
-    from matplotlib.figure import Figure
-
     points, of = sampled(streets, streets.drivable)
     low, high = points.min(axis=0), points.max(axis=0)
     cell = max(float((high - low).max()) / CELLS, 1.0)

@@ -6,14 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cosim.evaluation.identify import network_toml, own_splits
 from cosim.importing.baseline import Baseline
 from cosim.importing.case import Case
 from cosim.importing.demand import Traffic
 from cosim.importing.regions import digraph, names, positions
 from cosim.importing.streets import Streets
 from cosim.sumo.net import JAM_SPACING
+from nmfd.model.identification import observed_split_ratios
 from nmfd.model.mfd import Mfd
+from nmfd.model.model_file import network_toml
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.config import quoted
 
@@ -94,7 +95,7 @@ def network_of(streets: Streets, regions: np.ndarray, name: str, baseline: Basel
         adjacency=digraph(streets, regions) > 0, mfds=_placeholders(streets, regions, baseline), u_min=0.1, u_max=0.9)
     if baseline is None:
         return network
-    return replace(network, own_splits=own_splits(network, [{"crossings": baseline.crossings(regions)[None]}]))
+    return replace(network, own_splits=observed_split_ratios(network, baseline.crossings(regions)))
 
 
 def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline | None) -> tuple[Mfd, ...]:

@@ -8,12 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cosim.plant.plant import SumoPlant
+from cosim.plant.settings import settings
 from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
 from nmfd.model.scenario import Scenario
 
 if TYPE_CHECKING:
-    from cosim.plant.plant import SumoPlant
     from nmfd.rl import RegionalEnv, RegionsEnv
 
 
@@ -26,7 +27,7 @@ def gymnasium_env(
     guidance, metering: as of nmfd.rl.Interface; steps: control intervals of an episode, the scenario's if None
     city: what else the city does, such as "max-pressure+rerouting-30". Raises InputError.
     """
-    from nmfd.rl import RegionalEnv
+    from nmfd.rl import RegionalEnv  # of an extra: not there for everybody
 
     return RegionalEnv(*_city(scenario, steps, city), guidance=guidance, metering=metering)
 
@@ -36,17 +37,14 @@ def pettingzoo_env(
     city: str = "",
 ) -> "RegionsEnv":
     """One agent per region (nmfd.rl.RegionsEnv) in SUMO; the other arguments as of `gymnasium_env`."""
-    from nmfd.rl import RegionsEnv
+    from nmfd.rl import RegionsEnv  # of an extra: not there for everybody
 
     return RegionsEnv(*_city(scenario, steps, city), guidance=guidance, cooperative=cooperative)
 
 
-def _city(scenario: Scenario | Path | str, steps: int | None, city: str) -> tuple[Scenario, "SumoPlant"]:
-    from cosim.plant.plant import SumoPlant
-    from cosim.plant.settings import settings
-
+def _city(scenario: Scenario | Path | str, steps: int | None, city: str) -> tuple[Scenario, SumoPlant]:
     loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     if steps is not None:
         loaded = replace(loaded, steps=min(steps, loaded.steps), demand=loaded.demand[:steps])
     overrides = {**(parse(city).overrides if city else {}), "gateways_fixed": True}
-    return loaded, SumoPlant(loaded, overrides=replace(settings(loaded), **overrides))
+    return loaded, SumoPlant(loaded, overrides=settings(loaded).changed(**overrides))

@@ -30,12 +30,12 @@ class MaxPressure:
 
     def __init__(
         self, session: Session, city: City, signals: list[Signal], flows: Mapping[tuple[str, str], float], *,
-        others: list[Signal], min_green: float, show: Callable[[str, str], None],
+        min_green: float, show: Callable[[str, str], None],
     ):
-        """flows: (edge, next edge) -> any measure of flow, for the turning shares; others: signals that somebody else
-        controls, but whose queues count as well; min_green: [s]; show(signal, state) puts a state on a signal."""
+        """flows: (edge, next edge) -> any measure of flow, for the turning shares; min_green: [s]; show(signal, state)
+        puts a state on a signal."""
         self._session, self._show = session, show
-        roads = Roads(city, [*signals, *others], flows)
+        roads = Roads(city, signals, flows)
         self._lanes, self._weights, self._movements = roads.lanes, roads.weights, roads.movements
         self._gain, self._begins = roads.stages(signals)
         pairs = gateway_movements(city)

@@ -10,6 +10,7 @@ import numpy as np
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
 from nmfd.ledger import LedgerError
+from nmfd.types import State
 
 
 @dataclass
@@ -67,6 +68,19 @@ class Meter:
         self.arrivals = np.zeros(city.regions, dtype=int)
         self.crossings = np.zeros((city.regions,) * 3, dtype=int)
         self.entry_flow: Counter[tuple[int, str]] = Counter()
+        # Several movements may lead from one region to one edge: they share its flow.
+        self._alike = Counter((g.source, g.to_edge) for g in city.gateways)
+
+    def state(self, step: int, time: float) -> State:
+        """What the city is in at `time` [s] since the start, when control step `step` begins. LedgerError."""
+        return State(
+            step=step, time=time, accumulation=self.accumulation(step), backlog=self.backlog(),
+            completed=float(self.arrivals.sum()))
+
+    def gateway_flow(self) -> np.ndarray:
+        """(G,) [veh] over each gateway of the city since the beginning."""
+        return np.array([
+            self.entry_flow[g.source, g.to_edge] / self._alike[g.source, g.to_edge] for g in self._city.gateways])
 
     def observe(self) -> list[Event]:
         """Account for the last simulation step; call after every one. Departures first, then entries."""

@@ -26,7 +26,7 @@ GREEN = frozenset("Gg")
 class GatewaySignal:
     """One signal with gateway links under perimeter control.
 
-    programme: the original one, read at simulation time `start` [s]
+    programme: the original one, of `phases`, read at simulation time `start` [s]
     movements: link index -> (i, h)
     min_green: [s], never less, unless the original window is shorter
     """
@@ -35,7 +35,7 @@ class GatewaySignal:
         self, programme: Programme, movements: Mapping[int, tuple[int, int]], *, min_green: float, mode: str,
         start: float,
     ):
-        self.signal = programme.signal
+        self.signal, self.phases = programme.signal, programme.phases
         self._states = [phase.state for phase in programme.phases]
         self._original = [phase.duration for phase in programme.phases]
         self._movements = {link: _Movement(pair) for link, pair in movements.items()}
@@ -178,8 +178,8 @@ def _apportion(total: float, weights: list[float]) -> list[float]:
     return shares.tolist()
 
 
-class Actuator:
-    """All gateway signals of a city. `share` of u between its bounds is commanded once per control interval."""
+class GatewaySignals:
+    """Perimeter control at fixed-time signals (a cosim.plant.actuation.SignalControl)."""
 
     def __init__(self, signals: list[GatewaySignal], show: Callable[[str, str], None]):
         """show(signal, state) puts a state on a signal."""
@@ -195,3 +195,7 @@ class Actuator:
         for signal in self._signals:
             if now >= signal.next_change - 1e-6:
                 self._show(signal.signal, signal.update(now))
+
+    def green_time(self) -> dict[str, dict[int, float]]:
+        """Signal -> gateway link -> seconds of green shown so far."""
+        return {signal.signal: signal.green_time() for signal in self._signals}

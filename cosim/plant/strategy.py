@@ -8,18 +8,19 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from nmfd.controllers import registry
-from nmfd.errors import InputError
+from nmfd.errors import InputError, did_you_mean
 from nmfd.model.planning import PlanningModel, guided_model, planning_model, with_model
 from nmfd.model.scenario import Scenario
 
 ALONE = "no-control"  # the controller of a name that is only options
-FIXED, WEBSTER, ACTUATED, MAX_PRESSURE = "fixed", "webster", "actuated", "max-pressure"
-SIGNALS = (FIXED, WEBSTER, ACTUATED, MAX_PRESSURE)
-HOLD_BACK, REDISTRIBUTE = "hold-back", "redistribute"
-MODES = (HOLD_BACK, REDISTRIBUTE)
+Signals = Literal["fixed", "webster", "actuated", "max-pressure"]
+Mode = Literal["hold-back", "redistribute"]
+SIGNALS, MODES = get_args(Signals), get_args(Mode)
+FIXED, WEBSTER, ACTUATED, MAX_PRESSURE = SIGNALS
+HOLD_BACK, REDISTRIBUTE = MODES
 
 # Option -> (field of cosim.plant.settings.Settings, its value).
 _WORDS = {
@@ -115,4 +116,5 @@ def _unknown(name: str, word: str, *, controllers: bool) -> InputError:
     where = f"controller {name!r}" if word == name else f"strategy {name!r}: {word!r}"
     ranges = ", ".join(f"{stem}-N from {least} to {most} {unit}" for stem, (_, least, most, unit) in _NUMBERS.items())
     first = f"{', '.join(registry.choice())} or file.py:Class, with options joined by +: " if controllers else ""
-    return InputError(f"{where} is unknown; choose from {first}{', '.join(OPTIONS)} (whole numbers, {ranges})")
+    hint = did_you_mean(word, [*(registry.choice() if controllers else ()), *OPTIONS])
+    return InputError(f"{where} is unknown{hint}; choose from {first}{', '.join(OPTIONS)} (whole numbers, {ranges})")

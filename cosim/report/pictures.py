@@ -17,6 +17,7 @@ from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, edge_shapes, load_city
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
+from nmfd.runs import run_folder
 from nmfd.studies import plots
 from nmfd.studies.benchmark import REFERENCE, draw_accumulations
 
@@ -39,7 +40,7 @@ def draw(
     names = ranked(rows)
     seed = shown_seed(rows)
     order = list(dict.fromkeys(rows["controller"]))
-    runs = sorted((t for t in experiment.trajectories(folder) if t.controller in order),
+    runs = sorted((t for t in run_folder.trajectories(folder) if t.controller in order),
                   key=lambda t: (order.index(t.controller), t.seed))
     note = teleports(rows)
     draw_accumulations(out, scenario, runs, seed=seed, title=f"seed {seed}, shaded: all seeds; {note}")

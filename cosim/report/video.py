@@ -6,8 +6,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
+from matplotlib import animation, rc_context
 
-from cosim.evaluation.experiment import read_run, record_path
+from cosim.evaluation.experiment import read_run
 from cosim.evaluation.results import Finished, Level
 from cosim.evaluation.simulate import Result
 from cosim.report import figures, pictures
@@ -58,15 +59,10 @@ def film(
 ) -> Path:
     """Write the film, atomically; the suffix of `path` chooses the format. rate: frames per second.
 
-    Raises InputError for another suffix, a missing ffmpeg, and runs whose record lacks densities.
+    Raises InputError for another suffix, a missing ffmpeg, and runs that cannot be read.
     """
     with _writer(path, rate) as writer:
         results = {name: read_run(level.folder, name, seed) for name in names}
-        for name, result in results.items():
-            if "edge_vehicles" not in result.record:
-                raise InputError(
-                    f"{record_path(level.folder, name, seed)}: holds no link densities, which this version "
-                    "records; run it again")
         drawing, update = scene(finished.city, results, f"{finished.scenario.name}, demand times {level.demand:g}")
         steps = min(len(result.record["edge_vehicles"]) for result in results.values())
         shown = range(0, steps, -(-steps // FRAMES))
@@ -122,8 +118,6 @@ def scene(city: City, results: dict[str, Result], title: str) -> tuple:
 @contextmanager
 def _writer(path: Path, rate: int):
     """matplotlib's writer for the suffix of `path`. Raises InputError."""
-    from matplotlib import animation, rc_context
-
     if path.suffix == ".gif":
         yield animation.PillowWriter(fps=rate)
     elif path.suffix == ".mp4":
@@ -141,7 +135,7 @@ def ffmpeg() -> str | None:
     program = shutil.which("ffmpeg")
     if program is None:
         with suppress(ImportError, RuntimeError):
-            import imageio_ffmpeg
+            import imageio_ffmpeg  # of an extra: not there for everybody
 
             program = imageio_ffmpeg.get_ffmpeg_exe()
     return program

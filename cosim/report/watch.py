@@ -3,7 +3,6 @@
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -75,7 +74,7 @@ def watch(
                      "--window-size", "1200,900", *options),
             additional=(drawn,), program=program)
         plant = SumoPlant(
-            scenario, overrides=replace(settings(scenario), **strategy.overrides), window=window,
+            scenario, overrides=settings(scenario).changed(**strategy.overrides), window=window,
             planning=planning_of(scenario, task.controller))
         shapes = edge_shapes(plant.city)
         drawn.write_text(layers_xml(plant.city, shapes))

@@ -12,6 +12,9 @@ from importlib import metadata
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
+import sumo
+
+from cosim.sumo.recipe import CityTable, RecipeTable
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import config
@@ -57,17 +60,11 @@ class Node:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """A city.toml that was read and checked: junctions, streets between neighbours, speeds and signals."""
+    """A city.toml that was read and checked, with its junctions and the streets between neighbours."""
 
+    table: RecipeTable
     nodes: dict[str, Node]
     streets: list[tuple[str, str]]
-    centre_speed: float
-    outer_speed: float
-    pocket: float
-    cycle: int
-    yellow: int
-    all_red: int
-    left_green: int
 
 
 def ensure_built(network: RegionalModel) -> SumoFiles:
@@ -78,21 +75,17 @@ def ensure_built(network: RegionalModel) -> SumoFiles:
     if network.folder is None:
         raise InputError(f"network {network.name}: was not loaded from a folder; load it with load_network")
     path = network.folder / "network.toml"
-    root = config.read(path)
-    if not root.has("sumo"):
+    content = config.read(path)
+    if "sumo" not in content:
         raise InputError(
             f'{path}: sumo: missing; this network has no city to simulate: add [sumo] with recipe = "city.toml"')
-    table = config.Table(root.raw_table("sumo"), path, "sumo.")
-    if table.has("recipe"):
-        recipe = network.folder / table.text("recipe")
-        table.close()
-        return _built(recipe, network)
-    files = SumoFiles(
-        net_file=network.folder / table.text("net"), regions_csv=network.folder / table.text("regions"))
-    table.close()
+    table = config.checked(CityTable, content["sumo"], path, "sumo.")
+    if table.recipe is not None:
+        return _built(network.folder / table.recipe, network)
+    files = SumoFiles(net_file=network.folder / table.net, regions_csv=network.folder / table.regions)
     for key, file in (("net", files.net_file), ("regions", files.regions_csv)):
         if not file.is_file():
-            raise table.error(key, f"no such file: {file}; give the path of an existing one")
+            raise config.error(path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one")
     return files
 
 
@@ -124,44 +117,27 @@ def _stamp(recipe_file: Path) -> str:
 
 
 def read_recipe(path: Path, regions: int) -> Recipe:
-    """Read and check a city.toml. Raises InputError."""
-    root = config.read(path)
-    centre, outer, signals = (root.table(key) for key in ("centre", "outer", "signals"))
-    region = centre.integer("region", high=regions - 1)
-    centre_x, centre_y = _lines(centre, "x"), _lines(centre, "y")
-    outer_x, outer_y = _lines(outer, "x"), _lines(outer, "y")
-    picture = [line.split() for line in outer.lines("regions")][::-1]
-    if [len(row) for row in picture] != [len(outer_x)] * len(outer_y):
-        raise outer.error("regions", f"expected {len(outer_y)} rows of {len(outer_x)} regions or dots; correct it")
-    nodes = {}
-    for i, x in enumerate(centre_x):
-        for j, y in enumerate(centre_y):
-            nodes[f"c{i}{j}"] = Node(id=f"c{i}{j}", x=x, y=y, region=region, centre=True)
-    for j, y in enumerate(outer_y):
-        for i, x in enumerate(outer_x):
-            inside = centre_x[0] <= x <= centre_x[-1] and centre_y[0] <= y <= centre_y[-1]
+    """Read and check a city.toml (cosim.sumo.recipe). Raises InputError."""
+    table = config.checked(RecipeTable, config.read(path), path)
+    centre, outer = table.centre, table.outer
+    if centre.region >= regions:
+        raise config.error(path, "centre.region", config.got(f"a whole number from 0 to {regions - 1}", centre.region))
+    picture, nodes = outer.picture[::-1], {}
+    for i, x in enumerate(centre.x):
+        for j, y in enumerate(centre.y):
+            nodes[f"c{i}{j}"] = Node(id=f"c{i}{j}", x=x, y=y, region=centre.region, centre=True)
+    for j, y in enumerate(outer.y):
+        for i, x in enumerate(outer.x):
+            inside = centre.x[0] <= x <= centre.x[-1] and centre.y[0] <= y <= centre.y[-1]
             word = picture[j][i]
             if inside and word == ".":
                 continue
             if inside or word not in map(str, range(regions)):
                 allowed = "a dot (it lies in the centre)" if inside else f"a region from 0 to {regions - 1}"
-                raise outer.error("regions", f"expected {allowed} at x = {x:g}, y = {y:g}, got {word!r} instead")
+                raise config.error(
+                    path, "outer.regions", f"expected {allowed} at x = {x:g}, y = {y:g}, got {word!r} instead")
             nodes[f"o{i}{j}"] = Node(id=f"o{i}{j}", x=x, y=y, region=int(word), centre=False)
-    recipe = Recipe(
-        nodes=nodes, streets=_streets(nodes), centre_speed=centre.number("speed", above=0.0),
-        outer_speed=outer.number("speed", above=0.0), pocket=centre.number("pocket", low=10.0),
-        cycle=signals.integer("cycle", low=30), yellow=signals.integer("yellow", low=1),
-        all_red=signals.integer("all_red"), left_green=signals.integer("left_green", low=1))
-    for table in (centre, outer, signals, root):
-        table.close()
-    return recipe
-
-
-def _lines(table: config.Table, key: str) -> tuple[float, ...]:
-    lines = table.numbers(key)
-    if not 3 <= len(lines) <= 10 or any(b - a < 60 for a, b in zip(lines, lines[1:], strict=False)):
-        raise table.error(key, f"expected 3 to 10 rising numbers at least 60 m apart, got {list(lines)} instead")
-    return lines
+    return Recipe(table=table, nodes=nodes, streets=_streets(nodes))
 
 
 def _streets(nodes: dict[str, Node]) -> list[tuple[str, str]]:
@@ -209,14 +185,14 @@ def _plain_xml(recipe: Recipe) -> tuple[str, str, str, dict[str, int]]:
     edge_rows, connection_rows, region_of, first, last, lanes = [], [], {}, {}, {}, {}
     for a, b in recipe.streets:
         start, end, name = nodes[a], nodes[b], f"{a}-{b}"
-        speed = recipe.centre_speed if start.centre or end.centre else recipe.outer_speed
+        speed = (recipe.table.centre if start.centre or end.centre else recipe.table.outer).speed
         if start.centre and end.centre:
             pieces = [(name, a, b, 1)]
             if legs[b] > 2:
                 joint = f"{name}.j"
                 length = abs(end.x - start.x) + abs(end.y - start.y)
                 # netconvert cuts about 10 m off for the junction itself
-                share = 1.0 - (recipe.pocket + 10.0) / length
+                share = 1.0 - (recipe.table.centre.pocket + 10.0) / length
                 node_rows.append(_row(
                     "node", id=joint, x=start.x + share * (end.x - start.x), y=start.y + share * (end.y - start.y),
                     type="priority"))
@@ -271,9 +247,8 @@ def _link(source: str, target: str, lane: int, into: int) -> str:
 
 def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
     """The bytes of net.xml and regions.csv; the same recipe gives the same bytes. InputError if netconvert fails."""
-    import sumo
-
     *plain, region_of = _plain_xml(recipe)
+    signals = recipe.table.signals
     with Scratch("cosim-") as folder:
         options = []
         for kind, content in zip(("node", "edge", "connection"), plain, strict=True):
@@ -281,9 +256,9 @@ def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
             options += [f"--{kind}-files", f"{kind}.xml"]
         command = [
             str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"), *options, "--output-file", "net.xml",
-            "--no-turnarounds", "true", "--tls.cycle.time", str(recipe.cycle),
-            "--tls.yellow.time", str(recipe.yellow),
-            "--tls.allred.time", str(recipe.all_red), "--tls.left-green.time", str(recipe.left_green)]
+            "--no-turnarounds", "true", "--tls.cycle.time", str(signals.cycle),
+            "--tls.yellow.time", str(signals.yellow), "--tls.allred.time", str(signals.all_red),
+            "--tls.left-green.time", str(signals.left_green)]
         result = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, check=False,
             env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME})

@@ -16,7 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import libsumo
+import sumo
 import traci
+from sumolib.miscutils import getFreeSocketPort
 
 from cosim.sumo.recorded_trips import BOUND
 from cosim.sumo.xml_files import file_list
@@ -273,9 +275,6 @@ def _start_quietly(command: list[str]) -> None:
 
 def _start(window: Window, command: list[str]) -> None:
     """As libsumo.start, with `window`. Raises FatalTraCIError with what the program has said."""
-    import sumo
-    from sumolib.miscutils import getFreeSocketPort
-
     program = str(Path(sumo.SUMO_HOME) / "bin" / window.program)
     with tempfile.TemporaryFile("w+") as said:
         port = getFreeSocketPort()

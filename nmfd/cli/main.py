@@ -66,7 +66,7 @@ def benchmark(
     from nmfd.studies import benchmark as benchmarks
 
     loaded = with_faults(load_scenario(scenario), faults)
-    out = run_folder.default_folder(loaded) if out is None else out
+    out = run_folder.default_folder(loaded.name) if out is None else out
     try:
         with progress_line("benchmark") as progress:
             rows = benchmarks.benchmark(
@@ -81,9 +81,7 @@ def benchmark(
 
         from nmfd.runs import frames
 
-        names = [run_folder.run_name(row["controller"], row["seed"]) for row in rows]
-        frames.write(
-            out, [run_folder.read_trajectory(out / f"{name}.npz") for name in names], {"summary": pd.DataFrame(rows)})
+        frames.write(out, run_folder.trajectories(out), {"summary": pd.DataFrame(rows)})
     click.echo(f"{loaded.name}, {plant} plant, {loaded.steps} control intervals of {loaded.step:g} s")
     click.echo(benchmarks.summary_table(rows))
     click.echo(f"Written to {out}")

@@ -52,7 +52,7 @@ def robustness(
     from nmfd.studies import robustness as method
 
     loaded = load_scenario(scenario)
-    out = run_folder.default_folder(loaded) if out is None else out
+    out = run_folder.default_folder(loaded.name) if out is None else out
     try:
         with progress_line("robustness") as progress:
             rows = method.robustness(
@@ -210,7 +210,7 @@ def ablation(
     from nmfd.studies import ablation as method
 
     loaded = load_scenario(scenario)
-    out = run_folder.default_folder(loaded) if out is None else out
+    out = run_folder.default_folder(loaded.name) if out is None else out
     try:
         with progress_line(f"ablation {what}") as progress:
             if what == "training":

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from nmfd.controllers.pi_gating import PiGating
+from nmfd.controllers.options import options
+from nmfd.controllers.pi_gating import PiGating, SetPoint
 from nmfd.model.planning import PlanningModel
-from nmfd.runs import config
 from nmfd.types import Controls, Observation
 
 HOLD = (3, 9)            # control intervals between two draws, from and to
@@ -22,19 +22,16 @@ class Probing:
     and never those between the others. With guidance, theta lies between the drivers' own and a point of the simplex
     drawn by lot. Everything is drawn anew every few control intervals, from the seed of the run.
 
-    Options, in [controllers.probing-pc] or [controllers.probing-pcrg]:
-        set_point: [veh], one per protected region, the middle of the set points; default the critical accumulation
+    The set points are around the option set_point ([controllers.probing-pc] or [controllers.probing-pcrg]), or else the
+    critical accumulation.
     """
 
     def __init__(self, planning: PlanningModel, *, guidance: bool):
         """InputError for a wrong option."""
         self.name = "probing-pcrg" if guidance else "probing-pc"
         self._network, self._guidance, self._gating = planning.network, guidance, None
-        options = config.Table(
-            planning.controller_options.get(self.name, {}), planning.where, f"controllers.{self.name}.")
         critical = tuple(planning.network.mfds[region].critical for region in planning.protected)
-        middle = options.numbers("set_point", critical, length=len(critical))
-        options.close()
+        middle = options(SetPoint, planning, self.name).set_point or critical
         if middle:
             self._gating = PiGating(replace(planning, controller_options={PiGating.name: {"set_point": list(middle)}}))
             self._gating.critical = np.array(middle)

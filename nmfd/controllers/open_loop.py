@@ -9,7 +9,6 @@ import numpy as np
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import atomic
-from nmfd.runs.run_folder import scenario_hash
 from nmfd.types import Controls, Observation
 
 NAMES = {"bound-pc": False, "bound-pcrg": True}  # whether routes are guided too
@@ -50,8 +49,8 @@ class OpenLoop:
 
 
 def model_hash(scenario: Scenario) -> str:
-    """A fingerprint of all that a plan depends on: runs.scenario_hash without controllers and observation noise."""
-    return scenario_hash(replace(scenario, controller_options={}, protected=(), measurement_std=0.0))
+    """A fingerprint of all that a plan depends on: Scenario.hash without controllers and observation noise."""
+    return replace(scenario, controller_options={}, protected=(), measurement_std=0.0).hash
 
 
 def write(plan: Plan, scenario: Scenario, path: Path) -> None:
@@ -67,7 +66,7 @@ def write(plan: Plan, scenario: Scenario, path: Path) -> None:
 def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
     """What `write` wrote; InputError if it is none, of another scenario, or of the other action set."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:  # NumPy leaves others open
             content = {name: file[name] for name in file.files}
         plan = Plan(
             perimeter=content["perimeter"], splits=content.get("splits"), start=str(content["start"]),

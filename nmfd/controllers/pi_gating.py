@@ -2,15 +2,37 @@
 
 import numpy as np
 
+from nmfd.controllers.options import Options, options
 from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
-from nmfd.runs import config
+from nmfd.runs.config import PositiveNumbers, Problem, got, setting
 from nmfd.types import Controls, Observation
 
-# The defaults are moderate ones from the flat part of a sweep on the benchmark (kp 0 to 5, ki 0.01 to 0.1 1/s differ by
-# less than 2 % in total time spent). The error is a share of the critical accumulation, so that they carry over.
-KP = 1.0
-KI = 0.01
+
+class SetPoint(Options):
+    """Of controllers that hold the accumulation of the protected regions."""
+
+    set_point: PositiveNumbers | None = setting(
+        "accumulation of each protected region to hold; without it, from the MFD", None, unit="veh")
+
+    def misfit(self, planning: PlanningModel) -> Problem | None:
+        count = len(planning.protected)  # without a protected region gating cannot be made, and is not made
+        if not count or self.set_point is None or len(self.set_point) == count:
+            return None
+        return Problem("set_point", got(f"a list of {count} numbers", list(self.set_point)))
+
+
+class Gating(SetPoint):
+    """Of PI gating. The default gains are moderate ones from the flat part of a sweep on the benchmark, where kp from 0
+    to 5 and ki from 0.01 to 0.1 differ by less than 2 % in total time spent; relative to the critical accumulation,
+    they carry over to other cities."""
+
+    outflow_share: float = setting(
+        "the set point is where the MFD first reaches this share of its maximum; 1 is the critical accumulation, and "
+        "less leaves a margin where control below its largest does not hold back anybody yet", 1.0, unit="-", ge=0.1,
+        le=1.0)
+    kp: float = setting("proportional gain, per relative error", 1.0, unit="-", ge=0.0)
+    ki: float = setting("integral gain, per relative error", 0.01, unit="1/s", gt=0.0)
 
 
 class PiGating:
@@ -21,11 +43,7 @@ class PiGating:
     n_cr is the critical accumulation of p's MFD, dt the control interval. The clipped value is carried on, so that
     the integral cannot wind up. All other entries stay at u_max, and there is no route guidance.
 
-    Options, in [controllers.pi-gating]:
-        set_point: n_set [veh], one per protected region; default from the MFD, see outflow_share
-        outflow_share: the set point is where the MFD first reaches this share of its maximum [-]; default 1, the
-            critical accumulation. Less of it leaves a margin where u below u_max does not hold back anybody yet
-        kp [-], ki [1/s]: proportional and integral gain, per relative error; default KP and KI
+    n_set is the option set_point, or else of outflow_share; the options are in [controllers.pi-gating].
     """
 
     name = "pi-gating"
@@ -37,19 +55,12 @@ class PiGating:
             raise InputError(
                 f"{planning.where}: protected: pi-gating needs at least one protected region, got none; "
                 f"add protected = [<region>, ...] with regions from 0 to {network.regions - 1}")
-        options = config.Table(
-            planning.controller_options.get(self.name, {}), planning.where, f"controllers.{self.name}.")
+        chosen = options(Gating, planning, self.name)
         self._regions = np.array(planning.protected)
         self.critical = np.array([network.mfds[region].critical for region in self._regions])
-        share = options.number("outflow_share", 1.0, low=0.1, high=1.0)
-        default = tuple(network.mfds[region].reaching(share) for region in self._regions)
-        set_point = options.numbers("set_point", default, length=len(self._regions))
-        if min(set_point) <= 0:
-            raise options.error("set_point", f"expected numbers above 0 [veh], got {list(set_point)} instead")
-        self.set_point = np.array(set_point)
-        self._kp = options.number("kp", KP, low=0.0)
-        self._ki = options.number("ki", KI, above=0.0) * planning.step
-        options.close()
+        self.set_point = np.array(chosen.set_point or [
+            network.mfds[region].reaching(chosen.outflow_share) for region in self._regions])
+        self._kp, self._ki = chosen.kp, chosen.ki * planning.step
         self._open = np.where(network.adjacency, network.u_max, 0.0)
         self._entries = network.adjacency[:, self._regions]
         self._bounds = network.u_min, network.u_max

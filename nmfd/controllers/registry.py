@@ -11,13 +11,16 @@ from pathlib import Path
 
 from nmfd.controllers import custom, open_loop
 from nmfd.controllers.dpc import fallback, online, policy, training
+from nmfd.controllers.dpc.options import TRAINED, Online
 from nmfd.controllers.excitation import Probing
 from nmfd.controllers.mpc import controller as mpc
 from nmfd.controllers.no_control import NoControl, RouteGuidance
-from nmfd.controllers.pi_gating import PiGating
-from nmfd.errors import InputError
-from nmfd.model.planning import PlanningModel, planning_model
+from nmfd.controllers.options import Options, options
+from nmfd.controllers.pi_gating import Gating, PiGating, SetPoint
+from nmfd.errors import InputError, did_you_mean
+from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
+from nmfd.model.scenario_file import PlanningOptions
 from nmfd.runs import config
 from nmfd.runs.files import file_hash
 from nmfd.types import Controller
@@ -33,47 +36,30 @@ class Entry:
     make: of the planning model, and of the policy's file where there is one
     guides: whether it may guide routes
     policy: whose policy it reads, "" for none
-    checked: reads the options of a controller (its planning model, its name and variant), InputError; None: it has none
+    declared: its options
     """
 
     make: Callable[..., Controller]
     guides: bool = False
     policy: str = ""
-    checked: Callable[[PlanningModel, str, str], object] | None = None
-
-
-def _gating_options(planning: PlanningModel, name: str, variant: str) -> None:
-    if planning.protected:  # without a protected region gating cannot be made, and is not made
-        _ENTRIES[name].make(planning)
-
-
-def _mpc_options(planning: PlanningModel, name: str, variant: str) -> object:
-    return mpc.options(planning, name)
-
-
-def _training_options(planning: PlanningModel, name: str, variant: str) -> object:
-    return training.settings_of(planning, variant)
-
-
-def _online_options(planning: PlanningModel, name: str, variant: str) -> object:
-    return online.options(planning, name)
+    declared: type[Options] = Options
 
 
 _ENTRIES = {
     "no-control": Entry(make=NoControl),
     "route-guidance": Entry(make=RouteGuidance, guides=True),
-    "pi-gating": Entry(make=PiGating, checked=_gating_options),
-    "mpc-pc": Entry(make=partial(mpc.EconomicMpc, guidance=False), checked=_mpc_options),
-    "mpc-pcrg": Entry(make=partial(mpc.EconomicMpc, guidance=True), guides=True, checked=_mpc_options),
-    "probing-pc": Entry(make=partial(Probing, guidance=False), checked=_gating_options),
-    "probing-pcrg": Entry(make=partial(Probing, guidance=True), guides=True, checked=_gating_options),
-    **{name: Entry(make=partial(policy.load, guidance=guides), guides=guides, policy=name, checked=_training_options)
+    "pi-gating": Entry(make=PiGating, declared=Gating),
+    "mpc-pc": Entry(make=partial(mpc.EconomicMpc, guidance=False), declared=mpc.Mpc),
+    "mpc-pcrg": Entry(make=partial(mpc.EconomicMpc, guidance=True), guides=True, declared=mpc.Mpc),
+    "probing-pc": Entry(make=partial(Probing, guidance=False), declared=SetPoint),
+    "probing-pcrg": Entry(make=partial(Probing, guidance=True), guides=True, declared=SetPoint),
+    **{name: Entry(make=partial(policy.load, guidance=guides), guides=guides, policy=name, declared=TRAINED[name])
        for name, guides in training.NAMES.items()},
     "dpc-pc-guarded": Entry(make=partial(fallback.load, guidance=False), policy="dpc-pc"),
     "dpc-pcrg-guarded": Entry(make=partial(fallback.load, guidance=True), guides=True, policy="dpc-pcrg"),
-    "dpc-pc-online": Entry(make=partial(online.load, guidance=False), policy="dpc-pc", checked=_online_options),
+    "dpc-pc-online": Entry(make=partial(online.load, guidance=False), policy="dpc-pc", declared=Online),
     "dpc-pcrg-online": Entry(
-        make=partial(online.load, guidance=True), guides=True, policy="dpc-pcrg", checked=_online_options),
+        make=partial(online.load, guidance=True), guides=True, policy="dpc-pcrg", declared=Online),
     **{name: Entry(make=partial(open_loop.load, guidance=guides), guides=guides)
        for name, guides in open_loop.NAMES.items()},
 }
@@ -92,7 +78,8 @@ def policy_names() -> tuple[str, ...]:
 def check(name: str) -> None:
     """InputError unless `name` is a controller."""
     if not known(name):
-        raise InputError(f"controller {name!r} is unknown; choose from {', '.join(choice())}, or file.py:Class")
+        raise InputError(f"controller {name!r} is unknown{did_you_mean(name, choice())}; choose from "
+                         f"{', '.join(choice())}, or file.py:Class")
 
 
 def split(name: str) -> tuple[str, list[str]]:
@@ -194,22 +181,22 @@ def check_options(scenario: Scenario) -> None:
     An option of a controller that nobody runs today would else be found wrong in the middle of tomorrow's work. The
     networks of other models are read only where they are used.
     """
-    where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
-    tables = config.Table(scenario.controller_options, where, "controllers.")
-    for variant in scenario.controller_options:
-        table = tables.table(variant)
+    tables, planning = scenario.controller_options, planning_model(scenario)
+    for variant, table in tables.items():
         if variant == OWN:  # checked by those controllers, if at all
             continue
         name = split(variant)[0]
         if name not in _ENTRIES:
-            raise tables.error(variant, f"unknown controller; choose from {', '.join(names())}, or one of them with + "
-                               "and the options of a strategy; that of a controller of your own is "
-                               f"controllers.{OWN}.{variant}")
-        table.text("model", None)
-        checked = _ENTRIES[name].checked
-        if checked is None:
-            table.close()
-            continue
-        options = {**scenario.controller_options.get(name, {}), **table.raw()}
-        options.pop("model", None)
-        checked(planning_model(replace(scenario, controller_options={name: options, variant: options})), name, variant)
+            raise config.error(
+                planning.where, f"controllers.{variant}", f"unknown controller{did_you_mean(name, names())}; choose "
+                f"from {', '.join(names())}, or one of them with + and the options of a strategy; that of a controller "
+                f"of your own is controllers.{OWN}.{variant}")
+        own = {**tables.get(name, {}), **table}
+        model = {"model": own.pop("model")} if "model" in own else {}
+        config.checked(PlanningOptions, model, planning.where, f"controllers.{variant}.")
+        options(_ENTRIES[name].declared, replace(planning, controller_options={name: own}), name, variant)
+
+
+def declarations() -> dict[str, type[Options]]:
+    """Controller -> the declaration of its options."""
+    return {name: entry.declared for name, entry in _ENTRIES.items()}

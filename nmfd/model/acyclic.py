@@ -1,10 +1,17 @@
-"""The acyclic regional model (ANMFD; design.md, section 2): vehicles return neither to their origin nor to the region
-they came from.
+"""The acyclic regional model (ANMFD): vehicles return neither to their origin nor to the region they came from.
 
 The state is a vector over the cells that can ever be occupied, one per x_ogij (origin o, previous region g, current
-region i, destination j); its flows run along a list of moves from cell to cell. Equations as in the design, with the
-slips of the published text corrected: u_ih stands in every outflow, and theta_ogihj is theta_ihj with h = g and h = o
-removed and renormalised over what is left.
+region i, destination j); its flows run along a list of moves from cell to cell:
+
+    dx_iiii/dt = d_ii - m_iiiii
+    dx_iiij/dt = d_ij - sum_{h in N_i} u_ih m_iiihj                                              j != i
+    dx_ogii/dt = sum_f u_gi m_ofgii - m_ogiii                                    g in N_i, o != i
+    dx_ogij/dt = sum_f u_gi m_ofgij - sum_{h in N_i - {o, g}} u_ih m_ogihj       g in N_i, o != i, j != i
+    m_ogihj = theta_ogihj q_i(x_i) x_ogij
+
+After Tumu et al. (see `dynamics`), with the slips of the published text corrected: u_ih stands in every outflow;
+theta_ogihj is theta_ihj with h = g and h = o removed and renormalised over what is left (if nothing is, the least-bad
+next region is taken and counted); the sum that translates back keeps o = j and g = j where i = j.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,17 @@
-"""The regional model in torch, batched and differentiable (design.md, section 2). CasADi twin: dynamics_casadi.
+"""The regional model (NMFD) in torch, batched and differentiable: the one definition of its equations.
+
+After Tumu, Shaw Cortez, Drgona, Vrabie and Glavaski, "Differentiable Predictive Control for Large-Scale Urban Road
+Networks", and the multi-region models with perimeter control of Geroliminis, Haddad and Ramezani (2013). Regions
+i, j, h; x_i = sum_j x_ij; N_i the regions adjacent to i:
+
+    q_i    = g_i(x_i) / x_i = a x_i^2 + b x_i + c      as a polynomial: nothing is divided, nothing undefined at x = 0
+    m_ii   = q_i x_ii                                  trips that end in i
+    m_ihj  = theta_ihj q_i x_ij                        j != i, h in N_i
+    dx_ii/dt = d_ii - m_ii + sum_{h in N_i} u_hi m_hii
+    dx_ij/dt = d_ij - sum_{h in N_i} u_ih m_ihj + sum_{h in N_i, h != j} u_hi m_hij        j != i
+
+Twins, which say what they add: `dynamics_casadi` (for IPOPT), `acyclic` (no vehicle turns back), and
+nmfd.controllers.mpc.edge_model (as a list of edges, with adjoint gradients).
 
 Shapes: `...` is any batch. x (..., R, R) [veh], [i, j] in region i bound for j; demand (..., R, R) [veh/s];
 perimeter (..., R, R) [-], [i, h]; splits (..., R, R, R) [-], [i, h, j].

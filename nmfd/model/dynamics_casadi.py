@@ -1,4 +1,4 @@
-"""The regional model in CasADi (design.md, section 2): the twin of `dynamics`, for optimisation.
+"""The regional model in CasADi: the twin of `dynamics`, for optimisation by IPOPT.
 
 The same names and equations on SX, MX or DM matrices, without a batch: x (R, R) [veh], [i, j] in region i bound for j;
 demand (R, R) [veh/s]; perimeter (R, R) [-], [i, h]; splits: a sequence of R matrices (R, R) [-], splits[i][h, j].

@@ -27,6 +27,7 @@ OUTLIER = 0.3        # of the scale: from here on an error counts linearly (Hube
 BY_DESTINATION = 3.0  # weight of the errors of x_ij, beside those of x_i
 LEAST_RATE = 0.01    # of the free rate, up to the jam accumulation
 EXIT_RATES = 8.0     # most and 1 / least
+FEWEST = 30.0        # vehicles that must have crossed before their split ratios count
 RIDGE = 1e-3         # of the squared logarithm of exit rates and capacities: what the data do not say stays as it was
 
 
@@ -84,6 +85,20 @@ class _Model(torch.nn.Module):
     def penalty(self) -> torch.Tensor:
         moved = (self.capacity - self._first_capacity) * self.adjacency
         return RIDGE * ((self.exit_rates**2).mean() + (moved**2).mean())
+
+
+def observed_split_ratios(network: RegionalModel, crossings: np.ndarray) -> dict[tuple[int, int], dict[int, float]]:
+    """(i, j) -> {h: share}: by which neighbour h the vehicles in i bound for j went on in fact.
+
+    crossings: (R, R, R) [veh], [i, h, j] = from i to h, bound for j
+    """
+    crossings = crossings * network.split_mask
+    found = {}
+    for i, j in np.argwhere(crossings.sum(axis=1) >= FEWEST):
+        shares = crossings[i, :, j] / crossings[i, :, j].sum()
+        kept = {int(h): round(float(shares[h]), 4) for h in np.flatnonzero(shares >= 0.005)}
+        found[int(i), int(j)] = {h: share / sum(kept.values()) for h, share in kept.items()}
+    return found
 
 
 @one_thread()  # and sums are always in the same order

@@ -6,8 +6,7 @@ nobody else's result.
 """
 
 import copy
-import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import numpy as np
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel, check_step, load_network
 from nmfd.model.scenario import Scenario
+from nmfd.model.scenario_file import PlanningOptions
 from nmfd.runs import config
 
 GUIDED = "guided"         # in a network's folder: that of the same city's model with guided drivers
@@ -68,10 +68,9 @@ def planning_model(scenario: Scenario, controller: str = "") -> PlanningModel:
     options = {**tables.get(name, {}), **tables.get(controller, {})}
     network = None
     if "model" in options and scenario.folder is not None:
-        table = config.Table(options, scenario.folder / "scenario.toml", f"controllers.{controller}.")
-        folder = scenario.folder / table.text("model")
-        del options["model"]
-        network = other_model(scenario, folder, functools.partial(table.error, "model"))
+        where, prefix = scenario.folder / "scenario.toml", f"controllers.{controller}."
+        model = config.checked(PlanningOptions, {"model": options.pop("model")}, where, prefix).model
+        network = other_model(scenario, scenario.folder / model, f"{where}: {prefix}model")
     elif name.startswith(GUIDING) and (folder := guided_model(scenario.network)) is not None:
         network = other_model(scenario, folder)
     return PlanningModel(
@@ -87,18 +86,16 @@ def with_model(planning: PlanningModel, scenario: Scenario, folder: Path) -> Pla
     return replace(planning, network=other_model(scenario, folder))
 
 
-def other_model(
-    scenario: Scenario, folder: Path, wrong: Callable[[str], InputError] | None = None,
-) -> RegionalModel:
+def other_model(scenario: Scenario, folder: Path, where: str = "") -> RegionalModel:
     """The regional model in `folder`, of the same city as that of `scenario`.
 
-    wrong: the error that there is with it, of its words. Raises InputError.
+    where: who names it, for the InputError
     """
     model = load_network(folder)
     if not np.array_equal(model.adjacency, scenario.network.adjacency):
-        error = f"network {model.name} has other regions or boundaries than {scenario.network.name}; identify one " \
-                "for the same city with 'cosim identify'"
-        raise wrong(error) if wrong else InputError(f"{folder / 'network.toml'}: {error}")
+        raise InputError(
+            f"{where or folder / 'network.toml'}: network {model.name} has other regions or boundaries than "
+            f"{scenario.network.name}; identify one for the same city with 'cosim identify'")
     check_step(model, scenario.step / scenario.substeps, f"{model.folder}")
     return model
 

@@ -12,6 +12,7 @@ from scipy.sparse import csgraph
 
 from nmfd.errors import InputError
 from nmfd.model.mfd import Mfd
+from nmfd.model.network_file import NetworkTable
 from nmfd.runs import config
 
 # Of boundaries with a capacity. What passes is a smooth minimum of wish and limit, (wish^-n + limit^-n)^(-1/n), 84 % of
@@ -19,8 +20,6 @@ from nmfd.runs import config
 SHARPNESS = 4
 LEAST_ROOM = 0.03    # of the capacity, into a region however full: it never locks for good
 LEAST_LIMIT = 1e-6   # veh/s, against a division by zero
-MOST = 1e9           # veh in a region: beyond, it is a mistake
-LONGEST_NAME = 100   # characters: names become file names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,124 +114,47 @@ def _hops(adjacency: np.ndarray) -> np.ndarray:
 
 
 def load_network(folder: Path | str) -> RegionalModel:
-    """Read `folder`/network.toml.
+    """Read `folder`/network.toml (nmfd.model.network_file).
 
     Raises InputError for a missing file, an unknown key, a wrong type or range, an adjacency that is not symmetric
     or not connected, or an MFD that is none. The table [sumo] is left to the microsimulation.
     """
     folder = Path(folder)
-    root = config.read(folder / "network.toml")
-    name = root.text("name", longest=LONGEST_NAME)
-    perimeter = root.table("perimeter")
-    u_min = perimeter.number("min", low=0.0, high=1.0)
-    u_max = perimeter.number("max", low=0.0, high=1.0)
-    perimeter.close()
-    if u_min >= u_max:
-        raise root.error("perimeter", f"min must be less than max, got min = {u_min:g} and max = {u_max:g}")
-    default_mfd = _mfd(root.table("mfd")) if root.has("mfd") else None
-    rows = root.tables("regions")
-    if not rows:
-        raise root.error("regions", "empty; add at least one [[regions]] table")
-    names, positions, neighbours, barred, onward, mfds, boundaries = [], [], [], [], [], [], []
-    for number, row in enumerate(rows):
-        names.append(row.text("name", str(number), longest=LONGEST_NAME))
-        positions.append(row.numbers("position", length=2))
-        neighbours.append(row.integers("adjacent", high=len(rows) - 1))
-        barred.append(row.integers("no_way_to", (), high=len(rows) - 1))
-        if unknown := sorted(set(barred[-1]) - set(neighbours[-1])):
-            raise row.error(
-                "no_way_to", f"expected some of the adjacent regions {list(neighbours[-1])}, got {unknown[0]} instead")
-        mfds.append(_mfd(row.table("mfd")) if default_mfd is None or row.has("mfd") else default_mfd)
-        onward.append(tuple(h for h in neighbours[-1] if h not in barred[-1]))
-        boundaries.append(_boundary(row, len(rows), onward[-1]))
-        row.close()
-    own_splits = {}
-    for row in root.tables("own_splits", ()):
-        here, to = row.integer("region", high=len(rows) - 1), row.integer("destination", high=len(rows) - 1)
-        own_splits[here, to] = _shares(row, onward[here])
-        row.close()
-    root.raw_table("sumo")
-    root.close()
+    path = folder / "network.toml"
+    table = config.checked(NetworkTable, config.read(path), path)
+    rows = table.regions
     adjacency = np.zeros((len(rows), len(rows)), dtype=bool)
-    for i, regions in enumerate(neighbours):
-        adjacency[i, list(regions)] = True
-    _check_symmetry(adjacency, root)
-    for i, regions in enumerate(barred):
-        adjacency[i, list(regions)] = False
+    for i, row in enumerate(rows):
+        adjacency[i, list(row.onward)] = True
+    capacity = None
+    if rows[0].capacity is not None:
+        capacity = np.zeros(adjacency.shape)
+        for i, row in enumerate(rows):
+            capacity[i, list(row.onward)] = row.capacity
     network = RegionalModel(
-        name=name, region_names=tuple(names), positions=np.array(positions), adjacency=adjacency, mfds=tuple(mfds),
-        u_min=u_min, u_max=u_max, own_splits=own_splits, folder=folder, **_boundaries(root, onward, boundaries))
-    _check_graph(network, root)
-    for i, j in own_splits:
-        for h in own_splits[i, j]:
-            if not network.split_mask[i, h, j]:
-                raise root.error("own_splits", f"from region {i} to {j} by way of {h} leads back into {i}; remove it")
+        name=table.name, region_names=tuple(row.name or str(number) for number, row in enumerate(rows)),
+        positions=np.array([row.position for row in rows]), adjacency=adjacency,
+        mfds=tuple((row.mfd or table.mfd).mfd for row in rows), u_min=table.perimeter.min, u_max=table.perimeter.max,
+        own_splits={(row.region, row.destination): dict(zip(row.next, row.share, strict=True))
+                    for row in table.own_splits},
+        exit_rates=None if rows[0].exit_rates is None else np.array([row.exit_rates for row in rows]),
+        capacity=capacity, storage=None if rows[0].storage is None else np.array([row.storage for row in rows]),
+        folder=folder)
+    _check_ways(network, path)
     return network
 
 
-def _shares(row: config.Table, neighbours: tuple[int, ...]) -> dict[int, float]:
-    via, share = row.integers("next", high=10**6), row.numbers("share")
-    if not via or not set(via) <= set(neighbours):
-        raise row.error("next", f"expected some of the adjacent regions {list(neighbours)}, got {list(via)} instead")
-    if len(share) != len(via) or min(share) < 0 or abs(sum(share) - 1.0) > 1e-3:
-        raise row.error("share", f"expected {len(via)} numbers >= 0 with sum 1, got {list(share)} instead")
-    return dict(zip(via, share, strict=True))
-
-
-def _boundary(row: config.Table, regions: int, adjacent: tuple[int, ...]) -> dict:
-    """The options of one region: exit_rates (R,), capacity (one per region it leads to), storage; None if absent."""
-    found: dict = {
-        "exit_rates": row.numbers("exit_rates", length=regions) if row.has("exit_rates") else None,
-        "capacity": row.numbers("capacity", length=len(adjacent)) if row.has("capacity") else None,
-        "storage": row.number("storage", above=0.0, high=MOST) if row.has("storage") else None}
-    for key in ("exit_rates", "capacity"):
-        if found[key] is not None and min(found[key], default=1.0) <= 0:
-            raise row.error(key, f"expected numbers above 0, got {list(found[key])} instead")
-    for key, other in (("storage", "capacity"), ("capacity", "storage")):
-        if found[key] is not None and found[other] is None:
-            raise row.error(key, f"needs {other} beside it: both limit what passes a boundary; add or remove one")
-    return found
-
-
-def _boundaries(root: config.Table, neighbours: list[tuple], rows: list[dict]) -> dict[str, np.ndarray | None]:
-    """exit_rates, capacity and storage of RegionalModel; InputError where only some of the regions have one."""
-    fields: dict[str, np.ndarray | None] = {}
-    for key in rows[0]:
-        given = [row[key] is not None for row in rows]
-        if any(given) and not all(given):
-            raise root.error(f"regions[{given.index(False)}].{key}", "missing; give it for every region or for none")
-        fields[key] = np.array([row[key] for row in rows], dtype=float) if all(given) and key != "capacity" else None
-    if rows[0]["capacity"] is not None:
-        fields["capacity"] = np.zeros((len(rows), len(rows)))
-        for i, row in enumerate(rows):
-            fields["capacity"][i, list(neighbours[i])] = row["capacity"]
-    return fields
-
-
-def _mfd(table: config.Table) -> Mfd:
-    mfd = Mfd(a=table.number("a"), b=table.number("b"), c=table.number("c"),
-              jam=table.number("jam", above=0.0, high=MOST))
-    table.close()
-    if problem := mfd.problem():
-        raise table.error("c" if mfd.c <= 0 else "jam", problem)
-    return mfd
-
-
-def _check_symmetry(adjacency: np.ndarray, root: config.Table) -> None:
-    for i in range(len(adjacency)):
-        if adjacency[i, i]:
-            raise root.error(f"regions[{i}].adjacent", f"region {i} is listed as adjacent to itself; remove it")
-        for h in np.flatnonzero(adjacency[i] & ~adjacency[:, i]):
-            raise root.error(
-                f"regions[{i}].adjacent",
-                f"not symmetric: region {i} lists {h}, but region {h} does not list {i}; add or remove one of them "
-                "(no_way_to lists the adjacent regions into which no road leads)")
-
-
-def _check_graph(network: RegionalModel, root: config.Table) -> None:
+def _check_ways(network: RegionalModel, path: Path) -> None:
+    """InputError for a region that cannot be reached, or drivers whose way leads back to where they are."""
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
-        raise root.error("regions", f"region {j} cannot be reached from region {i}; connect them with adjacent")
+        raise config.error(
+            path, "regions", f"region {j} cannot be reached from region {i}; connect them with adjacent")
+    for (i, j), shares in network.own_splits.items():
+        for h in shares:
+            if not network.split_mask[i, h, j]:
+                raise config.error(
+                    path, "own_splits", f"from region {i} to {j} by way of {h} leads back into {i}; remove it")
 
 
 def check_step(network: RegionalModel, step: float, where: str) -> None:

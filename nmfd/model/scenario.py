@@ -1,7 +1,8 @@
 """Demand, noise, horizon: loaded from scenario.toml and checked."""
 
 import csv
-import os
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -11,11 +12,9 @@ import numpy as np
 
 from nmfd.errors import InputError
 from nmfd.faults import Fault, parse
-from nmfd.model.regional_model import LONGEST_NAME, RegionalModel, check_step, load_network
+from nmfd.model.regional_model import RegionalModel, check_step, load_network
+from nmfd.model.scenario_file import MOST_NUMBERS, ScenarioTable, read_tables
 from nmfd.runs import config
-
-MOST_NUMBERS = 2 * 10**8  # of a demand table: more would not fit into memory
-LONGEST_STEP = 86_400.0   # s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +69,19 @@ class Scenario:
 
 
     @cached_property
+    def hash(self) -> str:
+        """A fingerprint of all that a run depends on, whatever its files are called."""
+        settings = [
+            self.network.hash, self.step, self.steps, self.measurement_std, self.integrator, self.substeps,
+            self.protected, self.controller_options]
+        if self.forecast_error:
+            settings.append([self.forecast_error, self.forecast_seed])
+        if self.faults:
+            settings.append(self.faults)
+        text = json.dumps(settings, sort_keys=True, default=str)
+        return hashlib.sha256(text.encode() + np.ascontiguousarray(self.demand).tobytes()).hexdigest()[:16]
+
+    @cached_property
     def ordered_faults(self) -> tuple[Fault, ...]:
         """`faults`, parsed. InputError."""
         where = "scenario.toml" if self.folder is None else self.folder / "scenario.toml"
@@ -91,97 +103,54 @@ def trapezoid(time: np.ndarray, *, start: float, peak: float, ramp_up: float, fl
     return peak * np.clip(np.minimum(rising, falling), 0.0, 1.0)
 
 
-def read_tables(folder: Path) -> config.Table:
-    """`folder`/scenario.toml; what it does not say is that of the scenario in the folder `base`, if it names one.
-
-    Tables are completed key by key, everything else is taken whole. Raises InputError.
-    """
-    path, folders, content = folder / "scenario.toml", [], {}
-    while True:
-        table = config.read(folder / "scenario.toml")
-        own = table.raw()
-        if folder.resolve() in folders:
-            raise table.error("base", "the scenarios are each other's base; remove one of the keys")
-        folders.append(folder.resolve())
-        _name_from(own, folder, path.parent)
-        content = _completed(content, own)
-        base = table.text("base", None)
-        if base is None:
-            content.pop("base", None)
-            return config.Table(content, path)
-        folder = folder / base
-
-
-def _name_from(own: dict, folder: Path, here: Path) -> None:
-    """Files that a scenario.toml names are relative to it: rewrite them as seen from the folder `here`."""
-    def seen(name: str) -> str:
-        return os.path.relpath(folder / name, here)
-
-    for key in ("network", "demand_file"):
-        if isinstance(own.get(key), str):
-            own[key] = seen(own[key])
-    sumo = own.get("sumo")
-    for key in ("routes", "background", "additional") if isinstance(sumo, dict) else ():
-        if isinstance(sumo.get(key), list) and all(isinstance(name, str) for name in sumo[key]):
-            sumo[key] = [seen(name) for name in sumo[key]]
-    controllers = own.get("controllers")
-    for options in controllers.values() if isinstance(controllers, dict) else ():
-        if isinstance(options, dict) and isinstance(options.get("model"), str):
-            options["model"] = seen(options["model"])
-
-
-def _completed(content: dict, base: dict) -> dict:
-    """`content` with what only `base` has, in the tables of both too."""
-    both = {key: _completed(content[key], base[key]) for key in content
-            if isinstance(content[key], dict) and isinstance(base.get(key), dict)}
-    return {**base, **content, **both}
-
-
 def read_scenario(folder: Path | str) -> Scenario:
     """Read `folder`/scenario.toml and its network. Raises InputError.
 
     The table [controllers] is left to the controllers (nmfd.controllers.registry.checked_scenario), [sumo] to cosim.
     """
     folder = Path(folder)
-    root = read_tables(folder)
-    name = root.text("name", longest=LONGEST_NAME)
-    network = load_network(folder / root.text("network"))
-    step = root.number("step", above=0.0, high=LONGEST_STEP)
-    steps = root.integer("steps", low=1, high=MOST_NUMBERS // network.regions**2)
-    integrator = root.text("integrator", "euler", ("euler", "rk4"))
-    substeps = root.integer("substeps", 1, low=1, high=1000)
-    protected = root.integers("protected", (), high=network.regions - 1)
-    noise = root.table("noise", None)
-    measurement_std = noise.number("measurement_std", 0.0, low=0.0, high=1e6)
-    noise.close()
-    factor = root.number("demand_factor", 1.0, low=0.0, high=1000.0)
-    demand = np.zeros((steps, network.regions, network.regions))
-    time = step * np.arange(steps)
-    for row in root.tables("demand", () if root.has("demand_file") else ...):
-        pair = [_region(row, key, network) for key in ("from", "to")]
-        rate = trapezoid(
-            time, start=row.number("start", low=0.0), peak=row.number("peak", low=0.0, high=1e6),
-            ramp_up=row.number("ramp_up", low=0.0), flat=row.number("flat", low=0.0),
-            ramp_down=row.number("ramp_down", low=0.0))
-        demand[:, pair[0], pair[1]] += rate
-        if row.flag("both_ways", False):
-            demand[:, pair[1], pair[0]] += rate
-        row.close()
-    if root.has("demand_file"):
-        demand += _demand_file(folder / root.text("demand_file"), steps, network.regions)
-    forecast = root.table("forecast", None)
-    forecast_error, forecast_seed = forecast.number("error", 0.0, low=0.0, high=2.0), forecast.integer("seed", 0)
-    forecast.close()
-    controller_options, ordered = root.raw_table("controllers"), root.texts("faults", ())
-    root.raw_table("sumo")
-    root.close()
-    check_step(network, step / substeps, str(folder / "scenario.toml"))
+    path = folder / "scenario.toml"
+    table = config.checked(ScenarioTable, read_tables(folder), path)
+    network = load_network(folder / table.network)
+    _check_regions(table, network, path)
+    demand = _trapezoids(table, network.regions)
+    if table.demand_file is not None:
+        demand += _demand_file(folder / table.demand_file, table.steps, network.regions)
+    check_step(network, table.step / table.substeps, str(path))
     scenario = Scenario(
-        name=name, network=network, step=step, steps=steps, demand=factor * demand, measurement_std=measurement_std,
-        integrator=integrator, substeps=substeps, protected=protected, controller_options=controller_options,
-        demand_factor=factor, forecast_error=forecast_error, forecast_seed=forecast_seed, faults=ordered, folder=folder)
+        name=table.name, network=network, step=table.step, steps=table.steps, demand=table.demand_factor * demand,
+        measurement_std=table.noise.measurement_std, integrator=table.integrator, substeps=table.substeps,
+        protected=table.protected, controller_options=table.controllers, demand_factor=table.demand_factor,
+        forecast_error=table.forecast.error, forecast_seed=table.forecast.seed, faults=table.faults, folder=folder)
     _ = scenario.ordered_faults  # checked here, where the file is known
     return scenario
+
+
+def _check_regions(table: ScenarioTable, network: RegionalModel, path: Path) -> None:
+    """InputError for regions that the network has not, or more intervals than there is memory for."""
+    most, known = network.regions - 1, f"network {network.name} has the regions 0 to {network.regions - 1}"
+    if max(table.protected, default=0) > most:
+        raise config.error(path, "protected", config.got(
+            f"a list of distinct whole numbers from 0 to {most}", list(table.protected)))
+    for number, row in enumerate(table.demand or ()):
+        for key, region in (("from", row.origin), ("to", row.to)):
+            if region > most:
+                raise config.error(path, f"demand[{number}].{key}", f"region {region} is unknown; {known}")
+    if table.steps > MOST_NUMBERS // network.regions**2:
+        raise config.error(path, "steps", config.got(
+            f"a whole number from 1 to {MOST_NUMBERS // network.regions**2}", table.steps))
+
+
+def _trapezoids(table: ScenarioTable, regions: int) -> np.ndarray:
+    """(T, R, R) [veh/s]: the flows of [[demand]]."""
+    demand = np.zeros((table.steps, regions, regions))
+    time = table.step * np.arange(table.steps)
+    for row in table.demand or ():
+        rate = trapezoid(time, **row.model_dump(include={"start", "peak", "ramp_up", "flat", "ramp_down"}))
+        demand[:, row.origin, row.to] += rate
+        if row.both_ways:
+            demand[:, row.to, row.origin] += rate
+    return demand
 
 
 def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
@@ -213,11 +182,3 @@ def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
         if k < steps:
             demand[k, i, j] += rate
     return demand
-
-
-def _region(row: config.Table, key: str, network: RegionalModel) -> int:
-    value = row.integer(key)
-    if value >= network.regions:
-        raise row.error(
-            key, f"region {value} is unknown; network {network.name} has the regions 0 to {network.regions - 1}")
-    return value

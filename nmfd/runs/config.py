@@ -1,28 +1,94 @@
-"""Reading TOML tables with checked keys, types and ranges: the edge at which files are validated."""
+"""Settings, declared once as pydantic models and read from TOML: the edge at which files are validated.
 
-import math
+A declaration is a subclass of `Settings` whose fields are made by `setting` and `whole`; the reference pages and the
+JSON schemas for editors come from it (nmfd.runs.reference).
+"""
+
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated, Any, Self, TypeVar
 
-from nmfd.errors import InputError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from nmfd.errors import InputError, did_you_mean
+from nmfd.runs import schema
 
 MOST = 10**9        # of a whole number without a limit of its own
 LONGEST = 1000      # characters of a text
+LONGEST_NAME = 100  # characters: names become file names
 SHOWN = 60          # characters of a wrong value that a message repeats
 
 
-def read(path: Path) -> "Table":
-    """The root table of a TOML file; InputError if it is missing or not TOML."""
+def setting(text: str, default: Any = ..., *, unit: str = "", **limits: Any) -> Any:
+    """The field of a declaration. limits: ge, gt, le, lt, min_length, max_length, alias of pydantic.Field."""
+    if unit:  # given even so, it would replace what a type says of itself
+        limits["json_schema_extra"] = {"unit": unit}
+    return Field(default, description=text, **limits)
+
+
+def whole(text: str, default: Any = ..., *, low: int = 0, high: int = MOST, unit: str = "", alias: str | None = None):
+    """The same of a whole number from `low` to `high`."""
+    return setting(text, default, unit=unit, ge=low, le=high, alias=alias)
+
+
+class Problem(ValueError):
+    """What a validator finds wrong with `key` of its table, in words that end in the remedy."""
+
+    def __init__(self, key: str, text: str):
+        super().__init__(text)
+        self.key = key
+
+
+class Settings(BaseModel):
+    """A table of settings: unknown keys, texts for numbers, numbers that are not finite are mistakes."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    def changed(self, **changes: Any) -> Self:
+        """A copy with other values, checked like the first. InputError."""
+        return checked(type(self), {**vars(self), **changes}, "settings")
+
+
+def _line(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("not printable")
+    return text
+
+
+def _distinct(values: tuple) -> tuple:
+    if len(set(values)) < len(values):
+        raise ValueError("not distinct")
+    return values
+
+
+DISTINCT = AfterValidator(_distinct), Field(strict=False, json_schema_extra={"uniqueItems": True})
+Text = Annotated[str, Field(min_length=1, max_length=LONGEST), AfterValidator(_line)]
+Name = Annotated[str, Field(min_length=1, max_length=LONGEST_NAME), AfterValidator(_line)]
+Texts = Annotated[tuple[Text, ...], *DISTINCT]
+Region = Annotated[int, Field(ge=0)]
+Regions = Annotated[tuple[Region, ...], *DISTINCT]
+Numbers = Annotated[tuple[float, ...], Field(strict=False)]
+PositiveNumbers = Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(strict=False)]
+Share = Annotated[float, Field(ge=0.0, le=1.0, json_schema_extra={"unit": "-"})]
+Seconds = Annotated[float, Field(ge=0.0, json_schema_extra={"unit": "s"})]
+Flow = Annotated[float, Field(ge=0.0, le=1e6, json_schema_extra={"unit": "veh/s"})]
+S = TypeVar("S", bound=Settings)
+Rows = Annotated[tuple[S, ...], Field(strict=False)]  # a list of tables
+
+
+def read(path: Path) -> dict[str, Any]:
+    """The content of a TOML file; InputError if it is missing or not TOML."""
     path = Path(path)
     try:
         content = path.read_bytes()
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give the path of an existing one") from None
+        hint = did_you_mean(path.parent.name, (file.parent.name for file in path.parent.parent.glob(f"*/{path.name}")))
+        raise InputError(f"{path}: no such file{hint}; give the path of an existing one") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give a readable file") from None
     try:
-        return Table(tomllib.loads(content.decode()), path)
+        return tomllib.loads(content.decode())
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not UTF-8 text; save it as UTF-8") from None
     except tomllib.TOMLDecodeError as error:
@@ -31,12 +97,30 @@ def read(path: Path) -> "Table":
         raise InputError(f"{path}: is not valid TOML: nested too deeply; write it anew") from None
 
 
+def checked(declaration: type[S], values: Mapping[str, Any], where: Path | str, prefix: str = "") -> S:
+    """The table `values` as `declaration` has it. InputError, which begins with "where: prefix + key: "."""
+    try:
+        return declaration.model_validate(values)
+    except ValidationError as error:
+        raise InputError(f"{where}: {prefix}{_told(declaration, values, error)}") from None
+
+
+def error(where: Path | str, key: str, problem: str) -> InputError:
+    """What else is wrong with a key, in the same form."""
+    return InputError(f"{where}: {key}: {problem}")
+
+
+def got(allowed: str, value: Any) -> str:
+    """What a value should have been."""
+    return f"expected {allowed}, got {shown(value)} instead"
+
+
 def quoted(text: str) -> str:
     """A text without line breaks as TOML writes it."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
-def shown(value) -> str:
+def shown(value: Any) -> str:
     """A wrong value as a message repeats it: not more than the beginning of a long one."""
     try:
         text = repr(value)
@@ -45,139 +129,29 @@ def shown(value) -> str:
     return text if len(text) <= SHOWN else text[:SHOWN] + "..."
 
 
-class Table:
-    """One TOML table. Every key is taken once; `close` complains of the keys that nobody took."""
-
-    def __init__(self, values: Mapping, path: Path | str, prefix: str = ""):
-        self._values, self._path, self._prefix = dict(values), path, prefix
-        self._known: list[str] = []
-        self._taken: dict = {}
-
-    def error(self, key: str, problem: str) -> InputError:
-        return InputError(f"{self._path}: {self._prefix}{key}: {problem}")
-
-    def raw(self) -> dict:
-        """Everything in it that nobody has taken yet, unchecked."""
-        return dict(self._values)
-
-    def has(self, key: str) -> bool:
-        return key in self._values
-
-    def _take(self, key, default, required_as):
-        self._known.append(key)
-        if key in self._values:
-            self._taken[key] = self._values.pop(key)
-            return self._taken[key]
-        if default is ...:
-            raise self.error(key, f"missing; add {key} = {required_as}")
-        return default
-
-    def text(self, key: str, default=..., choices: tuple[str, ...] | None = None, *, longest: int = LONGEST) -> str:
-        value = self._take(key, default, f'"{choices[0]}"' if choices else '"..."')
-        if value is None:
-            return value
-        if not isinstance(value, str):
-            raise self.error(key, f"expected text in quotes, got {shown(value)} instead")
-        if choices and value not in choices:
-            raise self.error(key, f"expected one of {', '.join(choices)}, got {shown(value)} instead")
-        if not _is_line(value, longest):
-            raise self.error(key, f"expected 1 to {longest} printable characters, got {shown(value)} instead")
-        return value
-
-    def lines(self, key: str) -> list[str]:
-        """The lines of a text, without those that are empty."""
-        value = self._take(key, ..., '"""..."""')
-        if not isinstance(value, str):
-            raise self.error(key, f"expected text in quotes, got {shown(value)} instead")
-        return [line for line in value.splitlines() if line.strip()]
-
-    def number(self, key: str, default=..., *, low=-float("inf"), high=float("inf"), above=None) -> float:
-        """A finite number in [low, high], and above `above` if that is given."""
-        value = self._take(key, default, "<number>")
-        if value is default and not isinstance(value, (int, float)):
-            return value
-        allowed = f"a number in [{low:g}, {high:g}]"
-        if above is not None:
-            allowed = f"a number above {above:g}" + ("" if high == math.inf else f" up to {high:g}")
-        if not _is_number(value) or not low <= value <= high or (above is not None and value <= above):
-            raise self.error(key, f"expected {allowed}, got {shown(value)} instead")
-        return float(value)
-
-    def integer(self, key: str, default=..., *, low: int = 0, high: int = MOST) -> int:
-        value = self._take(key, default, "<whole number>")
-        if value is default and not isinstance(value, int):
-            return value
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise self.error(key, f"expected a whole number from {low} to {high}, got {shown(value)} instead")
-        return value
-
-    def flag(self, key: str, default=...) -> bool:
-        value = self._take(key, default, "true or false")
-        if not isinstance(value, bool):
-            raise self.error(key, f"expected true or false, got {shown(value)} instead")
-        return value
-
-    def numbers(self, key: str, default=..., *, length: int | None = None) -> tuple[float, ...]:
-        value = self._take(key, default, "[<number>, ...]")
-        if value is default and not isinstance(value, (list, tuple)):
-            return value
-        good = isinstance(value, (list, tuple)) and all(map(_is_number, value))
-        if not good or (length is not None and len(value) != length):
-            count = "" if length is None else f"{length} "
-            raise self.error(key, f"expected a list of {count}numbers, got {shown(value)} instead")
-        return tuple(float(v) for v in value)
-
-    def texts(self, key: str, default=...) -> tuple[str, ...]:
-        """Distinct texts."""
-        value = self._take(key, default, '["...", ...]')
-        good = isinstance(value, (list, tuple)) and all(isinstance(v, str) and _is_line(v) for v in value)
-        if not good or len(set(value)) != len(value):
-            raise self.error(key, f"expected a list of distinct texts in quotes, got {shown(value)} instead")
-        return tuple(value)
-
-    def integers(self, key: str, default=..., *, high: int) -> tuple[int, ...]:
-        """Distinct whole numbers from 0 to `high`."""
-        value = self._take(key, default, "[<region>, ...]")
-        good = isinstance(value, (list, tuple)) and all(
-            isinstance(v, int) and not isinstance(v, bool) and 0 <= v <= high for v in value)
-        if not good or len(set(value)) != len(value):
-            raise self.error(
-                key, f"expected a list of distinct whole numbers from 0 to {high}, got {shown(value)} instead")
-        return tuple(value)
-
-    def table(self, key: str, default=...) -> "Table":
-        value = self._take(key, {} if default is None else default, "a table")
-        if not isinstance(value, dict):
-            raise self.error(key, f"expected a table [{key}], got {shown(value)} instead")
-        return Table(value, self._path, f"{self._prefix}{key}.")
-
-    def raw_table(self, key: str) -> dict:
-        """A table that somebody else checks; empty if missing."""
-        self.table(key, None)
-        return self._taken.get(key, {})
-
-    def tables(self, key: str, default=...) -> list["Table"]:
-        value = self._take(key, default, f"a list of tables [[{key}]]")
-        if not isinstance(value, (list, tuple)) or not all(isinstance(v, dict) for v in value):
-            raise self.error(key, f"expected a list of tables [[{key}]], got {shown(value)} instead")
-        return [Table(v, self._path, f"{self._prefix}{key}[{n}].") for n, v in enumerate(value)]
-
-    def close(self) -> None:
-        """InputError that names every key that was not expected."""
-        if self._values:
-            key = next(iter(self._values))
-            raise self.error(key, f"unknown key; allowed here: {', '.join(self._known)}; remove or correct it")
-
-
-def _is_number(value) -> bool:
-    """A number that is finite as a float: not NaN, not infinite, not of four hundred digits."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:
-        return False
-
-
-def _is_line(value: str, longest: int = LONGEST) -> bool:
-    return 0 < len(value) <= longest and value.isprintable()
+def _told(declaration: type[Settings], values: Any, error: ValidationError) -> str:
+    """"key: problem" of the first mistake; a misspelt key comes before the one that is missing for it."""
+    first = min(error.errors(include_url=False), key=lambda found: found["type"] != "extra_forbidden")
+    root = schema.of(declaration)
+    path, here, table, kind = "", root, root, first["type"]
+    for place in first["loc"]:
+        table = here
+        if isinstance(place, str):
+            path += f".{place}" if path else place
+            here = schema.resolved(root, here.get("properties", {}).get(place, here.get("additionalProperties") or {}))
+            values = values.get(place)
+        elif "$ref" in here.get("items", {}):
+            path += f"[{place}]"
+            here, values = schema.resolved(root, here["items"]), values[place]
+        else:  # of a list of plain values, which is shown as a whole
+            kind = "value"
+            break
+    if isinstance(problem := first.get("ctx", {}).get("error"), Problem):
+        return f"{'.'.join(filter(None, (path, problem.key)))}: {problem}"
+    if kind == "missing":
+        return f"{path}: missing; add {first['loc'][-1]} = <{schema.allowed(here)}>"
+    if kind == "extra_forbidden":
+        keys = list(table["properties"])
+        hint = did_you_mean(str(first["loc"][-1]), keys)
+        return f"{path}: unknown key{hint}; allowed here: {', '.join(keys)}; remove or correct it"
+    return f"{path}: {got(schema.allowed(here), values)}"

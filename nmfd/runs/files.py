@@ -2,7 +2,6 @@
 
 import csv
 import errno
-import fcntl
 import hashlib
 import os
 import platform
@@ -10,6 +9,8 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from nmfd.errors import InputError
 
@@ -53,31 +54,33 @@ def locked(file: Path, what: Path) -> Iterator[None]:
 
     file: the lock, which holds process and host. The system lets go of it when the process ends, however it ends.
     """
-    while True:
-        handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.read(handle, 200).decode(errors="replace") or "another process"
-            os.close(handle)
-            raise InputError(
-                f"{what}: {holder} is writing to it; wait for its end, or choose another name with --out") from None
-        except OSError as error:
-            if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
-                os.close(handle)
-                raise
-        with suppress(FileNotFoundError):  # whoever had it may have removed it meanwhile
-            if os.path.samestat(os.fstat(handle), os.stat(file)):
-                break
-        os.close(handle)
+    lock = FileLock(file, timeout=0)
     try:
-        os.ftruncate(handle, 0)
-        os.write(handle, f"process {os.getpid()} on {platform.node()}".encode())
+        lock.acquire()
+    except Timeout:
+        raise InputError(
+            f"{what}: {_holder(file)} is writing to it; wait for its end, or choose another name with --out") from None
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):  # a file system without locks
+            raise
+    try:
+        with suppress(OSError), file.open("r+b", buffering=0) as stream:
+            stream.truncate(1)  # the first byte is what Windows locks
+            stream.seek(1)
+            stream.write(f"process {os.getpid()} on {platform.node()}".encode())
         yield
     finally:
-        with suppress(OSError):
-            os.unlink(file)
-        os.close(handle)
+        with suppress(OSError):  # Windows does not remove what is open
+            file.unlink()
+        lock.release()
+
+
+def _holder(lock: Path) -> str:
+    text = b""
+    with suppress(OSError), lock.open("rb", buffering=0) as stream:
+        stream.seek(1)
+        text = stream.read(200)
+    return text.decode(errors="replace") or "another process"
 
 
 def write_text(path: Path, text: str) -> None:

@@ -2,30 +2,28 @@
 
     <folder>/manifest.json              configuration, controllers, and seeds, versions and commit of every session
     <folder>/summary.csv                one row per finished run (metrics.summary)
-    <folder>/<controller>-<seed>.npz    its trajectory, without wall times: the same run gives the same bytes
+    <folder>/<controller>-<seed>.nc     all else of it (nmfd.types.Trajectory, in SUMO cosim.plant.record.Record too)
+                                        but wall times, so that the same run gives the same bytes; a netCDF file:
+                                        xarray.open_dataset, with dimensions, units and long names
 """
 
-import hashlib
 import json
 import math
-import platform
-import subprocess
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
-from importlib import metadata
 from pathlib import Path
 from urllib.parse import quote
 
+import netCDF4
 import numpy as np
 
 from nmfd.errors import InputError
 from nmfd.metrics import summary
-from nmfd.model.scenario import Scenario
+from nmfd.quantities import quantities
 from nmfd.runs import files
+from nmfd.runs.provenance import provenance
 from nmfd.types import Trajectory
 
 COLUMNS = {
@@ -35,36 +33,81 @@ COLUMNS = {
     "late_decisions": int, "sensor_faults": int, "plant_faults": int,
 }
 LOCK = ".lock"  # of a run folder
-PACKAGES = ("numpy", "torch", "casadi", "libsumo", "perimeter-cosim")
-# What NumPy raises for a file that is no .npz, cut off, changed, or without an array that it should have.
-DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-_ARRAYS = ("accumulation", "backlog", "completed", "observed", "observed_backlog", "perimeter", "splits", "status")
+# What reading raises for a file that is no netCDF, cut off, changed, or without a variable that it should have.
+DAMAGED = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError, MemoryError)
 
 
-def write_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """All of `trajectory` but its wall times in an .npz file without pickles, atomically."""
+def write_trajectory(path: Path, trajectory: Trajectory, record: Mapping[str, tuple] | None = None) -> None:
+    """All of `trajectory` but its wall times in a netCDF file, atomically. Raises InputError if it cannot be written.
+
+    record: more variables (nmfd.quantities.variables). Not by way of xarray: after Ctrl-C in the middle of it, it waits
+    for a lock of its own for ever.
+    """
+    content = {**trajectory.variables, **(record or {})}
+    del content["decision_time"]
     with files.atomic(path) as temporary:
-        np.savez_compressed(
-            temporary, controller=np.array(trajectory.controller), plant=np.array(trajectory.plant),
-            seed=np.array(trajectory.seed), step=np.array(trajectory.step),
-            estimated=np.array(trajectory.estimated), note=np.array(trajectory.note),
-            **{name: getattr(trajectory, name) for name in _ARRAYS})
+        try:
+            with netCDF4.Dataset(temporary, "w") as file:
+                file.setncatts(trajectory.labels)
+                for name, variable in content.items():
+                    _write_variable(file, name, *variable)
+        except RuntimeError as error:  # netCDF does not hand on what the system says
+            raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from None
+
+
+def _write_variable(file: netCDF4.Dataset, name: str, dimensions, values: np.ndarray, attributes: Mapping) -> None:
+    dimensions, text = np.atleast_1d(dimensions), values.dtype.kind == "U"
+    if values.dtype == np.float16:  # netCDF has none; compressed it takes no more room
+        values = values.astype(np.float32)
+    for dimension, size in zip(dimensions, values.shape, strict=True):
+        if dimension not in file.dimensions:
+            file.createDimension(dimension, size)
+    variable = file.createVariable(name, str if text else values.dtype, dimensions, zlib=not text)
+    variable.setncatts(attributes)
+    variable[...] = values.astype(object) if text else values
 
 
 def read_trajectory(path: Path) -> Trajectory:
     """What `write_trajectory` wrote; the wall times, which are in summary.csv, are NaN. Raises InputError."""
+    with opened(path) as file:
+        return trajectory_in(file)
+
+
+def trajectory_in(file: netCDF4.Dataset) -> Trajectory:
+    """That of a run's file (`opened`)."""
+    arrays = {name: file[name][...] for name in quantities(Trajectory) if name != "decision_time"}
+    arrays["note"] = tuple(arrays["note"])
+    return Trajectory(
+        controller=file.controller, plant=file.plant, seed=int(file.seed), step=float(file.step),
+        estimated=bool(file.estimated), decision_time=np.full(len(arrays["note"]), math.nan), wall_time=math.nan,
+        **arrays)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[netCDF4.Dataset]:
+    """The file of a run. Raises InputError, also where the body finds something missing."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return Trajectory(
-                controller=str(file["controller"]), plant=str(file["plant"]), seed=int(file["seed"]),
-                step=float(file["step"]), note=tuple(str(s) for s in file["note"]),
-                decision_time=np.full(len(file["status"]), math.nan), wall_time=math.nan,
-                estimated=bool(file["estimated"]),
-                **{name: file[name] for name in _ARRAYS})
+        with netCDF4.Dataset(path) as file:
+            file.set_auto_mask(False)
+            yield file
     except FileNotFoundError:
-        raise InputError(f"{path}: no such trajectory; run it again") from None
+        refuse_old(Path(path).parent)
+        raise InputError(f"{path}: no such run; choose one of {Path(path).parent / 'summary.csv'}, or run it") from None
     except DAMAGED as error:
-        raise InputError(f"{path}: is no trajectory ({error}); delete it and run it again") from None
+        problem = getattr(error, "strerror", None) or str(error).partition("\n")[0]
+        raise InputError(f"{path}: is no run ({problem}); delete it and run it again") from None
+
+
+def refuse_old(folder: Path) -> None:
+    """InputError for a folder of runs that an older version wrote."""
+    if not any(folder.glob("*-[0-9]*.npz")):
+        return
+    command = "the command that made it"
+    with suppress(InputError, LookupError):
+        manifest = read_manifest(folder / "manifest.json")
+        program = "cosim run, evaluate or sweep" if manifest["configuration"]["plant"] == "sumo" else "nmfd benchmark"
+        command = f"{program} {manifest['sessions'][-1]['scenario_folder']}, with {', '.join(manifest['controllers'])}"
+    raise InputError(f"{folder}: holds runs of an older version (.npz); delete it and run again: {command}")
 
 
 def write_summary(path: Path, rows: list[dict]) -> None:
@@ -91,53 +134,27 @@ def read_summary(path: Path) -> list[dict]:
     return files.read_rows(path, COLUMNS)
 
 
-def scenario_hash(scenario: Scenario) -> str:
-    """A fingerprint of all that a run on `scenario` depends on, whatever its files are called."""
-    settings = [
-        scenario.network.hash, scenario.step, scenario.steps, scenario.measurement_std, scenario.integrator,
-        scenario.substeps, scenario.protected, scenario.controller_options]
-    if scenario.forecast_error:
-        settings.append([scenario.forecast_error, scenario.forecast_seed])
-    if scenario.faults:
-        settings.append(scenario.faults)
-    text = json.dumps(settings, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode() + np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16]
-
-
-def provenance() -> dict:
-    """Date, versions, and the commit of the checkout that this package lies in; commit is None outside one."""
-    versions = {"python": platform.python_version()}
-    for package in PACKAGES:
-        with suppress(metadata.PackageNotFoundError):
-            versions[package] = metadata.version(package)
-    here = Path(__file__).resolve()
-    # An installed copy may lie inside somebody else's checkout: the commit counts only if this file is tracked.
-    tracked = _git(here.parent, "ls-files", "--error-unmatch", here.name) is not None
-    commit = _git(here.parent, "rev-parse", "HEAD") if tracked else None
-    changes = _git(here.parent, "status", "--porcelain", "--untracked-files=no") if commit else None
-    return {
-        "date": datetime.now().astimezone().isoformat(timespec="seconds"), "versions": versions,
-        "commit": commit, "dirty": None if changes is None else bool(changes)}
-
-
-def _git(folder: Path, *arguments: str) -> str | None:
-    try:
-        done = subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, timeout=10)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() if done.returncode == 0 else None
-
-
 def run_name(controller: str, seed: int) -> str:
     """What the files of a run are called; of a controller in a file, path/to/file.py:Class, without the / and :."""
     return f"{quote(controller, safe='+,-._ ')}-{seed}"
 
 
-def default_folder(scenario: Scenario) -> Path:
-    """runs/<scenario>-<timestamp> in the current folder, a name not taken yet."""
-    stem = f"{files.file_name(scenario.name)}-{datetime.now():%Y%m%d-%H%M%S}"
+def run_path(folder: Path, controller: str, seed: int) -> Path:
+    """The file of a run in its folder."""
+    return folder / f"{run_name(controller, seed)}.nc"
+
+
+def default_folder(scenario: str) -> Path:
+    """runs/<scenario>-<timestamp> in the current folder, a name not taken yet; scenario: its name."""
+    stem = f"{files.file_name(scenario)}-{datetime.now():%Y%m%d-%H%M%S}"
     candidates = (Path("runs") / (stem + (f"-{n}" if n > 1 else "")) for n in range(1, 1000))
     return next(folder for folder in candidates if not folder.exists())
+
+
+def trajectories(folder: Path) -> list[Trajectory]:
+    """The runs in summary.csv of a run folder. Raises InputError."""
+    rows = read_summary(folder / "summary.csv")
+    return [read_trajectory(run_path(folder, row["controller"], row["seed"])) for row in rows]
 
 
 class RunFolder:
@@ -150,16 +167,16 @@ class RunFolder:
 
     @property
     def finished(self) -> list[tuple[str, int]]:
-        """(controller, seed) of every run that is here with its row and its trajectory; `order`'s own come last."""
+        """(controller, seed) of every run that is here with its row and its file; `order`'s own come last."""
         return [run for run in self._order if run in self._rows and self.trajectory_path(*run).is_file()]
 
     def trajectory_path(self, controller: str, seed: int) -> Path:
-        return self.path / f"{run_name(controller, seed)}.npz"
+        return run_path(self.path, controller, seed)
 
-    def add(self, trajectory: Trajectory) -> None:
-        """Write a finished run at once: its trajectory, then summary.csv, which is what makes it count."""
+    def add(self, trajectory: Trajectory, record: Mapping[str, tuple] | None = None) -> None:
+        """Write a finished run at once: its file (`write_trajectory`), then summary.csv, which makes it count."""
         run = trajectory.controller, trajectory.seed
-        write_trajectory(self.trajectory_path(*run), trajectory)
+        write_trajectory(self.trajectory_path(*run), trajectory, record)
         self._rows[run] = summary(trajectory)
         write_summary(self.path / "summary.csv", self.rows())
 
@@ -201,6 +218,7 @@ def open_folder(
         if rows:
             write_summary(summary_path, [row for row in rows if row["controller"] not in changed])
 
+    refuse_old(Path(path))
     with manifest(path, configuration=configuration, controllers=controllers, session=session, results=summary_path,
                   renew=drop if renew else None):
         folder = RunFolder(Path(path), order, read_summary(summary_path) if summary_path.is_file() else [])

@@ -4,13 +4,13 @@ A killed process leaves its folder behind. Whoever makes the next one removes th
 lock on its folder, and the system lets go of that however it ended.
 """
 
-import fcntl
-import os
 import shutil
 import tempfile
 from contextlib import suppress
 from glob import escape
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 LOCK = ".scratch"  # not the name of any other file: folders that have one, locked by nobody, are removed
 
@@ -23,18 +23,20 @@ class Scratch:
         where = Path(tempfile.gettempdir()) if where is None else where
         sweep(where, prefix)
         while True:
-            self._folder = tempfile.TemporaryDirectory(prefix=prefix, dir=where)
+            self._folder = tempfile.TemporaryDirectory(prefix=prefix, dir=where, ignore_cleanup_errors=True)
             self.path = Path(self._folder.name)
-            with suppress(FileNotFoundError):
-                self._lock = (self.path / LOCK).open("x")
-                with suppress(OSError):  # a file system without locks: nothing is ever removed there
-                    fcntl.flock(self._lock, fcntl.LOCK_EX)
-                if os.path.samestat(os.fstat(self._lock.fileno()), os.stat(self.path / LOCK)):
-                    return  # nobody took it for an old one before it was locked
+            self._lock = FileLock(self.path / LOCK, timeout=0)
+            try:
+                self._lock.acquire()
+                return
+            except (Timeout, FileNotFoundError):  # somebody takes it for an old one, before it was locked
+                continue
+            except OSError:  # a file system without locks: nothing is ever removed there
+                return
 
     def close(self) -> None:
+        self._lock.release()
         self._folder.cleanup()
-        self._lock.close()
 
     def __enter__(self) -> Path:
         return self.path
@@ -46,6 +48,7 @@ class Scratch:
 def sweep(where: Path, prefix: str) -> None:
     """Remove the folders in `where` with this prefix whose processes have ended."""
     for lock in where.glob(f"{escape(prefix)}*/{LOCK}"):
-        with suppress(OSError), lock.open("r+") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(lock.parent, ignore_errors=True)
+        with suppress(OSError, Timeout):
+            with FileLock(lock, timeout=0):
+                shutil.rmtree(lock.parent, ignore_errors=True)
+            shutil.rmtree(lock.parent, ignore_errors=True)  # Windows keeps what is open

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from multiprocessing.connection import wait
 from pathlib import Path
 
+import psutil
+
 from nmfd.errors import InputError, RunFailed
 
 
@@ -28,6 +30,12 @@ def ended(failures: Sequence[tuple[str, Failure]]) -> Exception:
     """What to raise for (run, Failure) pairs: an InputError if the user can cure them all, else RunFailed."""
     text = "; ".join(f"{run}: {failure.reason}" for run, failure in failures)
     return InputError(text) if all(failure.mistake for _, failure in failures) else RunFailed(text)
+
+
+def cores() -> int:
+    """How many of them this process may use."""
+    mine = psutil.Process()
+    return len(mine.cpu_affinity()) if hasattr(mine, "cpu_affinity") else os.cpu_count() or 1  # not on macOS
 
 
 def attempt(function: Callable, task):

@@ -84,7 +84,7 @@ def configuration(scenario: Scenario, controllers, plant: str, policies) -> tupl
         policy = registry.policy_path(name, scenario, policies.get(name))
         settings[name] = registry.fingerprint(name, policy)
     common = {
-        "scenario": scenario.name, "scenario_hash": run_folder.scenario_hash(scenario),
+        "scenario": scenario.name, "scenario_hash": scenario.hash,
         "network": scenario.network.name,
         "network_hash": scenario.network.hash, "plant": plant, "step_s": scenario.step, "steps": scenario.steps,
         "measurement_std_veh": scenario.measurement_std}

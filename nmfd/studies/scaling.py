@@ -6,7 +6,6 @@ a fully connected network nearly empty of vehicles the best control is none. Pol
 decision does not depend on their weights.
 """
 
-import resource
 import statistics
 import sys
 import time
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import psutil
 import torch
 
 from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy
@@ -105,9 +105,11 @@ def made(name: str, planning: PlanningModel) -> Controller:
 def run_one(case: Case, *, memory_gib: float) -> dict:
     """The row of `case` in scaling.csv: ten control intervals on the regional model, on one thread.
 
-    Raises MemoryError above `memory_gib`, which is set for the whole process.
+    Raises MemoryError above `memory_gib`, which is set for the whole process, where the system can.
     """
-    resource.setrlimit(resource.RLIMIT_DATA, (int(memory_gib * 2**30), resource.getrlimit(resource.RLIMIT_DATA)[1]))
+    if hasattr(psutil, "RLIMIT_DATA"):  # only Linux has such a limit
+        mine = psutil.Process()
+        mine.rlimit(psutil.RLIMIT_DATA, (int(memory_gib * 2**30), mine.rlimit(psutil.RLIMIT_DATA)[1]))
     begin = time.perf_counter()
     city = network(case.family, case.regions)
     chosen = made(case.controller, PlanningModel(
@@ -133,12 +135,16 @@ def run_one(case: Case, *, memory_gib: float) -> dict:
         **case._asdict(), "status": "ok" if not unsolved else controls.note, "set_up_s": set_up,
         "first_decision_s": times[0], "median_decision_s": statistics.median(times[1:]),
         "longest_decision_s": max(times[1:]), "unsolved_decisions": unsolved,
-        "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if _mac() else 2**10)}
+        "peak_memory_mib": _peak_memory() / 2**20}
 
 
-def _mac() -> bool:
-    """There ru_maxrss is in bytes, elsewhere in KiB."""
-    return sys.platform == "darwin"
+def _peak_memory() -> int:
+    """The most that this process has had at a time [bytes]."""
+    if sys.platform == "win32":
+        return psutil.Process().memory_info().peak_wset
+    import resource  # Windows has none
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 2**10)
 
 
 def scaling(

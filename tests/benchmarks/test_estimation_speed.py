@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nmfd.api import load_scenario
-from nmfd.model.estimation import Estimator, Instruments, Observation
+from nmfd.model.estimation import Estimator, Instruments, Readings
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.types import Controls
@@ -34,7 +34,7 @@ def test_estimator_step(benchmark):
     plant.reset(0)
     for k in range(20):
         x = plant.step(controls).accumulation
-        observation = Observation(
+        observation = Readings(
             accumulation=0.9 * x.sum(axis=1), crossings=np.full((7, 7), np.nan), probes=np.round(0.1 * x),
             probe_departures=np.round(0.1 * SCENARIO.step * SCENARIO.demand[k]))
         estimator.step(controls, observation)

@@ -16,6 +16,7 @@ from nmfd.closed_loop import run
 from nmfd.controllers import registry
 from nmfd.controllers.dpc.policy import load_policy
 from nmfd.controllers.mpc.controller import EconomicMpc
+from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.no_control import NoControl
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
@@ -26,6 +27,7 @@ from nmfd.types import Observation, Status
 SCENARIO = load_scenario(Path(__file__).parents[2] / "scenarios" / "economic_mpc")
 KINDS = pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
 WHEN = (10, 20, 30, 40)  # control intervals: from free flow to gridlock in the centre
+HORIZON = 8  # control intervals
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -49,9 +51,9 @@ def measurement(x, k=0):
 
 
 def forecast(scenario, k):
-    """(8, R, R) [veh/s]."""
-    ahead = np.zeros((8, *scenario.demand.shape[1:]))
-    known = scenario.demand[k:k + 8]
+    """(HORIZON, R, R) [veh/s]."""
+    ahead = np.zeros((HORIZON, *scenario.demand.shape[1:]))
+    known = scenario.demand[k:k + HORIZON]
     ahead[:len(known)] = known
     return ahead
 
@@ -66,12 +68,12 @@ def compare(scenario, measured, guidance):
     """Total time spent over the horizon [veh s] by our MPC, by plain IPOPT, and whether that converged."""
     controller, k = EconomicMpc(planning_model(scenario), guidance=guidance), measured.step
     assert controller.act(measured).status == Status.OK
-    perimeter, splits, solved = plain.mpc(scenario, guidance=guidance)(
-        np.maximum(measured.accumulation, 0.0), forecast(scenario, k))
+    ipopt = Ipopt(planning_model(scenario), guidance=guidance, horizon=HORIZON)
+    perimeter, splits, reason = ipopt.solve(np.maximum(measured.accumulation, 0.0), forecast(scenario, k))
     rows = [controller.admissible.decision(u, theta) for u, theta in zip(perimeter, splits, strict=True)]
     other = controller.admissible.project(np.stack(rows))
     start, demand = controller.forecast(measured)
-    return controller.cost(start, demand, controller._plan), controller.cost(start, demand, other), solved
+    return controller.cost(start, demand, controller._plan), controller.cost(start, demand, other), reason is None
 
 
 @KINDS
@@ -111,8 +113,8 @@ def test_plain_dpc_decides_the_same(seen, guidance):
 @pytest.mark.benchmark(group="MPC, four decisions from nothing, 7 regions")
 class TestMpc:
     def test_plain(self, benchmark, seen, guidance):
-        decide = plain.mpc(SCENARIO, guidance=guidance)
-        benchmark(lambda: [decide(m.accumulation, forecast(SCENARIO, m.step)) for m in seen])
+        ipopt = Ipopt(planning_model(SCENARIO), guidance=guidance, horizon=HORIZON)
+        benchmark(lambda: [ipopt.solve(m.accumulation, forecast(SCENARIO, m.step)) for m in seen])
 
     def test_ours(self, benchmark, seen, guidance):
         controller = EconomicMpc(planning_model(SCENARIO), guidance=guidance)
@@ -130,8 +132,8 @@ class TestMpc:
 class TestMpcOfManyRegions:
     def test_plain(self, benchmark, guidance, regions):
         scenario, measured = random_city("complete", regions)
-        decide = plain.mpc(scenario, guidance=guidance)
-        benchmark.pedantic(lambda: decide(measured.accumulation, forecast(scenario, 0)), rounds=1)
+        ipopt = Ipopt(planning_model(scenario), guidance=guidance, horizon=HORIZON)
+        benchmark.pedantic(lambda: ipopt.solve(measured.accumulation, forecast(scenario, 0)), rounds=1)
 
     def test_ours(self, benchmark, guidance, regions):
         scenario, measured = random_city("complete", regions)

@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from nmfd.controllers.dpc.options import Online
 from nmfd.controllers.dpc.policy import DpcController, Policy, check_guidance, load_policy
 from nmfd.controllers.dpc.rollout import Rollout
+from nmfd.controllers.options import options
 from nmfd.model import dynamics
 from nmfd.model.planning import PlanningModel
-from nmfd.runs import config
 from nmfd.types import Controls, Observation
 
 MEMORY = 0.97  # of what was seen, per control interval: half is forgotten after 23
@@ -73,32 +74,21 @@ class ModelEstimate:
         return parts
 
 
-def options(planning: PlanningModel, name: str) -> tuple[int, int, float, int]:
-    """look_ahead, iterations, learning_rate and rollouts (OnlineDpc) in the table of `name`. Raises InputError."""
-    table = config.Table(planning.controller_options.get(name, {}), planning.where, f"controllers.{name}.")
-    found = (
-        table.integer("look_ahead", 80, low=1), table.integer("iterations", 2, low=0),
-        table.number("learning_rate", 3e-4, above=0.0), table.integer("rollouts", 4, low=1))
-    table.close()
-    return found
-
-
 class OnlineDpc:
     """A policy that is fine-tuned between control steps (nmfd.types.Controller).
 
     The frozen policy stays at hand: an interval is left to whichever of the two spends less time in the corrected
-    model. Options, in [controllers.dpc-pc-online] or [controllers.dpc-pcrg-online]:
-        look_ahead: control intervals of the rollouts; default 80
-        iterations: Adam steps per control interval; default 2
-        learning_rate: of Adam; default 3e-4
-        rollouts: per Adam step, each from the measured state with some noise; default 4
+    model. Options (nmfd.controllers.dpc.options.Online) are in [controllers.dpc-pc-online] or
+    [controllers.dpc-pcrg-online].
 
     demand, outflow: (R,) [-], the present estimate
     """
 
     def __init__(self, policy: Policy, planning: PlanningModel):
         self.name = f"dpc-{'pcrg' if policy.architecture.guidance else 'pc'}-online"
-        self._look_ahead, self._iterations, self._learning_rate, self._count = options(planning, self.name)
+        chosen = options(Online, planning, self.name)
+        self._look_ahead, self._iterations = chosen.look_ahead, chosen.iterations
+        self._learning_rate, self._count = chosen.learning_rate, chosen.rollouts
         self._planning, self._frozen = planning, policy.eval()
         self._rollout = Rollout(planning)
         self._nominal = self._rollout.parameters

@@ -5,7 +5,7 @@ As in Tumu et al.: an MLP backbone with one decoder for the perimeter (scaled si
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import nn
 
+from nmfd.controllers.dpc.options import DEEPEST, WIDEST, Activation
 from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.types import Controls, Observation, Status
 
 FORMAT = 1
-WIDEST, DEEPEST = 10_000, 100  # units per layer, layers: of a policy that fits into memory
 
 
 class SoftExponential(nn.Module):
@@ -47,7 +47,7 @@ class SoftExponential(nn.Module):
         return torch.where(small, identity, torch.where(safe > 0, rising, -logarithm / safe))
 
 
-ACTIVATIONS = {
+ACTIVATIONS: dict[Activation, Callable[[int], nn.Module]] = {
     "gelu": lambda width: nn.GELU(), "relu": lambda width: nn.ReLU(), "tanh": lambda width: nn.Tanh(),
     "soft-exponential": SoftExponential}
 
@@ -60,7 +60,7 @@ class Architecture:
 
     width: int = 128
     layers: int = 2
-    activation: str = "gelu"
+    activation: Activation = "gelu"
     guidance: bool = False
     sparse: bool = False
 

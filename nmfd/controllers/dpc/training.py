@@ -7,27 +7,25 @@ validation on the scenario itself is kept. The same seed gives the same weights.
 import io
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from nmfd.controllers.dpc import fallback
-from nmfd.controllers.dpc.policy import ACTIVATIONS, DEEPEST, WIDEST, Architecture, Policy, checkpoint
+from nmfd.controllers.dpc.options import TRAINED, Training
+from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
 from nmfd.controllers.dpc.rollout import Rollout, compiled_step
+from nmfd.controllers.options import options
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError, RunFailed
-from nmfd.model.planning import PlanningModel, planning_model
+from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
-from nmfd.runs import config
 from nmfd.runs.files import atomic, locked, sweep
 from nmfd.threads import one_thread
 
 VALIDATE_EVERY = 20  # Adam steps
-MOST_STEPS = 10**7
-ROBUST_NOISE = 3.0     # veh/s, of the policies whose name ends in -robust
 WORTH_COMPILING = 200  # Adam steps
 # Of the first policy from a gate: Adam steps, states in each, learning rate; width of the gate and the fullest region,
 # as a share of the set point; share of u where there is no gate.
@@ -35,54 +33,6 @@ GATE_STEPS, GATE_BATCH, GATE_RATE, GATE_WIDTH, GATE_FULLEST, OPENED = 1000, 256,
 WEAK, OPEN, RARE = 0.1, 3.0, 1e-3  # of the first policy from no control: factor of weights, logit of u, least theta
 VALIDATIONS = 16       # perturbed scenarios in a validation, if training perturbs the demand
 NAMES = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Training:
-    """Settings of one training, from the table [controllers.<name>] of scenario.toml, name one of NAMES.
-
-    width, layers, activation: of the policy
-    steps: Adam steps
-    batch: rollouts per step
-    learning_rate: of Adam at the start; falls to a tenth along a cosine
-    alternating: with route guidance, train the two decoders in turn (the backbone always)
-    demand_spread: every flow is scaled by a factor drawn from 1 +- demand_spread, per rollout
-    demand_low, demand_high: every flow is scaled, besides, by one factor drawn from between these, per rollout
-    initial_share: share of the rollouts that start from a random state, at a random time of the scenario
-    noise: largest sigma [veh/s] of the Gaussian noise on the demand of the pairs that have any, at every step; every
-        rollout has its own sigma, evenly between 0 and `noise` (demand_noise.WHERE, "pairs")
-    detour_cost: what a vehicle loses that is guided off the drivers' own split ratios, in the objective [s]
-    mfd_spread: of the regional model that every rollout has for itself (Rollout.draw_model) [-]
-    mfd_scale: of the accumulation axes of these models besides [-]; below 1 for a city that may lock, by chance, before
-        its mean outflow falls
-    from_no_control: the first policy is nearly no control, so that what training finds no reason to change stays open
-    from_gating: the first policy is nearly a gate on the protected regions, which holds them at the set point of
-        pi-gating: where the regional model locks whatever small changes do, descent finds no way to a gate by itself
-    noise_all: the same of the noise on every pair of regions ("all"), in every other rollout, instead of `noise`
-    """
-
-    width: int = 128
-    layers: int = 2
-    activation: str = "gelu"
-    steps: int = 400
-    batch: int = 16
-    learning_rate: float = 1e-3
-    alternating: bool = True
-    demand_spread: float = 0.2
-    demand_low: float = 1.0
-    demand_high: float = 1.0
-    initial_share: float = 0.5
-    noise: float = 0.0
-    noise_all: float = 0.0
-    mfd_spread: float = 0.0
-    mfd_scale: float = 1.0
-    detour_cost: float = 0.0
-    from_no_control: bool = False
-    from_gating: bool = False
-
-    @property
-    def levels(self) -> tuple[float, float]:
-        return self.demand_low, self.demand_high
 
 
 def settings(scenario: Scenario, controller: str, steps: int | None = None) -> Training:
@@ -97,40 +47,8 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         raise InputError(
             f"--controller: {controller!r} needs a table [controllers.\"{controller}\"] in {scenario.folder}/"
             f"scenario.toml that says what is different from {name}; add one, or train {name}")
-    return settings_of(planning_model(scenario, controller), controller, steps)
-
-
-def settings_of(planning: PlanningModel, controller: str, steps: int | None = None) -> Training:
-    """As `settings`, of the table [controllers.NAME] as it is in `planning`."""
-    name = controller.partition("+")[0]
-    default = Training(noise=ROBUST_NOISE if name.endswith("-robust") else 0.0)
-    table = config.Table(
-        planning.controller_options.get(name, {}), planning.where, f"controllers.{controller}.")
-    chosen = Training(
-        width=table.integer("width", default.width, low=1, high=WIDEST),
-        layers=table.integer("layers", default.layers, low=1, high=DEEPEST),
-        activation=table.text("activation", default.activation, tuple(ACTIVATIONS)),
-        steps=table.integer("steps", default.steps, low=1, high=MOST_STEPS),
-        batch=table.integer("batch", default.batch, low=1, high=100_000),
-        learning_rate=table.number("learning_rate", default.learning_rate, above=0.0, high=1.0),
-        alternating=table.flag("alternating", default.alternating),
-        demand_spread=table.number("demand_spread", default.demand_spread, low=0.0, high=1.0),
-        demand_low=table.number("demand_low", default.demand_low, above=0.0, high=1.0),
-        demand_high=table.number("demand_high", default.demand_high, low=1.0, high=100.0),
-        initial_share=table.number("initial_share", default.initial_share, low=0.0, high=1.0),
-        noise=table.number("noise", default.noise, low=0.0, high=1e6),
-        noise_all=table.number("noise_all", default.noise_all, low=0.0, high=1e6),
-        mfd_spread=table.number("mfd_spread", default.mfd_spread, low=0.0, high=1.0),
-        mfd_scale=table.number("mfd_scale", default.mfd_scale, low=0.1, high=1.0),
-        detour_cost=table.number("detour_cost", default.detour_cost, low=0.0, high=1e6),
-        from_no_control=table.flag("from_no_control", default.from_no_control),
-        from_gating=table.flag("from_gating", default.from_gating))
-    table.close()
-    if chosen.from_gating and not planning.protected:
-        raise table.error("from_gating", "expected a scenario with protected regions; name them, or leave it out")
-    if chosen.from_gating and chosen.from_no_control:
-        raise table.error("from_gating", "a policy cannot begin as both, a gate and no control; leave one out")
-    return chosen if steps is None else Training(**{**asdict(chosen), "steps": steps})
+    chosen = options(TRAINED[name], planning_model(scenario, controller), name, controller)
+    return chosen if steps is None else chosen.changed(steps=steps)
 
 
 def available(device: str) -> str:
@@ -156,7 +74,7 @@ def train(
     chosen = settings(scenario, controller, steps)
     planning = planning_model(scenario, controller)
     configuration = {
-        "controller": controller, "scenario": planning.name, "seed": seed, "compiled": compiled, **asdict(chosen)}
+        "controller": controller, "scenario": planning.name, "seed": seed, "compiled": compiled, **vars(chosen)}
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     guidance = NAMES[controller.partition("+")[0]]

@@ -8,17 +8,20 @@ gradients, while an interior-point method factorises the whole horizon some twen
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
 from nmfd.controllers.mpc.edge_model import Turns, build, vehicle_steps, vehicles_at_stake
+from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.mpc.projected_gradient import AT_REST, Minimum, minimise
+from nmfd.controllers.options import Options, options
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs import config
+from nmfd.runs.config import setting, whole
 from nmfd.types import Controls, Observation, Status
 
 ROUNDING = 0.005    # of the smallest jam accumulation: over which the solver sees the kink of the MFD there rounded off
@@ -30,30 +33,17 @@ FAILED = Status.SOLVER_FAILURE | Status.FALLBACK
 FEW = 5.0           # veh: added to the vehicles that a control decides on, where these scale the solver's steps
 
 
-@dataclass(frozen=True, kw_only=True)
-class Options:
-    """The table [controllers.mpc-pc] or [controllers.mpc-pcrg] of scenario.toml.
+class Mpc(Options):
+    """Of model predictive control."""
 
-    horizon: control intervals that the plan looks ahead
-    max_iterations: of the solver, per decision
-    time_limit: deadline of the solver, per decision [s]; default the control interval, as a later answer would be of
-        no use
-    """
-
-    horizon: int
-    max_iterations: int
-    time_limit: float
-
-
-def options(planning: PlanningModel, name: str) -> Options:
-    """The options of controller `name`, checked; InputError for an unknown key or a wrong value."""
-    table = config.Table(planning.controller_options.get(name, {}), planning.where, f"controllers.{name}.")
-    chosen = Options(
-        horizon=table.integer("horizon", 8, low=2, high=1000),
-        max_iterations=table.integer("max_iterations", 1000),
-        time_limit=table.number("time_limit", planning.step, above=0.0))
-    table.close()
-    return chosen
+    horizon: int = whole("control intervals that the plan looks ahead", 8, low=2, high=1000)
+    solver: Literal["projected-gradient", "ipopt"] = setting(
+        "ipopt: the published formulation by CasADi and IPOPT, two orders of magnitude slower: the reference",
+        "projected-gradient")
+    max_iterations: int = whole("of the solver, per decision", 1000)
+    time_limit: float | None = setting(
+        "deadline of the solver, per decision; without one, the control interval: a later answer is of no use", None,
+        unit="s", gt=0.0)
 
 
 class Admissible:
@@ -139,9 +129,10 @@ class EconomicMpc:
     def __init__(self, planning: PlanningModel, *, guidance: bool):
         """InputError for a wrong option."""
         self.name = "mpc-pcrg" if guidance else "mpc-pc"
-        self.options = options(planning, self.name)
+        self.options = options(Mpc, planning, self.name)
         network, horizon = planning.network, self.options.horizon
         used = np.flatnonzero(planning.forecast.sum(axis=(0, 1)) > 0)
+        self._regions = network.regions
         self._used = used if len(used) else np.arange(network.regions)
         self._demand, self._step, self._steps = planning.forecast, planning.step, planning.steps
         # With one Euler step per interval, the last controls move vehicles that the horizon does not see arrive.
@@ -156,6 +147,11 @@ class EconomicMpc:
         self.admissible = Admissible(network, self._model, guidance=guidance)
         self._open = self.admissible.open(self._moves)
         self._gating = PiGating(planning) if planning.protected else None
+        self._ipopt = None
+        if self.options.solver == "ipopt":
+            self._ipopt = Ipopt(
+                planning, guidance=guidance, horizon=horizon, iterations=self.options.max_iterations,
+                seconds=self.options.time_limit or planning.step)
         self.fault: str | None = None  # injected (nmfd.faults)
         self.reset()
 
@@ -221,10 +217,26 @@ class EconomicMpc:
         if self.fault == "solver-late":
             return Minimum(point=plan, value=np.inf, gap=np.inf, evaluations=0, reason="time limit")
         objective = _diverging if self.fault == "solver-diverges" else partial(self._rounded, start, demand)
+        if self._ipopt is not None and self.fault is None:
+            return self._by_ipopt(start, demand)
         return minimise(
             objective, self.admissible.project, self.admissible.gap, plan,
             metric=(self._at_stake(start, demand, plan) + FEW) ** 2, tolerance=TOLERANCE,
-            iterations=self.options.max_iterations, seconds=self.options.time_limit)
+            iterations=self.options.max_iterations, seconds=self.options.time_limit or self._step)
+
+
+    def _by_ipopt(self, start: np.ndarray, demand: np.ndarray) -> Minimum:
+        """The plan of IPOPT, made admissible: it keeps to bounds and sums up to its tolerance only."""
+        regions = self._regions
+        state, forecast = np.zeros((regions, regions)), np.zeros((len(demand), regions, regions))
+        state[:, self._used] = start.reshape(regions, -1)
+        forecast[:, :, self._used] = demand.reshape(len(demand), regions, -1)
+        perimeter, splits, reason = self._ipopt.solve(state, forecast)
+        rows = [self.admissible.decision(u, theta) for u, theta in zip(perimeter, splits, strict=True)]
+        plan = self.admissible.project(np.stack(rows[:self._moves]))
+        value, gradient = self._rounded(start, demand, plan)
+        return Minimum(
+            point=plan, value=value, gap=self.admissible.gap(plan, gradient), evaluations=1, reason=reason)
 
 
 def _diverging(plan: np.ndarray) -> tuple[float, np.ndarray]:

@@ -1,0 +1,86 @@
+"""What streets do, sampled every few seconds: vehicles, speeds and queues, and their means over a control interval."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cosim.sumo.net import City
+from cosim.sumo.session import Session
+
+EVERY = 10.0  # s, between two samples
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreetMeans:
+    """Means over the samples of one control interval.
+
+    vehicles: (E,) [veh], by the city's edges; speed: (E,) [m/s], NaN where there were none, 0 on closed streets
+    accumulation: (R,) [veh]; production: (R,) [veh m/s]
+    queue, queue_max: (G,) [veh] halting on the edge before a gateway, mean and largest
+    """
+
+    vehicles: np.ndarray
+    speed: np.ndarray
+    accumulation: np.ndarray
+    production: np.ndarray
+    queue: np.ndarray
+    queue_max: np.ndarray
+
+
+def samples_apart(seconds: float, session: Session, steps: int) -> int:
+    """Simulation steps from one sample to the next: at least one, at most the `steps` of a control interval."""
+    return min(max(1, round(seconds / session.step_length)), steps)
+
+
+class StreetSampler:
+    """The samples of one control interval: `sample` as often as they are due, `finish` at its end."""
+
+    def __init__(self, session: Session, city: City):
+        self._session, self._city = session, city
+        self._number = {edge: n for n, edge in enumerate(city.edges)}
+        self._region = np.array([city.region_of[edge] for edge in city.edges])
+        self._upstream = sorted({g.from_edge for g in city.gateways})  # gateways may share the edge before them
+        self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in city.gateways], dtype=int)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._vehicles, self._metres = np.zeros((2, len(self._city.edges)))  # sums over the samples: n and n v
+        self._queues: list[list[int]] = []
+
+    def sample(self) -> None:
+        counts, speeds = self.present()
+        self._vehicles, self._metres = self._vehicles + counts, self._metres + counts * speeds
+        self._queues.append([self._session.halting(edge) for edge in self._upstream])
+
+    def finish(self, closed: np.ndarray) -> StreetMeans:
+        """The means since the last call; new ones begin. closed: (E,) bool, streets on which nobody may drive"""
+        samples, vehicles, metres = len(self._queues), self._vehicles, self._metres
+        queues = np.array(self._queues).reshape(samples, len(self._upstream))
+        with np.errstate(invalid="ignore"):
+            speed = metres / vehicles
+        speed[closed] = 0.0  # nobody is sent through a street because it is empty
+        production, accumulation = (
+            np.bincount(self._region, amount, self._city.regions) / samples for amount in (metres, vehicles))
+        mean, largest = (queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))
+        self._begin()
+        return StreetMeans(
+            vehicles=vehicles / samples, speed=speed, accumulation=accumulation, production=production, queue=mean,
+            queue_max=largest)
+
+    def present(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vehicles (E,) [veh] and mean speed (E,) [m/s] by edge, now."""
+        count, mean_speed, edges = self._session.vehicle_count, self._session.mean_speed, self._city.edges
+        counts, speeds = np.zeros((2, len(edges)))
+        travelled = self.travelled()
+        counts[travelled] = [count(edges[n]) for n in travelled]
+        for n in np.flatnonzero(counts):
+            speeds[n] = mean_speed(edges[n])
+        return counts, speeds
+
+    def travelled(self) -> list[int]:
+        """Numbers of edges, among them all that have vehicles: a large city has more edges than vehicles under way."""
+        vehicles = self._session.running()
+        if 2 * len(vehicles) > len(self._city.edges):
+            return list(range(len(self._city.edges)))
+        roads = set(map(self._session.road, vehicles))  # some may be junctions, or closed to cars
+        return [self._number[road] for road in roads & self._number.keys()]

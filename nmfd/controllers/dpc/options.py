@@ -1,0 +1,89 @@
+"""The options of DPC policies, declared: how they are trained, and how one goes on learning while it drives."""
+
+from typing import Any, Literal
+
+from pydantic import model_validator
+
+from nmfd.controllers.options import Options
+from nmfd.model.planning import PlanningModel
+from nmfd.runs.config import Flow, Problem, Share, setting, whole
+
+MOST_STEPS = 10**7
+WIDEST, DEEPEST = 10_000, 100  # units per layer, layers: of a policy that fits into memory
+Activation = Literal["gelu", "relu", "tanh", "soft-exponential"]
+ROBUST_NOISE = 3.0  # veh/s
+
+
+def _noise(default: float) -> Any:
+    return setting(
+        "largest standard deviation of the Gaussian noise on the demand of the pairs that have any, at every step; "
+        "every rollout has its own, evenly from 0 to this", default)
+
+
+class Training(Options):
+    """Of the policy, and of the training that makes it: `nmfd train SCENARIO --controller NAME`."""
+
+    width: int = whole("units per hidden layer", 128, low=1, high=WIDEST)
+    layers: int = whole("hidden layers", 2, low=1, high=DEEPEST)
+    activation: Activation = setting("of the hidden units", "gelu")
+    steps: int = whole("Adam steps", 400, low=1, high=MOST_STEPS)
+    batch: int = whole("rollouts per step", 16, low=1, high=100_000)
+    learning_rate: float = setting(
+        "of Adam at the start; falls to a tenth along a cosine", 1e-3, unit="-", gt=0.0, le=1.0)
+    alternating: bool = setting("with route guidance, train the two decoders in turn (the backbone always)", True)
+    demand_spread: Share = setting("every flow is scaled by a factor drawn from 1 - this to 1 + this, per rollout", 0.2)
+    demand_low: float = setting(
+        "every flow is scaled, besides, by one factor from this to demand_high, per rollout", 1.0, unit="-", gt=0.0,
+        le=1.0)
+    demand_high: float = setting("the upper end of that", 1.0, unit="-", ge=1.0, le=100.0)
+    initial_share: Share = setting(
+        "share of the rollouts that start from a random state, at a random time of the scenario", 0.5)
+    noise: Flow = _noise(0.0)
+    noise_all: Flow = setting(
+        "the same of noise on every pair of regions, in every other rollout, instead of noise", 0.0)
+    mfd_spread: Share = setting(
+        "how far the regional model that every rollout has for itself is from the scenario's", 0.0)
+    mfd_scale: float = setting(
+        "of the accumulation axes of these models besides; below 1 for a city that may lock, by chance, before its "
+        "mean outflow falls", 1.0, unit="-", ge=0.1, le=1.0)
+    detour_cost: float = setting(
+        "what a vehicle loses that is guided off the drivers' own split ratios, in the objective", 0.0, unit="s",
+        ge=0.0, le=1e6)
+    from_no_control: bool = setting(
+        "the first policy is nearly no control, so that what training finds no reason to change stays open", False)
+    from_gating: bool = setting(
+        "the first policy is nearly a gate on the protected regions, which holds them at the set point of pi-gating: "
+        "where the regional model locks whatever small changes do, descent finds no way to a gate by itself", False)
+
+    @model_validator(mode="after")
+    def _begins_as_one(self):
+        if self.from_gating and self.from_no_control:
+            raise Problem("from_gating", "a policy cannot begin as both, a gate and no control; omit one")
+        return self
+
+    def misfit(self, planning: PlanningModel) -> Problem | None:
+        if not self.from_gating or planning.protected:
+            return None
+        return Problem("from_gating", "expected a scenario with protected regions; name them, or omit it")
+
+    @property
+    def levels(self) -> tuple[float, float]:
+        return self.demand_low, self.demand_high
+
+
+class RobustTraining(Training):
+    """The same of the policies whose name ends in -robust."""
+
+    noise: Flow = _noise(ROBUST_NOISE)
+
+
+TRAINED = {"dpc-pc": Training, "dpc-pcrg": Training, "dpc-pc-robust": RobustTraining, "dpc-pcrg-robust": RobustTraining}
+
+
+class Online(Options):
+    """Of a policy that goes on learning while it drives."""
+
+    look_ahead: int = whole("control intervals of the rollouts", 80, low=1)
+    iterations: int = whole("Adam steps per control interval", 2)
+    learning_rate: float = setting("of Adam", 3e-4, unit="-", gt=0.0)
+    rollouts: int = whole("per Adam step, each from the measured state with some noise", 4, low=1)

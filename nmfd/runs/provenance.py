@@ -1,0 +1,34 @@
+"""Where and with what a run was made."""
+
+import platform
+import subprocess
+from contextlib import suppress
+from datetime import datetime
+from importlib import metadata
+from pathlib import Path
+
+PACKAGES = ("numpy", "torch", "casadi", "libsumo", "perimeter-cosim")
+
+
+def provenance() -> dict:
+    """Date, versions, and the commit of the checkout that this package lies in; commit is None outside one."""
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            versions[package] = metadata.version(package)
+    here = Path(__file__).resolve()
+    # An installed copy may lie inside somebody else's checkout: the commit counts only if this file is tracked.
+    tracked = _git(here.parent, "ls-files", "--error-unmatch", here.name) is not None
+    commit = _git(here.parent, "rev-parse", "HEAD") if tracked else None
+    changes = _git(here.parent, "status", "--porcelain", "--untracked-files=no") if commit else None
+    return {
+        "date": datetime.now().astimezone().isoformat(timespec="seconds"), "versions": versions,
+        "commit": commit, "dirty": None if changes is None else bool(changes)}
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

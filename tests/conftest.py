@@ -1,0 +1,45 @@
+"""What every test shares: one thread per process, and no skipped test where `--no-skips` forbids it."""
+
+import os
+import sys
+
+import pytest
+from xdist.workermanage import NodeManager
+
+sys.dont_write_bytecode = False  # else every process rewrites the asserts of all files anew, for 6 s
+# Here and in the commands that tests call: workers must not fight for cores. Torch reads it when it is imported.
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+
+ALLOWED = ("no GPU", "no real city")  # reasons for which a test may be skipped all the same
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--no-skips", action="store_true", help="a skipped test fails, unless a GPU or a real city is missing")
+    parser.addoption(
+        "--may-skip", action="append", default=[*ALLOWED], metavar="REASON", help="nor does it fail for this reason")
+
+
+def pytest_keyboard_interrupt() -> None:
+    NodeManager.EXIT_TIMEOUT = 0.1  # s, that workers have to end: they are in the middle of a test; usually it is 10 s
+
+
+def _fail_if_skipped(report: pytest.TestReport | pytest.CollectReport, config: pytest.Config) -> None:
+    if config.getoption("no_skips") and report.skipped and not hasattr(report, "wasxfail"):
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        if not any(allowed in reason for allowed in config.getoption("may_skip")):
+            report.outcome, report.longrepr = "failed", f"--no-skips: {reason}"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item):
+    report = yield
+    _fail_if_skipped(report, item.config)
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector):
+    report = yield
+    _fail_if_skipped(report, collector.config)
+    return report

@@ -1,0 +1,168 @@
+"""Who is guided where, worked out by hand: two ways from region 0 to region 3, a through region 1 and b through 2."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from cosim.plant import guidance
+from cosim.plant.guidance import Guide
+from cosim.plant.meter import Event
+from cosim.sumo.net import City, Gateway
+
+# s and z are in region 0, a and b in 1 and 2; all lead to t in 3, where t2 follows, and z by a shorter u.
+REGION_OF = {"a": 1, "b": 2, "s": 0, "t": 3, "t2": 3, "u": 3, "v": 3}
+AFTER = {"s": ("a", "b"), "a": ("t",), "b": ("t",), "t": ("t2", "u"), "t2": ("v",), "u": ("v",), "v": ()}
+EDGES = tuple(sorted(REGION_OF))
+
+
+@pytest.fixture(autouse=True)
+def everybody_sees_the_same_times(monkeypatch):
+    monkeypatch.setattr(guidance, "SPREAD", 0.0)
+
+
+class Town:
+    """A guide of drivers on s, bound for t: by a it takes `through_a` [s] more than the last edge, by b `through_b`."""
+
+    def __init__(self, *, through_a, through_b, theta, own=0.5, most_detour=1e9, compliance=1.0, seed=0):
+        length = dict.fromkeys(EDGES, 10.0) | {"a": through_a, "b": through_b, "u": 5.0}
+        city = City(
+            net_file=Path(), regions=4, region_of=REGION_OF, edges=EDGES, length=length,
+            lanes=dict.fromkeys(EDGES, 1), lane_ids={}, speed=dict.fromkeys(EDGES, 1.0), successors=AFTER,
+            turn_time={(e, f): 1.0 for e, after in AFTER.items() for f in after}, signals={},
+            gateways=tuple(sorted((
+                Gateway(source=REGION_OF[e], target=REGION_OF[f], from_edge=e, to_edge=f, signal=None, links=())
+                for e, after in AFTER.items() for f in after if REGION_OF[e] != REGION_OF[f]),
+                key=lambda g: (g.source, g.target))))
+        self.routes, self.takes_it, self.shares = {}, True, np.zeros((2, 4, 4, 4))
+        for shares, to_a in zip(self.shares, (own, theta), strict=True):
+            shares[0, 1, 3], shares[0, 2, 3] = to_a, 1.0 - to_a
+            shares[1, 3, 3] = shares[2, 3, 3] = 1.0
+        session = SimpleNamespace(
+            road=lambda vehicle: self.routes[vehicle][0], route=self.routes.get, route_index=lambda vehicle: 0,
+            step_length=1.0, set_route=self._set_route)
+        self.guide = Guide(session, city, self.shares[0], compliance=compliance, most_detour=most_detour,
+                           random=np.random.default_rng(seed))
+        self.command()
+
+    def _set_route(self, vehicle, way):
+        if self.takes_it:
+            self.routes[vehicle] = tuple(way)
+        return self.takes_it
+
+    def command(self, **speeds):
+        """The next control interval, with these speeds [m/s] in the last one; elsewhere nobody was seen."""
+        speed = np.array([speeds.get(edge, np.nan) for edge in EDGES]) if speeds else None
+        self.guide.command(self.shares[1], speed)
+
+    def drive(self, count, by="a", free=True):
+        """By which of a and b each of `count` drivers goes who were on their way by `by`."""
+        ways = ""
+        for n in range(count):
+            vehicle = f"{len(self.routes)}-{n}"
+            self.routes[vehicle] = ("s", by, "t")
+            self.guide.apply([Event(
+                vehicle=vehicle, source=None, region=0, destination=3, edge="t", free=free)])
+            assert self.routes[vehicle] in (("s", "a", "t"), ("s", "b", "t"))
+            ways += self.routes[vehicle][1]
+        return ways
+
+
+def test_own_split_ratios_leave_everybody_on_the_fastest_way():
+    assert Town(through_a=30.0, through_b=90.0, theta=0.5).drive(12, by="b") == 12 * "a"
+    assert Town(through_a=90.0, through_b=30.0, theta=0.5).drive(12, by="a") == 12 * "b"
+
+
+@pytest.mark.parametrize("theta, expected", [(0.0, 0), (0.25, 20), (0.4, 32), (0.5, 40), (0.8, 40)])
+def test_theta_shifts_the_shares_of_those_who_wish(theta, expected):
+    """All wish to go by a: theta takes theta / own of them there, and b gets what is freed."""
+    town = Town(through_a=30.0, through_b=31.0, theta=theta)
+    ways = town.drive(40)
+    assert abs(ways.count("a") - expected) <= 1
+    assert town.guide.realised[0, :, 3].tolist() == [0, ways.count("a"), ways.count("b"), 0]
+    assert town.guide.realised.sum() == 40 and town.guide.refused == 0
+
+
+@pytest.mark.parametrize("bonus, first", [(30.0, 5), (10.0, 13)])
+def test_a_longer_way_is_taken_as_soon_as_its_region_is_far_enough_behind(monkeypatch, bonus, first):
+    """Half of them shall go by b, which takes 125 s more. After n drivers by a, the lead of a's price is
+    125 - bonus ((n + 1) / 2 - ((n + 1) / 2 - n)) = 125 - bonus n: b it is from n = 125 / bonus on."""
+    monkeypatch.setattr(guidance, "BONUS", bonus)
+    town = Town(through_a=30.0, through_b=155.0, theta=0.25)
+    ways = town.drive(first + 1)
+    assert ways.index("b") == first
+
+
+@pytest.mark.parametrize("most, expected", [(59.0, "a"), (61.0, "b")])
+def test_nobody_is_sent_on_a_longer_detour_whatever_theta_says(most, expected):
+    """60 s more by b, where all are sent: or, where that is too much, the fastest way of all."""
+    assert Town(through_a=30.0, through_b=90.0, theta=0.0, most_detour=most).drive(3) == 3 * expected
+    other = {"a": "b", "b": "a"}[expected]  # the same with the ways exchanged
+    assert Town(through_a=90.0, through_b=30.0, theta=1.0, most_detour=most).drive(3, by="b") == 3 * other
+
+
+@pytest.mark.parametrize("by_b, expected", [(44.0, "b"), (46.0, "a")])
+def test_travel_times_are_smoothed(by_b, expected):
+    """a, 20 s when it is free, took 70 s: half way is 45 s. One interval later it is 57.5 s."""
+    town = Town(through_a=20.0, through_b=by_b, theta=0.5)
+    town.command(a=20.0 / 70.0)
+    index, time = EDGES.index, town.guide._time
+    assert time[index("a")] == pytest.approx(45.0)
+    assert time[index("b")] == pytest.approx(by_b)  # nobody was seen there: as when it is free
+    town.routes["new"] = ("s",)
+    town.guide.apply([Event(vehicle="new", source=None, region=0, destination=3, edge="t")])
+    assert town.routes["new"][1] == expected
+    town.command(a=20.0 / 70.0)
+    assert time[index("a")] == pytest.approx(57.5)
+    town.command(a=1e-9)  # standing: no slower than a tenth of a metre per second
+    assert time[index("a")] == pytest.approx(0.5 * 57.5 + 0.5 * 200.0)
+    town.command(a=50.0)  # nobody is faster than allowed
+    assert time[index("a")] == pytest.approx(0.5 * (0.5 * 57.5 + 0.5 * 200.0) + 0.5 * 20.0)
+
+
+def test_what_was_assigned_before_fades():
+    town = Town(through_a=30.0, through_b=31.0, theta=0.0)
+    town.drive(10)
+    assert town.guide._assigned[0, :, 3].tolist() == [0.0, 0.0, 10.0, 0.0]
+    assert town.guide._wished[0, :, 3].tolist() == [0.0, 10.0, 0.0, 0.0]
+    town.command()
+    assert town.guide._assigned[0, 2, 3] == pytest.approx(9.0) and town.guide._wished[0, 1, 3] == pytest.approx(9.0)
+    assert town.guide.realised.sum() == 10
+
+
+def test_a_refused_way_is_counted_and_nobody_is_sent():
+    town = Town(through_a=30.0, through_b=90.0, theta=0.5)
+    town.takes_it = False
+    assert town.drive(3, by="b") == "bbb"
+    assert town.guide.refused == 3 and town.guide.realised.sum() == 0
+
+
+def test_compliance_and_drivers_who_are_not_free():
+    assert Town(through_a=30.0, through_b=90.0, theta=0.5, compliance=0.0).drive(5, by="b") == "bbbbb"
+    assert Town(through_a=30.0, through_b=90.0, theta=0.5).drive(5, by="b", free=False) == "bbbbb"
+    half = Town(through_a=30.0, through_b=90.0, theta=0.5, compliance=0.5).drive(200, by="b")
+    assert 75 < half.count("a") < 125
+
+
+def test_without_a_command_nobody_is_guided():
+    town = Town(through_a=30.0, through_b=90.0, theta=0.5)
+    town.guide.command(None, None)
+    assert town.drive(3, by="b") == "bbb"
+
+
+@pytest.mark.parametrize("present, expected", [
+    ("t t2 v", "t u v"), ("t u v", "t u v"), ("t closed v", "t closed v")], ids=["slower", "fastest", "closed to cars"])
+def test_in_the_region_of_the_destination_it_is_the_fastest_way(present, expected):
+    """22 s by t2, 17 s by u, with two turns each: 1.29 times, so one keeps it until it takes longer. A way over
+    roads that are closed to cars is left alone."""
+    town = Town(through_a=30.0, through_b=90.0, theta=0.5)
+    present, expected = tuple(present.split()), tuple(expected.split())
+    town.routes["x"] = present
+    event = Event(vehicle="x", source=None, region=3, destination=3, edge="v")
+    town.guide.apply([event])
+    assert town.routes["x"] == (present if present == ("t", "t2", "v") else expected)
+    town.command(t2=0.5)  # 15 s now: 27 s against 17 s
+    town.guide.apply([event])
+    assert town.routes["x"] == expected
+    assert town.guide.realised.sum() == 0

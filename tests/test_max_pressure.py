@@ -1,0 +1,189 @@
+"""Max-pressure without SUMO: the ways between stages, rations of green, and pressures worked out by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from signal_rules import CROSS, MIN_GREEN, PHASES, SINGLE, check, signal
+
+from cosim.plant.max_pressure import EVERY, PERMISSIVE, Junction, MaxPressure, Roads, transition
+from cosim.sumo.net import Gateway
+from cosim.sumo.session import Phase
+from cosim.sumo.signals import Link
+
+
+@pytest.mark.parametrize("phases", [PHASES, SINGLE, CROSS])
+def test_every_way_between_stages_is_safe(phases):
+    """Random switching: yellow after green, the minimum green, nothing green together that never was."""
+    random = np.random.default_rng(2)
+    junction, states = Junction(signal(phases), 0.0, min_green=MIN_GREEN), []
+    for second in range(1500):
+        if second >= junction.next_change:
+            junction.advance(float(second))
+        if junction.may_switch(float(second)) and random.random() < 0.3:
+            other = int(random.integers(junction.stages))
+            if other != junction.stage:
+                junction.switch(other, float(second))
+        states.append(junction.state)
+    assert len(set(states)) > 3
+    check(states, phases, MIN_GREEN)
+
+
+def test_the_programme_s_own_way_is_kept():
+    phases = signal(SINGLE).phases
+    assert [p.state for p in transition(phases, 0, 2)] == ["yr"]
+    phases = signal([("GGr", 20), ("yyr", 4), ("rrr", 2), ("rrG", 20), ("rry", 3), ("Grr", 9), ("yrr", 3)]).phases
+    assert [(p.state, p.duration) for p in transition(phases, 0, 3)] == [("yyr", 4), ("rrr", 2)]
+    assert [(p.state, p.duration) for p in transition(phases, 0, 5)] == [("Gyr", 4), ("Grr", 2)]
+    assert transition(phases, 5, 0) == [Phase(duration=3, state="yrr")]
+
+
+@pytest.mark.parametrize("phases", [PHASES, SINGLE, CROSS])
+def test_rationed_green(phases):
+    """Random switching and commands: all is safe; no cycle has more green than its ration; u_max rations nothing."""
+    random, links = np.random.default_rng(3), (0, 1)
+    junction = Junction(signal(phases), 0.0, {link: (0, 1) for link in links}, min_green=MIN_GREEN)
+    cycle, states, budgets = int(sum(d for _, d in phases)), [], []
+    for second in range(40 * cycle):
+        now = float(second)
+        if second % cycle == 0:
+            share = 1.0 if second >= 30 * cycle else float(random.uniform())
+            junction.command(np.full((2, 2), share))
+            budgets.append(np.inf if share == 1.0 else MIN_GREEN + share * (cycle - MIN_GREEN))
+        if now >= junction.next_change - 1e-6:
+            junction.advance(now)
+        if junction.may_switch(now) and random.random() < 0.1:
+            junction.switch((junction.stage + 1) % junction.stages, now)
+        states.append(junction.state)
+    check(states, phases, MIN_GREEN)
+    green = np.array([[state[link] in "Gg" for link in links] for state in states]).reshape(40, cycle, 2).sum(axis=1)
+    assert (green <= np.ceil(np.array(budgets))[:, None]).all()
+    limited = np.isfinite(budgets)
+    assert (green[limited] >= np.array(budgets)[limited, None] - 1.0).any()  # rations are used up somewhere
+    assert junction.green_time(40.0 * cycle) == {link: green[:, n].sum() for n, link in enumerate(links)}
+
+
+@pytest.mark.parametrize("min_green", [2.0, 9.0])
+def test_the_minimum_green_is_that_of_the_settings(min_green):
+    """A stage lasts so long, and so much green has a gateway whose ration is the least."""
+    held = Junction(signal(CROSS), 0.0, {0: (0, 1)}, min_green=min_green)
+    held.command(np.zeros((2, 2)))
+    assert held.may_switch(min_green) and not held.may_switch(min_green - 1.0)
+    while held.next_change < 66.0:
+        held.advance(held.next_change)
+    assert held.green_time(66.0) == {0: min_green}
+
+
+def link(index, start, end, lane=0):
+    return Link(index=index, from_edge=start, lane=lane, to_edge=end)
+
+
+# a and c meet at the signal s, which lets one of them through; b, d, e and f follow. b has two lanes and ends at the
+# signal t, where the left one leads to e alone, the right one to e and f. x leads into a and nowhere else: one road.
+LANES = dict.fromkeys("acdefx", 1) | {"b": 2}
+AFTER = {"x": ("a",), "a": ("b",), "c": ("d",), "b": ("e", "f"), "d": (), "e": (), "f": ()}
+TOWN = SimpleNamespace(edges=tuple("abcdefx"), lanes=LANES, successors=AFTER, gateways=())
+CROSSING = signal(CROSS, (link(0, "a", "b"), link(1, "c", "d")), "s")
+END = signal([("GGg", 30), ("yyy", 3), ("rrG", 30), ("rry", 3)], (
+    link(0, "b", "e", lane=1), link(1, "b", "e"), link(2, "b", "f")), "t")
+FLOWS = {("b", "e"): 3.0, ("b", "f"): 1.0}
+
+
+def weights(**vehicles):
+    """Movement -> weight [veh] with so many vehicles on every lane of an edge, and the matrices."""
+    roads = Roads(TOWN, [CROSSING, END], FLOWS)
+    present = np.array([vehicles.get(lane.partition("_")[0], 0.0) for lane in roads.lanes])
+    return dict(zip(roads.movements, (roads.weights @ present).tolist(), strict=True)), roads
+
+
+def test_weights_by_hand():
+    """What waits for a movement: all of a; of b the left lane for e, and of the right one three quarters for e. Less
+    what it would run into, by turning shares: 0.75 (left + 0.75 right) + 0.25 (0.25 right)."""
+    found, _ = weights(a=10.0, b=4.0, c=2.0)
+    assert found["b", "e"] == pytest.approx(4.0 + 3.0) and found["b", "f"] == pytest.approx(1.0)
+    assert found["a", "b"] == pytest.approx(10.0 - 0.75 * 7.0 - 0.25 * 1.0)
+    assert found["c", "d"] == pytest.approx(2.0)
+
+
+def test_what_is_upstream_on_the_same_road_counts_too():
+    assert weights(x=5.0)[0]["a", "b"] == pytest.approx(5.0)
+    assert weights(d=9.0)[0]["c", "d"] == 0.0  # nobody on d wants to go on anywhere
+
+
+def test_without_expected_flows_all_turns_are_alike():
+    roads = Roads(TOWN, [CROSSING, END], {})
+    present = np.array([4.0 * (lane[0] == "b") for lane in roads.lanes])
+    assert (roads.weights @ present)[roads.movements["b", "f"]] == pytest.approx(0.5 * 4.0)
+
+
+def test_saturation_flows_by_hand():
+    """A lane each; of a lane that two movements share, a share; of a permissive green, less."""
+    _, roads = weights()
+    gain, begins = roads.stages([CROSSING, END])
+    assert begins == [0, 2]
+    dense = gain.toarray()
+    movement = roads.movements
+    assert dense[0, movement["a", "b"]] == 1.0 and dense[1, movement["c", "d"]] == 1.0
+    assert dense[2, movement["b", "e"]] == pytest.approx(1.75)
+    assert dense[2, movement["b", "f"]] == pytest.approx(0.25 * PERMISSIVE)
+    assert dense[3, movement["b", "f"]] == pytest.approx(0.25)
+    assert np.count_nonzero(dense) == 5
+
+
+@pytest.fixture
+def junctions():
+    """Max-pressure at both signals, what it has shown, and the vehicles on every lane of an edge."""
+    vehicles, shown = {}, []
+    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane.partition("_")[0], 0.0))
+    control = MaxPressure(session, TOWN, [CROSSING], FLOWS, others=[END], min_green=12.0,
+                          show=lambda name, state: shown.append((session.time, name, state)))
+
+    def play(until):
+        while session.time <= until:
+            control.play(session.time)
+            session.time += 1.0
+        return shown
+
+    return control, vehicles, play
+
+
+def test_the_green_goes_where_the_pressure_is_after_the_minimum(junctions):
+    """Decided every EVERY seconds, so at 15 s; yellow for 3 s; and back in the same way."""
+    _, vehicles, play = junctions
+    assert EVERY == 5.0
+    vehicles["c"] = 3.0
+    assert play(30.0) == [(0.0, "s", "Gr"), (15.0, "s", "yr"), (18.0, "s", "rG")]
+    vehicles.update(c=0.0, a=1.0)  # since 18 s: until 30 s at least, and 30 s has passed
+    assert play(60.0)[3:] == [(35.0, "s", "ry"), (38.0, "s", "Gr")]
+
+
+@pytest.mark.parametrize("a, b, c, state", [
+    (5.0, 0.0, 4.9, "Gr"), (5.0, 0.0, 5.0, "Gr"), (5.0, 0.0, 5.1, "rG"), (9.0, 3.0, 4.9, "rG"), (9.0, 0.0, 8.9, "Gr"),
+    (0.0, 4.0, 0.1, "rG"), (0.0, 4.0, 0.0, "Gr")],
+    ids=["less", "as much", "more", "less but nothing ahead", "more and nothing ahead", "negative", "nobody"])
+def test_the_higher_pressure_wins_and_the_green_stays_in_doubt(junctions, a, b, c, state):
+    """The pressure of a is what waits there less what stands on b: 9 - 0.75 * 5.25 - 0.25 * 0.75 = 4.9 - at b = 3."""
+    _, vehicles, play = junctions
+    vehicles.update(a=a, b=b, c=c)
+    assert play(40.0)[-1][2] == state
+
+
+def test_a_spent_ration_exerts_no_pressure():
+    """The gateway a -> b has 10 s of green in a cycle; then it is red, and c gets the green for a single vehicle."""
+    town = SimpleNamespace(**{**vars(TOWN), "gateways": (
+        Gateway(source=0, target=1, from_edge="a", to_edge="b", signal="s", links=(0,)),)})
+    shown, session = [], SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 50.0, "c": 1.0}.get(lane[0], 0.0))
+    control = MaxPressure(
+        session, town, [CROSSING], FLOWS, others=[], min_green=5.0, show=lambda name, state: shown.append(state))
+    control.command(np.full((2, 2), 5.0 / 61.0), {})  # 5 s, and so much of the other 61 s
+    assert control.green_time() == {"s": {0: 0.0}}
+    for second in range(66):
+        session.time = float(second)
+        control.play(session.time)
+    session.time = 66.0
+    assert control.green_time()["s"][0] == pytest.approx(10.0, abs=1.0) and shown[-1] == "rG"
+    control.command(np.zeros((2, 2)), {"s": [0]})  # opened all the same
+    for second in range(66, 132):
+        session.time = float(second)
+        control.play(session.time)
+    assert shown[-1] == "Gr" and control.green_time()["s"][0] > 50.0

@@ -1,0 +1,94 @@
+"""Outflow curves: what they say in closed form, and fits to samples of a curve that is known."""
+
+import numpy as np
+import pytest
+
+from nmfd.model.mfd import Mfd, fit
+
+# The published curve with a tenth of its jam accumulation: the coefficients span nine orders of magnitude.
+TRUTH = Mfd(a=4.133e-9, b=-8.282e-6, c=0.0042, jam=1000.0)
+# One sample in each of the 24 bins, the last one at the jam.
+X = TRUTH.jam * (np.arange(24) + 0.5) / 23.5
+
+
+def same(curve, expected, rel=1e-3):
+    assert (curve.a, curve.b, curve.c, curve.jam) == pytest.approx(
+        (expected.a, expected.b, expected.c, expected.jam), rel=rel)
+
+
+def test_a_parabola_in_closed_form():
+    """g = c x (1 - x / 2 n) has its most, c n / 2, at n; three quarters of it at n / 2, and it ends at 2 n."""
+    curve = Mfd(a=0.0, b=-0.004 / 1000.0, c=0.004, jam=np.inf)
+    assert curve.critical == pytest.approx(500.0, abs=0.1)
+    assert curve.capacity == pytest.approx(1.0)
+    assert curve.reaching(0.75) == pytest.approx(250.0, abs=0.1) and curve.reaching(1.0) == curve.critical
+    np.testing.assert_allclose(curve.outflow([0.0, 250.0, 1000.0]), [0.0, 0.75, 0.0], atol=1e-12)
+    np.testing.assert_allclose(curve.rate([0.0, 250.0]), [0.004, 0.003])
+
+
+def test_beyond_the_jam_the_outflow_is_constant():
+    at_jam = TRUTH.outflow(TRUTH.jam)
+    assert at_jam == pytest.approx(TRUTH.a * 1e9 + TRUTH.b * 1e6 + TRUTH.c * 1e3)
+    np.testing.assert_allclose(TRUTH.outflow([1000.0, 1500.0, 9000.0]), at_jam)
+    np.testing.assert_allclose(TRUTH.rate(4000.0), at_jam / 4000.0)
+
+
+@pytest.mark.parametrize("change, expected", [
+    ({"c": 0.0}, "c must be positive"), ({"jam": 0.0}, "jam must be positive"), ({"b": -9e-6}, "is not positive at"),
+    ({"a": 1e308}, "is not finite up to")], ids=lambda value: next(iter(value)) if isinstance(value, dict) else "")
+def test_what_is_no_curve(change, expected):
+    assert TRUTH.problem() is None
+    assert expected in Mfd(**{"a": TRUTH.a, "b": TRUTH.b, "c": TRUTH.c, "jam": TRUTH.jam, **change}).problem()
+
+
+def test_a_fit_to_exact_samples_gives_the_coefficients_back():
+    same(fit(X, TRUTH.outflow(X)), TRUTH)
+
+
+@pytest.mark.parametrize("scale", [0.02, 50.0])
+def test_a_city_of_another_size_has_the_same_curve_on_other_axes(scale):
+    """x and g both times s: c stays, b falls with s, a with its square."""
+    same(fit(scale * X, scale * TRUTH.outflow(X)),
+         Mfd(a=TRUTH.a / scale**2, b=TRUTH.b / scale, c=TRUTH.c, jam=scale * TRUTH.jam))
+
+
+def test_what_is_no_sample_does_not_count():
+    x = np.concatenate([X, [np.nan, 400.0, np.inf, 0.0, -50.0]])
+    g = np.concatenate([TRUTH.outflow(X), [1.0, np.nan, 1.0, 9.0, 9.0]])
+    same(fit(x, g), TRUTH)
+    for nothing in ([], [np.nan], [0.0]):
+        with pytest.raises(ValueError, match="no samples"):
+            fit(nothing, nothing)
+
+
+def test_every_bin_counts_alike_and_by_its_median():
+    """A thousand samples of an empty city and a wild one among three change nothing."""
+    g = TRUTH.outflow(X)
+    x = np.concatenate([np.full(1000, X[0]), X, X[[5, 5]], X[[9, 9]]])
+    many = np.concatenate([np.full(1000, g[0]), g, g[5] * np.array([1.0, 30.0]), g[9] * np.array([0.0, 1.0])])
+    same(fit(x, many), TRUTH)
+
+
+def test_the_jam_is_where_the_outflow_stops_falling():
+    short = Mfd(a=TRUTH.a / 0.6**2, b=TRUTH.b / 0.6, c=TRUTH.c, jam=600.0)
+    same(fit(X, short.outflow(X)), short, rel=5e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_the_samples_the_curve_is_safe(seed):
+    """The rate falls, stays positive up to the jam and keeps to the most that the integration step allows."""
+    random = np.random.default_rng(seed)
+    x = random.uniform(1.0, 500.0, 200)
+    for g in (random.uniform(0.0, 2.0, 200), 1e-5 * x**2, 0.01 * x, np.maximum(1.0 - 0.01 * x, 0.0), 0.02 * x**0.5):
+        for most in (np.inf, 1.0 / 150.0):
+            curve = fit(x, g, max_rate=most)
+            rate = curve.rate(np.linspace(0.0, curve.jam, 400))
+            assert curve.problem() is None and curve.jam <= x.max()
+            assert (np.diff(rate) <= 1e-9 * rate[0]).all() and rate[0] <= most * (1.0 + 1e-6)
+            assert curve.outflow(curve.jam) >= 0.009 * g.max()
+
+
+def test_the_most_that_is_allowed_binds():
+    """Samples of 0.01 x with at most half of that: the line 0.005 x is as near as a curve may come."""
+    curve = fit(X, 0.01 * X, max_rate=0.005)
+    np.testing.assert_allclose(curve.outflow(X), 0.005 * X, rtol=1e-3)

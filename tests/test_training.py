@@ -1,0 +1,299 @@
+"""What a training draws, descends and keeps: every number from its definition, on a scenario of two regions."""
+
+import math
+import shutil
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+import tiny
+import torch
+
+from nmfd.api import load_scenario
+from nmfd.controllers.dpc import rollout as rollout_module
+from nmfd.controllers.dpc import training
+from nmfd.controllers.dpc.policy import Architecture, Policy
+from nmfd.controllers.dpc.rollout import Rollout
+from nmfd.errors import RunFailed
+from nmfd.model.planning import planning_model
+
+# One value that is no default for every setting, and one beyond each end of what is allowed.
+CHOSEN = {
+    "width": 8, "layers": 1, "activation": "relu", "steps": 3, "batch": 4, "learning_rate": 0.25, "alternating": False,
+    "demand_spread": 0.5, "demand_low": 0.75, "demand_high": 1.5, "initial_share": 0.25, "noise": 0.125,
+    "noise_all": 0.0625, "mfd_spread": 0.375, "mfd_scale": 0.875, "detour_cost": 20.0, "from_no_control": True}
+BEYOND = {
+    "width": (0, 10**9), "layers": (0, 10**9), "steps": (0, 10**9), "batch": (0, 10**9), "learning_rate": (0.0, 1.1),
+    "demand_spread": (-0.1, 1.1), "demand_low": (0.0, 1.1), "demand_high": (0.9, 101.0), "initial_share": (-0.1, 1.1),
+    "noise": (-0.1, 1e7), "noise_all": (-0.1, 1e7), "mfd_spread": (-0.1, 1.1), "mfd_scale": (0.05, 1.1),
+    "detour_cost": (-0.1, 1e7)}
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    return load_scenario(tiny.write(tmp_path))
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(0)
+
+
+def made(scenario, *, guidance=False):
+    torch.manual_seed(0)
+    return Policy(scenario.network, Architecture(width=8, guidance=guidance))
+
+
+def test_every_setting_is_taken_over(scenario):
+    wanted = replace(scenario, controller_options={"dpc-pc": CHOSEN})
+    assert asdict(training.settings(wanted, "dpc-pc")) == {**asdict(training.Training()), **CHOSEN}
+    assert training.settings(wanted, "dpc-pc", steps=7).steps == 7
+    assert training.settings(wanted, "dpc-pc").levels == (0.75, 1.5)
+    gate = replace(scenario, controller_options={"dpc-pc": {"from_gating": True}})
+    assert training.settings(gate, "dpc-pc").from_gating
+    assert training.settings(scenario, "dpc-pc") == training.Training()
+    assert training.settings(scenario, "dpc-pc-robust") == training.Training(noise=training.ROBUST_NOISE)
+
+
+@pytest.mark.parametrize("key, value", [(key, value) for key, ends in BEYOND.items() for value in ends])
+def test_what_is_out_of_range_is_refused(scenario, key, value):
+    with pytest.raises(Exception, match=rf"dpc-pc\.{key}: ") as caught:
+        training.settings(replace(scenario, controller_options={"dpc-pc": {key: value}}), "dpc-pc")
+    assert "\n" not in str(caught.value)
+
+
+def test_starts_without_a_spread_are_those_of_the_scenario(scenario, generator):
+    x, demand = Rollout(planning_model(scenario), dtype=torch.float64).random_start(3, 0.0, 0.0, generator)
+    assert x.shape == (3, 2, 2) and not x.any()
+    for n in range(3):
+        np.testing.assert_array_equal(demand[:, n], scenario.demand)
+
+
+def test_spread_and_level_scale_the_flows(scenario, generator):
+    """Every flow for itself by 1 +- 0.3, evenly and the same at all times; all of a rollout by 0.5 to 2."""
+    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
+    _, demand = rollout.random_start(4000, 0.3, 0.0, generator)
+    busy = int(scenario.demand[:, 0, 1].argmax())
+    factor = demand[busy, :, 0, 1] / scenario.demand[busy, 0, 1]
+    assert 0.7 <= factor.min() < 0.71 and 1.29 < factor.max() <= 1.3 and factor.mean() == pytest.approx(1.0, abs=0.01)
+    torch.testing.assert_close(demand, factor[:, None, None] * torch.tensor(scenario.demand)[:, None])
+    _, demand = rollout.random_start(4000, 0.0, 0.0, generator, (0.5, 2.0))
+    level = demand[busy, :, 0, 1] / scenario.demand[busy, 0, 1]
+    assert 0.5 <= level.min() < 0.51 and 1.99 < level.max() <= 2.0 and level.mean() == pytest.approx(1.25, abs=0.03)
+
+
+def test_a_share_of_the_rollouts_starts_later_in_a_random_state(scenario, generator):
+    """Three quarters of them: up to 80 % of the jam, only for destinations in use; the demand goes on from there."""
+    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
+    x, demand = rollout.random_start(4000, 0.0, 0.75, generator)
+    assert not x[3000:].any() and (x[:3000].sum((1, 2)) > 0).all()
+    assert not x[:, :, 0].any()  # nobody is bound for region 0
+    filling = x[:3000].sum(-1) / 1000.0
+    assert filling.min() >= 0.0 and 0.7 < filling.max() <= 0.8 and filling.mean() == pytest.approx(0.2, abs=0.01)
+    padded = np.concatenate([scenario.demand, np.zeros_like(scenario.demand)])
+    later = {n: [shift for shift in range(11) if (demand[:, n].numpy() == padded[shift : shift + 20]).all()]
+             for n in (*range(50), 3500)}
+    assert later[3500] == [0] and all(later.values())
+    assert {0, 1, 2, 3} <= {shift for found in later.values() for shift in found}
+
+
+def test_every_destination_in_use_gets_its_part(scenario, generator):
+    both = replace(scenario, demand=scenario.demand + scenario.demand.transpose(0, 2, 1))
+    x, _ = Rollout(planning_model(both), dtype=torch.float64).random_start(2000, 0.0, 1.0, generator)
+    assert (x > 0).all()
+    assert (x[:, 0, 0] > x[:, 0, 1]).double().mean() == pytest.approx(0.5, abs=0.05)
+
+
+def test_noise_on_the_demand(scenario, generator):
+    """Of the pairs that have any, with the sigma of the rollout; in every other rollout of all pairs."""
+    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
+    demand = torch.full((20, 4000, 2, 2), 50.0, dtype=torch.float64)
+    assert rollout.perturb(demand, torch.ones(4000), 0.0, 0.0, generator) is demand
+    level = torch.linspace(0.0, 1.0, 4000, dtype=torch.float64)
+    off = rollout.perturb(demand, level, 2.0, 0.0, generator) - 50.0
+    assert not off[:, :, 1, 0].any() and not off[:, 0].any()
+    for n in (1000, 2500, 3999):
+        around = off[:, n - 100 : n + 1, 0, 1]
+        assert around.std().item() == pytest.approx(2.0 * level[n - 50].item(), rel=0.1)
+    both = rollout.perturb(demand, torch.ones(4000, dtype=torch.float64), 2.0, 4.0, generator) - 50.0
+    assert not both[:, ::2, 1, 0].any() and both[:, ::2, 0, 1].std().item() == pytest.approx(2.0, rel=0.05)
+    assert both[:, 1::2].std(dim=(0, 1)).flatten().tolist() == pytest.approx([4.0] * 4, rel=0.05)
+    empty = rollout.perturb(0.0 * demand, torch.ones(4000, dtype=torch.float64), 2.0, 0.0, generator)
+    assert empty.min() == 0.0 and empty.max() > 0.0
+
+
+def test_models_are_drawn_around_the_nominal_one(scenario, generator):
+    """The accumulation axis by exp(0.2 n), the outflow by half of that, n cut at two deviations."""
+    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
+    nominal = rollout.parameters
+    rollout.draw_model(8000, 0.2, generator, scale=0.5)
+    p = rollout.parameters
+    wide, high = torch.log(p.jam / nominal.jam / 0.5), torch.log(p.c / nominal.c)
+    for factor, most in ((wide, 0.4), (high, 0.2)):
+        assert factor.min().item() == pytest.approx(-most) and factor.max().item() == pytest.approx(most)
+        assert factor.mean().item() == pytest.approx(0.0, abs=0.01)
+    assert torch.corrcoef(torch.stack([wide[:, 0], wide[:, 1], high[:, 0]])).triu(1).abs().max() < 0.05
+    assert p.capacity is None and p.storage is None
+
+
+@pytest.mark.parametrize("rates", [None, 1.5], ids=["one rate", "exit rates"])
+def test_no_drawn_model_is_too_fast_for_the_step(scenario, generator, rates):
+    """A free rate of 0.9 per integration step, half of the draws above it: all above 1 are cut down to 1."""
+    fastest = 0.9 / scenario.step * scenario.substeps
+    network = replace(
+        scenario.network, exit_rates=None if rates is None else np.array([[1.0, rates], [rates, 0.5]]),
+        mfds=tuple(replace(m, c=fastest / (rates or 1.0)) for m in scenario.network.mfds))
+    rollout = Rollout(planning_model(replace(scenario, network=network)), dtype=torch.float64)
+    rollout.draw_model(500, 0.8, generator)
+    drawn = rollout.parameters.c * (rates or 1.0) * scenario.step / scenario.substeps
+    assert drawn.max().item() == pytest.approx(1.0) and drawn.min() < 0.6
+    assert 0.2 < (drawn > 0.999).double().mean() < 0.6
+
+
+@pytest.mark.parametrize("rates", [1.0, 2.0])
+def test_half_of_the_moved_shares_are_diverted(scenario, rates):
+    """100 vehicles leave at 0.003 / s; own shares are all to 1, theta sends 0.4 of them elsewhere."""
+    network = replace(scenario.network, exit_rates=np.full((2, 2), rates),
+                      mfds=tuple(replace(m, a=0.0, b=0.0, c=0.003) for m in scenario.network.mfds))
+    rollout = Rollout(planning_model(replace(scenario, network=network)), dtype=torch.float64)
+    x = torch.zeros(1, 2, 2, dtype=torch.float64)
+    x[0, 0, 1] = 100.0
+    own, theta = torch.zeros(2, 1, 2, 2, 2, dtype=torch.float64)
+    own[0, 0, 1, 1], theta[0, 0, 1, 1], theta[0, 0, 0, 1] = 1.0, 0.6, 0.4
+    rollout.nominal_splits = own[0]
+    diverted = rollout._diverted(x, theta)
+    assert diverted[0, 0, 1].item() == diverted.sum() == pytest.approx(0.4 * 0.003 * 100.0 * rates)
+
+
+def test_compilation_is_tried_out_where_there_is_a_compiler(monkeypatch):
+    asked = []
+    monkeypatch.setattr(rollout_module, "compiled_step", lambda step: lambda x: asked.append(step(x).tolist()))
+    monkeypatch.setenv("CXX", "my-compiler")
+    monkeypatch.setattr(shutil, "which", lambda name: name if name == "my-compiler" else None)
+    assert rollout_module.can_compile() and asked == [[-1.0]]
+    monkeypatch.delenv("CXX")
+    assert not rollout_module.can_compile() and len(asked) == 1
+    monkeypatch.setattr(shutil, "which", lambda name: name)
+    monkeypatch.setattr(rollout_module, "compiled_step", lambda step: step / 0)
+    assert not rollout_module.can_compile()
+
+
+def test_the_total_time_spent_is_that_of_the_states(scenario, generator):
+    """Vehicles at every beginning of an interval, times its length."""
+    rollout, policy = Rollout(planning_model(scenario), dtype=torch.float32), made(scenario)
+    x, demand = rollout.random_start(5, 0.2, 0.5, generator)
+    exact, seen = rollout.states(policy, x, demand, generator.manual_seed(1))
+    assert torch.equal(exact[0], x) and exact.shape == (20, 5, 2, 2)
+    assert (seen - exact).std().item() == pytest.approx(scenario.measurement_std, rel=0.1)
+    again = torch.stack([rollout.step(policy, exact[k], demand[k], seen[k] - exact[k]) for k in range(19)])
+    torch.testing.assert_close(again, exact[1:], rtol=1e-4, atol=1e-3)
+    total = rollout.total_time_spent(policy, x, demand, generator.manual_seed(1))
+    torch.testing.assert_close(total, scenario.step * sum(state.sum((1, 2)) for state in exact))
+
+
+def test_a_validation_is_the_scenario_itself(scenario):
+    """Without noise: the TTS from its own start, whatever the seed."""
+    quiet, policy = replace(scenario, measurement_std=0.0), made(scenario)
+    rollout = Rollout(planning_model(quiet))
+    with torch.no_grad():
+        expected = rollout.total_time_spent(
+            policy, torch.zeros(1, 2, 2), rollout.demand[:, None], torch.Generator()).item()
+    for seed in (0, 1):
+        assert training.validate(policy, rollout, seed, training.Training()) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("chosen", [
+    {"noise": 1.0}, {"noise_all": 1.0}, {"mfd_spread": 0.3}, {"demand_high": 2.0}, {"demand_low": 0.5}],
+    ids=lambda chosen: next(iter(chosen)))
+def test_a_validation_is_perturbed_as_the_training(scenario, chosen):
+    """18 rollouts instead of 2; the same seed gives the same number, and more demand or noise means more vehicles."""
+    quiet, policy = replace(scenario, measurement_std=0.0), made(scenario)
+    rollout, asked = Rollout(planning_model(quiet)), []
+    total = rollout.total_time_spent
+    rollout.total_time_spent = lambda policy, x, demand, generator: asked.append(demand) or total(
+        policy, x, demand, generator)
+    plain = training.validate(policy, rollout, 0, training.Training())
+    values = [training.validate(policy, rollout, seed, training.Training(**chosen)) for seed in (0, 0, 1)]
+    assert [demand.shape[1] for demand in asked] == [2, 18, 18, 18]
+    assert values[0] == values[1] != plain
+    sums = asked[1].sum((0, 2, 3)) / quiet.demand.sum()
+    if "mfd_spread" in chosen:
+        assert sums.tolist() == pytest.approx([1.0] * 18)
+    elif "demand_low" in chosen or "demand_high" in chosen:
+        end = 0.5 if "demand_low" in chosen else 2.0  # nine levels from 1 to the end, two rollouts of each
+        low, high = sorted((1.0, end))
+        assert sorted(sums.tolist()) == pytest.approx(np.repeat(np.linspace(low, high, 9), 2).tolist(), rel=1e-4)
+    else:  # sigma rises from none to that of the training
+        assert sums[0] == pytest.approx(1.0) and sums[-2:].mean() > 1.05
+
+
+@pytest.fixture
+def steps(monkeypatch):
+    """The learning rate of every Adam step, and the gradients it saw (None for what it leaves alone)."""
+    seen = []
+
+    class Noted(torch.optim.Adam):
+        def step(self):
+            [group] = self.param_groups
+            seen.append((group["lr"], [weights.grad is not None for weights in group["params"]],
+                         math.sqrt(sum((w.grad**2).sum().item() for w in group["params"] if w.grad is not None))))
+            super().step()
+
+    monkeypatch.setattr(torch.optim, "Adam", Noted)
+    return seen
+
+
+def test_the_learning_rate_falls_to_a_tenth_along_a_cosine(tmp_path, scenario, steps):
+    chosen = replace(scenario, controller_options={"dpc-pc": {"learning_rate": 0.5, "batch": 2, "width": 4}})
+    training.train(chosen, "dpc-pc", seed=0, out=tmp_path / "p.pt", steps=4)
+    expected = [0.5 * (0.1 + 0.45 * (1.0 + math.cos(math.pi * k / 4))) for k in range(4)]
+    assert [rate for rate, _, _ in steps] == pytest.approx(expected)
+    assert expected[0] == 0.5 and expected[2] == pytest.approx(0.275)
+    assert max(norm for _, _, norm in steps) <= 1.0 + 1e-5  # clipped
+
+
+@pytest.mark.parametrize("alternating", [True, False])
+def test_decoders_are_trained_in_turn(tmp_path, scenario, steps, alternating):
+    """First the perimeter's, then that of the split ratios; the backbone always."""
+    options = {"alternating": alternating, "batch": 2, "width": 4}
+    training.train(replace(scenario, controller_options={"dpc-pcrg": options}), "dpc-pcrg", seed=0,
+                   out=tmp_path / "p.pt", steps=2)
+    names = [name for name, _ in made(scenario, guidance=True).named_parameters()]
+    for (_, given, _), left in zip(steps, ("splits_decoder", "perimeter_decoder"), strict=True):
+        for name, has in zip(names, given, strict=True):
+            assert has == (not (alternating and name.startswith(left))), name
+
+
+def test_the_best_validation_is_kept_and_told(tmp_path, scenario, monkeypatch):
+    scores, logged, notes = iter([7.0, 5.0, 6.0]), [], []
+    monkeypatch.setattr(training, "VALIDATE_EVERY", 2)
+    monkeypatch.setattr(training, "validate", lambda *_: next(scores))
+    options = {"batch": 2, "width": 4}
+    out = training.train(
+        replace(scenario, controller_options={"dpc-pc": options}), "dpc-pc", seed=3, out=tmp_path / "p.pt", steps=5,
+        log=lambda done, score: logged.append((done, score)), progress=lambda *note: notes.append(note))
+    assert logged == [(2, 7.0), (4, 5.0), (5, 6.0)]
+    assert notes == [(1, 5, "best inf veh s"), (2, 5, "best 7 veh s"), (3, 5, "best 7 veh s"), (4, 5, "best 5 veh s"),
+                     (5, 5, "best 5 veh s")]
+    configuration = torch.load(out, weights_only=True)["configuration"]
+    assert configuration["validation_veh_s"] == 5.0
+    assert {key: configuration[key] for key in ("controller", "scenario", "seed", "compiled", "steps", "batch")} == {
+        "controller": "dpc-pc", "scenario": "tiny", "seed": 3, "compiled": False, "steps": 5, "batch": 2}
+
+
+def test_a_training_that_diverges_says_so(tmp_path, scenario, monkeypatch):
+    monkeypatch.setattr(training, "validate", lambda *_: math.nan)
+    options = {"batch": 2, "width": 4}
+    with pytest.raises(RunFailed, match="dpc-pc: every validation of 2 steps diverged; lower the learning rate"):
+        training.train(replace(scenario, controller_options={"dpc-pc": options}), "dpc-pc", seed=0,
+                       out=tmp_path / "p.pt", steps=2)
+
+
+def test_the_states_that_a_policy_sees(scenario):
+    """As a share of its scale, of four batches and all intervals; the same seed, the same states."""
+    policy, rollout = made(scenario), Rollout(planning_model(scenario))
+    chosen = training.Training(batch=3, mfd_spread=0.2, noise=0.5)
+    seen = [training.visited(policy, rollout, chosen, seed) for seed in (0, 0, 1)]
+    assert seen[0].shape == (20 * 12, 4) and np.isfinite(seen[0]).all()
+    assert (seen[0] == seen[1]).all() and (seen[0] != seen[2]).any()
+    assert seen[0].std() > 0.0 and np.abs(seen[0]).max() < 10.0
