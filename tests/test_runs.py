@@ -5,6 +5,7 @@ import hashlib
 import io
 import json
 import os
+import termios
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from trajectories import trajectory
 
 from cosim.plant.record import Record
 from nmfd import quantities
-from nmfd.cli.progress import ProgressLine, progress_line
+from nmfd.cli.progress import progress_line
 from nmfd.errors import InputError
 from nmfd.runs import files, run_folder, workers
 from nmfd.types import Trajectory
@@ -219,18 +220,30 @@ class Terminal(io.StringIO):
 
 
 def test_progress_is_shown_on_a_terminal_only_and_wiped():
-    with progress_line("x", io.StringIO()) as line:
-        assert line is None
+    with progress_line("x", io.StringIO()) as show:
+        assert show is None
     stream = Terminal()
-    with progress_line("training", stream) as line:
-        line(1, 4, "best 3")
-    drawn, wiped = stream.getvalue().split("\r")[1], stream.getvalue().split("\r")[2]
-    assert drawn.startswith("training  [######....") and drawn.endswith("best 3")
-    assert wiped == " " * len(drawn) and stream.getvalue().endswith("\r")
+    with progress_line("training", stream) as show:
+        show(0, 4, "best 3")
+    *_, drawn, wiped, end = stream.getvalue().split("\r")
+    assert drawn.startswith("training  [....") and "0/4" in drawn and drawn.endswith("best 3")
+    assert wiped.isspace() and len(wiped) >= len(drawn) and end == ""
 
 
-def test_progress_line_fits_the_terminal(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "30")
+def test_progress_line_fits_the_terminal():
+    behind, terminal = os.openpty()
+    termios.tcsetwinsize(terminal, (24, 30))
+    with open(terminal, "w") as stream, progress_line("training", stream) as show:
+        show(0, 4, "a long note")
+    drawn = os.read(behind, 1000).decode().split("\r")
+    os.close(behind)
+    assert max(map(len, drawn)) < 30 and any("training" in line for line in drawn)
+
+
+def test_progress_begins_again_with_another_total():
+    """Studies count runs, then iterations: the remaining time is that of what is shown."""
     stream = Terminal()
-    ProgressLine("training", stream)(1, 4, "a long note")
-    assert len(stream.getvalue()) == 30  # with the carriage return
+    with progress_line("identify", stream) as show:
+        show(3, 4)
+        show(0, 100, "fitting")
+    assert "0/100  ? left, fitting" in stream.getvalue().split("\r")[-3]
