@@ -5,11 +5,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from jaxtyping import config, install_import_hook
 from xdist.workermanage import NodeManager
 
 sys.dont_write_bytecode = False  # else every process rewrites the asserts of all files anew, for 6 s
 # Here and in the commands that tests call: workers must not fight for cores. Torch reads it when it is imported.
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+install_import_hook("nmfd", "annotations.check")  # before anything of it is imported
 
 ALLOWED = ("no GPU", "no real city")  # reasons for which a test may be skipped all the same
 
@@ -41,6 +43,12 @@ def _fail_if_skipped(report: pytest.TestReport | pytest.CollectReport, config: p
         reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
         if not any(allowed in reason for allowed in config.getoption("may_skip")):
             report.outcome, report.longrepr = "failed", f"--no-skips: {reason}"
+
+
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests of what we say to users whose arguments are of a wrong type."""
+    monkeypatch.setattr(config, "jaxtyping_disable", True)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -6,7 +6,8 @@ import numpy as np
 
 from nmfd.closed_loop import noise_of, noisy
 from nmfd.model.regional_model import RegionalModel
-from nmfd.types import Controls, Observation
+from nmfd.model.scenario import Scenario
+from nmfd.types import Controls, Observation, Plant
 
 LOGITS = 5.0  # actions in [-1, 1] times this are the logits of the split ratios: up to e^10 between two ways
 
@@ -28,7 +29,7 @@ class Interface:
         self, network: RegionalModel, *, guidance: bool = False, metering: bool = False,
         regions: Sequence[int] | None = None,
     ):
-        self._network, self._guidance = network, guidance
+        self._network = network
         chosen = np.arange(network.regions) if regions is None else np.array(regions)
         self._chosen, self._all = chosen, regions is None
         self._critical = np.array([mfd.critical for mfd in network.mfds])
@@ -39,7 +40,7 @@ class Interface:
         entered, gate = np.unique(self._boundaries[1], return_inverse=True)
         self._gate = gate if metering else np.arange(len(gate))  # which number of an action is u of each boundary
         self._count = len(entered) if metering else len(gate)
-        self.action_size = self._count + (len(self._ways[0]) if guidance else 0)
+        self.action_size = self._count + (0 if self._ways is None else len(self._ways[0]))
         self.observation_size = len(chosen) * (network.regions + 1) + (0 if self._all else network.regions)
         self._open = np.where(network.adjacency, network.u_max, 0.0)
         # The split ratios of these regions that no action decides: where there is one way only.
@@ -70,7 +71,7 @@ class Interface:
 
     def splits(self, action: np.ndarray) -> np.ndarray | None:
         """(..., R, R, R) [-] of actions (..., action_size), 0 in other regions; None without guidance."""
-        if not self._guidance:
+        if self._ways is None:
             return None
         action = np.clip(np.asarray(action, dtype=float)[..., self._count:], -1.0, 1.0)
         weight = np.zeros((*action.shape[:-1], *self._rest.shape))
@@ -97,10 +98,9 @@ def combined(parts: dict[int, Controls], network: RegionalModel) -> Controls:
 class Episode:
     """A closed loop that is stepped from outside, with the noise and states of nmfd.closed_loop.run of one seed."""
 
-    def __init__(self, scenario, plant):
-        self.scenario, self._plant = scenario, plant
+    def __init__(self, scenario: Scenario, plant: Plant):
+        self.scenario, self._plant, self._closed = scenario, plant, False
         self.unit = sum(mfd.critical for mfd in scenario.network.mfds)  # [veh]
-        self._state = None
 
     def reset(self, seed: int) -> Observation:
         """What the agent sees at the beginning."""
@@ -121,9 +121,10 @@ class Episode:
         return self._state.completed
 
     def close(self) -> None:
-        if self._plant is not None:
+        """Close the plant, once."""
+        if not self._closed:
             self._plant.close()
-            self._plant = None
+            self._closed = True
 
     def _seen(self) -> Observation:
         noise = self.scenario.measurement_std * self._random.standard_normal(self._state.accumulation.shape)
