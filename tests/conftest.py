@@ -11,7 +11,6 @@ from xdist.workermanage import NodeManager
 sys.dont_write_bytecode = False  # else every process rewrites the asserts of all files anew, for 6 s
 # Here and in the commands that tests call: workers must not fight for cores. Torch reads it when it is imported.
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-install_import_hook("nmfd", "annotations.check")  # before anything of it is imported
 
 ALLOWED = ("no GPU", "no real city")  # reasons for which a test may be skipped all the same
 
@@ -21,6 +20,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--no-skips", action="store_true", help="a skipped test fails, unless a GPU or a real city is missing")
     parser.addoption(
         "--may-skip", action="append", default=[*ALLOWED], metavar="REASON", help="nor does it fail for this reason")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Annotations are checked at every call, but where times are measured, and mutmut has wrapped every function."""
+    if not config.getoption("benchmark_only") and "MUTANT_UNDER_TEST" not in os.environ:
+        install_import_hook("nmfd", "annotations.check")
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
@@ -47,7 +52,7 @@ def _fail_if_skipped(report: pytest.TestReport | pytest.CollectReport, config: p
 
 @pytest.fixture
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For tests of what we say to users whose arguments are of a wrong type."""
+    """No check of annotations: for tests of what users are told who give something of a wrong type."""
     monkeypatch.setattr(config, "jaxtyping_disable", True)
 
 

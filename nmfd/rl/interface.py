@@ -3,11 +3,16 @@
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
+from nmfd.arrays import PerRegion
 from nmfd.closed_loop import noise_of, noisy
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, Plant
+
+Pairs = Float[np.ndarray, "*#B R R"]  # of some states or controls, or of one
+Actions = Float[np.ndarray, "*B A"]
 
 LOGITS = 5.0  # actions in [-1, 1] times this are the logits of the split ratios: up to e^10 between two ways
 
@@ -46,7 +51,7 @@ class Interface:
         # The split ratios of these regions that no action decides: where there is one way only.
         self._rest = np.where(network.split_mask & ~choice & mine[:, None, None], network.nominal_splits, 0.0)
 
-    def observation(self, accumulation: np.ndarray, backlog: np.ndarray) -> np.ndarray:
+    def observation(self, accumulation: Pairs, backlog: Pairs) -> Float[np.ndarray, "*B O"]:
         """(..., observation_size) of accumulation (..., R, R) and backlog (..., R, R) [veh]."""
         batch, chosen = accumulation.shape[:-2], self._chosen
         parts = [
@@ -56,11 +61,11 @@ class Interface:
             parts.append(accumulation.sum(axis=-1) / self._critical)
         return np.concatenate(parts, axis=-1, dtype=np.float32)
 
-    def observed(self, observation: Observation) -> np.ndarray:
+    def observed(self, observation: Observation) -> Float[np.ndarray, " O"]:
         """(observation_size,) of what a controller sees."""
         return self.observation(observation.accumulation, observation.backlog)
 
-    def perimeter(self, action: np.ndarray) -> np.ndarray:
+    def perimeter(self, action: Actions) -> Pairs:
         """(..., R, R) [-] of actions (..., action_size); u_max at the boundaries of other regions."""
         network = self._network
         share = 0.5 * (np.clip(np.asarray(action, dtype=float)[..., :self._count], -1.0, 1.0) + 1.0)
@@ -69,7 +74,7 @@ class Interface:
             network.u_min + (network.u_max - network.u_min) * share[..., self._gate])
         return perimeter
 
-    def splits(self, action: np.ndarray) -> np.ndarray | None:
+    def splits(self, action: Actions) -> Float[np.ndarray, "*B R R R"] | None:
         """(..., R, R, R) [-] of actions (..., action_size), 0 in other regions; None without guidance."""
         if self._ways is None:
             return None
@@ -79,7 +84,7 @@ class Interface:
         sums = weight.sum(axis=-2, keepdims=True)
         return self._rest + weight / np.where(sums > 0, sums, 1.0)
 
-    def controls(self, action: np.ndarray) -> Controls:
+    def controls(self, action: Float[np.ndarray, " A"]) -> Controls:
         """Of one action (action_size,)."""
         return Controls(perimeter=self.perimeter(action), splits=self.splits(action))
 
@@ -108,7 +113,7 @@ class Episode:
         self._state, self.steps = self._plant.reset(seed), 0
         return self._seen()
 
-    def step(self, controls: Controls) -> tuple[Observation, np.ndarray, bool]:
+    def step(self, controls: Controls) -> tuple[Observation, PerRegion, bool]:
         """What the agent sees next; vehicles (R,) [veh] in and before each region when the interval began; the end."""
         spent = (self._state.accumulation + self._state.backlog).sum(axis=1)
         self._state = self._plant.step(controls)
