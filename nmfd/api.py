@@ -78,7 +78,8 @@ def benchmark(
     out: the run folder, runs/<scenario>-<time> if None; finished runs in it are kept
     policies: controller -> file, if not SCENARIO/NAME.pt
 
-    `nmfd.table(rows)` gives the text that the command prints. Raises InputError and nmfd.runs.workers.RunFailed.
+    `nmfd.summary_table(rows)` gives the text that the command prints.
+    Raises InputError and nmfd.runs.workers.RunFailed.
     """
     scenario = _loaded(scenario)
     return benchmarks.benchmark(

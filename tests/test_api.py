@@ -75,7 +75,7 @@ def test_run_and_benchmark_agree_with_the_command_line(tmp_path):
     nmfd.write_trajectory(tmp_path / "same.nc", trajectory)
     assert (tmp_path / "same.nc").read_bytes() == (out / "pi-gating-1.nc").read_bytes()
     rows = nmfd.benchmark(folder, ["pi-gating"], seeds=2, out=out)
-    assert rows == run_folder.read_summary(out / "summary.csv") and nmfd.table(rows) in done.output
+    assert rows == run_folder.read_summary(out / "summary.csv") and nmfd.summary_table(rows) in done.output
 
 
 class Half:

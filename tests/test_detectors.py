@@ -170,14 +170,15 @@ def test_same_seed_same_bytes(scenario, run, tmp_path):
 
 
 def test_table_and_picture(scenario, run, tmp_path):
-    rows = estimation_errors.write(tmp_path, scenario.network, [run, replace(run, seed=4, estimated=False)])
+    rows = estimation_errors.write_errors(tmp_path, scenario.network, [run, replace(run, seed=4, estimated=False)])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate-pi-gating-3.png", "estimation.csv"]
     assert len(pd.read_csv(tmp_path / "estimation.csv")) == len(rows) == 8
-    assert "x_ij RMSE" in estimation_errors.table(rows) and "mean of the regions" in estimation_errors.table(rows)
+    shown = estimation_errors.error_table(rows)
+    assert "x_ij RMSE" in shown and "mean of the regions" in shown
     ax = plots.region_estimate(plots.figure(4.0, 3.0).subplots(), scenario.network, 3, run)
     lines = [line.get_ydata() for line in ax.get_lines()]
     np.testing.assert_allclose(lines, [run.accumulation[:, 3].sum(axis=1), run.observed[:, 3].sum(axis=1)])
-    assert estimation_errors.write(tmp_path / "none", scenario.network, [replace(run, estimated=False)]).empty
+    assert estimation_errors.write_errors(tmp_path / "none", scenario.network, [replace(run, estimated=False)]).empty
 
 
 @pytest.mark.parametrize("lines, problem", [

@@ -12,10 +12,8 @@ from commands import cosim
 
 from cosim.evaluation import evaluate, experiment
 from cosim.evaluation.simulate import FACTS, Result
-from cosim.plant.record import Record
 from cosim.report import pictures
 from nmfd.errors import InputError
-from nmfd.quantities import quantities
 from nmfd.runs.workers import Failure
 
 ROOT = Path(__file__).parents[1]
@@ -55,8 +53,7 @@ def made_up(task) -> Result:
         backlog=np.zeros((3, 7, 7)), completed=np.zeros(3), perimeter=np.ones((2, 7, 7)),
         splits=np.zeros((2, 7, 7, 7)), decision_time=np.zeros(2), wall_time=1.0)
     facts = {name: 0 for name in FACTS} | {"controller": task.controller, "seed": task.seed}
-    record = {name: np.zeros([2] + [7] * (len(about["dimensions"]) - 1)) for name, about in quantities(Record).items()}
-    return Result(trajectory=trajectory, record=record, facts=facts)
+    return Result(trajectory=trajectory, record=trajectories.record(2, regions=7), facts=facts)
 
 
 def evaluation(city, tmp_path, *, controllers=("no-control", "pi-gating"), seeds=(2000, 2001), **others):

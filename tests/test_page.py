@@ -15,7 +15,7 @@ from made_up import rows_of
 
 from cosim.evaluation import results
 from cosim.evaluation import statistics as tables
-from cosim.report import html, markup, summary_text
+from cosim.report import html, summary_text
 
 VOID = {"meta", "link", "img", "br"}
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -100,7 +100,7 @@ def test_why_a_strategy_gains_is_told(content, evaluation):
     assert len(lines) == 2 * 2 and "Signals under control see" in why
     words = Page(content).words
     for line in [*lines, *(line for line in why.splitlines() if line.startswith("Signals under"))]:
-        assert markup.typeset(line) in words, line
+        assert html.typeset(line) in words, line
 
 
 def test_every_number_of_the_tables_is_there(content, evaluation):
@@ -267,7 +267,7 @@ def test_the_words_name_what_is_uneven_late_or_lost():
 
 
 def test_minus_signs_and_units():
-    assert markup.typeset("rerouting-30: -5.1 to +2 %") == "rerouting-30: \N{MINUS SIGN}5.1 to +2\N{NO-BREAK SPACE}%"
+    assert html.typeset("rerouting-30: -5.1 to +2 %") == "rerouting-30: \N{MINUS SIGN}5.1 to +2\N{NO-BREAK SPACE}%"
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium")

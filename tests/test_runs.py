@@ -5,18 +5,20 @@ import hashlib
 import io
 import json
 import os
+import termios
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trajectories
 import xarray as xr
 from trajectories import trajectory
 
 from cosim.plant.record import Record
 from nmfd import quantities
-from nmfd.cli.progress import ProgressLine, progress_line
+from nmfd.cli.progress import progress_line
 from nmfd.errors import InputError
 from nmfd.runs import files, run_folder, workers
 from nmfd.types import Trajectory
@@ -44,7 +46,7 @@ def test_trajectory_round_trip_and_same_bytes(tmp_path):
 
 def test_the_same_run_gives_the_same_bytes_at_another_time(tmp_path, monkeypatch):
     """HDF5 can keep times of its objects."""
-    more = quantities.variables(Record, made_up_record())
+    more = quantities.variables(Record, trajectories.record(4, regions=2))
     run_folder.write_trajectory(tmp_path / "a.nc", trajectory(), more)
     time.sleep(1.1)
     run_folder.write_trajectory(tmp_path / "b.nc", trajectory(), more)
@@ -52,15 +54,8 @@ def test_the_same_run_gives_the_same_bytes_at_another_time(tmp_path, monkeypatch
     assert hashlib.sha256(first).digest() == hashlib.sha256(second).digest()
 
 
-def made_up_record(steps=4):
-    """One array of a record in SUMO for each: 2 regions, 3 gateways, 5 edges."""
-    sizes = {"interval": steps, "gateway": 3, "edge": 5}
-    return {name: np.random.default_rng(0).random([sizes.get(axis, 2) for axis in about["dimensions"]])
-            for name, about in quantities.quantities(Record).items()}
-
-
 def test_xarray_opens_a_run_with_names_and_units(tmp_path):
-    original, record = replace(trajectory(), estimated=True), made_up_record()
+    original, record = replace(trajectory(), estimated=True), trajectories.record(4, regions=2)
     run_folder.write_trajectory(tmp_path / "a.nc", original, quantities.variables(Record, record))
     with xr.open_dataset(tmp_path / "a.nc") as data:
         assert dict(data.sizes) == {
@@ -106,7 +101,8 @@ def test_a_folder_of_an_older_version_says_what_to_run(tmp_path, plant, command)
         (tmp_path / "manifest.json").write_text(json.dumps({
             "configuration": {"plant": plant}, "controllers": {"no-control": {}, "pi-gating": {}},
             "sessions": [{"scenario_folder": "scenarios/x"}]}))
-    for use in (lambda: run_folder.read_trajectory(tmp_path / "no-control-0.nc"), lambda: opened(tmp_path).__enter__()):
+    for use in (lambda: run_folder.read_trajectory(tmp_path / "no-control-0.nc"), lambda: opened(tmp_path).__enter__(),
+                lambda: run_folder.read_summary(tmp_path / "summary.csv")):
         with pytest.raises(InputError, match=f"older version .*; delete it and run again: {command}$"):
             use()
 
@@ -225,18 +221,30 @@ class Terminal(io.StringIO):
 
 
 def test_progress_is_shown_on_a_terminal_only_and_wiped():
-    with progress_line("x", io.StringIO()) as line:
-        assert line is None
+    with progress_line("x", io.StringIO()) as show:
+        assert show is None
     stream = Terminal()
-    with progress_line("training", stream) as line:
-        line(1, 4, "best 3")
-    drawn, wiped = stream.getvalue().split("\r")[1], stream.getvalue().split("\r")[2]
-    assert drawn.startswith("training  [######....") and drawn.endswith("best 3")
-    assert wiped == " " * len(drawn) and stream.getvalue().endswith("\r")
+    with progress_line("training", stream) as show:
+        show(0, 4, "best 3")
+    *_, drawn, wiped, end = stream.getvalue().split("\r")
+    assert drawn.startswith("training  [....") and "0/4" in drawn and drawn.endswith("best 3")
+    assert wiped.isspace() and len(wiped) >= len(drawn) and end == ""
 
 
-def test_progress_line_fits_the_terminal(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "30")
+def test_progress_line_fits_the_terminal():
+    behind, terminal = os.openpty()
+    termios.tcsetwinsize(terminal, (24, 30))
+    with open(terminal, "w") as stream, progress_line("training", stream) as show:
+        show(0, 4, "a long note")
+    drawn = os.read(behind, 1000).decode().split("\r")
+    os.close(behind)
+    assert max(map(len, drawn)) < 30 and any("training" in line for line in drawn)
+
+
+def test_progress_begins_again_with_another_total():
+    """Studies count runs, then iterations: the remaining time is that of what is shown."""
     stream = Terminal()
-    ProgressLine("training", stream)(1, 4, "a long note")
-    assert len(stream.getvalue()) == 30  # with the carriage return
+    with progress_line("identify", stream) as show:
+        show(3, 4)
+        show(0, 100, "fitting")
+    assert "0/100  ? left, fitting" in stream.getvalue().split("\r")[-3]

@@ -58,7 +58,7 @@ def made_up(task) -> Result:
         backlog=np.zeros((3, 7, 7)), completed=np.arange(3.0), perimeter=np.zeros((2, 7, 7)),
         splits=np.zeros((2, 7, 7, 7)), decision_time=np.ones(2), wall_time=1.0)
     facts = {**dict.fromkeys(FACTS, 1.0), "controller": task.controller, "seed": task.seed}
-    return Result(trajectory=trajectory, record={"production": np.zeros((2, 7))}, facts=facts)
+    return Result(trajectory=trajectory, record=trajectories.record(2, regions=7), facts=facts)
 
 
 def test_a_failed_run_is_a_row_and_is_tried_again(peak, tmp_path, ran):

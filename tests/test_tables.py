@@ -56,7 +56,7 @@ def test_pairs_hold_every_pair_in_both_directions(rows):
 
 
 def test_tables_show_a_line_per_controller_and_the_teleports(rows, tmp_path):
-    table = statistics.write(tmp_path, rows, "pi-gating")
+    table = statistics.write_tables(tmp_path, rows, "pi-gating")
     text, page = statistics.text(table, "pi-gating"), (tmp_path / "evaluate.md").read_text()
     assert "Demand times 1.3" in text and "against pi-gating" in text and "%*" in text
     first = next(line for line in page.splitlines() if line.startswith("| dpc-pc"))

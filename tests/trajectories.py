@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from cosim.plant.record import Record
+from nmfd.quantities import quantities
 from nmfd.types import Status, Trajectory
 
 
@@ -12,6 +14,13 @@ def made(**fields) -> Trajectory:
         "observed": fields["accumulation"], "observed_backlog": fields["backlog"], "estimated": False,
         "decision_time": np.zeros(steps), "status": np.zeros(steps, dtype=int), "note": ("",) * steps, "wall_time": 1.0}
     return Trajectory(**usual | fields)
+
+
+def record(steps: int, *, regions: int, gateways: int = 3, edges: int = 5) -> dict[str, np.ndarray]:
+    """The arrays of a Record, at random."""
+    sizes, random = {"interval": steps, "gateway": gateways, "edge": edges}, np.random.default_rng(0)
+    return {name: random.random([sizes.get(axis, regions) for axis in about["dimensions"]])
+            for name, about in quantities(Record).items()}
 
 
 def trajectory(controller="no-control", seed=0, steps=4):

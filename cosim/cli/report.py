@@ -37,7 +37,7 @@ def report(folders: tuple[Path, ...], out: Path | None, reference: str | None, s
     if reference is not None and reference not in known:
         raise InputError(f"--reference: {reference!r} is not in these runs; choose from {', '.join(sorted(known))}")
     with progress_line("report") as progress:
-        path = html.write(out or folders[0] / "report.html", found, reference, progress)
+        path = html.write_page(out or folders[0] / "report.html", found, reference, progress)
     click.echo(f"Written to {path}: open it in a browser")
 
 

@@ -64,7 +64,7 @@ def run(
              faults=faults)
         for name in names]
     out, rows = _experiment(tasks, out, kinds)
-    click.echo(experiment.table(rows))
+    click.echo(experiment.overview_table(rows))
     if parquet:
         from nmfd.runs import frames, run_folder  # heavy
 
@@ -72,7 +72,7 @@ def run(
     if (out / "estimation.csv").is_file():
         import pandas as pd
 
-        click.echo(estimation_errors.table(pd.read_csv(out / "estimation.csv")))
+        click.echo(estimation_errors.error_table(pd.read_csv(out / "estimation.csv")))
     click.echo(f"Written to {out}: see total_accumulation.png and region_accumulation.png")
 
 
@@ -138,8 +138,8 @@ def compare(
     result = experiment.read_run(out, controller, seed)
     scenario = scenario_of(task)
     scenario = replace(scenario, network=strategy.planning_of(scenario, controller, model).network)
-    rows = model_validation.write(out, scenario, result)
-    click.echo(model_validation.table(rows))
+    rows = model_validation.write_comparison(out, scenario, result)
+    click.echo(model_validation.error_table(rows))
     name = run_folder.run_name(controller, seed)
     click.echo(f"Written to {out}: see compare-{name}-accumulation.png and ...-mfd.png")
 
@@ -149,8 +149,8 @@ def _foresight(target: Path, model: Path | None) -> None:
     from cosim.evaluation import prediction_error, results  # heavy
 
     found = prediction_error.foresee(results.read(target), model)
-    prediction_error.write(target / "foresight.csv", found)
-    click.echo(prediction_error.table(found))
+    prediction_error.write_foresights(target / "foresight.csv", found)
+    click.echo(prediction_error.foresight_table(found))
     click.echo(f"Written to {target / 'foresight.csv'}")
 
 

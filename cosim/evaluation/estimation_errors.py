@@ -8,6 +8,7 @@ import pandas as pd
 
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files, run_folder
+from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
 from nmfd.types import Trajectory
 
@@ -15,7 +16,7 @@ COLUMNS = (
     "controller", "seed", "region", "name", "critical_veh", "mean_veh", "rmse_veh", "rmse_share", "bias_veh",
     "cell_rmse_veh")
 CAPTION = (
-    "estimate against exact accumulation of a region: RMSE, also as a share of the critical accumulation; bias > 0:\n"
+    "estimate against exact accumulation of a region: RMSE, also as a share of the critical accumulation; bias > 0: "
     "too many; x_ij RMSE: of the single cells (region, destination) in which there were vehicles; mean over runs")
 
 
@@ -40,7 +41,7 @@ def errors(network: RegionalModel, trajectory: Trajectory) -> list[dict]:
     return [*rows, {name: whole[name] for name in COLUMNS}]
 
 
-def write(folder: Path, network: RegionalModel, trajectories: Sequence[Trajectory]) -> pd.DataFrame:
+def write_errors(folder: Path, network: RegionalModel, trajectories: Sequence[Trajectory]) -> pd.DataFrame:
     """estimation.csv, and one picture per run that was controlled on estimates; nothing without such a run."""
     estimated = [trajectory for trajectory in trajectories if trajectory.estimated]
     rows = pd.DataFrame([row for trajectory in estimated for row in errors(network, trajectory)], columns=COLUMNS)
@@ -58,7 +59,7 @@ def write(folder: Path, network: RegionalModel, trajectories: Sequence[Trajector
     return rows
 
 
-def table(rows: pd.DataFrame) -> str:
+def error_table(rows: pd.DataFrame) -> str:
     """The errors as text: one line per controller and region, means over seeds."""
     numbers = ["critical_veh", "mean_veh", "rmse_veh", "rmse_share", "bias_veh", "cell_rmse_veh"]
     keys = ["controller", "region", "name"]
@@ -66,9 +67,8 @@ def table(rows: pd.DataFrame) -> str:
     for column in numbers:
         shown[column] = [
             f"{100 * value:.1f} %" if column == "rmse_share" else f"{value:.1f}" for value in shown[column]]
-    shown.columns = [
-        "controller", "region", "name", "critical", "mean", "RMSE", "of critical", "bias", "x_ij RMSE"]
-    return shown.to_string(index=False) + "\n" + CAPTION
+    headings = ["controller", "region", "name", "critical", "mean", "RMSE", "of critical", "bias", "x_ij RMSE"]
+    return text_columns(headings, shown.to_numpy(), CAPTION)
 
 
 def _rms(values) -> float:

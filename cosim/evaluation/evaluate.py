@@ -64,10 +64,10 @@ def evaluate(
             f"--reference: {evaluation.reference!r} is neither among --controllers nor in {out}; add it to them")
     failures = experiment.perform(
         evaluation.plan(), workers=workers, fresh=True, progress=progress, tell=tell,
-        kept=lambda: statistics.write(out, all_runs(evaluation), None))
+        kept=lambda: statistics.write_tables(out, all_runs(evaluation), None))
     rows, table = all_runs(evaluation), pd.DataFrame()
     if len(rows):
-        table = statistics.write(out, rows, evaluation.reference)
+        table = statistics.write_tables(out, rows, evaluation.reference)
         scenario = load_scenario(evaluation.scenario)
         why = explain.text(level_folders(out), scenario.network, rows)
         files.write_text(out / "evaluate.md", statistics.markdown(table, evaluation.reference) + "\n" + why)

@@ -30,13 +30,14 @@ from nmfd.model.scenario import Scenario
 from nmfd.quantities import quantities, variables
 from nmfd.runs import files as disk
 from nmfd.runs import run_folder
+from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
 from nmfd.studies.benchmark import REFERENCE, draw_accumulations, interval
 
 # Of loading runs: whether they guide routes, and so depend on the drivers' own split ratios.
 LOADING = {"probing-pc": False, "probing-pcrg": True, "route-guidance": True}
 CAPTION = (
-    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; backlog: not\n"
+    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; backlog: not "
     "inserted at the end; step: median / longest decision; outside SUMO: share of the wall time not in its own step")
 
 
@@ -53,7 +54,7 @@ def experiment(
     if (out / "summary.csv").is_file() and (kept := run_folder.trajectories(out)):
         scenario = scenario_of(tasks[0])
         draw_accumulations(out, scenario, kept)
-        estimation_errors.write(out, scenario.network, kept)
+        estimation_errors.write_errors(out, scenario.network, kept)
     if failures:
         raise ended([(label(task), failure) for task, failure in failures])
     return overview(out)
@@ -241,7 +242,7 @@ def read_facts(path: Path) -> pd.DataFrame:
         raise InputError(f"{path}: is no table of runs ({error}); delete the folder and run again") from None
 
 
-def table(rows: pd.DataFrame) -> str:
+def overview_table(rows: pd.DataFrame) -> str:
     """The overview as text: one line per controller, means over seeds, TTS with its 95 % interval."""
     reference = rows.loc[rows["controller"] == REFERENCE, "total_time_spent_veh_s"]
     lines = []
@@ -258,4 +259,4 @@ def table(rows: pd.DataFrame) -> str:
             **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
             "wall [s]": f"{group['wall_time_s'].mean():.0f}",
             "outside SUMO": f"{100 * group['overhead_share'].mean():.1f} %"})
-    return pd.DataFrame(lines).to_string(index=False) + "\n" + CAPTION
+    return text_table(lines, CAPTION)

@@ -16,6 +16,7 @@ from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
+from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
 from nmfd.types import Controls, Observation, Trajectory
 
@@ -25,7 +26,7 @@ COLUMNS = (
 COLLAPSED = 0.7  # of the largest outflow so far
 HELD_UP = "held up by a neighbour"
 CAPTION = (
-    "RMSE, bias: of the accumulation that the regional model predicts for the whole run from its start [veh]; next\n"
+    "RMSE, bias: of the accumulation that the regional model predicts for the whole run from its start [veh]; next "
     "interval: predicted one control interval ahead from every recorded state; bias > 0: the model holds too many")
 
 
@@ -143,19 +144,19 @@ def held_up(accumulation: np.ndarray, outflow: np.ndarray, adjacency: np.ndarray
     return (collapsed[:, None, :] & earlier[None]).any(axis=2)
 
 
-def table(rows: pd.DataFrame) -> str:
+def error_table(rows: pd.DataFrame) -> str:
     """The errors as text."""
     shown = rows.copy()
     for column in ("critical_veh", "mean_veh", "rmse_veh", "bias_veh", "next_interval_rmse_veh"):
         shown[column] = [f"{value:.1f}" for value in rows[column]]
     for column in ("rmse_share", "next_interval_rmse_share"):
         shown[column] = [f"{100 * value:.1f} %" for value in rows[column]]
-    shown.columns = [
+    headings = [
         "region", "name", "critical", "mean", "RMSE", "of critical", "bias", "next interval RMSE", "of critical"]
-    return shown.to_string(index=False) + "\n" + CAPTION
+    return text_columns(headings, shown.to_numpy(), CAPTION)
 
 
-def write(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
+def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
     """Compare, and add compare-<run>.csv and two pictures to the run folder; returns the rows of `errors`."""
     predicted = predict(scenario, result)
     rows = pd.DataFrame(errors(scenario, result, predicted), columns=COLUMNS)

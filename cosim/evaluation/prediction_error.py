@@ -17,13 +17,14 @@ from nmfd.model import identification
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
+from nmfd.runs.tables import text_table
 
 COLUMNS = (
     "demand", "controller", "runs", "model", "region", "critical_veh", "most_share", "next_interval_rmse_share",
     "ahead_s", "ahead_rmse_share")
 CAPTION = (
-    "RMSE of the predicted accumulation, predicted from every recorded state under the recorded departures and\n"
-    "controls, as a share of the region's critical accumulation, mean of the regions; most: the largest accumulation\n"
+    "RMSE of the predicted accumulation, predicted from every recorded state under the recorded departures and "
+    "controls, as a share of the region's critical accumulation, mean of the regions; most: the largest accumulation "
     "of any region in any of the runs, as a share of its critical one")
 
 
@@ -74,17 +75,16 @@ def _of(
             integrator=scenario.integrator))
 
 
-def table(foresights: Sequence[Foresight]) -> str:
+def foresight_table(foresights: Sequence[Foresight]) -> str:
     """As text, one line per strategy and demand level."""
-    rows = [{
+    return text_table([{
         "demand": f"{one.demand:g}", "controller": one.controller, "runs": one.runs,
         "model": one.model.name if one.model else "", "most": f"{one.most.max():.1f}",
         "next interval": f"{100 * one.errors[0].mean():.1f} %",
-        "later": f"{100 * one.errors[1].mean():.1f} % ({one.ahead:g} s)"} for one in foresights]
-    return pd.DataFrame(rows).to_string(index=False) + "\n" + CAPTION
+        "later": f"{100 * one.errors[1].mean():.1f} % ({one.ahead:g} s)"} for one in foresights], CAPTION)
 
 
-def write(path: Path, foresights: Sequence[Foresight]) -> None:
+def write_foresights(path: Path, foresights: Sequence[Foresight]) -> None:
     """COLUMNS as a table, one row per strategy, demand level and region."""
     rows = [
         (one.demand, one.controller, one.runs, one.model, region, one.critical[region], one.most[region],

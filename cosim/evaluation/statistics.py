@@ -14,6 +14,7 @@ import pandas as pd
 
 from nmfd.metrics import COUNTED
 from nmfd.runs import files
+from nmfd.runs.tables import text_table, wrapped
 from nmfd.studies.benchmark import REFERENCE, interval
 
 TTS = "total_time_spent_veh_s"
@@ -22,11 +23,11 @@ MEANS = (  # columns of summary.csv and sumo.csv of which an evaluation shows th
     "co2_kg", "fuel_kg", "gateway_queue_mean_veh", "gateway_full_share", "control_step_ms_median", "overhead_share",
     "wall_time_s")
 CAPTION = (
-    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; change: of TTS,\n"
-    "paired by seed, mean of the percentages ± 95 % interval, * if that excludes zero; backlog: not inserted at the\n"
-    "end, and its time integral; teleports: all seeds; trip, delay: mean time on the road, and between the wanted and\n"
-    "the real departure, of all trips, unfinished ones with what they had spent at the end; queue: halting on the\n"
-    "edges before gateways, mean / longest; full: share of these edges and intervals that were full; decision: median\n"
+    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; change: of TTS, "
+    "paired by seed, mean of the percentages ± 95 % interval, * if that excludes zero; backlog: not inserted at the "
+    "end, and its time integral; teleports: all seeds; trip, delay: mean time on the road, and between the wanted and "
+    "the real departure, of all trips, unfinished ones with what they had spent at the end; queue: halting on the "
+    "edges before gateways, mean / longest; full: share of these edges and intervals that were full; decision: median "
     "/ longest; " + "; ".join(f"{heading}: {what}" for heading, what in COUNTED.values()))
 
 
@@ -156,9 +157,9 @@ def text(table: pd.DataFrame, reference: str | None = None) -> str:
     """`statistics` for the terminal."""
     parts = []
     for level, part in table.groupby("demand", sort=True):
-        first, second = shown(part, reference)
-        parts += [f"Demand times {level:g}", first.to_string(index=False), "", second.to_string(index=False), ""]
-    return "\n".join([*parts, CAPTION])
+        parts += [f"Demand times {level:g}", *(
+            text_table(rows.to_dict("records")) + "\n" for rows in shown(part, reference))]
+    return "\n".join([*parts, *wrapped(CAPTION)])
 
 
 def markdown(table: pd.DataFrame, reference: str | None = None) -> str:
@@ -166,7 +167,7 @@ def markdown(table: pd.DataFrame, reference: str | None = None) -> str:
     parts = []
     for level, part in table.groupby("demand", sort=True):
         parts += [f"## Demand times {level:g}", *(_markdown(t) for t in shown(part, reference))]
-    return "\n\n".join([*parts, " ".join(CAPTION.split())]) + "\n"
+    return "\n\n".join([*parts, CAPTION]) + "\n"
 
 
 def _markdown(table: pd.DataFrame) -> str:
@@ -174,7 +175,7 @@ def _markdown(table: pd.DataFrame) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def write(folder: Path, rows: pd.DataFrame, reference: str | None = None) -> pd.DataFrame:
+def write_tables(folder: Path, rows: pd.DataFrame, reference: str | None = None) -> pd.DataFrame:
     """evaluate.csv, evaluate.md, pairs.csv and runs.csv in `folder`; returns `statistics`."""
     table = statistics(rows, reference)
     for name, content in (("runs.csv", rows), ("evaluate.csv", table), ("pairs.csv", pairs(rows))):

@@ -20,6 +20,7 @@ from nmfd.api import load_scenario
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.runs.frames import write_parquet
+from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, ended, outcomes
 
 OK, FAILED = "ok", "failed"
@@ -153,4 +154,4 @@ def text(rows: pd.DataFrame) -> str:
         table["completed [veh]"] = good["completed_veh"].mean().map("{:,.0f}".format)
         table["trip [s]"] = good["mean_trip_time_s"].mean().map("{:,.0f}".format)
         table["CO2 [kg]"] = good["co2_kg"].mean().map("{:,.0f}".format)
-    return table.fillna("").reset_index().to_string(index=False)
+    return text_table(table.reset_index().astype(object).fillna("").to_dict("records"))

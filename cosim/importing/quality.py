@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from cosim.importing.baseline import Baseline
 from cosim.importing.streets import Streets, graph
 from cosim.sumo.net import City
+from nmfd.runs.tables import text_table
 
 QUALITY = (
     "region", "name", "edges", "lane_km", "signals", "pieces", "mean_density_veh_km", "variance_before",
@@ -102,16 +103,15 @@ def _signals(streets: Streets, regions: np.ndarray, city: City) -> np.ndarray:
 
 def text(tables: Tables) -> str:
     """The quality table for the terminal."""
-    head = (
-        "region", "lane-km", "signals", "density", "var. before", "within", "gateways", "controlled", "uncontrolled")
-    lines = [f"{head[0]:<18}" + "".join(f"{column:>13}" for column in head[1:])]
+    lines = []
     for row in tables.quality:
         share = "-" if np.isnan(row["uncontrolled_share"]) else f"{100 * row['uncontrolled_share']:.0f} %"
-        cells = (row["lane_km"], row["signals"], row["mean_density_veh_km"], row["variance_before"],
-                 row["variance_within"], row["gateways"], row["controlled_gateways"], share)
         title = row["name"] if row["region"] == "all" else f"{row['region']} {row['name']}"
-        lines.append(f"{title:<18}" + "".join(f"{cell:>13}" for cell in cells))
-    lines.append(
-        "density: vehicles per lane-km in the busiest quarter of an hour without control; its variance over lanes;\n"
-        "uncontrolled: share of the flow over the region's boundary that no controlled signal sees")
-    return "\n".join(lines)
+        lines.append({
+            "region": title, "lane-km": row["lane_km"], "signals": row["signals"],
+            "density": row["mean_density_veh_km"], "var. before": row["variance_before"],
+            "within": row["variance_within"], "gateways": row["gateways"], "controlled": row["controlled_gateways"],
+            "uncontrolled": share})
+    return text_table(
+        lines, "density: vehicles per lane-km in the busiest quarter of an hour without control; its variance over "
+        "lanes; uncontrolled: share of the flow over the region's boundary that no controlled signal sees")

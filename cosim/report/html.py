@@ -1,20 +1,25 @@
 """The report: one HTML file with everything in it, from the finished runs of one or several folders."""
 
+import base64
 import json
+import math
+import re
+import struct
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from cosim.evaluation import explain, statistics
 from cosim.evaluation.results import Finished, Level
 from cosim.report import pictures as report
 from cosim.report import summary_text
-from cosim.report.markup import cell, fold, items, page, picture, table, tag, text, typeset
 from nmfd.runs import files
 from nmfd.runs.scratch import Scratch
 from nmfd.studies.benchmark import REFERENCE
 
+PIXELS = 150.0  # per inch, of the pictures (nmfd.studies.plots.save)
 WORDS = (
     "Total time spent (TTS) adds up the time of all vehicles on the road and of those that wait to enter: less is "
     "better. A vehicle hour is one vehicle for one hour, 3600 veh s. Regions are the districts by which controllers "
@@ -46,125 +51,130 @@ REGIONS = (
 DEMAND = "Total time spent as a share of that without control, over the demand, with 95 % intervals."
 
 
-def write(
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """A picture inside the page: a data URI, and the width at which it was drawn [CSS pixels]."""
+
+    uri: str
+    caption: str
+    width: float
+
+
+def write_page(
     path: Path, found: Sequence[Finished], reference: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """The page of the runs, atomically. reference: a strategy to pair with, besides no control."""
-    total, done, parts = sum(len(run.levels) for run in found), 0, []
+    total, done, runs = sum(len(run.levels) for run in found), 0, []
     for number, run in enumerate(found):
-        body = []
+        levels = []
         for level in run.levels:
-            body.append(_level(run, level, reference))
+            levels.append(_level(run, level, reference))
             done += 1
             if progress:
                 progress(done, total)
-        parts.append(_run(run, f"run-{number}", body))
-    contents = tag("nav", tag("ul", *(
-        tag("li", text("a", run.name, href=f"#run-{number}")) for number, run in enumerate(found))))
-    names = ", ".join(dict.fromkeys(run.scenario.name for run in found))
-    header = text("h1", f"Traffic control in SUMO: {names}") + text("p", WORDS, class_="note")
-    version = found[-1].levels[-1].manifest["sessions"][-1].get("versions", {}).get("perimeter-cosim", "")
-    files.write_text(path, page(
-        f"{names}: report", header + (contents if len(found) > 1 else ""), "\n".join(parts),
-        text("p", f"Made by cosim report from {', '.join(map(str, (run.path for run in found)))}; perimeter-cosim "
-             f"{version}. The page holds everything it shows.")))
+        runs.append({**_run(run), "anchor": f"run-{number}", "levels": levels})
+    environment = Environment(
+        loader=PackageLoader("cosim.report", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True,
+        undefined=StrictUndefined)
+    environment.filters |= {"cell": cell, "typeset": typeset}
+    files.write_text(path, environment.get_template("page.html.j2").render(
+        runs=runs, words=WORDS, caption=statistics.CAPTION,
+        names=", ".join(dict.fromkeys(run.scenario.name for run in found)),
+        paths=", ".join(str(run.path) for run in found),
+        version=found[-1].levels[-1].manifest["sessions"][-1].get("versions", {}).get("perimeter-cosim", "")))
     return path
 
 
-def _run(run: Finished, anchor: str, levels: Sequence[str]) -> str:
+def _run(run: Finished) -> dict:
+    """What the page shows of a folder before its levels, and its configuration."""
     configuration, rows = run.levels[0].manifest["configuration"], run.rows
     first = summary_text.opening(
         run.scenario.name, configuration["steps"], configuration["step_s"], len(run.levels), rows)
-    lead = [text("p", typeset(sentence)) for sentence in (
-        first, *(_at(run, level) + summary_text.head(level.rows) for level in run.levels))]
     with Scratch("cosim-") as folder:
         if run.city is not None:
             report.region_map(folder / "regions.png", run.scenario, run.city)
         if len(run.levels) > 1:
             report.demand_levels(folder / "demand.png", rows)
-        shown = [picture(folder / f"{name}.png", caption) for name, caption in (
-            ("demand", DEMAND), ("regions", REGIONS)) if (folder / f"{name}.png").is_file()]
-    return tag(
-        "section", text("h2", run.name), tag("div", *lead, class_="story"), *shown, *levels, _configuration(run),
-        id=anchor)
+        pictures = _pictures(folder, (("demand", DEMAND), ("regions", REGIONS)))
+    return {
+        "name": run.name, "story": [first, *(_at(run, level) + summary_text.head(level.rows) for level in run.levels)],
+        "pictures": pictures, "configuration": _configuration(run),
+        "strategies": list({
+            name: (name, _plain(depends) or "nothing of its own") for level in run.levels
+            for name, depends in level.manifest.get("controllers", {}).items()}.values())}
 
 
 def _at(run: Finished, level: Level) -> str:
     return f"At demand times {level.demand:g}: " if len(run.levels) > 1 else ""
 
 
-def _level(run: Finished, level: Level, reference: str | None) -> str:
+def _level(run: Finished, level: Level, reference: str | None) -> dict:
+    """What the page shows of a demand level."""
     rows, names = level.rows, set(level.rows["controller"])
     if reference not in names:
         reference = None
-    first, second = statistics.shown(statistics.statistics(rows, reference), reference)
+    outcome, how = statistics.shown(statistics.statistics(rows, reference), reference)
     title = f"Demand times {level.demand:g}"
-    parts = [
-        text("h3", title), items(summary_text.details(rows)), *_why(run, level),
-        _frame(f"What came of it, {title.lower()}", first),
-        _frame(f"How, {title.lower()}", second), text("p", " ".join(statistics.CAPTION.split()), class_="caption"),
-        fold("Every strategy against every other, paired by seed", _numbers(
-            "pairs", statistics.pairs(rows).drop(columns="demand"))),
-        fold("Every run", _numbers("runs", rows))]
+    signals, reasons = explain.at(level.demand, level.folder, run.scenario.network, rows)
     with Scratch("cosim-") as folder:
         report.draw(level.folder, run.scenario, run.city, rows, folder)
         report.draw_more(folder, run.scenario, level.folder, rows)
-        missing = []
-        for heading, pictures in PICTURES:
-            there = [(name, caption) for name, caption in pictures if (folder / f"{name}.png").is_file()]
-            missing += [] if there else [heading.lower()]
-            if there:
-                parts += [text("h4", heading), *(
-                    picture(folder / f"{name}.png", f"{title}. {caption}") for name, caption in there)]
-    if missing:
-        why = run.changed or "there was nothing of the kind in these runs, or an older version did not record it"
-        parts.append(text("p", f"Without pictures of {', '.join(missing)}: {why}.", class_="note"))
+        pictures = [(heading, _pictures(folder, chosen, f"{title}. ")) for heading, chosen in PICTURES]
+    missing = ", ".join(heading.lower() for heading, there in pictures if not there)
+    why = run.changed or "there was nothing of the kind in these runs, or an older version did not record it"
     pair = [name for name in report.ranked(rows) if name != REFERENCE][:1]
-    both = f" and, where two are compared, {REFERENCE} and {pair[0]}" if len(pair) and REFERENCE in names else ""
-    parts.insert(2, text("p", f"Pictures of single runs show seed {report.shown_seed(rows)}{both}.", class_="note"))
-    return tag("div", *parts)
+    both = f" and, where two are compared, {REFERENCE} and {pair[0]}" if pair and REFERENCE in names else ""
+    return {
+        "title": title, "details": summary_text.details(rows), "signals": signals, "reasons": reasons,
+        "shown": f"Pictures of single runs show seed {report.shown_seed(rows)}{both}.",
+        "outcome": outcome, "how": how, "pairs": statistics.pairs(rows).drop(columns="demand"),
+        "runs": rows[["controller", *(name for name in rows.columns if name != "controller")]],
+        "pictures": [(heading, there) for heading, there in pictures if there],
+        "missing": f"Without pictures of {missing}: {why}." if missing else ""}
 
 
-def _why(run: Finished, level: Level) -> list[str]:
-    """Why strategies gain or not, where there is one to tell of."""
-    city, lines = explain.at(level.demand, level.folder, run.scenario.network, level.rows)
-    return [text("h4", "Why"), text("p", typeset(city)), items(lines)] if lines else []
+def _pictures(folder: Path, wanted: Sequence[tuple[str, str]], before: str = "") -> list[Picture]:
+    """Those of the wanted pictures, (name, caption), that were drawn in `folder`; `before` each caption."""
+    return [picture(folder / f"{name}.png", before + caption) for name, caption in wanted
+            if (folder / f"{name}.png").is_file()]
 
 
-def _frame(label: str, frame: pd.DataFrame) -> str:
-    return table(label, list(frame.columns), frame.values.tolist())
+def picture(path: Path, caption: str) -> Picture:
+    content = path.read_bytes()
+    return Picture(
+        uri=f"data:image/png;base64,{base64.b64encode(content).decode()}", caption=caption,
+        width=96.0 * struct.unpack(">I", content[16:20])[0] / PIXELS)
 
 
-def _numbers(label: str, frame: pd.DataFrame) -> str:
-    """All columns of a csv file, the controller first."""
-    frame = frame[["controller", *(name for name in frame.columns if name != "controller")]]
-    return table(label, list(frame.columns), frame.to_dict("split")["data"])
+def typeset(sentence: str) -> str:
+    """With true minus signs, and units that stay on the line of their number."""
+    return re.sub(r"(?<![\w.])-(?=\d)", "\N{MINUS SIGN}", sentence).replace(" %", "\N{NO-BREAK SPACE}%")
 
 
-def _configuration(run: Finished) -> str:
+def cell(value: object) -> str:
+    """A value as text: seven digits, a dash where there is none."""
+    if isinstance(value, float):
+        return "–" if math.isnan(value) else f"{value:.7g}"
+    return "–" if value is None or value == "" or "nan" in str(value).split() else str(value)
+
+
+def _configuration(run: Finished) -> list[tuple[str, str]]:
     """What the runs depend on, and when and with what they were made."""
     latest = run.levels[-1].manifest
     settings = {**latest["configuration"], "demand_factor": ", ".join(f"{level.demand:g}" for level in run.levels),
                 "seeds": summary_text.seeds(run.rows["seed"])}
-    controllers = {
-        name: depends for level in run.levels for name, depends in level.manifest.get("controllers", {}).items()}
     sessions = [session for level in run.levels for session in level.manifest["sessions"]]
     versions = {package: version for session in sessions for package, version in session.get("versions", {}).items()}
     kept = {json.dumps([session.get("commit"), session.get("dirty")]): session for session in sessions}
     commits = [f"{session.get('commit') or 'unknown'}{' with changes' if session.get('dirty') else ''}"
                for session in kept.values()]
     dates = sorted(str(session.get("date", "")) for session in sessions)
-    rows = [
+    return [
         *((key, _plain(value)) for key, value in settings.items()),
         ("made", dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}, {len(dates)} sessions"),
         ("commit", ", ".join(commits)),
         ("versions", ", ".join(f"{package} {version}" for package, version in versions.items()))]
-    return tag(
-        "div", text("h3", "Configuration"), table("configuration", ("key", "value"), rows, words=True),
-        fold("What each strategy depends on", table(
-            "strategies", ("strategy", "depends on"),
-            [(name, _plain(depends) or "nothing of its own") for name, depends in controllers.items()], words=True)))
 
 
 def _plain(value: object) -> str:

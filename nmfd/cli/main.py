@@ -83,7 +83,7 @@ def benchmark(
 
         frames.write(out, run_folder.trajectories(out), {"summary": pd.DataFrame(rows)})
     click.echo(f"{loaded.name}, {plant} plant, {loaded.steps} control intervals of {loaded.step:g} s")
-    click.echo(benchmarks.table(rows))
+    click.echo(benchmarks.summary_table(rows))
     click.echo(f"Written to {out}")
 
 

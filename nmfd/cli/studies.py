@@ -63,7 +63,7 @@ def robustness(
             raise Interrupted("interrupted before a run was finished; nothing is kept") from None
         raise Interrupted(
             f"interrupted; finished runs are in {out}: the same command with --out {quoted(out)} goes on") from None
-    click.echo(method.table(rows))
+    click.echo(method.improvement_table(rows))
     click.echo(f"Written to {out}")
 
 
@@ -114,7 +114,7 @@ def adaptation(
         if not (out / "adaptation.csv").exists():
             raise Interrupted("interrupted before a run was finished; nothing is kept") from None
         raise Interrupted(f"interrupted; finished runs are in {out}: the same command goes on") from None
-    click.echo(method.table(rows))
+    click.echo(method.adaptation_table(rows))
     click.echo(f"Written to {out}")
 
 
@@ -225,7 +225,7 @@ def ablation(
             raise Interrupted("interrupted before a run was finished; nothing is kept") from None
         raise Interrupted(
             f"interrupted; finished runs are in {out}: the same command with --out {quoted(out)} goes on") from None
-    click.echo(method.table(rows))
+    click.echo(method.ablation_table(rows))
     click.echo(f"Written to {out}")
 
 
@@ -275,5 +275,5 @@ def scaling(
         if not (out / "scaling.csv").exists():
             raise Interrupted("interrupted before a case was finished; nothing is kept") from None
         raise Interrupted(f"interrupted; finished cases are in {out}: the same command goes on") from None
-    click.echo(method.table(rows))
+    click.echo(method.scaling_table(rows))
     click.echo(f"Written to {out}")

@@ -131,6 +131,7 @@ def read_manifest(path: Path) -> dict:
 
 def read_summary(path: Path) -> list[dict]:
     """The rows of summary.csv with the types of metrics.summary. Raises InputError."""
+    refuse_old(Path(path).parent)
     return files.read_rows(path, COLUMNS)
 
 

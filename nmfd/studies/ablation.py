@@ -17,6 +17,7 @@ from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
 from nmfd.runs.scratch import Scratch
+from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, ended
 from nmfd.studies import plots, plots_studies
 from nmfd.studies.benchmark import PLANTS, configuration, interval, results
@@ -167,27 +168,32 @@ def draw(folder: Path, rows: Mapping[str, Sequence[Mapping]]) -> Path:
     return plots.save(drawing, folder / "horizon.png")
 
 
-def table(rows: Mapping[str, Sequence[Mapping]]) -> str:
+def ablation_table(rows: Mapping[str, Sequence[Mapping]]) -> str:
     """The result as text: one line per training and one per method, or one line per horizon."""
     if "training" in rows:
-        return "\n".join([*map(_training_line, rows["training"]), *_method_lines(rows["training"])])
-    return "\n".join(
-        f"{row['controller']:<8}  horizon {row['horizon']:>2}  {row['total_time_spent_veh_s']:.4e} veh s  final "
-        f"{row['final_accumulation_veh']:>7,.0f} veh  {row['control_step_ms_median']:>6.0f} / "
-        f"{row['control_step_ms_max']:.0f} ms median / longest  {row['solver_failures']} failures"
-        for row in rows["horizon"])
+        return text_table([*map(_training_line, rows["training"]), *_method_lines(rows["training"])])
+    return text_table([{
+        "controller": row["controller"], "horizon": row["horizon"], **_totals(row),
+        "decision [ms]": f"{row['control_step_ms_median']:.0f} / {row['control_step_ms_max']:.0f}",
+        "failures": row["solver_failures"]} for row in rows["horizon"]], "decision: median / longest")
 
 
-def _training_line(row: Mapping) -> str:
-    return (f"{row['method']:<11}  seed {row['seed']}  {row['total_time_spent_veh_s']:.4e} veh s  final "
-            f"{row['final_accumulation_veh']:>7,.0f} veh  best validation {row['best_validation_veh_s']:.4e} veh s")
+def _totals(row: Mapping) -> dict:
+    return {"TTS [veh s]": f"{row['total_time_spent_veh_s']:.4e}",
+            "final [veh]": f"{row['final_accumulation_veh']:,.0f}"}
 
 
-def _method_lines(rows: Sequence[Mapping]) -> list[str]:
+def _training_line(row: Mapping) -> dict:
+    return {"method": row["method"], "seed": row["seed"], **_totals(row),
+            "best validation [veh s]": f"{row['best_validation_veh_s']:.4e}"}
+
+
+def _method_lines(rows: Sequence[Mapping]) -> list[dict]:
     """The mean total time spent of each method, with its 95 % interval from two seeds up."""
     lines = []
     for method in dict.fromkeys(row["method"] for row in rows):
         totals = [row["total_time_spent_veh_s"] for row in rows if row["method"] == method]
         spread = f" ± {interval(totals):.1e}" if len(totals) > 1 else ""
-        lines.append(f"{method:<11}  mean    {statistics.fmean(totals):.4e}{spread} veh s")
+        lines.append({"method": method, "seed": "mean", "TTS [veh s]": f"{statistics.fmean(totals):.4e}{spread}",
+                      "final [veh]": "", "best validation [veh s]": ""})
     return lines

@@ -19,9 +19,9 @@ from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
+from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, ended
 from nmfd.studies.benchmark import PLANTS, REFERENCE, configuration, results
-from nmfd.studies.text_table import aligned
 
 RAIN = 0.8      # of the outflow at every accumulation
 MORE = 1.2      # times the demand
@@ -33,7 +33,7 @@ COLUMNS = {
     "case": str, "seed": int, "controller": str, "total_time_spent_veh_s": float, "final_accumulation_veh": float,
     "control_step_ms_median": float, "control_step_ms_max": float, "fallbacks": int}
 CAPTION = (
-    "TTS: total time spent, mean over seeds; change: against the first controller but no-control; decision: median /\n"
+    "TTS: total time spent, mean over seeds; change: against the first controller but no-control; decision: median / "
     "longest; nothing of a case is told to a controller:\n" + "\n".join(
         f"  {name}: {what}" for name, what in CASES.items()))
 
@@ -121,22 +121,23 @@ def _run(row: Mapping) -> Run:
     return Run(row["case"], row["seed"], row["controller"])
 
 
-def table(rows: Sequence[Mapping]) -> str:
+def adaptation_table(rows: Sequence[Mapping]) -> str:
     """Means over the seeds as text: one line per case and controller."""
     groups: dict[tuple[str, str], list[Mapping]] = {}
     for row in rows:
         groups.setdefault((row["case"], row["controller"]), []).append(row)
-    lines = [["case", "controller", "seeds", "TTS [veh s]", "change", "final [veh]", "decision [ms]"]]
+    lines = []
     for case in dict.fromkeys(case for case, _ in groups):
         names = [name for there, name in groups if there == case]
         mean = {name: statistics.fmean(r["total_time_spent_veh_s"] for r in groups[case, name]) for name in names}
         first = next((name for name in names if name != REFERENCE), names[0])
         for name in names:
             group = groups[case, name]
-            lines.append([
-                case, name, str(len(group)), f"{mean[name]:.4g}",
-                "" if name == first or not mean[first] else f"{100 * (mean[name] / mean[first] - 1):+.1f} %",
-                f"{statistics.fmean(r['final_accumulation_veh'] for r in group):,.0f}",
-                f"{statistics.fmean(r['control_step_ms_median'] for r in group):.3g} / "
-                f"{max(r['control_step_ms_max'] for r in group):.3g}"])
-    return "\n".join([*aligned(lines, left=(0, 1)), CAPTION])
+            change = "" if name == first or not mean[first] else f"{100 * (mean[name] / mean[first] - 1):+.1f} %"
+            lines.append({
+                "case": case, "controller": name, "seeds": len(group), "TTS [veh s]": f"{mean[name]:.4g}",
+                "change": change,
+                "final [veh]": f"{statistics.fmean(r['final_accumulation_veh'] for r in group):,.0f}",
+                "decision [ms]": f"{statistics.fmean(r['control_step_ms_median'] for r in group):.3g} / "
+                                 f"{max(r['control_step_ms_max'] for r in group):.3g}"})
+    return text_table(lines, CAPTION)

@@ -14,18 +14,19 @@ from nmfd.metrics import COUNTED
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
+from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
 from nmfd.studies import plots
-from nmfd.studies.text_table import aligned
 from nmfd.types import Plant, Trajectory
 
 PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
 CAPTION = (
-    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against no-control; control: time of all\n"
-    "decisions of a run; step: median / longest decision; decisions of all seeds:\n" + "; ".join(
+    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against no-control; control: time of all "
+    "decisions of a run; step: median / longest decision; decisions of all seeds: " + "; ".join(
         f"{heading}: {what}" for heading, what in COUNTED.values()))
-BOUND_CAPTION = "above bound: TTS against the bound with the same controls, perimeter alone (PC) or with routes (PCRG)"
+BOUND_CAPTION = (
+    "; above bound: TTS against the bound with the same controls, perimeter alone (PC) or with routes (PCRG)")
 
 
 def run_one(
@@ -175,16 +176,14 @@ def interval(values: Sequence[float]) -> float:
     return float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
 
 
-def table(rows: Sequence[Mapping]) -> str:
+def summary_table(rows: Sequence[Mapping]) -> str:
     """The rows of summary.csv as text: one line per controller, means over seeds, TTS with its 95 % interval."""
     groups: dict[str, list[Mapping]] = {}
     for row in rows:
         groups.setdefault(row["controller"], []).append(row)
     tts = {name: [row["total_time_spent_veh_s"] for row in group] for name, group in groups.items()}
     with_bound = any(name in tts for name in ("bound-pc", "bound-pcrg"))
-    lines = [["controller", "seeds", "TTS [veh s]", "change", *["above bound"] * with_bound, "final [veh]",
-              "max [veh]", "completed [veh]", "control [s]", "step [ms]",
-              *(heading for heading, _ in COUNTED.values())]]
+    lines = []
     for name, group in groups.items():
         def mean(column, group=group):
             return statistics.fmean(row[column] for row in group)
@@ -195,15 +194,18 @@ def table(rows: Sequence[Mapping]) -> str:
             change = _percent(tts[name], tts[REFERENCE])
         bound = "bound-pcrg" if "-pcrg" in name else "bound-pc"
         above = _percent(tts[name], tts[bound]) if bound in tts and name != bound else ""
-        lines.append([
-            name, str(len(group)), _scientific(statistics.fmean(tts[name])) + (
+        lines.append({
+            "controller": name, "seeds": len(group),
+            "TTS [veh s]": _scientific(statistics.fmean(tts[name])) + (
                 "" if math.isnan(spread) else f" ± {_scientific(spread, 1)}"),
-            change, *[above] * with_bound, f"{mean('final_accumulation_veh'):,.0f}",
-            f"{mean('max_accumulation_veh'):,.0f}",
-            f"{mean('completed_veh'):,.0f}", f"{mean('evaluation_time_s'):.3g}",
-            f"{mean('control_step_ms_median'):.3g} / {max(row['control_step_ms_max'] for row in group):.3g}",
-            *(str(sum(row[column] for row in group)) for column in COUNTED)])
-    return "\n".join([*aligned(lines), CAPTION, *[BOUND_CAPTION] * with_bound])
+            "change": change, **({"above bound": above} if with_bound else {}),
+            "final [veh]": f"{mean('final_accumulation_veh'):,.0f}",
+            "max [veh]": f"{mean('max_accumulation_veh'):,.0f}",
+            "completed [veh]": f"{mean('completed_veh'):,.0f}", "control [s]": f"{mean('evaluation_time_s'):.3g}",
+            "step [ms]": f"{mean('control_step_ms_median'):.3g} / "
+                         f"{max(row['control_step_ms_max'] for row in group):.3g}",
+            **{heading: sum(row[column] for row in group) for column, (heading, _) in COUNTED.items()}})
+    return text_table(lines, CAPTION + BOUND_CAPTION * with_bound)
 
 
 def _percent(values: Sequence[float], reference: Sequence[float]) -> str:

@@ -16,16 +16,16 @@ from nmfd.metrics import summary
 from nmfd.model.demand_noise import perturbed
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
+from nmfd.runs.tables import text_columns
 from nmfd.runs.workers import Failure, ended
 from nmfd.studies import plots, plots_studies
 from nmfd.studies.benchmark import PLANTS, REFERENCE, configuration, interval, results
-from nmfd.studies.text_table import aligned
 
 COLUMNS = {
     "sigma_veh_per_s": float, "scenario": int, "controller": str, "trips_veh": float,
     "total_time_spent_veh_s": float, "final_accumulation_veh": float, "fallbacks": int}
 CAPTION = (
-    "improvement of total time spent over no-control in the same perturbed scenario [%], mean ± 95 % interval;\n"
+    "improvement of total time spent over no-control in the same perturbed scenario [%], mean ± 95 % interval; "
     "trips: mean of all perturbed scenarios [veh]; sigma of the noise on the demand in veh/s")
 
 
@@ -139,11 +139,11 @@ def draw(folder: Path, rows: Sequence[Mapping]) -> Path:
     return plots.save(drawing, folder / "robustness.png")
 
 
-def table(rows: Sequence[Mapping]) -> str:
+def improvement_table(rows: Sequence[Mapping]) -> str:
     """Improvements as text: one line per controller, one column per sigma."""
     count = trips(rows)
-    lines = [["sigma", *(f"{sigma:g}" for sigma in count)], ["trips", *(f"{total:,.0f}" for total in count.values())]]
+    lines = [["trips", *(f"{total:,.0f}" for total in count.values())]]
     for name in compared(rows):
         gains = improvements(rows, name)
         lines.append([name, *("{:.1f} ± {:.1f}".format(*gains[s]) if s in gains else "-" for s in count)])
-    return "\n".join([*aligned(lines), CAPTION])
+    return text_columns(["sigma", *(f"{sigma:g}" for sigma in count)], lines, CAPTION)

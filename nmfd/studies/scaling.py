@@ -26,9 +26,9 @@ from nmfd.model.mfd import Mfd
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files, run_folder
+from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, outcomes
 from nmfd.studies import plots, plots_scaling
-from nmfd.studies.text_table import aligned
 from nmfd.threads import one_thread
 from nmfd.types import Controller, Observation, Status
 
@@ -43,8 +43,8 @@ COLUMNS = {
     "first_decision_s": float, "median_decision_s": float, "longest_decision_s": float, "unsolved_decisions": int,
     "peak_memory_mib": float}
 CAPTION = (
-    "time per decision: median / longest of the decisions after the first; set-up: network, controller and policy;\n"
-    "memory: peak of the whole process, Python and its libraries included; unsolved: decisions that were a\n"
+    "time per decision: median / longest of the decisions after the first; set-up: network, controller and policy; "
+    "memory: peak of the whole process, Python and its libraries included; unsolved: decisions that were a "
     "failure or a fallback")
 
 
@@ -229,14 +229,11 @@ def draw(folder: Path, rows: Sequence[Mapping]) -> Path:
     return plots.save(drawing, folder / "scaling.png")
 
 
-def table(rows: Sequence[Mapping]) -> str:
+def scaling_table(rows: Sequence[Mapping]) -> str:
     """The rows as text."""
-    lines = [["family", "load", "controller", "regions", "set-up [s]", "first [s]", "decision [ms]", "memory [MiB]",
-              "unsolved", "status"]]
-    for row in rows:
-        lines.append([
-            row["family"], row["load"], row["controller"], str(row["regions"]), f"{row['set_up_s']:.3g}",
-            f"{row['first_decision_s']:.3g}",
-            f"{1e3 * row['median_decision_s']:.3g} / {1e3 * row['longest_decision_s']:.3g}",
-            f"{row['peak_memory_mib']:.0f}", str(row["unsolved_decisions"]), row["status"]])
-    return "\n".join([*aligned(lines, left=(0, 1, 2, 9)), CAPTION])
+    return text_table([{
+        "family": row["family"], "load": row["load"], "controller": row["controller"], "regions": row["regions"],
+        "set-up [s]": f"{row['set_up_s']:.3g}", "first [s]": f"{row['first_decision_s']:.3g}",
+        "decision [ms]": f"{1e3 * row['median_decision_s']:.3g} / {1e3 * row['longest_decision_s']:.3g}",
+        "memory [MiB]": f"{row['peak_memory_mib']:.0f}", "unsolved": row["unsolved_decisions"],
+        "status": row["status"]} for row in rows], CAPTION)

@@ -1,0 +1,31 @@
+"""Tables as text, for the terminal."""
+
+import re
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+
+from tabulate import tabulate
+
+WIDTH = 120  # characters of a line below a table
+NUMBER = re.compile(r"[-+]?\d.*|-|nan|")  # also with a unit, an interval or a second number
+
+
+def text_table(rows: Sequence[Mapping[str, object]], caption: str = "") -> str:
+    """The rows, each with the same headings: columns of numbers to the right, of words to the left; then `caption`."""
+    return text_columns(list(rows[0]) if rows else [], [list(row.values()) for row in rows], caption)
+
+
+def text_columns(headings: Sequence[str], lines: Iterable[Sequence[object]], caption: str = "") -> str:
+    """As `text_table`, from the cells of each line."""
+    cells = [[str(cell) for cell in line] for line in (headings, *lines)]
+    sides = ["right" if all(map(NUMBER.fullmatch, column[1:])) else "left" for column in zip(*cells, strict=True)]
+    # headings as a line: tabulate makes columns wider than their headings
+    table = tabulate(cells, tablefmt="plain", disable_numparse=True, colalign=sides)
+    return "\n".join([table, *wrapped(caption)])
+
+
+def wrapped(caption: str) -> list[str]:
+    """Lines of at most WIDTH characters; those of an indented line are indented, too."""
+    return [part for line in caption.splitlines() for part in textwrap.wrap(
+        line, WIDTH, subsequent_indent=" " * (len(line) - len(line.lstrip())), break_long_words=False,
+        break_on_hyphens=False)]
