@@ -10,9 +10,8 @@ from pathlib import Path
 import click
 
 from cosim.cli.options import parsed_level, parsed_levels
-from nmfd.cli.errors import Interrupted
 from nmfd.cli.options import COUNT, FILE, FOLDER, SEED
-from nmfd.cli.progress import progress_line
+from nmfd.cli.progress import progress_line, resumable
 from nmfd.errors import InputError
 from nmfd.runs import files
 
@@ -72,12 +71,8 @@ def identify(
         loading = identify.Loading(
             levels=factors, seeds=range(1000, 1000 + seeds), guided=guide,
             options=options.split("+") if options else (), network=target, iterations=iterations)
-        try:
-            with progress_line("identify") as progress:
-                text = identify.identify(scenario, loading, out=folder, workers=workers, progress=progress)
-        except KeyboardInterrupt:
-            raise Interrupted(
-                f"interrupted; finished loading runs are in {folder}: the same command goes on") from None
+        with resumable("identify", folder) as progress:
+            text = identify.identify(scenario, loading, out=folder, workers=workers, progress=progress)
         if both:
             click.echo("Drivers who are guided:" if guide else "Drivers who go their own ways:")
         click.echo(text)

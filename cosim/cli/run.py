@@ -10,9 +10,8 @@ from pathlib import Path
 import click
 
 from cosim.cli.options import CONTROLLER_HELP, tell
-from nmfd.cli.errors import Interrupted
 from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, fault_option
-from nmfd.cli.progress import progress_line
+from nmfd.cli.progress import resumable
 from nmfd.errors import InputError
 
 
@@ -163,10 +162,5 @@ def _experiment(tasks: list, out: Path | None, sumo_output: tuple[str, ...] = ()
 
     out = run_folder.default_folder(load_scenario(tasks[0].scenario).name) if out is None else out
     tasks = [replace(task, sumo_output=paths(sumo_output, out, task.controller, task.seed)) for task in tasks]
-    try:
-        with progress_line("cosim") as progress:
-            return out, experiment.experiment(tasks, out=out, workers=2, progress=progress, tell=tell)
-    except KeyboardInterrupt:
-        if not (out / "summary.csv").exists():
-            raise Interrupted("interrupted before a run was finished; nothing is kept") from None
-        raise Interrupted(f"interrupted; finished runs are in {out}: the same command with --out goes on") from None
+    with resumable("cosim", out, "summary.csv") as progress:
+        return out, experiment.experiment(tasks, out=out, workers=2, progress=progress, tell=tell)
