@@ -127,7 +127,7 @@ def import_(
       cosim import city.net.xml.gz --regions 6 --demand peak --out networks/mycity
       cosim import city.sumocfg --taz districts.taz.xml --out networks/mycity --begin 7:00:00 --end 9:00:00
     """
-    from cosim.importing.importer import Order, import_city, parse_time  # heavy
+    from cosim.importing.importer import ImportOptions, import_city, parse_time  # heavy
 
     own = {key: file for key, file in (("edges", edges), ("taz", taz), ("polygons", polygons)) if file}
     if len(own) + (regions is not None) != 1:
@@ -135,7 +135,7 @@ def import_(
     if no_run and method == "density" and not own:
         raise InputError("--no-run: the densities come from that run; add --method geometric")
     method, given = next(iter(own.items()), (method, None))
-    order = Order(
+    order = ImportOptions(
         source=source, regions=regions, out=out, method=method, given=given, seed=seed, run=not no_run, force=force,
         peak=demand is not None, level=parsed_level(level, no_run), mesoscopic=mesoscopic,
         scenario=scenario or out.parent.parent / "scenarios" / out.name,

@@ -141,7 +141,7 @@ def sweep(
     if repeated := [name for n, name in enumerate(names) if name in names[:n]]:
         raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
     if scheduler is not None and workers is not None:
-        raise InputError("--workers: is for processes here, and --scheduler has workers of its own; leave one away")
+        raise InputError("--workers: is for processes here, and --scheduler has workers of its own; omit one")
     files = policy_files(policies, names)
 
     from cosim.evaluation import sweeps  # heavy

@@ -93,8 +93,8 @@ def compare(
 
     For a scenario, the microsimulation is run first; for the run folder of `cosim run`, its record is used. Then the
     regional model is driven with the recorded departures and controls. Writes compare-NAME-SEED.csv and pictures
-    beside the run. For a RUN folder without --controller, `cosim evaluate`'s too: how far ahead the models foresee all
-    of its runs, as a table and foresight.csv.
+    beside the run. For a RUN folder without --controller, `cosim evaluate`'s too: how far ahead the models foresee
+    all of its runs, as a table and foresight.csv.
 
     \b
     Examples:
@@ -110,12 +110,12 @@ def compare(
     manifest = run_folder.read_manifest(target / "manifest.json") if (target / "manifest.json").is_file() else None
     results = manifest is not None or any(target.glob("demand-*/manifest.json"))
     if results and out is not None:
-        raise InputError(f"--out: {out}: a comparison is written into its run folder {target}; leave --out away")
+        raise InputError(f"--out: {out}: a comparison is written into its run folder {target}; omit --out")
     if results and controller is None:
         if seed is not None or steps is not None:
             raise InputError(
                 f"--{'seed' if steps is None else 'steps'}: without --controller all runs of {target} are compared, "
-                "whole; name a controller, or leave it away")
+                "whole; name a controller, or omit it")
         _foresight(target, model)
         return
     controller, seed = controller or "no-control", seed or 0
@@ -148,7 +148,7 @@ def _foresight(target: Path, model: Path | None) -> None:
     """All runs of a folder against the regional models."""
     from cosim.evaluation import prediction_error, results  # heavy
 
-    found = prediction_error.foresee(results.read(target), model)
+    found = prediction_error.prediction_errors(results.read(target), model)
     prediction_error.write_foresights(target / "foresight.csv", found)
     click.echo(prediction_error.foresight_table(found))
     click.echo(f"Written to {target / 'foresight.csv'}")

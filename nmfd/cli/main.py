@@ -131,7 +131,7 @@ def train(
     if compiled and not rollout.can_compile(device):
         if not default:
             raise InputError("--compile: does not work here, most likely for want of a C++ compiler; install g++ or "
-                             "leave it out")
+                             "omit it")
         compiled = False
         click.echo("nmfd: cannot compile here, most likely for want of a C++ compiler; training goes on uncompiled, "
                    "about half as fast", err=True)
