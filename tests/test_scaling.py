@@ -54,7 +54,8 @@ def test_cases_are_kept_added_and_drawn(tmp_path):
     assert first.exit_code == 0, first.output
     assert "mpc-pc" in first.stdout and f"Written to {out}" in first.stdout
     row = files.read_rows(out / "scaling.csv", scaling.COLUMNS)[0]
-    second = nmfd("scaling", "--regions", "3,4", "--controllers", "mpc-pc", "--out", out, "--workers", 2, "--family", "hexagonal")
+    second = nmfd(
+        "scaling", "--regions", "3,4", "--controllers", "mpc-pc", "--out", out, "--workers", 2, "--family", "hexagonal")
     assert second.exit_code == 0, second.output
     rows = files.read_rows(out / "scaling.csv", scaling.COLUMNS)
     assert [(r["family"], r["regions"]) for r in rows] == [("complete", 3), ("hexagonal", 3), ("hexagonal", 4)]
