@@ -15,16 +15,8 @@ from typing import Literal
 import numpy as np
 
 from nmfd.arrays import PerPair, PerTurn
-from nmfd.controllers.mpc.edge_model import (
-    Decision,
-    Demands,
-    PerCell,
-    Plan,
-    Turns,
-    build,
-    vehicle_steps,
-    vehicles_at_stake,
-)
+from nmfd.controllers.mpc import edge_model
+from nmfd.controllers.mpc.edge_model import Decision, Demands, PerCell, Plan, Turns
 from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.mpc.projected_gradient import AT_REST, Minimum, minimise
 from nmfd.controllers.options import Options, options
@@ -148,12 +140,12 @@ class EconomicMpc:
         # With one Euler step per interval, the last controls move vehicles that the horizon does not see arrive.
         blind = planning.integrator == "euler" and planning.substeps == 1
         self._moves = horizon - 1 if blind else horizon
-        self._model = build(network, self._used, guidance=guidance)
+        self._model = edge_model.build(network, self._used, guidance=guidance)
         rounded = replace(self._model, rounding=ROUNDING * min(mfd.jam for mfd in network.mfds))
         scheme: dict = {"step": planning.step, "substeps": planning.substeps, "integrator": planning.integrator}
-        self._exact: Callable = partial(vehicle_steps, self._model, **scheme)
-        self._rounded: Callable = partial(vehicle_steps, rounded, gradient=True, **scheme)
-        self._at_stake: Callable = partial(vehicles_at_stake, self._model, **scheme)
+        self._exact: Callable = partial(edge_model.vehicle_steps, self._model, **scheme)
+        self._rounded: Callable = partial(edge_model.vehicle_steps, rounded, gradient=True, **scheme)
+        self._affected: Callable = partial(edge_model.affected_vehicles, self._model, **scheme)
         self.admissible = Admissible(network, self._model, guidance=guidance)
         self._open = self.admissible.open(self._moves)
         self._gating = PiGating(planning) if planning.protected else None
@@ -231,7 +223,7 @@ class EconomicMpc:
             return self._by_ipopt(self._ipopt, start, demand)
         return minimise(
             objective, self.admissible.project, self.admissible.gap, plan,
-            metric=(self._at_stake(start, demand, plan) + FEW) ** 2, tolerance=TOLERANCE,
+            metric=(self._affected(start, demand, plan) + FEW) ** 2, tolerance=TOLERANCE,
             iterations=self.options.max_iterations, seconds=self.options.time_limit or self._step)
 
     def _by_ipopt(self, solver: Ipopt, start: PerCell, demand: Demands) -> Minimum:
