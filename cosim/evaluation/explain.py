@@ -65,6 +65,7 @@ class Deeds:
     guided: float
 
     def __str__(self) -> str:
+        """As the end of a sentence about the controller."""
         parts = [f"it held back in {_share(self.held)} of its commands"] if self.held >= HARDLY else []
         if self.guided > 0:
             parts.append(f"it guided {self.guided:.1f} times per trip")

@@ -31,15 +31,17 @@ CAPTION = (
 
 
 class Replay:
-    """The recorded controls of a trajectory, as a controller."""
+    """The recorded controls of a trajectory, as a controller (nmfd.types.Controller)."""
 
     def __init__(self, trajectory: Trajectory):
+        """trajectory: with as many intervals as are to be controlled"""
         self.name, self._trajectory = trajectory.controller, trajectory
 
     def reset(self, seed: int = 0) -> None:
-        pass
+        """There is nothing to reset."""
 
     def act(self, observation: Observation) -> Controls:
+        """The controls that were recorded for this control step, whatever is observed."""
         k = observation.step
         return Controls(perimeter=self._trajectory.perimeter[k], splits=self._trajectory.splits[k])
 
@@ -87,7 +89,9 @@ def errors(scenario: Scenario, result: Result, predicted: Trajectory) -> list[di
     return [*rows, _row("all", "all regions", critical.sum(), simulated.sum(1), whole.sum(1), ahead.sum(1))]
 
 
-def _row(region, name, critical, simulated, whole, ahead) -> dict:
+def _row(
+    region: int | str, name: str, critical: float, simulated: np.ndarray, whole: np.ndarray, ahead: np.ndarray,
+) -> dict:
     rmse, next_rmse = float(np.sqrt((whole**2).mean())), float(np.sqrt((ahead**2).mean()))
     return dict(zip(COLUMNS, (
         region, name, float(critical), float(simulated.mean()), rmse, rmse / critical, float(whole.mean()), next_rmse,

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -60,7 +61,7 @@ def gateway_marks(ax: Axes, streets: Streets, tables: Tables) -> Axes:
     return ax
 
 
-def _streets(ax: Axes, streets: Streets, array: np.ndarray | None = None, **style) -> LineCollection:
+def _streets(ax: Axes, streets: Streets, array: np.ndarray | None = None, **style: Any) -> LineCollection:
     members = np.flatnonzero(streets.drivable)
     lines = LineCollection(
         [streets.shapes[n] for n in members], linewidths=0.6 + 0.5 * np.minimum(streets.lanes[members], 4),

@@ -11,7 +11,7 @@ import numpy as np
 import sumo
 
 from cosim.importing.streets import Streets
-from cosim.sumo.xml_files import file_list, read_xml
+from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.errors import InputError
 from nmfd.runs.scratch import Scratch
 
@@ -53,7 +53,7 @@ class Baseline:
         mean = self.presence[first : first + PEAK].sum(axis=0) / (INTERVAL * min(PEAK, len(total)))
         return np.where(streets.lane_metres > 0, mean / np.maximum(streets.lane_metres, 1.0), 0.0)
 
-    def moves(self) -> Counter:
+    def moves(self) -> Counter[tuple[int, int]]:
         """(edge, next edge) -> vehicles that went from one to the other."""
         found: Counter[tuple[int, int]] = Counter()
         for (way, _), count in self.ways.items():
@@ -104,14 +104,15 @@ def run_baseline(
             "--duration-log.statistics", "true",
             *options, where=str(streets.path))
         statistic = ElementTree.parse(folder / "statistic.xml").getroot()
-        counts, trips = statistic.find("vehicles"), statistic.find("vehicleTripStatistics")
-        waiting = int(counts.get("waiting"))
+        counts, trips = child(statistic, "vehicles"), child(statistic, "vehicleTripStatistics")
+        waiting = int(attribute(counts, "waiting"))
         ways, driven = _ways(folder / "ways.xml", streets)
         return Baseline(
             presence=_presence(edges, streets, begin, end), ways=ways,
-            teleports=int(statistic.find("teleports").get("total")), waiting=waiting,
-            running=int(counts.get("running")), dropped=max(len(set(vehicles) - driven) - waiting, 0),
-            delay=float(trips.get("totalDepartDelay")) + waiting * max(float(trips.get("departDelayWaiting")), 0.0))
+            teleports=int(attribute(child(statistic, "teleports"), "total")), waiting=waiting,
+            running=int(attribute(counts, "running")), dropped=max(len(set(vehicles) - driven) - waiting, 0),
+            delay=float(attribute(trips, "totalDepartDelay"))
+            + waiting * max(float(attribute(trips, "departDelayWaiting")), 0.0))
 
 
 def run_sumo(program: str, *arguments: str, where: str) -> None:
@@ -127,24 +128,24 @@ def _presence(path: Path, streets: Streets, begin: float, end: float) -> np.ndar
     presence = np.zeros((max(1, int(np.ceil((end - begin) / INTERVAL))), len(streets.edges)))
     for _, element in ElementTree.iterparse(path):
         if element.tag == "interval":
-            k = int((float(element.get("begin")) - begin) / INTERVAL + 0.5)
+            k = int((float(attribute(element, "begin")) - begin) / INTERVAL + 0.5)
             for edge in element:
-                if (n := streets.number.get(edge.get("id"))) is not None and k < len(presence):
-                    presence[k, n] += float(edge.get("sampledSeconds"))
+                if (n := streets.number.get(attribute(edge, "id"))) is not None and k < len(presence):
+                    presence[k, n] += float(attribute(edge, "sampledSeconds"))
             element.clear()
     return presence
 
 
-def _ways(path: Path, streets: Streets) -> tuple[Counter, set[str]]:
+def _ways(path: Path, streets: Streets) -> tuple[Counter[tuple[tuple[int, ...], int]], set[str]]:
     """(Baseline.ways, the vehicles that drove)"""
     ways: Counter[tuple[tuple[int, ...], int]] = Counter()
     driven_by = set()
     for _, element in ElementTree.iterparse(path):
         if element.tag == "vehicle":
-            driven_by.add(element.get("id"))
+            driven_by.add(attribute(element, "id"))
             route = element.find("route")
-            if route is not None and route.get("edges"):
-                edges = [streets.number.get(edge, -1) for edge in route.get("edges").split()]
+            if route is not None and (names := route.get("edges")):
+                edges = [streets.number.get(edge, -1) for edge in names.split()]
                 left = [float(time) >= 0 for time in route.get("exitTimes", "").split()] or (
                     [element.get("arrival") is not None] * len(edges))
                 driven = tuple(n for n, gone in zip(edges, left, strict=False) if gone and n >= 0)

@@ -89,7 +89,8 @@ def _carriageways(streets: Streets, label: np.ndarray) -> np.ndarray:
     count = np.bincount(of, minlength=len(label))
     edges = edges[votes > 0.5 * count[edges[:, 0]]]
     size, limit = np.bincount(label, streets.lane_metres), LARGEST * streets.lane_metres.sum()
-    label, group = label.copy(), {}
+    label = label.copy()
+    group: dict[int, list[int]] = {}
     for n, name in enumerate(label):
         group.setdefault(int(name), []).append(n)
     for a, b in edges:

@@ -55,8 +55,9 @@ def _merges(blocks: Blocks, feature: np.ndarray) -> list[tuple[int, int, int]]:
     """All merges (cluster, cluster, new cluster), the cheapest first."""
     count = len(blocks.weight)
     weight, mean = list(blocks.weight), [row for row in feature]
-    near: list[set[int] | None] = [
-        set(blocks.joins.indices[blocks.joins.indptr[n] : blocks.joins.indptr[n + 1]].tolist()) for n in range(count)]
+    near: dict[int, set[int]] = {  # of every cluster that is not part of a larger one yet
+        n: set(blocks.joins.indices[blocks.joins.indptr[n] : blocks.joins.indptr[n + 1]].tolist())
+        for n in range(count)}
 
     def cost(a: int, b: int) -> float:
         gap = mean[a] - mean[b]
@@ -67,15 +68,13 @@ def _merges(blocks: Blocks, feature: np.ndarray) -> list[tuple[int, int, int]]:
     merges = []
     while heap:
         _, a, b = heapq.heappop(heap)
-        if near[a] is None or near[b] is None:
+        if a not in near or b not in near:
             continue
         new, total = len(weight), weight[a] + weight[b]
         merges.append((a, b, new))
         mean.append((weight[a] * mean[a] + weight[b] * mean[b]) / total)
         weight.append(total)
-        around = (near[a] | near[b]) - {a, b}
-        near.append(around)
-        near[a] = near[b] = None
+        near[new] = around = (near.pop(a) | near.pop(b)) - {a, b}
         for other in sorted(around):
             near[other] = (near[other] - {a, b}) | {new}
             heapq.heappush(heap, (cost(other, new), other, new))

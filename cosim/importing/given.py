@@ -71,7 +71,9 @@ def _assign(labels: np.ndarray, streets: Streets, edge: str, region: int, where:
 
 def _polygons(streets: Streets, path: Path) -> np.ndarray:
     """An edge is in the region in which its middle lies; the smallest polygon counts where several do."""
-    labels, regions, found = np.full(len(streets.edges), -1), {}, []
+    labels = np.full(len(streets.edges), -1)
+    regions: dict[str, int] = {}
+    found: list[tuple[float, int, int, np.ndarray]] = []
     for polygon in read_xml(path).iter("poly"):
         region = regions.setdefault(polygon.get("id", "").partition(".")[0], len(regions))
         corners = _corners(polygon, path, streets)

@@ -15,6 +15,7 @@ COLOURS = ("#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#b07aa1", "#e
 
 
 def colour(region: int) -> str:
+    """The colour of a region on maps, as #rrggbb."""
     return COLOURS[region % len(COLOURS)]
 
 

@@ -58,6 +58,7 @@ class Clock:
 
     @property
     def end(self) -> float:
+        """[s] of SUMO's time."""
         return self.begin + self.steps * self.step
 
 
@@ -71,7 +72,7 @@ def clock(case: Case, streets: Streets, traffic: Traffic) -> Clock:
     """Control intervals of the most common signal cycle, until RECOVERY after the last departure."""
     running = [found[-1] for found in streets.logics.values() if round(found[-1].cycle) > 0]
     cycles = Counter(round(logic.cycle) for logic in running if logic.kind == "static")
-    cycle = float(max(sorted(cycles), key=cycles.get)) if cycles else DEFAULT_CYCLE
+    cycle = float(max(sorted(cycles), key=cycles.__getitem__)) if cycles else DEFAULT_CYCLE
     step = cycle * np.ceil(CYCLES[0] / cycle)
     if step > CYCLES[1]:
         step = DEFAULT_CYCLE
@@ -116,6 +117,7 @@ def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline | No
 
 
 def network_text(network: RegionalModel, sumo: Mapping[str, str], source: str) -> str:
+    """The network.toml. sumo: its table [sumo]; source: what was imported."""
     return network_toml(
         network, sumo,
         f"Imported from {source}. The MFDs are PLACEHOLDERS from lane length and speed limits:\n"

@@ -47,7 +47,7 @@ def tables(
         "source": g.source, "target": g.target, "from_edge": g.from_edge, "to_edge": g.to_edge,
         "lanes": " ".join(map(str, g.lanes)), "shared_lanes": " ".join(map(str, g.shared)), "signal": g.signal or "",
         "links": " ".join(map(str, g.links)),
-        "signal_serves": " ".join(f"{i}-{h}" for i, h in sorted(pairs.get(g.signal, ()))),
+        "signal_serves": " ".join(f"{i}-{h}" for i, h in sorted(pairs.get(g.signal or "", ()))),
         "control": "no signal" if g.signal is None else left_alone.get(g.signal, "controlled"),
         "flow_veh": moves[streets.number[g.from_edge], streets.number[g.to_edge]]} for g in city.gateways]
     density = np.zeros(len(regions)) if baseline is None else 1000.0 * baseline.density(streets)
@@ -97,7 +97,7 @@ def _signals(streets: Streets, regions: np.ndarray, city: City) -> np.ndarray:
         votes.setdefault(signal, Counter())[int(regions[streets.number[edge]])] += 1
     count = np.zeros(int(regions.max()) + 1, dtype=int)
     for found in votes.values():
-        count[max(sorted(found), key=found.get)] += 1
+        count[max(sorted(found), key=found.__getitem__)] += 1
     return count
 
 

@@ -113,7 +113,7 @@ class _State:
         """What the variance within loses: it is the total minus sum over regions of |sum|^2 / size."""
         weight, part = self._weight[block], self._weight[block] * self._feature[block]
 
-        def between(total, size):
+        def between(total: np.ndarray, size: float) -> float:
             return float(total @ total) / max(size, 1e-12)
 
         before = between(self._sum[here], self._size[here]) + between(self._sum[region], self._size[region])

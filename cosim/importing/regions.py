@@ -54,7 +54,7 @@ def connect(streets: Streets, regions: np.ndarray) -> np.ndarray:
                 votes.setdefault(piece[a], {}).setdefault(int(regions[b]), 0)
                 votes[piece[a]][int(regions[b])] += 1
         for number, found in votes.items():
-            regions[loose & (piece == number)] = max(sorted(found), key=found.get)
+            regions[loose & (piece == number)] = max(sorted(found), key=found.__getitem__)
     return regions
 
 

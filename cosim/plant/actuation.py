@@ -104,10 +104,12 @@ class Actuation:
 
     def _overridden(self, edge_vehicles: np.ndarray) -> dict[str, set[int]]:
         """Signal -> links of the gateways that stay open because of their queue."""
-        limit, links = self._queue_override, {}
+        limit = self._queue_override
+        links: dict[str, set[int]] = {}
         for n in np.flatnonzero(gateway_room_taken(edge_vehicles, self._city) >= limit) if limit else ():
             gateway = self._city.gateways[n]
-            links.setdefault(gateway.signal, set()).update(gateway.links)
+            if gateway.signal is not None:
+                links.setdefault(gateway.signal, set()).update(gateway.links)
         return links
 
 
@@ -127,8 +129,8 @@ def _programmed_green(city: City, phases: Mapping[str, Sequence[Phase]], step: f
     """(G,) [s] per control interval `step` [s]; NaN without phases."""
     green = np.full(len(city.gateways), np.nan)
     for n, gateway in enumerate(city.gateways):
-        if gateway.signal in phases:
-            plan = phases[gateway.signal]
+        plan = None if gateway.signal is None else phases.get(gateway.signal)
+        if plan is not None:
             lasting = [phase.duration * (phase.state[link] in GREEN) for phase in plan for link in gateway.links]
             green[n] = sum(lasting) / len(gateway.links) * step / sum(phase.duration for phase in plan)
     return green

@@ -111,8 +111,10 @@ class Detectors:
     """The readings of one run. `sample` after every EVERY seconds; `readings` at the end of a control interval."""
 
     def __init__(self, session: Session, city: City, layout: Layout, meter: Meter, known: Instruments):
+        """meter: follows the probes; known: what follows from the layout (`instruments`)"""
         self._session, self._meter, self._known, self._layout, self._city = session, meter, known, layout, city
-        self._loops, _, _, edges = zip(*_loops(city, layout), strict=True) if layout.edges else ((),) * 4
+        loops = _loops(city, layout)
+        self._loops, edges = [name for name, *_ in loops], [edge for *_, edge in loops]
         each = dict(zip(layout.edges, map(len, layout.positions), strict=True))
         # The length of lane that a loop stands for.
         self._length = np.array([city.length[city.edges[edge]] / each[edge] for edge in edges])
@@ -126,6 +128,7 @@ class Detectors:
         self._working = np.random.default_rng([LAYOUT, 1]).random(len(self._loops)) >= share
 
     def sample(self) -> None:
+        """Read the loops once."""
         occupancy = self._session.loop_occupancy
         self._occupancy += [occupancy(loop) for loop in self._loops]
         self._samples += 1

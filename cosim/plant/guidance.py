@@ -113,7 +113,7 @@ class Guide:
         self._ahead: dict[tuple[int, int], np.ndarray] = {}
         self._ways: dict[tuple[int, int], Ways] = {}
         self._homes: dict[tuple[int, int], Home] = {}
-        self._splits: np.ndarray | None = None
+        self._guides, self._splits = False, own
         self._assigned, self._wished = np.zeros((2, *(city.regions,) * 3))
         self.realised = np.zeros((city.regions,) * 3, dtype=int)
         self.refused = 0
@@ -124,8 +124,9 @@ class Guide:
         speed: (E,) [m/s] of the city's edges, the mean over the last interval and NaN on empty ones; None: as before.
         A mean, because the speed at one instant is that of a red or a green signal, every time the same one.
         """
-        self._splits = splits
+        self._guides = splits is not None
         if splits is not None:
+            self._splits = splits
             self._interval += 1
             if speed is not None:
                 now = np.where(np.isnan(speed), self._free, self._length / np.maximum(speed, SLOWEST))
@@ -136,7 +137,7 @@ class Guide:
 
     def apply(self, events: list[Event]) -> None:
         """Guide the vehicles that departed or entered a region in the last step, and those whose time has come."""
-        if self._splits is None:
+        if not self._guides:
             return
         self._steps += 1
         for event in events:
@@ -233,8 +234,8 @@ class Guide:
     def _present(self, vehicle: str) -> list[int] | None:
         """The edges of the driver's present way from where he is; None where it uses roads that are closed to cars."""
         route = self._session.route(vehicle)[self._session.route_index(vehicle):]
-        way = list(map(self._index.get, route))
-        return None if None in way else way
+        way = [number for edge in route if (number := self._index.get(edge)) is not None]
+        return way if len(way) == len(route) else None
 
     def _takes(self, present: list[int] | None, here: int, time: np.ndarray) -> tuple[float, bool]:
         """[s] from the end of edge `here` to the end of the present way, if it begins there, at `time` (E,) [s]; and

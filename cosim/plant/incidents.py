@@ -34,6 +34,7 @@ class Incidents:
     """
 
     def __init__(self, faults: Sequence[Fault], session: Session, city: City):
+        """faults: of the city, already checked (`check`)"""
         self._faults, self._session, self._city = faults, session, city
         self._limits: dict[str, list[float]] = {}  # closed edge -> what its lanes allowed before
         self._own = {fault.name: session.programme_id(fault.name) for fault in faults if fault.kind == "signal"}

@@ -15,16 +15,23 @@ from nmfd.types import State
 
 @dataclass
 class _Vehicle:
-    """origin, destination: regions; edge: the last edge of its route; free: guidance may reroute it; region: where it
-    is now, None before the departure; announced: the region of its last Event (on a junction it may be ahead of
-    that)."""
+    """origin, destination: regions; edge: the last edge of its route; announced: the region of its last Event (on a
+    junction it may be ahead of that), its origin before the first; free: guidance may reroute it; region: where it is
+    now, None before the departure."""
 
     origin: int
     destination: int
     edge: str
+    announced: int
     free: bool = True
     region: int | None = None
-    announced: int | None = None
+
+    @property
+    def here(self) -> int:
+        """The region, of one that has departed."""
+        if self.region is None:
+            raise RuntimeError(f"a vehicle bound for {self.edge} is on the road, but was never seen to depart")
+        return self.region
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +59,7 @@ class Meter:
     """
 
     def __init__(self, session: Session, city: City, probes: frozenset[str] = frozenset()):
+        """probes: vehicles that are counted apart, too"""
         self._session, self._city, self._probes = session, city, probes
         self._vehicles: dict[str, _Vehicle] = {}
         self._teleporting: set[str] = set()
@@ -130,7 +138,7 @@ class Meter:
         on_road = self._session.running()
         for vehicle in on_road:
             known = self._vehicles[vehicle]
-            region = self._city.region_of.get(self._session.road(vehicle), known.region)
+            region = self._city.region_of.get(self._session.road(vehicle), known.here)
             self._cross(known, region)
             counted[region, known.destination] += 1
         for vehicle in self._teleporting.difference(on_road):
@@ -184,8 +192,9 @@ class Meter:
     def _load(self, vehicle: str) -> _Vehicle:
         if vehicle not in self._vehicles:
             route, region_of = self._session.route(vehicle), self._city.region_of
+            origin = region_of.get(route[0], 0)
             self._vehicles[vehicle] = _Vehicle(
-                origin=region_of.get(route[0], 0), destination=region_of.get(route[-1], 0), edge=route[-1],
+                origin=origin, destination=region_of.get(route[-1], 0), edge=route[-1], announced=origin,
                 free=self._session.is_free(vehicle))
         return self._vehicles[vehicle]
 
@@ -193,7 +202,7 @@ class Meter:
         known = self._vehicles[vehicle]
         if vehicle in self._teleporting or known.region == known.announced == region:
             return None
-        source = known.announced if known.region == region else known.region
+        source = known.announced if known.region == region else known.here
         self._cross(known, region)
         known.announced = region
         self.entry_flow[source, edge] += 1

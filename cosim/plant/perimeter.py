@@ -35,6 +35,7 @@ class GatewaySignal:
         self, programme: Programme, movements: Mapping[int, tuple[int, int]], *, min_green: float, mode: str,
         start: float,
     ):
+        """mode: HOLD_BACK or REDISTRIBUTE of cosim.plant.strategy"""
         self.signal, self.phases = programme.signal, programme.phases
         self._states = [phase.state for phase in programme.phases]
         self._original = [phase.duration for phase in programme.phases]

@@ -45,6 +45,7 @@ class Recorder:
     """Adds up a record: `add` at the end of every control interval."""
 
     def __init__(self, meter: Meter, guide: Guide, actuation: Actuation):
+        """What they have counted until now belongs to no interval."""
         self._meter, self._guide, self._actuation = meter, guide, actuation
         self._rows: list[dict[str, np.ndarray]] = []
         self._before = self._totals()

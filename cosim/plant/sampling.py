@@ -36,6 +36,7 @@ class StreetSampler:
     """The samples of one control interval: `sample` as often as they are due, `finish` at its end."""
 
     def __init__(self, session: Session, city: City):
+        """Samples are of the city's normal edges, and of those before its gateways."""
         self._session, self._city = session, city
         self._number = {edge: n for n, edge in enumerate(city.edges)}
         self._region = np.array([city.region_of[edge] for edge in city.edges])
@@ -48,6 +49,7 @@ class StreetSampler:
         self._queues: list[list[int]] = []
 
     def sample(self) -> None:
+        """Take one sample."""
         counts, speeds = self.present()
         self._vehicles, self._metres = self._vehicles + counts, self._metres + counts * speeds
         self._queues.append([self._session.halting(edge) for edge in self._upstream])

@@ -89,8 +89,8 @@ class Ways:
     """
 
     def __init__(
-        self, first, second, next_region, *, inside: Moves, outside: Moves, reached: np.ndarray, ahead: np.ndarray,
-        time: np.ndarray,
+        self, first: np.ndarray, second: np.ndarray, next_region: np.ndarray, *, inside: Moves, outside: Moves,
+        reached: np.ndarray, ahead: np.ndarray, time: np.ndarray,
     ):
         """first, second, next_region: (G,), the last in rising order; inside: moves in the region; outside: those
         elsewhere, back; reached: (nodes of `outside`, G), which edges can be reached from second[g]; ahead: (nodes of

@@ -6,6 +6,7 @@ near or above capacity, and for left turns that are permitted in one stage and p
 """
 
 import hashlib
+import inspect
 import math
 import sys
 from collections.abc import Mapping, Sequence
@@ -55,8 +56,8 @@ def optimised(city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, s
     lanes = {signal.id: _lanes(signal, flows) for signal in signals}
     best, plan = math.inf, list(signals)
     for cycle in CYCLES:
-        found = [_split(signal, lanes[signal.id], cycle) for signal in signals]
-        if not all(found):  # too short
+        found = [split for signal in signals if (split := _split(signal, lanes[signal.id], cycle)) is not None]
+        if len(found) < len(signals):  # too short
             continue
         total = sum(delay for _, delay in found)
         if total >= best:  # longer ones are worse still
@@ -78,7 +79,7 @@ def plan(
     sources = (
         cosim.sumo.turning_flows, cosim.plant.offsets, cosim.sumo.signals, cosim.sumo.trips, sys.modules[__name__])
     for source in sources:
-        content.update(Path(source.__file__).read_bytes())
+        content.update(Path(inspect.getfile(source)).read_bytes())
     content.update(city.net_file.read_bytes())
     content.update(repr((step, sorted(city.region_of.items()))).encode())
     content.update(np.ascontiguousarray(demand).tobytes())
@@ -149,8 +150,11 @@ def _opposing(signal: Signal, lanes: list[_Lane]) -> dict[tuple[int, str], tuple
     return found
 
 
-def _delay(signal: Signal, durations: list[float], lanes: list[_Lane], opposing, cycle: float) -> float:
-    """Sum over the lanes of flow times delay [veh s/s]."""
+def _delay(
+    signal: Signal, durations: list[float], lanes: list[_Lane], opposing: Mapping[tuple[int, str], tuple[float, float]],
+    cycle: float,
+) -> float:
+    """Sum over the lanes of flow times delay [veh s/s]; opposing: see `_opposing`."""
     total = 0.0
     for lane in lanes:
         served, served_before = 0.0, math.inf  # veh per cycle that could pass; headway in the phase before

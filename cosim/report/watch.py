@@ -94,16 +94,19 @@ class Painted:
     """A SUMO plant (nmfd.types.Plant) whose gateways are painted with every command."""
 
     def __init__(self, plant: SumoPlant, network: RegionalModel):
+        """plant: started with a window that has the marks of `marked`; network: whose bounds u has"""
         self._plant, self._network = plant, network
         self._marked = marked(plant.city)
 
     def reset(self, seed: int) -> State:
+        """As the plant does."""
         state = self._plant.reset(seed)
         leaks = set(self._plant.leaks())
         self._controlled = {mark: gateway for mark, gateway in self._marked.items() if gateway not in leaks}
         return state
 
     def step(self, controls: Controls) -> State:
+        """Paint the gateways that a command reaches, then simulate a control interval."""
         low, high = self._network.u_min, self._network.u_max
         self._plant.session.paint({
             mark: colour((controls.perimeter[g.source, g.target] - low) / (high - low))
@@ -111,9 +114,11 @@ class Painted:
         return self._plant.step(controls)
 
     def observe(self) -> Observation | None:
+        """As the plant does."""
         return self._plant.observe()
 
     def close(self) -> None:
+        """As the plant does."""
         self._plant.close()
 
 

@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -94,7 +95,9 @@ def make_trips(city: City, demand: np.ndarray, step: float, seed: int) -> Trips:
                  arrival=lengths * (0.1 + 0.8 * positions))
 
 
-def _departures(demand: np.ndarray, step: float, rng) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _departures(
+    demand: np.ndarray, step: float, rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(times, origins, destinations), sorted by time, rounded to 0.01 s."""
     clock = step * np.arange(len(demand) + 1)
     times, origins, destinations = [], [], []
@@ -123,7 +126,7 @@ def _ends(city: City, region: int, *, departing: bool) -> tuple[list[str], np.nd
     """
     edges = [edge for edge in city.edges if city.region_of[edge] == region]
     before = _predecessors(city)
-    onward = city.successors if departing else before
+    onward: Mapping[str, Sequence[str]] = city.successors if departing else before
     good = [edge for edge in edges if _stays(city, edge, onward) and city.length[edge] >= SHORT
             and not _is_pocket(city, edge, before[edge])]
     chosen = good if len(good) >= 2 else edges
@@ -139,7 +142,7 @@ def _predecessors(city: City) -> dict[str, list[str]]:
     return before
 
 
-def _stays(city: City, edge: str, onward) -> bool:
+def _stays(city: City, edge: str, onward: Mapping[str, Sequence[str]]) -> bool:
     """Whether some way on from the edge stays in its region; a dead end does not."""
     seen = {edge}
     here = edge
@@ -165,7 +168,8 @@ def _draw(ends: tuple[list[str], np.ndarray], uniform: float) -> str:
 class Ways:
     """Shortest paths over the edges as nodes: an arc costs the junction and the edge after it."""
 
-    def __init__(self, city: City, rng):
+    def __init__(self, city: City, rng: np.random.Generator):
+        """rng: draws how each group of drivers sees the travel times"""
         self.city = city
         number = {edge: n for n, edge in enumerate(city.edges)}
         arcs = [(number[a], number[b], city.turn_time[a, b]) for a, after in city.successors.items() for b in after]

@@ -64,6 +64,6 @@ def _edges(element: ElementTree.Element, routes: Mapping[str, Sequence[str]]) ->
     route = element.find("route")
     if route is not None:
         return route.get("edges", "").split(), True
-    if element.get("route"):
-        return routes.get(element.get("route"), ()), True
+    if name := element.get("route"):
+        return routes.get(name, ()), True
     return [edge for key in ("from", "via", "to") for edge in element.get(key, "").split()], False
