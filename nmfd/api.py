@@ -105,7 +105,7 @@ def named(controller: str | Controller, scenario: Scenario, policy: Path | str |
     if isinstance(controller, str):
         return controller, registry.make(controller, scenario, policy=None if policy is None else Path(policy))
     if policy is not None:
-        raise InputError(f"policy: {policy}: is for a controller by name; this one is an object: leave policy out")
+        raise InputError(f"policy: {policy}: is for a controller by name; this one is an object: omit policy")
     for method in ("reset", "act"):
         if not callable(getattr(controller, method, None)):
             raise InputError(

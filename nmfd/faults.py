@@ -76,7 +76,7 @@ def without_city(faults: Sequence[Fault], where: str) -> None:
     for fault in faults:
         if fault.kind in CITY:
             raise InputError(
-                f"{where}: {fault.kind} is a fault of a city in SUMO, not of the regional model; leave it out")
+                f"{where}: {fault.kind} is a fault of a city in SUMO, not of the regional model; omit it")
 
 
 class Sensors:

@@ -1,4 +1,4 @@
-"""The vehicle ledger: who entered has ended his trip or is inside. Always on, in every plant, at every control step."""
+"""The vehicle ledger: who entered has ended their trip or is inside. Always on, in every plant, at every step."""
 
 import math
 

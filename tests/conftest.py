@@ -7,11 +7,15 @@ from pathlib import Path
 import pytest
 from xdist.workermanage import NodeManager
 
+from cosim.sumo.build import ensure_built
+from nmfd.model.regional_model import load_network
+
 sys.dont_write_bytecode = False  # else every process rewrites the asserts of all files anew, for 6 s
 # Here and in the commands that tests call: workers must not fight for cores. Torch reads it when it is imported.
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
-ALLOWED = ("no GPU", "no real city")  # reasons for which a test may be skipped all the same
+# Reasons for which a test may be skipped all the same; benchmarks run when they are asked for.
+ALLOWED = ("no GPU", "no real city", "--benchmark-skip active")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -22,14 +26,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """The city that most tests drive is built once, before workers copy it."""
-    grid7 = Path(__file__).parents[1] / "networks" / "grid7"
-    if not hasattr(session.config, "workerinput") and not session.config.option.collectonly and not (
-            grid7 / "build").is_dir():
-        from cosim.sumo.build import ensure_built  # here, because it takes a second, and is needed once
-        from nmfd.model.regional_model import load_network
-
-        ensure_built(load_network(grid7))
+    """The city that most tests drive is built once, before workers use and copy it."""
+    if not hasattr(session.config, "workerinput") and not session.config.option.collectonly:
+        ensure_built(load_network(Path(__file__).parents[1] / "networks" / "grid7"))
 
 
 def pytest_keyboard_interrupt() -> None:

@@ -20,7 +20,7 @@ import tiny_city
 import torch
 from commands import call, good
 
-from cosim.sumo.recorded_trips import read_originals
+from cosim.sumo.recorded_trips import read_recorded_trips
 from nmfd import closed_loop
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc import training
@@ -424,7 +424,7 @@ def test_unsorted_routes_are_sorted(copied):
     root = gzip.decompress(file.read_bytes()).decode()
     vehicles = [ElementTree.tostring(vehicle, encoding="unicode") for vehicle in ElementTree.fromstring(root)]
     (copied / "r.rou.xml").write_text(f"<routes>{''.join(reversed(vehicles))}</routes>")
-    assert (np.diff(read_originals([copied / "r.rou.xml"]).depart) >= 0).all()
+    assert (np.diff(read_recorded_trips([copied / "r.rou.xml"]).depart) >= 0).all()
 
 
 LINES = {

@@ -119,7 +119,7 @@ def test_network_file_comes_back_the_same(scenario, result, tmp_path):
     network = scenario.network
     crossings = result.record["crossings"].sum(axis=0)
     crossings[0, 1, 6] = crossings[0, 3, 6] / 3.0
-    network = replace(network, own_splits=observed_split_ratios(network, crossings))
+    network = replace(network, observed_split_ratios=observed_split_ratios(network, crossings))
     for kind in (network, tiny.limited(network)):
         text = network_toml(kind, {"recipe": "city.toml"}, "a test")
         (tmp_path / "network.toml").write_text(text)

@@ -115,7 +115,7 @@ def test_identify_writes_a_network_that_loads(small, tmp_path):
     good(cosim("identify", scenario, "--levels", "1.0", "--seeds", "2", "--iterations", "5", "--out", out))
     after = load_network(network)
     assert after.hash != before.hash and (after.adjacency == before.adjacency).all()
-    assert after.own_splits and all(mfd.problem() is None for mfd in after.mfds)
+    assert after.observed_split_ratios and all(mfd.problem() is None for mfd in after.mfds)
     assert len(pd.read_csv(out / "samples.csv")) > 40 and (out / "mfd.png").is_file()
 
 

@@ -143,7 +143,7 @@ def test_a_small_evaluation_in_sumo(city, tmp_path):
     file.write_text(re.sub(r"ramp_up = [\d.]+", "ramp_up = 60.0", file.read_text()))
     change(file, r"outflow_share = [\d.]+", "set_point = [20.0]")
     out = tmp_path / "out"
-    arguments = ("evaluate", city, "--controllers", "no-control,pi-gating", "--seeds", "2", "--steps", "2", "--workers",
+    arguments = ("evaluate", city, "--controllers", "no-control,pi-gating", "--seeds", "2", "--steps", "3", "--workers",
                  "1", "--out", out)
     result = cosim(*arguments)
     assert result.exit_code == 0, result.output + str(result.exception)

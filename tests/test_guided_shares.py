@@ -88,7 +88,7 @@ def test_theta_shifts_the_shares_of_those_who_wish(theta, expected):
 def test_a_longer_way_is_taken_as_soon_as_its_region_is_far_enough_behind(monkeypatch, bonus, first):
     """Half of them shall go by b, which takes 125 s more. After n drivers by a, the lead of a's price is
     125 - bonus ((n + 1) / 2 - ((n + 1) / 2 - n)) = 125 - bonus n: b it is from n = 125 / bonus on."""
-    monkeypatch.setattr(guidance, "BONUS", bonus)
+    monkeypatch.setattr(guidance, "SHARE_PENALTY", bonus)
     town = Town(through_a=30.0, through_b=155.0, theta=0.25)
     ways = town.drive(first + 1)
     assert ways.index("b") == first

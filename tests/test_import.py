@@ -14,13 +14,13 @@ import tiny_city
 from commands import cosim, error_line, good
 
 from cosim.importing import level
-from cosim.importing.case import read_case
+from cosim.importing.case import read_sumo_input
 from cosim.importing.demand import read_traffic
 from cosim.importing.streets import graph, read_streets
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.sumo.net import load_city
-from cosim.sumo.recorded_trips import read_originals, read_routes
+from cosim.sumo.recorded_trips import read_recorded_trips, read_routes
 from cosim.sumo.turning_flows import own_flows
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
@@ -42,7 +42,7 @@ def imported(config, tmp_path_factory):
 
 
 def test_traffic_keeps_cars_and_leaves_the_rest_alone(config):
-    case = read_case(config)
+    case = read_sumo_input(config)
     assert case.begin == 600.0 and case.end == 1500.0
     traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
     ids = [vehicle.get("id") for vehicle in traffic.vehicles]
@@ -114,7 +114,7 @@ def test_import_is_deterministic_and_atomic(imported, config, tmp_path):
 
 def test_scenario_drives_the_original_vehicles(imported, config):
     scenario = load_scenario(imported[0] / "scenarios" / "tiny")
-    case = read_case(config)
+    case = read_sumo_input(config)
     traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
     assert scenario.demand.sum() * scenario.step == pytest.approx(len(traffic.vehicles), rel=1e-4)
     assert settings(scenario).begin == 600.0 and settings(scenario).ways_return
@@ -220,7 +220,7 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
     (tmp_path / "city.sumocfg").write_text(
         '<configuration><net-file v="city.net.xml"/><route-files v="cars.rou.xml"/><begin v="600"/><scale v="2.5"/>'
         '<mesosim v="true"/><max-depart-delay value="60"/><tripinfo-output value="trips.xml"/></configuration>')
-    case = read_case(tmp_path / "city.sumocfg")
+    case = read_sumo_input(tmp_path / "city.sumocfg")
     assert case.scale == 2.5 and case.mesoscopic and case.left_out == ["max-depart-delay = 60"]
     text = good(cosim("import", tmp_path / "city.sumocfg", "--regions", 2, "--method", "geometric", "--no-run",
                       "--out", tmp_path / "networks" / "x"))
@@ -244,7 +244,7 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
         settings(scenario).routes, settings(scenario).additional))
     files = scenario.network.folder
     city = load_city(files / "city.net.xml.gz", files / "regions.csv", 3)
-    flows = own_flows(city, read_originals(own), read_routes(additional), 2.0)
+    flows = own_flows(city, read_recorded_trips(own), read_routes(additional), 2.0)
     assert flows["A1B1", "B1B0"] >= 2.0 / 900.0                       # the route that one vehicle names
     assert 2.0 * 75 / 900 <= flows["B1C1", "C1D1"] < 2.0 * 120 / 900   # the flow straight on, of trips
     assert all(b in city.successors[a] for a, b in flows)
@@ -297,7 +297,7 @@ def test_import_at_a_congested_level(config, tmp_path):
     scenario = load_scenario(tmp_path / "scenarios" / "busy")
     assert "level: " in text and settings(scenario).mesoscopic
     assert f"demand times {scenario.demand_factor:g}" in text
-    vehicles = read_originals([scenario.folder / "vehicles.rou.xml.gz"])
+    vehicles = read_recorded_trips([scenario.folder / "vehicles.rou.xml.gz"])
     total = scenario.demand.sum() * scenario.step
     assert total == pytest.approx(scenario.demand_factor * len(vehicles.depart), rel=1e-4)
     line = error_line(cosim("import", config, "--regions", 2, "--level", "twice", "--out", tmp_path / "networks" / "x"))
@@ -347,7 +347,7 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
     assert (tmp_path / "loading" / "guided" / "level-2" / "probing-pcrg-1000.nc").is_file()
     loaded = load_scenario(scenario)
     guided = planning_model(loaded, "dpc-pcrg").network
-    assert guided.hash != loaded.network.hash and guided.own_splits == loaded.network.own_splits
+    assert guided.hash != loaded.network.hash and guided.observed_split_ratios == loaded.network.observed_split_ratios
     assert "PLACEHOLDERS" not in (network / "network.toml").read_text()
     good(cosim("import", config, "--regions", 2, "--method", "geometric", "--no-run", "--out", network, "--force"))
     assert planning_model(load_scenario(scenario), "dpc-pcrg").network.regions == 2

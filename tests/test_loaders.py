@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from cosim.importing.case import seconds
 from cosim.plant.strategy import parse
 from cosim.sumo.net import load_city
-from cosim.sumo.recorded_trips import read_originals
+from cosim.sumo.recorded_trips import read_recorded_trips
 from nmfd.api import load_scenario
 from nmfd.cli.options import policy_files, whole_numbers
 from nmfd.controllers.dpc.policy import load_policy
@@ -138,7 +138,7 @@ def test_any_bytes(tmp_path, network, content, kind):
 
 
 def read_originals_of(path: Path):
-    found = read_originals([path])
+    found = read_recorded_trips([path])
     return None if not len(found.depart) else found
 
 

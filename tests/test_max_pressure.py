@@ -132,11 +132,15 @@ def test_saturation_flows_by_hand():
 
 @pytest.fixture
 def junctions():
-    """Max-pressure at both signals, what it has shown, and the vehicles on every lane of an edge."""
+    """Max-pressure at both signals, what s has shown, and the vehicles on every lane of an edge."""
     vehicles, shown = {}, []
     session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane.partition("_")[0], 0.0))
-    control = MaxPressure(session, TOWN, [CROSSING], FLOWS, others=[END], min_green=12.0,
-                          show=lambda name, state: shown.append((session.time, name, state)))
+
+    def show(name, state):
+        if name == "s":
+            shown.append((session.time, name, state))
+
+    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, min_green=12.0, show=show)
 
     def play(until):
         while session.time <= until:
@@ -174,7 +178,7 @@ def test_a_spent_ration_exerts_no_pressure():
         Gateway(source=0, target=1, from_edge="a", to_edge="b", signal="s", links=(0,)),)})
     shown, session = [], SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 50.0, "c": 1.0}.get(lane[0], 0.0))
     control = MaxPressure(
-        session, town, [CROSSING], FLOWS, others=[], min_green=5.0, show=lambda name, state: shown.append(state))
+        session, town, [CROSSING], FLOWS, min_green=5.0, show=lambda name, state: shown.append(state))
     control.command(np.full((2, 2), 5.0 / 61.0), {})  # 5 s, and so much of the other 61 s
     assert control.green_time() == {"s": {0: 0.0}}
     for second in range(66):

@@ -9,11 +9,11 @@ import pytest
 import tiny_city
 from commands import cosim
 
-from cosim.importing.case import read_case
+from cosim.importing.case import read_sumo_input
 from cosim.importing.demand import read_traffic
 from cosim.importing.od import read_od, trips
 from cosim.importing.streets import read_streets
-from cosim.sumo.recorded_trips import read_originals
+from cosim.sumo.recorded_trips import read_recorded_trips
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 
@@ -102,7 +102,7 @@ def test_import_of_a_matrix(net, tmp_path):
     assert result.exit_code == 0, result.output
     scenario = load_scenario(tmp_path / "scenarios" / "od")
     assert "begin = 27000.0" in (scenario.folder / "scenario.toml").read_text()
-    vehicles = read_originals([scenario.folder / "vehicles.rou.xml.gz"])
+    vehicles = read_recorded_trips([scenario.folder / "vehicles.rou.xml.gz"])
     assert len(vehicles.depart) in (120, 121) and scenario.demand.sum() * scenario.step == pytest.approx(
         len(vehicles.depart), rel=1e-4)
     ends = pd.DataFrame([(e.get("from"), e.get("to")) for e in vehicles.elements], columns=["from", "to"])
@@ -116,7 +116,7 @@ def test_relations_in_an_additional_file(net, tmp_path):
     (tmp_path / "city.add.xml").write_text(ZONES.replace("</additional>", RELATIONS[6:-7] + "</additional>"))
     (tmp_path / "city.sumocfg").write_text(
         f'<configuration><net-file value="{net}"/><additional-files value="city.add.xml"/></configuration>')
-    case = read_case(tmp_path / "city.sumocfg")
+    case = read_sumo_input(tmp_path / "city.sumocfg")
     traffic = read_traffic(case, read_streets(case.net), seed=0)
     assert len(traffic.vehicles) in (120, 121) and "interval" not in [element.tag for element in traffic.shared]
 
@@ -141,4 +141,4 @@ def test_unknown_zone_and_vehicles_beside_a_matrix(net, tmp_path):
     result = cosim("import", net, *arguments)
     assert result.exit_code == 2 and "TAZ 'west' is unknown; define it in a file for --zones" in result.stderr
     result = cosim("import", tiny_city.city(tmp_path), *arguments)
-    assert result.exit_code == 2 and "vehicles of its own; leave --od away" in result.stderr
+    assert result.exit_code == 2 and "vehicles of its own; omit --od" in result.stderr

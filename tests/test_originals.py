@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tiny
 
-from cosim.sumo.recorded_trips import draw, read_originals, write_originals
+from cosim.sumo.recorded_trips import draw, read_recorded_trips, write_recorded_trips
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
@@ -20,13 +20,13 @@ VEHICLES = "<routes>" + "".join(
 @pytest.fixture
 def originals(tmp_path):
     (tmp_path / "cars.rou.xml").write_text(VEHICLES)
-    return read_originals([tmp_path / "cars.rou.xml"])
+    return read_recorded_trips([tmp_path / "cars.rou.xml"])
 
 
 def test_seed_moves_departures_and_nothing_else(originals, tmp_path):
     def written(name, **options):
         path = tmp_path / name
-        write_originals(originals, path, **{"seed": 1, "factor": 1.0, "jitter": 10.0, "begin": 100.0} | options)
+        write_recorded_trips(originals, path, **{"seed": 1, "factor": 1.0, "jitter": 10.0, "begin": 100.0} | options)
         return path.read_bytes()
 
     assert written("a") == written("b") != written("c", seed=2)
@@ -61,7 +61,7 @@ def test_factor_thins_and_duplicates(originals, factor, count):
 def test_route_files_that_are_none(tmp_path, text, expected):
     (tmp_path / "cars.rou.xml").write_text(text)
     with pytest.raises(InputError, match=expected):
-        read_originals([tmp_path / "cars.rou.xml"])
+        read_recorded_trips([tmp_path / "cars.rou.xml"])
 
 
 def with_demand_file(folder, rows):

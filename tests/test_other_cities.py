@@ -8,7 +8,7 @@ import tiny_city
 from commands import cosim
 from tiny_city import driven
 
-from cosim.importing.case import read_case
+from cosim.importing.case import read_sumo_input
 from cosim.importing.demand import read_traffic
 from cosim.importing.importer import left_alone
 from cosim.importing.level import congesting
@@ -16,7 +16,7 @@ from cosim.importing.streets import read_streets
 from cosim.plant.meter import Meter
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
-from cosim.sumo.recorded_trips import draw, read_originals
+from cosim.sumo.recorded_trips import draw, read_recorded_trips
 from cosim.sumo.session import REFUSALS
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
@@ -45,7 +45,7 @@ def city(net, tmp_path):
 
 
 def traffic_of(config):
-    case = read_case(config)
+    case = read_sumo_input(config)
     return read_traffic(case, read_streets(case.net, case.additional), seed=0)
 
 
@@ -118,7 +118,7 @@ def test_an_id_twice(city):
 def test_copies_of_vehicles_get_ids_of_their_own(tmp_path):
     (tmp_path / "a.rou.xml").write_text("<routes>" + "".join(
         f'<trip id="{name}" depart="1" from="a" to="b"/>' for name in ("0", "0.1", "0.1.1", "1")) + "</routes>")
-    drawn = draw(read_originals([tmp_path / "a.rou.xml"]), seed=0, factor=3.0, jitter=0.0, begin=0.0)
+    drawn = draw(read_recorded_trips([tmp_path / "a.rou.xml"]), seed=0, factor=3.0, jitter=0.0, begin=0.0)
     names = [name for _, _, name in drawn]
     assert len(names) == len(set(names)) == 12 and {"0", "0.1", "0.1.1", "1", "1.1", "1.2", "0.2"} <= set(names)
 
@@ -177,7 +177,7 @@ def test_what_else_changes_routes_and_vehicles(city, tmp_path, monkeypatch):
 def test_signals_that_cannot_be_controlled(net, city, tmp_path):
     """Off, or without any programme, as railway crossings are: no gateway counts as controlled by them."""
     config = city(additional='<tlLogic id="B1" programID="off" type="static" offset="0"/>')
-    case = read_case(config)
+    case = read_sumo_input(config)
     found = left_alone(read_streets(case.net, case.additional), traffic_of(config))
     assert found == {"B1": "switched off"}
     text = re.sub(r'<tlLogic id="C2".*?</tlLogic>', "", net.read_text(), flags=re.DOTALL)

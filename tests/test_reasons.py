@@ -85,5 +85,5 @@ def test_load_and_deeds_are_counted(network):
 def test_nothing_to_compare_with(network):
     rows = table(ALIKE)[lambda frame: frame["controller"] != "no-control"]
     found = explain.load(network, [run(network, 2.0, 0.9)], [])
-    line = explain.verdict(rows, 1.0, "pi-gating", found, 0.0, explain.Deeds(held=0.1, guided=0.0), network)
+    line = explain.verdict(rows, 1.0, "pi-gating", found, 0.0, explain.ControlActivity(held=0.1, guided=0.0), network)
     assert "no common seed with no-control" in line and np.isnan(found.inside).all()

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trajectories
 import xarray as xr
 from trajectories import trajectory
 

@@ -50,11 +50,11 @@ def test_a_row(tmp_path):
 
 def test_cases_are_kept_added_and_drawn(tmp_path):
     out = tmp_path / "out"
-    first = nmfd("--regions", 3, "--controllers", "mpc-pc", "--out", out)
+    first = nmfd("scaling", "--regions", 3, "--controllers", "mpc-pc", "--out", out)
     assert first.exit_code == 0, first.output
     assert "mpc-pc" in first.stdout and f"Written to {out}" in first.stdout
     row = files.read_rows(out / "scaling.csv", scaling.COLUMNS)[0]
-    second = nmfd("--regions", "3,4", "--controllers", "mpc-pc", "--out", out, "--workers", 2, "--family", "hexagonal")
+    second = nmfd("scaling", "--regions", "3,4", "--controllers", "mpc-pc", "--out", out, "--workers", 2, "--family", "hexagonal")
     assert second.exit_code == 0, second.output
     rows = files.read_rows(out / "scaling.csv", scaling.COLUMNS)
     assert [(r["family"], r["regions"]) for r in rows] == [("complete", 3), ("hexagonal", 3), ("hexagonal", 4)]
@@ -98,7 +98,7 @@ def test_fresh_processes_and_their_time_limit():
     (["--workers", "0"], "'--workers'"), (["--out", "/dev/null/x"], "/dev/null/x: Not a directory")])
 def test_errors_are_one_line(tmp_path, arguments, fragment):
     out = [] if "--out" in arguments else ["--out", tmp_path / "out"]
-    result = nmfd(*arguments, *out)
+    result = nmfd("scaling", *arguments, *out)
     assert result.exit_code == 2 and result.stderr.count("\n") == 1 and result.stdout == ""
     assert result.stderr.startswith("nmfd: error: ") and fragment in result.stderr
     assert not (tmp_path / "out").exists()
@@ -106,6 +106,6 @@ def test_errors_are_one_line(tmp_path, arguments, fragment):
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    result = nmfd("--regions", 2, "--out", tmp_path)
+    result = nmfd("scaling", "--regions", 2, "--out", tmp_path)
     assert result.exit_code == 2 and "holds no manifest.json" in result.stderr
     assert np.array([path.name for path in tmp_path.iterdir()]) == ["notes.txt"]

@@ -149,7 +149,7 @@ def test_one_run_for_real(peak, tmp_path):
     (("--controllers", "no-control", "--compliance", "0.5"), "--compliance: expected whole percentages"),
     (("--controllers", "no-control", "--compliance", "5,05"), "names a percentage twice"),
     (("--controllers", "dpc-pcrg+compliance-50", "--compliance", "0"), "exclude each other"),
-    (("--controllers", "no-control", "--workers", "2", "--scheduler", "tcp://x:1"), "leave one away"),
+    (("--controllers", "no-control", "--workers", "2", "--scheduler", "tcp://x:1"), "omit one"),
 ])
 def test_mistakes(peak, tmp_path, arguments, expected):
     done = sweep(peak, *arguments, "--out", tmp_path / "out")

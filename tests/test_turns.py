@@ -93,7 +93,7 @@ def test_rounding_changes_the_rate_at_the_kink_only():
 def test_vehicles_at_stake():
     model = edge_model.build(NETWORK, SOME, guidance=True)
     start, demand, plan = problem(model, moves=1, horizon=1)
-    stake = edge_model.vehicles_at_stake(model, start, demand, plan, 30.0)[0]
+    stake = edge_model.affected_vehicles(model, start, demand, plan, 30.0)[0]
     q = edge_model.rate(model, start.reshape(7, -1).sum(axis=1))[0]
     leaving = 30.0 * q[model.region] * start
     edges = len(model.edges)

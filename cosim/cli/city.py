@@ -11,9 +11,8 @@ from typing import Literal
 import click
 
 from cosim.cli.options import parsed_level, parsed_levels
-from nmfd.cli.errors import Interrupted
 from nmfd.cli.options import COUNT, FILE, FOLDER, SEED
-from nmfd.cli.progress import progress_line
+from nmfd.cli.progress import progress_line, resumable
 from nmfd.errors import InputError
 from nmfd.runs import files
 
@@ -73,12 +72,8 @@ def identify(
         loading = identify.Loading(
             levels=factors, seeds=range(1000, 1000 + seeds), guided=guide,
             options=options.split("+") if options else (), network=target, iterations=iterations)
-        try:
-            with progress_line("identify") as progress:
-                text = identify.identify(scenario, loading, out=folder, workers=workers, progress=progress)
-        except KeyboardInterrupt:
-            raise Interrupted(
-                f"interrupted; finished loading runs are in {folder}: the same command goes on") from None
+        with resumable("identify", folder) as progress:
+            text = identify.identify(scenario, loading, out=folder, workers=workers, progress=progress)
         if both:
             click.echo("Drivers who are guided:" if guide else "Drivers who go their own ways:")
         click.echo(text)
@@ -128,7 +123,7 @@ def import_(
       cosim import city.net.xml.gz --regions 6 --demand peak --out networks/mycity
       cosim import city.sumocfg --taz districts.taz.xml --out networks/mycity --begin 7:00:00 --end 9:00:00
     """
-    from cosim.importing.importer import Order, import_city, parse_time  # heavy
+    from cosim.importing.importer import ImportOptions, import_city, parse_time  # heavy
     from cosim.importing.partition import Clustered, Drawn
 
     cuts: list[Clustered | Drawn] = [] if regions is None else [Clustered(method=method, regions=regions)]
@@ -139,7 +134,7 @@ def import_(
         raise InputError("--regions: give a number of regions, or else one of --edges, --taz and --polygons")
     if no_run and cuts[0].method == "density":
         raise InputError("--no-run: the densities come from that run; add --method geometric")
-    order = Order(
+    order = ImportOptions(
         source=source, out=out, cut=cuts[0], seed=seed, run=not no_run, force=force,
         peak=demand is not None, level=parsed_level(level, no_run), mesoscopic=mesoscopic,
         scenario=scenario or out.parent.parent / "scenarios" / out.name,

@@ -13,9 +13,9 @@ from cosim.cli.options import CONTROLLER_HELP, parsed_compliance, parsed_levels,
 from cosim.cli.reference import reference
 from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
-from nmfd.cli.errors import Commands, Interrupted
+from nmfd.cli.errors import Commands
 from nmfd.cli.options import COUNT, FOLDER, SEED, policy_files
-from nmfd.cli.progress import progress_line
+from nmfd.cli.progress import resumable
 from nmfd.errors import InputError, RunFailed
 from nmfd.runs import files as disk
 from nmfd.runs.workers import cores
@@ -82,14 +82,11 @@ def evaluate(
         levels=tuple(parsed_levels("--demand", demand)), steps=steps, policies=files, reference=reference,
         out=Path("runs") / f"{disk.file_name(loaded.name)}-evaluate" if out is None else out)
     workers = cores() if workers is None else workers
-    try:
-        with progress_line("evaluate") as progress:
-            table, failures = evaluate.evaluate(chosen, workers=workers, progress=progress, tell=tell)
-            if len(table):
-                pictures.draw_all(
-                    chosen.out, evaluate.level_folders(chosen.out), loaded, evaluate.all_runs(chosen))
-    except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; finished runs are in {chosen.out}: the same command goes on") from None
+    with resumable("evaluate", chosen.out) as progress:
+        table, failures = evaluate.evaluate(chosen, workers=workers, progress=progress, tell=tell)
+        if len(table):
+            pictures.draw_all(
+                chosen.out, evaluate.level_folders(chosen.out), loaded, evaluate.all_runs(chosen))
     if len(table):
         click.echo(statistics.text(table, reference))
         click.echo(f"Written to {chosen.out}: see evaluate.md, pairs.csv and the pictures")
@@ -141,7 +138,7 @@ def sweep(
     if repeated := [name for n, name in enumerate(names) if name in names[:n]]:
         raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
     if scheduler is not None and workers is not None:
-        raise InputError("--workers: is for processes here, and --scheduler has workers of its own; leave one away")
+        raise InputError("--workers: is for processes here, and --scheduler has workers of its own; omit one")
     files = policy_files(policies, names)
 
     from cosim.evaluation import sweeps  # heavy
@@ -153,11 +150,8 @@ def sweep(
         policies=files,
         out=Path("runs") / f"{disk.file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
     workers = cores() if workers is None else workers
-    try:
-        with progress_line("sweep") as progress:
-            rows = sweeps.sweep(order, workers=workers, scheduler=scheduler, progress=progress, tell=tell)
-    except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; finished runs are in {order.out}: the same command goes on") from None
+    with resumable("sweep", order.out) as progress:
+        rows = sweeps.sweep(order, workers=workers, scheduler=scheduler, progress=progress, tell=tell)
     click.echo(sweeps.text(rows))
     click.echo(f"Written to {order.out / 'sweep.parquet'}")
     if failed := int((rows["status"] == sweeps.FAILED).sum()):

@@ -15,7 +15,7 @@ def parsed_level(text: str, no_run: bool) -> float | None:
     """--level; None for auto. InputError for anything else."""
     if text == "auto":
         if no_run:
-            raise InputError("--level: auto simulates the city, which --no-run forbids; leave one of them away")
+            raise InputError("--level: auto simulates the city, which --no-run forbids; omit one of them")
         return None
     try:
         (found,) = parsed_levels("--level", text)

@@ -10,9 +10,8 @@ from pathlib import Path
 import click
 
 from cosim.cli.options import CONTROLLER_HELP, tell
-from nmfd.cli.errors import Interrupted
 from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, fault_option
-from nmfd.cli.progress import progress_line
+from nmfd.cli.progress import resumable
 from nmfd.errors import InputError
 
 
@@ -93,8 +92,8 @@ def compare(
 
     For a scenario, the microsimulation is run first; for the run folder of `cosim run`, its record is used. Then the
     regional model is driven with the recorded departures and controls. Writes compare-NAME-SEED.csv and pictures
-    beside the run. For a RUN folder without --controller, `cosim evaluate`'s too: how far ahead the models foresee all
-    of its runs, as a table and foresight.csv.
+    beside the run. For a RUN folder without --controller, `cosim evaluate`'s too: how far ahead the models foresee
+    all of its runs, as a table and foresight.csv.
 
     \b
     Examples:
@@ -110,12 +109,12 @@ def compare(
     manifest = run_folder.read_manifest(target / "manifest.json") if (target / "manifest.json").is_file() else None
     results = manifest is not None or any(target.glob("demand-*/manifest.json"))
     if results and out is not None:
-        raise InputError(f"--out: {out}: a comparison is written into its run folder {target}; leave --out away")
+        raise InputError(f"--out: {out}: a comparison is written into its run folder {target}; omit --out")
     if results and controller is None:
         if seed is not None or steps is not None:
             raise InputError(
                 f"--{'seed' if steps is None else 'steps'}: without --controller all runs of {target} are compared, "
-                "whole; name a controller, or leave it away")
+                "whole; name a controller, or omit it")
         _foresight(target, model)
         return
     controller, seed = controller or "no-control", seed or 0
@@ -148,7 +147,7 @@ def _foresight(target: Path, model: Path | None) -> None:
     """All runs of a folder against the regional models."""
     from cosim.evaluation import prediction_error, results  # heavy
 
-    found = prediction_error.foresee(results.read(target), model)
+    found = prediction_error.prediction_errors(results.read(target), model)
     prediction_error.write_foresights(target / "foresight.csv", found)
     click.echo(prediction_error.foresight_table(found))
     click.echo(f"Written to {target / 'foresight.csv'}")
@@ -163,10 +162,5 @@ def _experiment(tasks: list, out: Path | None, sumo_output: tuple[str, ...] = ()
 
     out = run_folder.default_folder(load_scenario(tasks[0].scenario).name) if out is None else out
     tasks = [replace(task, sumo_output=paths(sumo_output, out, task.controller, task.seed)) for task in tasks]
-    try:
-        with progress_line("cosim") as progress:
-            return out, experiment.experiment(tasks, out=out, workers=2, progress=progress, tell=tell)
-    except KeyboardInterrupt:
-        if not (out / "summary.csv").exists():
-            raise Interrupted("interrupted before a run was finished; nothing is kept") from None
-        raise Interrupted(f"interrupted; finished runs are in {out}: the same command with --out goes on") from None
+    with resumable("cosim", out, "summary.csv") as progress:
+        return out, experiment.experiment(tasks, out=out, workers=2, progress=progress, tell=tell)

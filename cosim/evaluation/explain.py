@@ -26,7 +26,7 @@ MORE_FULL = 0.02     # of the edges before gateways and intervals
 
 
 @dataclass(frozen=True, kw_only=True)
-class Load:
+class Loading:
     """Of R regions: most (R,), the highest accumulation over the critical one, mean over the runs; beyond (R,), the
     share of the time beyond it; inside (R,), the share of the vehicles there that had started there, NaN if unknown."""
 
@@ -40,7 +40,7 @@ class Load:
         return np.flatnonzero(self.beyond > HARDLY)
 
 
-def load(network: RegionalModel, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> Load:
+def load(network: RegionalModel, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> Loading:
     """What some runs were like."""
     critical = np.array([mfd.critical for mfd in network.mfds])
     states = [trajectory.accumulation.sum(axis=2) / critical for trajectory in trajectories]
@@ -50,13 +50,13 @@ def load(network: RegionalModel, trajectories: Sequence[Trajectory], records: It
         came += record["crossings"].sum(axis=(0, 1, 3))
     with np.errstate(invalid="ignore"):
         inside = started / (started + came)
-    return Load(
+    return Loading(
         most=np.mean([state.max(axis=0) for state in states], axis=0),
         beyond=np.mean([(state > 1.0).mean(axis=0) for state in states], axis=0), inside=inside)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Deeds:
+class ControlActivity:
     """What a controller did. held: share of its perimeter commands, one per boundary, direction and interval, that were
     below the upper bound by more than NEARLY_OPEN of the range; guided: vehicles per trip that it gave a next region.
     """
@@ -72,14 +72,14 @@ class Deeds:
         return " and ".join(parts) or "it never held back and never guided"
 
 
-def deeds(network: RegionalModel, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> Deeds:
+def deeds(network: RegionalModel, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> ControlActivity:
     """What a controller did in some runs."""
     limit = network.u_max - NEARLY_OPEN * (network.u_max - network.u_min)
     held = [(t.perimeter[:, network.adjacency] < limit).mean() for t in trajectories]
     guided, trips = 0.0, 0.0
     for record in records:
         guided, trips = guided + record["guided"].sum(), trips + record["departures"].sum()
-    return Deeds(held=float(np.mean(held)), guided=float(guided / max(trips, 1.0)))
+    return ControlActivity(held=float(np.mean(held)), guided=float(guided / max(trips, 1.0)))
 
 
 def text(folders: Mapping[float, Path], network: RegionalModel, rows: pd.DataFrame) -> str:
@@ -115,7 +115,8 @@ def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Trajector
 
 
 def verdict(
-    rows: pd.DataFrame, level: float, name: str, found: Load, leaking: float, done: Deeds, network: RegionalModel,
+    rows: pd.DataFrame, level: float, name: str, found: Loading, leaking: float, done: ControlActivity,
+    network: RegionalModel,
 ) -> str:
     """What a controller came to against no control, and why, in one line that begins behind its name. rows: of this
     demand level; leaking: share of the flow over the boundaries that passes no signal under control."""
@@ -135,7 +136,7 @@ def verdict(
 
 
 def _reasons(
-    rows: pd.DataFrame, name: str, found: Load, leaking: float, done: Deeds, network: RegionalModel,
+    rows: pd.DataFrame, name: str, found: Loading, leaking: float, done: ControlActivity, network: RegionalModel,
 ) -> list[str]:
     """Why perimeter control, or guidance, gains nothing."""
     reasons = []
@@ -154,7 +155,7 @@ def _reasons(
     return [*reasons, str(done)]
 
 
-def _city(network: RegionalModel, found: Load, leaking: float, shown: str) -> str:
+def _city(network: RegionalModel, found: Loading, leaking: float, shown: str) -> str:
     """The city without control, in two sentences."""
     when = "Without control" if shown == REFERENCE else f"Under {shown}"
     hot = [f"{_list(network, [r])} ({_share(found.beyond[r])} of the time, most {found.most[r]:.1f} times it)"

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from cosim.evaluation import experiment, mfd_bands
-from cosim.evaluation.model_validation import HELD_UP, draw_mfds, outflow_samples
+from cosim.evaluation.model_validation import SPILLBACK, draw_mfds, outflow_samples
 from cosim.evaluation.simulate import Result, Task
 from cosim.sumo.build import network_folder
 from nmfd.api import load_scenario
@@ -159,7 +159,7 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
     if guided:  # what theta is compared with stays what it is for the plant (cosim.plant.guidance)
         return network
     crossings = sum(result.record["crossings"].sum(axis=0) for result in results)
-    return replace(network, own_splits=observed_split_ratios(network, crossings))
+    return replace(network, observed_split_ratios=observed_split_ratios(network, crossings))
 
 
 def samples_of(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, np.ndarray]]:
@@ -195,7 +195,7 @@ def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[in
 
 def own_points(cloud: dict[str, np.ndarray]) -> np.ndarray:
     """(n, 2): the samples that the region's own MFD explains."""
-    return np.concatenate([points for label, points in cloud.items() if label != HELD_UP])
+    return np.concatenate([points for label, points in cloud.items() if label != SPILLBACK])
 
 
 def hysteresis(cloud: dict[str, np.ndarray]) -> float:

@@ -24,7 +24,7 @@ COLUMNS = (
     "region", "name", "critical_veh", "mean_veh", "rmse_veh", "rmse_share", "bias_veh", "next_interval_rmse_veh",
     "next_interval_rmse_share")
 COLLAPSED = 0.7  # of the largest outflow so far
-HELD_UP = "held up by a neighbour"
+SPILLBACK = "held up by a neighbour"
 CAPTION = (
     "RMSE, bias: of the accumulation that the regional model predicts for the whole run from its start [veh]; next "
     "interval: predicted one control interval ahead from every recorded state; bias > 0: the model holds too many")
@@ -103,14 +103,14 @@ def outflow_samples(
 ) -> dict[str, np.ndarray]:
     """MFD samples of one region: label -> (n, 2) of accumulation [veh] and outflow [veh/s].
 
-    Labels: "loading" and "unloading", and HELD_UP for intervals in which a neighbour's congestion, not the region's
+    Labels: "loading" and "unloading", and SPILLBACK for intervals in which a neighbour's congestion, not the region's
     own, limited what could leave (`held_up`).
 
     Per control interval, the outflow that the model's g has to give: trips ended in the region and transfers out of
     it as counted, the transfers divided by the u of the interval where it was below the bound that is meant by the
     original programme. In the model x_ii leaves at q x_ii and x_ij at u q x_ij, so q = outflow / (x_ii + u x_i,other).
     """
-    samples: dict[str, list[np.ndarray]] = {"loading": [], "unloading": [], HELD_UP: []}
+    samples: dict[str, list[np.ndarray]] = {"loading": [], "unloading": [], SPILLBACK: []}
     for trajectory, record in zip(trajectories, records, strict=True):
         x = 0.5 * (trajectory.accumulation[1:] + trajectory.accumulation[:-1])
         total, own = x.sum(2), x[:, range(x.shape[1]), range(x.shape[1])]
@@ -123,7 +123,7 @@ def outflow_samples(
         seen, blocked = total[:, region] >= 5.0, held_up(total, outflow, adjacency)[:, region]
         samples["loading"].append(points[seen & ~blocked & rising])
         samples["unloading"].append(points[seen & ~blocked & ~rising])
-        samples[HELD_UP].append(points[seen & blocked])
+        samples[SPILLBACK].append(points[seen & blocked])
     return {label: np.concatenate(clouds) for label, clouds in samples.items()}
 
 

@@ -1,4 +1,4 @@
-"""How far ahead the regional models foresee the accumulations of finished runs, over all runs of a folder."""
+"""How far ahead the regional models prediction_errors the accumulations of finished runs, over all runs of a folder."""
 
 import os
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ CAPTION = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Foresight:
+class ModelError:
     """How well one model foresees the runs of one strategy at one demand level.
 
     model: the folder of its network; critical: (R,) [veh]; most: (R,) [-], the largest accumulation in the runs, as a
@@ -46,7 +46,7 @@ class Foresight:
     errors: np.ndarray
 
 
-def foresee(found: Finished, model: Path | None = None) -> list[Foresight]:
+def prediction_errors(found: Finished, model: Path | None = None) -> list[ModelError]:
     """Of every strategy at every demand level of the folder.
 
     model: the folder of a network, instead of that with which each controller plans. Raises InputError.
@@ -61,11 +61,11 @@ def foresee(found: Finished, model: Path | None = None) -> list[Foresight]:
 
 def _of(
     demand: float, controller: str, scenario: Scenario, network: RegionalModel, results: Sequence[experiment.Result],
-) -> Foresight:
+) -> ModelError:
     seen = [observed(result) for result in results]
     intervals = identification.intervals_within(AHEAD, scenario.step, seen)
     critical = np.array([curve.critical for curve in network.mfds])
-    return Foresight(
+    return ModelError(
         demand=demand, controller=controller, runs=len(results), critical=critical,
         model=network.folder and Path(os.path.normpath(network.folder)),
         most=np.max([run.accumulation.sum(axis=2).max(axis=0) for run in seen], axis=0) / critical,
@@ -75,7 +75,7 @@ def _of(
             integrator=scenario.integrator))
 
 
-def foresight_table(foresights: Sequence[Foresight]) -> str:
+def foresight_table(foresights: Sequence[ModelError]) -> str:
     """As text, one line per strategy and demand level."""
     return text_table([{
         "demand": f"{one.demand:g}", "controller": one.controller, "runs": one.runs,
@@ -84,7 +84,7 @@ def foresight_table(foresights: Sequence[Foresight]) -> str:
         "later": f"{100 * one.errors[1].mean():.1f} % ({one.ahead:g} s)"} for one in foresights], CAPTION)
 
 
-def write_foresights(path: Path, foresights: Sequence[Foresight]) -> None:
+def write_foresights(path: Path, foresights: Sequence[ModelError]) -> None:
     """COLUMNS as a table, one row per strategy, demand level and region."""
     rows = [
         (one.demand, one.controller, one.runs, one.model, region, one.critical[region], one.most[region],

@@ -25,7 +25,7 @@ IDLE = re.compile(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Case:
+class SumoInput:
     """A simulation as its owner set it up.
 
     source: the file that was given; net; routes and additional in SUMO's order
@@ -76,12 +76,12 @@ class Case:
                 if name not in TAKEN and not IDLE.fullmatch(name)]
 
 
-def read_case(path: Path) -> Case:
+def read_sumo_input(path: Path) -> SumoInput:
     """Read a sumocfg, or take a net.xml(.gz) as a case without demand. Raises InputError, also for a file it names
     that is missing."""
     root = root_of(path)
     if root.tag == "net":
-        return Case(source=path, net=path)
+        return SumoInput(source=path, net=path)
     if root.tag not in ("configuration", "sumoConfiguration"):
         raise InputError(f"{path}: expected a sumocfg or a net.xml, got a file of <{root.tag}> instead")
     given = {}
@@ -95,7 +95,7 @@ def read_case(path: Path) -> Case:
     if not options["net-file"]:
         raise InputError(f"{path}: net-file: missing; add <net-file value=\"city.net.xml\"/> to its <input>")
     end = seconds(options["end"] or "-1", f"{path}: end")
-    return Case(
+    return SumoInput(
         source=path, net=_files(path, "net-file", options["net-file"])[0],
         routes=_files(path, "route-files", options["route-files"]),
         additional=_files(path, "additional-files", options["additional-files"]),

@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from cosim.importing.case import Case, seconds
+from cosim.importing.case import SumoInput, seconds
 from cosim.importing.harmless import silent, softened
 from cosim.importing.od import Cell, read_od, relations, trips
 from cosim.importing.streets import Streets
@@ -49,7 +49,7 @@ class Traffic:
 
 
 def read_traffic(
-    case: Case, streets: Streets, seed: int, od: Sequence[Path] = (), zones: Sequence[Path] = (),
+    case: SumoInput, streets: Streets, seed: int, od: Sequence[Path] = (), zones: Sequence[Path] = (),
 ) -> Traffic:
     """All route and additional files of the case, and the OD matrices `od` between TAZ of these or of `zones`. Flows
     and matrices become single vehicles, and TAZ and junctions the edges drawn for them (by `seed`); all else stays as
@@ -58,7 +58,7 @@ def read_traffic(
 
 
 class _Reader:
-    def __init__(self, case: Case, streets: Streets, random: np.random.Generator):
+    def __init__(self, case: SumoInput, streets: Streets, random: np.random.Generator):
         self._case, self._streets, self._random = case, streets, random
         self._moves, self._car_moves = set(map(tuple, streets.all_links)), set(map(tuple, streets.links))
         self._classes: dict[str, str] = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_PEDTYPE": "pedestrian"}
@@ -104,7 +104,7 @@ class _Reader:
         """Trips of the matrices, those of the case's own files only where it has no vehicles."""
         if vehicles and od:
             raise InputError(
-                f"--od: {self._case.source} has {vehicles:,} vehicles of its own; leave --od away, or give the network "
+                f"--od: {self._case.source} has {vehicles:,} vehicles of its own; omit --od, or give the network "
                 "alone")
         if vehicles and cells:
             self._notes["relations between zones, left out: there are vehicles"] = len(cells)

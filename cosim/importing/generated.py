@@ -1,7 +1,7 @@
 """A demand for a city that comes without any: a morning peak towards the centre, through traffic and a background.
 
 The centre is where the signals are. Everybody takes a fastest way at free flow, with some seconds for every junction
-and more for a signal, as one of TASTES groups of drivers sees the times.
+and more for a signal, as one of DRIVER_CLASSES groups of drivers sees the times.
 """
 
 from collections.abc import Iterable
@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from cosim.importing.demand import Traffic
 from cosim.importing.streets import Streets
-from cosim.sumo.trips import SHORT, TASTE_SPREAD, TASTES
+from cosim.sumo.trips import CLASS_SPREAD, DRIVER_CLASSES, SHORT
 from nmfd.errors import InputError
 
 RAMP_UP, FLAT, RAMP_DOWN = 1800.0, 1800.0, 1800.0   # s
@@ -107,13 +107,13 @@ class _Ways:
         signalled = np.array([signal is not None for signal in streets.link_signals])
         self._turn = np.where(signalled, SIGNAL, JUNCTION)
         self.time = streets.length / streets.speed + JUNCTION
-        self._taste = np.exp(TASTE_SPREAD * random.standard_normal((TASTES, self._size)))
+        self._taste = np.exp(CLASS_SPREAD * random.standard_normal((DRIVER_CLASSES, self._size)))
 
     def routes(self, first: np.ndarray, last: np.ndarray) -> list[tuple[int, ...]]:
         """The route of every trip; empty where there is none."""
         found: list[tuple[int, ...]] = [()] * len(first)
-        tastes = self._random.integers(TASTES, size=len(first))
-        for taste in range(TASTES):
+        tastes = self._random.integers(DRIVER_CLASSES, size=len(first))
+        for taste in range(DRIVER_CLASSES):
             cost = self._turn + (self.time * self._taste[taste])[self._links[:, 1]]
             graph = csr_array((cost, (self._links[:, 0], self._links[:, 1])), shape=(self._size,) * 2)
             starts = np.unique(first[tastes == taste])

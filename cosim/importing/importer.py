@@ -10,14 +10,14 @@ import numpy as np
 
 from cosim.importing import level, model, quality, written
 from cosim.importing.baseline import Baseline, run_baseline
-from cosim.importing.case import Case, read_case, seconds
+from cosim.importing.case import SumoInput, read_sumo_input, seconds
 from cosim.importing.demand import Traffic, read_traffic
 from cosim.importing.generated import morning_peak
 from cosim.importing.partition import Clustered, Drawn, partition
 from cosim.importing.regions import positions
 from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.net import City, load_city
-from cosim.sumo.recorded_trips import MESOSCOPIC, read_originals, write_originals
+from cosim.sumo.recorded_trips import MESOSCOPIC, read_recorded_trips, write_recorded_trips
 from nmfd.errors import InputError
 from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel
@@ -28,7 +28,7 @@ LITTLE = 0.3  # of the flow over the boundaries passes no signal under control: 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Order:
+class ImportOptions:
     """What the user asked for.
 
     cut: how to come by regions
@@ -57,12 +57,12 @@ class Order:
     zones: tuple[Path, ...] = ()
 
 
-def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) -> str:
+def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage: None) -> str:
     """Write the network and the scenario; returns what was found, for the terminal. Raises InputError, before anything
     is written. tell: called with what is going on."""
     _check_free(order)
     tell("reading")
-    case = _windowed(read_case(order.source), order)
+    case = _windowed(read_sumo_input(order.source), order)
     case = replace(case, routes=(*case.routes, *order.routes))
     streets = read_streets(case.net, case.additional)
     order = replace(order, mesoscopic=order.mesoscopic or case.mesoscopic)
@@ -118,7 +118,7 @@ def import_city(order: Order, tell: Callable[[str], None] = lambda stage: None) 
     return report
 
 
-def _traffic(case: Case, streets: Streets, order: Order) -> Traffic:
+def _traffic(case: SumoInput, streets: Streets, order: ImportOptions) -> Traffic:
     """The city's own vehicles, or a generated demand beside what else its files hold."""
     zones = order.zones
     if order.od and not zones and isinstance(order.cut, Drawn) and order.cut.method == "taz":
@@ -132,7 +132,7 @@ def _traffic(case: Case, streets: Streets, order: Order) -> Traffic:
         return traffic
     if len(traffic.depart):
         raise InputError(
-            f"--demand: {order.source} has {len(traffic.depart):,} vehicles of its own; leave --demand away, or give "
+            f"--demand: {order.source} has {len(traffic.depart):,} vehicles of its own; omit --demand, or give "
             "the network alone")
     peak = morning_peak(streets, level=order.level or 1.0, begin=case.begin, seed=order.seed)
     known = {part.get("id") for element in traffic.shared for part in element.iter("vType")}
@@ -152,7 +152,7 @@ def left_alone(streets: Streets, traffic: Traffic) -> dict[str, str]:
     return found
 
 
-def _check_free(order: Order) -> None:
+def _check_free(order: ImportOptions) -> None:
     for folder, file, option in ((order.out, "network.toml", "--out"), (order.scenario, "scenario.toml", "--scenario")):
         if folder.name in ("", "..") or "," in str(folder):
             raise InputError(f"{option}: expected a folder such as {option[2:]}/mycity, without a comma, which SUMO "
@@ -163,7 +163,7 @@ def _check_free(order: Order) -> None:
             raise InputError(f"{option}: {folder / file} exists; choose another folder, or --force to replace it")
 
 
-def _windowed(case: Case, order: Order) -> Case:
+def _windowed(case: SumoInput, order: ImportOptions) -> SumoInput:
     """The case from --begin to --end, where these are given."""
     begin = case.begin if order.begin is None else order.begin
     end = case.end if order.end is None else order.end
@@ -177,7 +177,7 @@ def _windowed(case: Case, order: Order) -> Case:
 
 
 @contextmanager
-def _folders(order: Order) -> Iterator[tuple[Path, Path]]:
+def _folders(order: ImportOptions) -> Iterator[tuple[Path, Path]]:
     """Temporary folders for network and scenario, which take their places together at the end."""
     with ExitStack() as stack:
         made: list[tuple[Path, Path]] = []
@@ -201,7 +201,7 @@ def _folders(order: Order) -> Iterator[tuple[Path, Path]]:
 class _Baselines:
     """Runs without control at any multiple of the demand; the last one is kept."""
 
-    def __init__(self, streets: Streets, case: Case, clock: model.Clock, folder: Path, files: Mapping,
+    def __init__(self, streets: Streets, case: SumoInput, clock: model.Clock, folder: Path, files: Mapping,
                  vehicles: Sequence[str]):
         self._streets, self._clock, self._files, self._vehicles = streets, clock, files, vehicles
         self._routes, self._background, self._additional = (
@@ -217,8 +217,8 @@ class _Baselines:
                 routes, vehicles = self._routes, self._vehicles
                 if factor != 1.0:
                     routes = [folder / "vehicles.rou.xml"]
-                    vehicles = write_originals(
-                        read_originals(self._routes), routes[0], seed=0, factor=factor, jitter=0.0,
+                    vehicles = write_recorded_trips(
+                        read_recorded_trips(self._routes), routes[0], seed=0, factor=factor, jitter=0.0,
                         begin=self._clock.begin)
                 self._last = (factor, mesoscopic), run_baseline(
                     self._streets, routes=[*routes, *self._background], additional=self._additional,
@@ -227,7 +227,7 @@ class _Baselines:
         return self._last[1]
 
 
-def _level_line(order: Order, factor: float, congests: bool) -> str:
+def _level_line(order: ImportOptions, factor: float, congests: bool) -> str:
     """What came of --level, for the report."""
     if order.level is not None:
         return ""
@@ -250,8 +250,11 @@ def _notes(traffic: Traffic) -> str:
     return "".join(f"; {note}: {count:,}" for note, count in sorted(traffic.notes.items()))
 
 
-def _report(order: Order, case: Case, streets: Streets, traffic: Traffic, clock: model.Clock, network: RegionalModel,
-            asked: int, city: City, found: quality.Tables, left: Mapping[str, str], baseline: Baseline | None) -> str:
+def _report(
+    order: ImportOptions, case: SumoInput, streets: Streets, traffic: Traffic, clock: model.Clock,
+    network: RegionalModel, asked: int, city: City, found: quality.Tables, left: Mapping[str, str],
+    baseline: Baseline | None,
+) -> str:
     """What was found, what was left alone and what cannot be done, in a few lines."""
     usable, part = streets.drivable.sum(), streets.main_part.sum()
     signals = set(city.signals.values())

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cosim.importing.baseline import Baseline
-from cosim.importing.case import Case
+from cosim.importing.case import SumoInput
 from cosim.importing.demand import Traffic
 from cosim.importing.regions import digraph, names, positions
 from cosim.importing.streets import Streets
@@ -62,13 +62,13 @@ class Clock:
         return self.begin + self.steps * self.step
 
 
-def without_idle(case: Case, traffic: Traffic) -> Case:
+def without_idle(case: SumoInput, traffic: Traffic) -> SumoInput:
     """The case, which begins later where nobody departs for more than IDLE: at the full IDLE before the first does."""
     first = traffic.depart[0] if len(traffic.depart) else case.begin
     return case if first - case.begin <= IDLE else replace(case, begin=float(first // IDLE * IDLE))
 
 
-def clock(case: Case, streets: Streets, traffic: Traffic) -> Clock:
+def clock(case: SumoInput, streets: Streets, traffic: Traffic) -> Clock:
     """Control intervals of the most common signal cycle, until RECOVERY after the last departure."""
     running = [found[-1] for found in streets.logics.values() if round(found[-1].cycle) > 0]
     cycles = Counter(round(logic.cycle) for logic in running if logic.kind == "static")
@@ -96,7 +96,7 @@ def network_of(streets: Streets, regions: np.ndarray, name: str, baseline: Basel
         adjacency=digraph(streets, regions) > 0, mfds=_placeholders(streets, regions, baseline), u_min=0.1, u_max=0.9)
     if baseline is None:
         return network
-    return replace(network, own_splits=observed_split_ratios(network, baseline.crossings(regions)))
+    return replace(network, observed_split_ratios=observed_split_ratios(network, baseline.crossings(regions)))
 
 
 def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline | None) -> tuple[Mfd, ...]:
@@ -125,8 +125,8 @@ def network_text(network: RegionalModel, sumo: Mapping[str, str], source: str) -
 
 
 def scenario_text(
-    network: RegionalModel, clock: Clock, case: Case, *, name: str, network_path: str, protected: int, files: Mapping,
-    leave: Sequence[str], factor: float = 1.0, mesoscopic: bool = False,
+    network: RegionalModel, clock: Clock, case: SumoInput, *, name: str, network_path: str, protected: int,
+    files: Mapping, leave: Sequence[str], factor: float = 1.0, mesoscopic: bool = False,
 ) -> str:
     """scenario.toml; files: routes, background, additional -> file names beside it."""
     fastest = max(mfd.c for mfd in network.mfds)
@@ -152,7 +152,7 @@ def scenario_text(
     return "\n".join(lines) + "\n" + TRAINING
 
 
-def step_length(case: Case, clock: Clock) -> float:
+def step_length(case: SumoInput, clock: Clock) -> float:
     """[s] The city's own step where the control interval is a multiple of it, else 1 s."""
     own = case.step_length
     return own if 0.0 < own <= 1.0 and abs(clock.step / own - round(clock.step / own)) < 1e-9 else 1.0

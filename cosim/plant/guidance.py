@@ -14,7 +14,7 @@ without coming back to i, at the travel times of the last control interval (smoo
 them. In h it is guided again, and in the region of d it is sent there on the fastest way. With a period it is asked
 again where it is, every so often as long as it stays in i: in a city that congests, the fastest way when it came may
 be a standing one soon. Nobody is sent on a detour that takes much longer, whatever theta says, and nobody leaves the
-way that he is on for a small gain: everybody who changes his way makes the travel times that the others were told
+way that they are on for a small gain: everybody who changes his way makes the travel times that the others were told
 wrong.
 
 Where the boundaries of the regions are ragged, a main road may leave i and come back. With `ways_return` the fastest
@@ -34,13 +34,13 @@ from cosim.plant.shortest_paths import Home, Moves, Ways
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
 
-SMOOTHING = 0.5  # weight of the newest travel times
-TASTES = 4       # groups of drivers who see different travel times: were they all sent one way, it would jam
-SPREAD = 0.15    # standard deviation of the logarithm of their travel times
-SLOWEST = 0.1    # m/s; slower is as good as standing
-BONUS = 30.0     # s per vehicle that a region is behind its share
-LOYALTY = 0.3    # a driver keeps his way if the best one does not save more than this share of its own time
-MEMORY = 0.9     # of the vehicles assigned before and of their wishes, per control interval
+SMOOTHING = 0.5            # weight of the newest travel times
+DRIVER_CLASSES = 4         # groups of drivers who see different travel times: were all sent one way, it would jam
+SPREAD = 0.15              # standard deviation of the logarithm of their travel times
+SLOWEST = 0.1              # m/s; slower is as good as standing
+SHARE_PENALTY = 30.0       # s per vehicle that a region is behind its share
+SWITCHING_THRESHOLD = 0.3  # drivers keep their way if the best one does not save more than this share of its own time
+MEMORY = 0.9               # of the vehicles assigned before and of their wishes, per control interval
 
 
 def shifted(wish: Sequence[float], own: Sequence[float], theta: Sequence[float]) -> list[float]:
@@ -57,8 +57,8 @@ def shifted(wish: Sequence[float], own: Sequence[float], theta: Sequence[float])
 
 @dataclass(eq=False)
 class _Visit:
-    """A driver who follows, in one region: how he came, and how he sees travel times; following: where he was sent
-    last, and in which control interval."""
+    """A driver who follows, in one region: how they came, and how they see travel times; following: where they were
+    sent last, and in which control interval."""
 
     event: Event
     taste: int
@@ -68,7 +68,7 @@ class _Visit:
 
 class Guide:
     """Reroutes vehicles; `compliance` is the probability that a driver follows, drawn anew in every region,
-    `most_detour` [s] the most that a commanded next region may cost him, and `period` [s] the time after which he is
+    `most_detour` [s] the most that a commanded next region may cost them, and `period` [s] the time after which he is
     asked again; 0: never in the same region.
 
     realised: (R, R, R) [veh], [i, h, j] = vehicles sent from i to h on their way to j since the start, those who were
@@ -105,7 +105,7 @@ class Guide:
             np.array([(self._index[g.from_edge], self._index[g.to_edge], g.target)
                       for g in city.gateways if g.source == region], dtype=int).reshape(-1, 3).T
             for region in range(city.regions)]
-        self._taste = np.exp(SPREAD * random.standard_normal((TASTES, len(city.edges))))
+        self._taste = np.exp(SPREAD * random.standard_normal((DRIVER_CLASSES, len(city.edges))))
         self._length = np.array([city.length[edge] for edge in city.edges])
         self._free = self._length / np.array([city.speed[edge] for edge in city.edges])
         self._time = self._free.copy()
@@ -143,7 +143,7 @@ class Guide:
         for event in events:
             self._visits.pop(event.vehicle, None)
             if event.free and self._random.random() < self._compliance:
-                visit = _Visit(event, int(self._random.integers(TASTES)))
+                visit = _Visit(event, int(self._random.integers(DRIVER_CLASSES)))
                 if event.edge in self._index:  # or it may use roads that are closed to cars, as taxis do
                     self._ask(visit)
         for visit in self._due.pop(self._steps, ()):
@@ -151,11 +151,11 @@ class Guide:
                 self._ask(visit)
 
     def _ask(self, visit: _Visit) -> None:
-        """Guide a driver, unless he is on a junction or in the next region already: too late to turn."""
+        """Guide a driver, unless they are on a junction or in the next region already: too late to turn."""
         event, target, after = visit.event, self._index[visit.event.edge], self._period
         try:
             here = self._index.get(self._session.road(event.vehicle))
-        except REFUSALS:  # he has arrived
+        except REFUSALS:  # they have arrived
             self._visits.pop(event.vehicle, None)
             return
         if here is None or self._region[here] != event.region:
@@ -214,7 +214,7 @@ class Guide:
         if not any(allowed):  # every region with a share is too far out of the way
             allowed = [c <= fastest for c in least]
         price = [
-            c - BONUS * (share * everybody - sent) if good else np.inf
+            c - SHARE_PENALTY * (share * everybody - sent) if good else np.inf
             for c, share, sent, good in zip(least, shares, assigned, allowed, strict=True)]
         n = price.index(min(price))
         following = int(ways.neighbours[n])
@@ -223,7 +223,7 @@ class Guide:
                 way = ways.route(here, int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]])), target)
             if not self._send(event.vehicle, way):
                 return
-        if visit.following is not None:  # what he was told before does not count any more
+        if visit.following is not None:  # what they were told before does not count any more
             before = event.region, visit.following, event.destination
             self.realised[before] -= 1
             self._assigned[before] -= MEMORY ** (self._interval - visit.interval)
@@ -232,7 +232,7 @@ class Guide:
         visit.following, visit.interval = following, self._interval
 
     def _present(self, vehicle: str) -> list[int] | None:
-        """The edges of the driver's present way from where he is; None where it uses roads that are closed to cars."""
+        """The edges of the driver's present way from where they are; None where it uses roads closed to cars."""
         route = self._session.route(vehicle)[self._session.route_index(vehicle):]
         way = [number for edge in route if (number := self._index.get(edge)) is not None]
         return way if len(way) == len(route) else None
@@ -263,7 +263,7 @@ class Guide:
             return False
         if following is not None and self._next_region(present) != following:
             return False
-        return takes <= (1.0 + LOYALTY) * cost
+        return takes <= (1.0 + SWITCHING_THRESHOLD) * cost
 
     def _next_region(self, way: list[int]) -> int:
         """The region that a way enters first, or, if ways may return, when it leaves its own for good; its own if it

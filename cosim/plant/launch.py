@@ -8,7 +8,14 @@ from cosim.plant.programmes import CitySignals, write_signal_programmes
 from cosim.plant.settings import ESTIMATE, Settings, scenario_file
 from cosim.sumo import outputs as sumo_output
 from cosim.sumo.net import City
-from cosim.sumo.recorded_trips import MESOSCOPIC, Originals, check_edges, read_originals, read_routes, write_originals
+from cosim.sumo.recorded_trips import (
+    MESOSCOPIC,
+    RecordedTrips,
+    check_edges,
+    read_recorded_trips,
+    read_routes,
+    write_recorded_trips,
+)
 from cosim.sumo.session import Session, Window
 from cosim.sumo.tripinfo import trip_options
 from cosim.sumo.trips import write_trips
@@ -24,9 +31,9 @@ REROUTING = (
     "--device.rerouting.adaptation-interval", "1", "--device.rerouting.adaptation-steps", "180")
 
 
-def own_vehicles(scenario: Scenario, chosen: Settings, city: City) -> Originals:
+def own_vehicles(scenario: Scenario, chosen: Settings, city: City) -> RecordedTrips:
     """The vehicles of the route files that [sumo] names. Raises InputError."""
-    originals = read_originals(own_files(scenario, chosen.routes))
+    originals = read_recorded_trips(own_files(scenario, chosen.routes))
     check_edges(originals, city, f"{scenario_file(scenario)}: sumo.routes")
     return originals
 
@@ -50,7 +57,7 @@ class Launch:
         self._scenario, self._settings, self._city, self._signals = scenario, chosen, city, signals
         self._layout, self._outputs, self._window = layout, outputs, window
         self._scratch = Scratch("cosim-")
-        self._originals: Originals | None = None
+        self._originals: RecordedTrips | None = None
         self.vehicles: list[str] = []
         self.trip_file = outputs.get("tripinfo", self._scratch.path / "tripinfo.xml")
 
@@ -108,7 +115,7 @@ class Launch:
             return [f"v{n}" for n in range(write_trips(self._city, scenario.demand, scenario.step, seed, path))]
         if self._originals is None:
             self._originals = own_vehicles(scenario, chosen, self._city)
-        return write_originals(
+        return write_recorded_trips(
             self._originals, path, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
             begin=chosen.begin)
 

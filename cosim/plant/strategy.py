@@ -61,7 +61,7 @@ def parse(name: str) -> Strategy:
             raise _unknown(name, word, controllers=False)
         key, value = option
         if key in chosen:
-            raise InputError(f"strategy {name!r}: {chosen[key]} and {word} exclude each other; leave one of them out")
+            raise InputError(f"strategy {name!r}: {chosen[key]} and {word} exclude each other; omit one of them")
         chosen[key], overrides[key] = word, value
     return Strategy(name=name, controller=controller, overrides=overrides)
 

@@ -22,14 +22,14 @@ BOUND = frozenset({
 
 
 @dataclass(frozen=True, kw_only=True)
-class Originals:
+class RecordedTrips:
     """N vehicles or trips. depart: (N,) [s]; elements: their XML, without anything that another one repeats."""
 
     depart: np.ndarray
     elements: tuple[ElementTree.Element, ...]
 
 
-def read_originals(paths: Sequence[Path]) -> Originals:
+def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
     """The `vehicle` and `trip` elements of SUMO route files. Raises InputError.
 
     Every one must have a time as its depart; types and routes that several share belong to an additional file.
@@ -59,10 +59,10 @@ def read_originals(paths: Sequence[Path]) -> Originals:
                 f"{path}: vehicle {element.get('id')}: depart: expected a time from 0 s up, got "
                 f"{element.get('depart')!r} instead; move it to a file in sumo.background") from None
     order = np.argsort(departs, kind="stable")
-    return Originals(depart=departs[order], elements=tuple(elements[n][1] for n in order))
+    return RecordedTrips(depart=departs[order], elements=tuple(elements[n][1] for n in order))
 
 
-def check_edges(originals: Originals, city: City, where: str) -> None:
+def check_edges(originals: RecordedTrips, city: City, where: str) -> None:
     """InputError for a vehicle on an edge that the city does not have: SUMO would leave it out without a word."""
     for element in originals.elements:
         route = element.find("route")
@@ -93,7 +93,7 @@ def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
 
 
 def draw(
-    originals: Originals, *, seed: int, factor: float, jitter: float, begin: float,
+    originals: RecordedTrips, *, seed: int, factor: float, jitter: float, begin: float,
 ) -> list[tuple[float, int, str]]:
     """(departure [s], number of the vehicle, its id) sorted by departure, for one run.
 
@@ -124,8 +124,8 @@ def _copy(name: str, number: int, taken: set[str]) -> str:
     return found
 
 
-def write_originals(
-    originals: Originals, path: Path, *, seed: int, factor: float, jitter: float, begin: float,
+def write_recorded_trips(
+    originals: RecordedTrips, path: Path, *, seed: int, factor: float, jitter: float, begin: float,
 ) -> list[str]:
     """Write the vehicles of one run to a SUMO route file; returns their ids. The same seed gives the same bytes."""
     drawn = draw(originals, seed=seed, factor=factor, jitter=jitter, begin=begin)

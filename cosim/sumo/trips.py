@@ -15,8 +15,8 @@ from cosim.sumo.net import City
 from nmfd.errors import InputError
 
 STREAM = 7101       # keeps the random numbers of trips apart from others of the same seed
-TASTES = 8          # groups of drivers who see different travel times
-TASTE_SPREAD = 0.15  # standard deviation of the logarithm of their travel times
+DRIVER_CLASSES = 8          # groups of drivers who see different travel times
+CLASS_SPREAD = 0.15  # standard deviation of the logarithm of their travel times
 SHORT = 30.0        # m; no trip starts or ends on a shorter edge where its region has longer ones
 
 
@@ -63,7 +63,7 @@ def make_trips(city: City, demand: np.ndarray, step: float, seed: int) -> Trips:
 
     Every pair of regions gets its number of vehicles to within one, at the times at which its cumulated demand passes
     whole numbers, shifted by a random phase. Edges are drawn by length times lanes. Each route is a shortest one in
-    free-flow time as one of `TASTES` groups of drivers sees it. InputError where no way leads from i to j.
+    free-flow time as one of `DRIVER_CLASSES` groups of drivers sees it. InputError where no way leads from i to j.
     """
     if demand.shape[1:] != (city.regions, city.regions):
         raise InputError(f"{city.net_file}: demand for {demand.shape[1]} regions, but the city has {city.regions}")
@@ -72,7 +72,7 @@ def make_trips(city: City, demand: np.ndarray, step: float, seed: int) -> Trips:
     starts = [_ends(city, region, departing=True) for region in range(city.regions)]
     goals = [_ends(city, region, departing=False) for region in range(city.regions)]
     draws = rng.random((len(depart), 2))
-    tastes = rng.integers(TASTES, size=len(depart))
+    tastes = rng.integers(DRIVER_CLASSES, size=len(depart))
     positions = rng.random(len(depart))
     trees = Ways(city, rng)
     number = {edge: n for n, edge in enumerate(city.edges)}
@@ -176,13 +176,13 @@ class Ways:
         self._from, self._to = (np.array([arc[n] for arc in arcs], dtype=int) for n in (0, 1))
         self._turn = np.array([arc[2] for arc in arcs])
         self._time = np.array([city.length[edge] / city.speed[edge] for edge in city.edges])
-        self._noise = np.exp(TASTE_SPREAD * rng.standard_normal((TASTES, len(city.edges))))
+        self._noise = np.exp(CLASS_SPREAD * rng.standard_normal((DRIVER_CLASSES, len(city.edges))))
 
     def routes(self, first: np.ndarray, last: np.ndarray, tastes: np.ndarray) -> list[tuple[str, ...]]:
         """The route of every trip; empty where there is none."""
         found: list[tuple[str, ...]] = [()] * len(first)
         count = len(self.city.edges)
-        for taste in range(TASTES):
+        for taste in range(DRIVER_CLASSES):
             cost = self._turn + (self._time * self._noise[taste])[self._to]
             graph = csr_matrix((np.maximum(cost, 1e-6), (self._from, self._to)), shape=(count, count))
             members = np.flatnonzero(tastes == taste)

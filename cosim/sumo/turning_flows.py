@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 
 from cosim.sumo.net import City
-from cosim.sumo.recorded_trips import Originals
-from cosim.sumo.trips import TASTES, Ways, make_trips
+from cosim.sumo.recorded_trips import RecordedTrips
+from cosim.sumo.trips import DRIVER_CLASSES, Ways, make_trips
 
 # Of the trips that plans are made for. No seeds of an evaluation: a plan knows the demand, not the day's drivers.
 PLANNING_SEEDS = (778_001, 778_002, 778_003, 778_004)
@@ -34,7 +34,7 @@ def turning_flows(city: City, demand: np.ndarray, step: float) -> Mapping[tuple[
 
 
 def own_flows(
-    city: City, originals: Originals, routes: Mapping[str, Sequence[str]], factor: float,
+    city: City, originals: RecordedTrips, routes: Mapping[str, Sequence[str]], factor: float,
 ) -> Mapping[tuple[str, str], float]:
     """The same of a city's own vehicles, `factor` times as many: of those that have a route on it; the others, which
     have a beginning and an end only, are thought to take a fastest way. routes: those that vehicles name."""
@@ -54,7 +54,7 @@ def own_flows(
         number = {edge: n for n, edge in enumerate(city.edges)}
         random = np.random.default_rng(PLANNING_SEEDS[0])
         begin, end = np.array([[number[edge] for edge in leg] for leg in legs]).T
-        for route in Ways(city, random).routes(begin, end, random.integers(TASTES, size=len(legs))):
+        for route in Ways(city, random).routes(begin, end, random.integers(DRIVER_CLASSES, size=len(legs))):
             turns.update(pairwise(route))
     return {turn: factor * count / PEAK for turn, count in turns.items()}
 

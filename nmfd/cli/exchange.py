@@ -1,5 +1,6 @@
 """Commands of `nmfd` for what comes from elsewhere and goes there: controllers of one's own, and exported policies."""
 
+from importlib import resources
 from pathlib import Path
 
 import click
@@ -20,8 +21,6 @@ def new_controller(file: Path) -> None:
       nmfd new-controller mine.py
       nmfd benchmark scenarios/economic_mpc --controllers no-control,pi-gating,mine.py:MyController
     """
-    from importlib import resources
-
     if file.suffix != ".py":
         raise InputError(f"{file}: expected a name that ends in .py, such as {file.with_suffix('.py')}")
     if file.exists():
@@ -49,7 +48,7 @@ def export(policy: Path, out: Path, scenario: Path | None) -> None:
     Example:
       nmfd export scenarios/economic_mpc/dpc-pcrg.pt --out dpc-pcrg.onnx
     """
-    from nmfd.controllers.dpc import onnx_export
+    from nmfd.controllers.dpc import onnx_export  # heavy
 
     if not out.parent.is_dir():
         raise InputError(f"{out.parent}: no such folder; make it first or choose another --out")

@@ -7,6 +7,7 @@ import click
 from nmfd.cli.errors import Commands, Interrupted
 from nmfd.cli.exchange import export, new_controller
 from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, controller_names, fault_option, policy_files, quoted
+from nmfd.cli.progress import progress_line, resumable
 from nmfd.cli.studies import ablation, adaptation, bound, robustness, scaling
 from nmfd.errors import InputError
 
@@ -59,25 +60,18 @@ def benchmark(
     names = controller_names(controllers)
     files = policy_files(policies, names)
 
-    from nmfd.api import load_scenario
-    from nmfd.cli.progress import progress_line
+    from nmfd.api import load_scenario  # heavy
     from nmfd.model.scenario import with_faults
     from nmfd.runs import run_folder
     from nmfd.studies import benchmark as benchmarks
 
     loaded = with_faults(load_scenario(scenario), faults)
     out = run_folder.default_folder(loaded.name) if out is None else out
-    try:
-        with progress_line("benchmark") as progress:
-            rows = benchmarks.benchmark(
-                loaded, names, range(seeds), plant, out=out, policies=files, workers=workers, progress=progress)
-    except KeyboardInterrupt:
-        if not (out / "summary.csv").exists():
-            raise Interrupted("interrupted before a run was finished; nothing is kept") from None
-        raise Interrupted(
-            f"interrupted; finished runs are in {out}: the same command with --out {quoted(out)} goes on") from None
+    with resumable("benchmark", out, "summary.csv") as progress:
+        rows = benchmarks.benchmark(
+            loaded, names, range(seeds), plant, out=out, policies=files, workers=workers, progress=progress)
     if parquet:
-        import pandas as pd
+        import pandas as pd  # heavy
 
         from nmfd.runs import frames
 
@@ -115,8 +109,7 @@ def train(
       nmfd train scenarios/economic_mpc --controller dpc-pcrg
       nmfd train scenarios/economic_mpc --controller dpc-pc --steps 200 --out mine.pt
     """
-    from nmfd.api import load_scenario
-    from nmfd.cli.progress import progress_line
+    from nmfd.api import load_scenario  # heavy
     from nmfd.controllers.dpc import rollout, training
 
     loaded = load_scenario(scenario)
@@ -131,7 +124,7 @@ def train(
     if compiled and not rollout.can_compile(device):
         if not default:
             raise InputError("--compile: does not work here, most likely for want of a C++ compiler; install g++ or "
-                             "leave it out")
+                             "omit it")
         compiled = False
         click.echo("nmfd: cannot compile here, most likely for want of a C++ compiler; training goes on uncompiled, "
                    "about half as fast", err=True)
@@ -172,7 +165,7 @@ def show(scenario: Path, out: Path | None) -> None:
     Example:
       nmfd show scenarios/economic_mpc --out figures
     """
-    from nmfd.api import load_scenario
+    from nmfd.api import load_scenario  # heavy
     from nmfd.runs import files as disk
     from nmfd.studies import benchmark as benchmarks
 

@@ -43,7 +43,7 @@ def fault_option(more: str = ""):
 
 def controller_names(controllers: str) -> list[str]:
     """The controllers in a list separated by commas. InputError for an unknown, repeated or empty name."""
-    from nmfd.controllers import registry
+    from nmfd.controllers import registry  # heavy
 
     names = [name.strip() for name in controllers.split(",")]
     for name in names:

@@ -1,11 +1,15 @@
 """One line of progress on stderr, where that is a terminal; silence elsewhere."""
 
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Protocol, TextIO
 
 from tqdm.std import tqdm
+
+from nmfd.cli.errors import Interrupted
 
 LINE = "{desc}  [{bar:24}]  {n_fmt}/{total_fmt}  {remaining} left{postfix}"
 
@@ -34,3 +38,20 @@ def progress_line(label: str, stream: TextIO | None = None) -> Iterator[Show | N
             line.update(done - line.n)
 
         yield show
+
+
+@contextmanager
+def resumable(label: str, out: Path, results: str = "") -> Iterator[Show | None]:
+    """`progress_line` of a command that keeps what is finished in the folder `out`; Ctrl-C says how to go on.
+
+    results: the file there that holds what is finished; without it nothing is kept
+    """
+    try:
+        with progress_line(label) as show:
+            yield show
+    except KeyboardInterrupt:
+        if results and not (out / results).exists():
+            raise Interrupted("interrupted before a run was finished; nothing is kept") from None
+        raise Interrupted(
+            f"interrupted; finished runs are in {out}: the same command with --out {shlex.quote(str(out))} goes on"
+        ) from None

@@ -28,10 +28,10 @@ def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) 
             f"adjacent = [{neighbours}]\n{barred}{_options(network, region)}\n"
             f"[regions.mfd]\na = {curve.a:.6g}\nb = {curve.b:.6g}\nc = {curve.c:.6g}\n"
             f"jam = {curve.jam:.6g}\n")
-    for (i, j), shares in sorted(network.own_splits.items()):
+    for (i, j), shares in sorted(network.observed_split_ratios.items()):
         via = ", ".join(str(h) for h in shares)
         share = ", ".join(f"{value:.4f}" for value in shares.values())
-        out.write(f"\n[[own_splits]]\nregion = {i}\ndestination = {j}\nnext = [{via}]\nshare = [{share}]\n")
+        out.write(f"\n[[observed_split_ratios]]\nregion = {i}\ndestination = {j}\nnext = [{via}]\nshare = [{share}]\n")
     return out.getvalue()
 
 

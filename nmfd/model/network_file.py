@@ -94,7 +94,7 @@ class NetworkTable(Settings):
     perimeter: PerimeterTable = setting("bounds of the control")
     mfd: MfdTable | None = setting("of every region without one of its own", None)
     regions: Rows[RegionTable] = setting("one table per region", min_length=1)
-    own_splits: Rows[SplitsTable] = setting("one table per region and destination", ())
+    observed_split_ratios: Rows[SplitsTable] = setting("one table per region and destination", ())
     sumo: dict[str, Any] = setting("the city to simulate, for cosim", {})
 
     @model_validator(mode="after")
@@ -106,8 +106,8 @@ class NetworkTable(Settings):
                     f"a list of distinct whole numbers from 0 to {most}", list(row.adjacent)))
         for number, row in enumerate(self.regions):
             self._check_region(number, row)
-        for number, splits in enumerate(self.own_splits):
-            self._check_splits(f"own_splits[{number}]", splits)
+        for number, splits in enumerate(self.observed_split_ratios):
+            self._check_splits(f"observed_split_ratios[{number}]", splits)
         return self
 
     def _check_region(self, i: int, row: RegionTable) -> None:

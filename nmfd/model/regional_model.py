@@ -33,8 +33,8 @@ class RegionalModel:
         neighbours that only one-way streets join
     mfds: one outflow MFD per region
     u_min, u_max: bounds of the perimeter control [-]
-    own_splits: {(i, j): {h: share}}, what drivers do by themselves where it was measured; elsewhere they follow the
-        fewest boundaries
+    observed_split_ratios: {(i, j): {h: share}}, what drivers do by themselves where it was measured; elsewhere they
+        follow the fewest boundaries
     exit_rates: (R, R) [-], [i, j]: how fast vehicles in i bound for j leave i, relative to the mean g_i(x_i)/x_i of
         the MFD; None for 1: trips of all kinds have the same length in a region
     capacity: (R, R) [veh/s], [i, h]: the most that passes from i to an empty region h under u_max; None: u_ih is a
@@ -50,7 +50,7 @@ class RegionalModel:
     mfds: tuple[Mfd, ...]
     u_min: float
     u_max: float
-    own_splits: Mapping[tuple[int, int], Mapping[int, float]] = field(default_factory=dict)
+    observed_split_ratios: Mapping[tuple[int, int], Mapping[int, float]] = field(default_factory=dict)
     exit_rates: np.ndarray | None = None
     capacity: np.ndarray | None = None
     storage: np.ndarray | None = None
@@ -82,11 +82,11 @@ class RegionalModel:
 
     @cached_property
     def nominal_splits(self) -> np.ndarray:
-        """(R, R, R), [i, h, j]: theta without guidance [-]: `own_splits`, else the fewest boundaries, equally where
-        there are several such ways."""
+        """(R, R, R), [i, h, j]: theta without guidance [-]: `observed_split_ratios`, else the fewest boundaries,
+        equally where there are several such ways."""
         closer = self.hops[None, :, :] == self.hops[:, None, :] - 1
         theta = (self.adjacency[:, :, None] & closer & self.split_mask).astype(float)
-        for (i, j), shares in self.own_splits.items():
+        for (i, j), shares in self.observed_split_ratios.items():
             theta[i, :, j] = 0.0
             theta[i, list(shares), j] = list(shares.values())
         sums = theta.sum(axis=1, keepdims=True)
@@ -135,8 +135,8 @@ def load_network(folder: Path | str) -> RegionalModel:
         name=table.name, region_names=tuple(row.name or str(number) for number, row in enumerate(rows)),
         positions=np.array([row.position for row in rows]), adjacency=adjacency,
         mfds=tuple((row.mfd or table.mfd).mfd for row in rows), u_min=table.perimeter.min, u_max=table.perimeter.max,
-        own_splits={(row.region, row.destination): dict(zip(row.next, row.share, strict=True))
-                    for row in table.own_splits},
+        observed_split_ratios={(row.region, row.destination): dict(zip(row.next, row.share, strict=True))
+                    for row in table.observed_split_ratios},
         exit_rates=None if rows[0].exit_rates is None else np.array([row.exit_rates for row in rows]),
         capacity=capacity, storage=None if rows[0].storage is None else np.array([row.storage for row in rows]),
         folder=folder)
@@ -150,11 +150,12 @@ def _check_ways(network: RegionalModel, path: Path) -> None:
         i, j = np.argwhere(network.hops < 0)[0]
         raise config.error(
             path, "regions", f"region {j} cannot be reached from region {i}; connect them with adjacent")
-    for (i, j), shares in network.own_splits.items():
+    for (i, j), shares in network.observed_split_ratios.items():
         for h in shares:
             if not network.split_mask[i, h, j]:
                 raise config.error(
-                    path, "own_splits", f"from region {i} to {j} by way of {h} leads back into {i}; remove it")
+                    path, "observed_split_ratios",
+                    f"from region {i} to {j} by way of {h} leads back into {i}; remove it")
 
 
 def check_step(network: RegionalModel, step: float, where: str) -> None:

@@ -40,7 +40,7 @@ def atomic(path: Path) -> Iterator[Path]:
 def sweep(folder: Path, stems: Collection[str] | None = None) -> None:
     """Remove what killed processes left half-written in `folder`, of files with these stems, or of all.
 
-    To be called by whoever has the folder or the files to himself (`locked`).
+    To be called by whoever has the folder or the files to themselves (`locked`).
     """
     for path in folder.iterdir():
         name = TEMPORARY.fullmatch(path.name)

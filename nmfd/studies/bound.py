@@ -48,7 +48,7 @@ def compute(
             NmfdPlant(scenario), registry.make(controller, scenario), scenario, seed=0,
             progress=progress and (lambda done, total, name=controller: progress(done, total, f"closed loop {name}")))
         if not guidance and not np.array_equal(trajectory.splits[0], scenario.network.nominal_splits):
-            raise InputError(f"--from: {controller} guides routes, which {name} may not; leave it out")
+            raise InputError(f"--from: {controller} guides routes, which {name} may not; omit it")
         begin[controller] = trajectory.perimeter, trajectory.splits
     return solve(scenario, begin, guidance=guidance, iterations=iterations, progress=progress)
 

@@ -1,4 +1,4 @@
-"""One step of the estimator, 7 regions: pytest tests/benchmarks --benchmark-only"""
+"""One step of the estimator, 7 regions: pytest -n0 tests/benchmarks --benchmark-only"""
 
 from pathlib import Path
 

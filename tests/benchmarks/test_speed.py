@@ -1,4 +1,4 @@
-"""Speed against plain versions of the same: pytest tests/benchmarks --benchmark-only
+"""Speed against plain versions of the same: pytest -n0 tests/benchmarks --benchmark-only
 
 What is compared must agree; that part runs with the other tests.
 """

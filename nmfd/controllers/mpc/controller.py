@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from nmfd.controllers.mpc.edge_model import Turns, build, vehicle_steps, vehicles_at_stake
+from nmfd.controllers.mpc.edge_model import Turns, affected_vehicles, build, vehicle_steps
 from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.mpc.projected_gradient import AT_REST, Minimum, minimise
 from nmfd.controllers.options import Options, options
@@ -143,7 +143,7 @@ class EconomicMpc:
         scheme: dict = {"step": planning.step, "substeps": planning.substeps, "integrator": planning.integrator}
         self._exact: Callable = partial(vehicle_steps, self._model, **scheme)
         self._rounded: Callable = partial(vehicle_steps, rounded, gradient=True, **scheme)
-        self._at_stake: Callable = partial(vehicles_at_stake, self._model, **scheme)
+        self._affected: Callable = partial(affected_vehicles, self._model, **scheme)
         self.admissible = Admissible(network, self._model, guidance=guidance)
         self._open = self.admissible.open(self._moves)
         self._gating = PiGating(planning) if planning.protected else None
@@ -221,7 +221,7 @@ class EconomicMpc:
             return self._by_ipopt(start, demand)
         return minimise(
             objective, self.admissible.project, self.admissible.gap, plan,
-            metric=(self._at_stake(start, demand, plan) + FEW) ** 2, tolerance=TOLERANCE,
+            metric=(self._affected(start, demand, plan) + FEW) ** 2, tolerance=TOLERANCE,
             iterations=self.options.max_iterations, seconds=self.options.time_limit or self._step)
 
 

@@ -129,12 +129,12 @@ def _boundary(model: Turns, wish: np.ndarray, perimeter: np.ndarray, accumulatio
 
 
 def pull_derivative(
-    model: Turns, price: np.ndarray, perimeter: np.ndarray, splits: np.ndarray, record: tuple,
+    model: Turns, adjoint: np.ndarray, perimeter: np.ndarray, splits: np.ndarray, record: tuple,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The worth of x (C,), of the perimeter (E,) and the splits (V,), where a unit of dx/dt is worth `price` (C,)."""
+    """The gradient of x (C,), of the perimeter (E,) and the splits (V,), where one of dx/dt has `adjoint` (C,)."""
     x, leaving, q, change_of_q, wish, share, boundary = record
     regions, edges = len(model.jam), len(model.edges)
-    gain = price[model.target] - price[model.source]
+    gain = adjoint[model.target] - adjoint[model.source]
     of_perimeter = np.bincount(model.edge, gain * wish, edges)
     of_wish, of_accumulation = share[model.edge] * gain, 0.0
     if boundary is not None:
@@ -143,7 +143,7 @@ def pull_derivative(
         of_wish = of_wish + (of_share * by_wish)[model.edge]
         of_perimeter = of_share * by_perimeter
         of_accumulation = np.bincount(model.edges[:, 1], of_share * by_ahead, regions)
-    of_leaving = np.bincount(model.source, splits * of_wish, len(x)) - np.where(model.ends, price, 0.0)
+    of_leaving = np.bincount(model.source, splits * of_wish, len(x)) - np.where(model.ends, adjoint, 0.0)
     of_region = of_accumulation + change_of_q * (of_leaving * model.exit_rates * x).reshape(regions, -1).sum(axis=1)
     return q * of_leaving + of_region[model.region], of_perimeter, of_wish * leaving[model.source]
 
@@ -164,13 +164,13 @@ def advance(
 
 
 def pull_advance(
-    model: Turns, price, perimeter, splits, records: list, step: float, integrator: str = "euler",
+    model: Turns, adjoint, perimeter, splits, records: list, step: float, integrator: str = "euler",
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The worth of x (C,) and of the decision (E + V,) before a step, where x after it is worth `price` (C,)."""
+    """The gradient of x (C,) and of the decision (E + V,) before a step, where x after it has `adjoint` (C,)."""
     weights, nodes = SCHEMES[integrator]
-    of_x, of_decision, of_node = price, np.zeros(len(perimeter) + len(splits)), None
+    of_x, of_decision, of_node = adjoint, np.zeros(len(perimeter) + len(splits)), None
     for stage in reversed(range(len(weights))):
-        of_slope = step * weights[stage] * price
+        of_slope = step * weights[stage] * adjoint
         if stage < len(nodes):
             of_slope = of_slope + step * nodes[stage] * of_node
         of_node, *more = pull_derivative(model, of_slope, perimeter, splits, records[stage])
@@ -199,17 +199,17 @@ def vehicle_steps(
             total += float(x.sum())
     if not gradient:
         return total, None
-    worth, price = np.zeros_like(plan), np.zeros_like(x)
+    of_plan, adjoint = np.zeros_like(plan), np.zeros_like(x)
     for node, k in reversed(list(enumerate(interval))):
         if (node + 1) % substeps == 0:
-            price = price + 1.0
-        price, of_decision = pull_advance(
-            model, price, plan[k, :edges], plan[k, edges:], tape.pop(), step / substeps, integrator)
-        worth[k] += of_decision
-    return total, worth
+            adjoint = adjoint + 1.0
+        adjoint, of_decision = pull_advance(
+            model, adjoint, plan[k, :edges], plan[k, edges:], tape.pop(), step / substeps, integrator)
+        of_plan[k] += of_decision
+    return total, of_plan
 
 
-def vehicles_at_stake(
+def affected_vehicles(
     model: Turns, start: np.ndarray, demand: np.ndarray, plan: np.ndarray, step: float, *, substeps: int = 1,
     integrator: str = "euler",
 ) -> np.ndarray:
