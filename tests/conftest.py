@@ -5,14 +5,16 @@ import sys
 from pathlib import Path
 
 import pytest
+from jaxtyping import install_import_hook
 from xdist.workermanage import NodeManager
-
-from cosim.sumo.build import ensure_built
-from nmfd.model.regional_model import load_network
 
 sys.dont_write_bytecode = False  # else every process rewrites the asserts of all files anew, for 6 s
 # Here and in the commands that tests call: workers must not fight for cores. Torch reads it when it is imported.
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+# What the annotations say of the shapes of arrays is checked at every call.
+install_import_hook(
+    ["cosim.evaluation", "cosim.importing", "cosim.plant", "cosim.report", "cosim.sumo.net", "cosim.sumo.trips"],
+    "array_checks.arrays")
 
 # Reasons for which a test may be skipped all the same; benchmarks run when they are asked for.
 ALLOWED = ("no GPU", "no real city", "--benchmark-skip active")
@@ -28,6 +30,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_sessionstart(session: pytest.Session) -> None:
     """The city that most tests drive is built once, before workers use and copy it."""
     if not hasattr(session.config, "workerinput") and not session.config.option.collectonly:
+        from cosim.sumo.build import ensure_built  # after the hook, as all imports of what it checks
+        from nmfd.model.regional_model import load_network
+
         ensure_built(load_network(Path(__file__).parents[1] / "networks" / "grid7"))
 
 

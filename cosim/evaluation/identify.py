@@ -16,8 +16,10 @@ import numpy as np
 from cosim.evaluation import experiment, mfd_bands
 from cosim.evaluation.model_validation import SPILLBACK, draw_mfds, outflow_samples
 from cosim.evaluation.simulate import Result, Task
+from cosim.sumo.arrays import Points
 from cosim.sumo.build import network_folder
 from nmfd.api import load_scenario
+from nmfd.arrays import StatesOverTime
 from nmfd.errors import InputError
 from nmfd.model import identification, mfd
 from nmfd.model.identification import Observed, observed_split_ratios
@@ -162,7 +164,7 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
     return replace(network, observed_split_ratios=observed_split_ratios(network, crossings))
 
 
-def samples_of(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, np.ndarray]]:
+def samples_of(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, Points]]:
     """Outflow samples of every region (cosim.evaluation.model_validation.outflow_samples)."""
     return [
         outflow_samples(
@@ -178,7 +180,7 @@ def observed(result: Result) -> Observed:
         perimeter=trajectory.perimeter, splits=trajectory.splits, crossings=record["crossings"].sum(axis=3))
 
 
-def nearly_empty(samples: Sequence[dict[str, np.ndarray]]) -> list[int]:
+def nearly_empty(samples: Sequence[dict[str, Points]]) -> list[int]:
     """The regions with too few samples to fit anything to."""
     return [region for region, cloud in enumerate(samples) if len(own_points(cloud)) < SAMPLES]
 
@@ -193,12 +195,12 @@ def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[in
         storage=np.where(alone, np.maximum(model.storage, [mfd.jam for mfd in mfds]), model.storage))
 
 
-def own_points(cloud: dict[str, np.ndarray]) -> np.ndarray:
+def own_points(cloud: dict[str, Points]) -> Points:
     """(n, 2): the samples that the region's own MFD explains."""
     return np.concatenate([points for label, points in cloud.items() if label != SPILLBACK])
 
 
-def hysteresis(cloud: dict[str, np.ndarray]) -> float:
+def hysteresis(cloud: dict[str, Points]) -> float:
     """How much larger the outflow is while loading than while unloading at the same accumulation, as a share of it [-].
 
     The mean over bins of accumulation with both, weighted by the outflow; NaN where there is none.
@@ -234,7 +236,7 @@ def fit_table(network: RegionalModel, samples: Sequence[dict]) -> str:
     return "\n".join(lines)
 
 
-def unreached(network: RegionalModel, accumulations: Sequence[np.ndarray]) -> str:
+def unreached(network: RegionalModel, accumulations: Sequence[StatesOverTime]) -> str:
     """A line on the regions whose critical accumulation no loading run reached, each run (T+1, R, R) [veh]; or none."""
     most = np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
     short = [f"{region} {network.region_names[region]} ({100 * most[region] / curve.critical:.0f} % of it)"

@@ -11,12 +11,14 @@ from matplotlib.collections import LineCollection
 from cosim.importing.layers import colour
 from cosim.importing.quality import Tables
 from cosim.importing.streets import Streets
+from cosim.sumo.arrays import EdgeNumbers, PerEdge
+from nmfd.arrays import Positions
 from nmfd.studies import plots
 
 
 def draw_map(
-    path: Path, streets: Streets, regions: np.ndarray, names: Sequence[str], places: np.ndarray, tables: Tables,
-    density: np.ndarray | None,
+    path: Path, streets: Streets, regions: EdgeNumbers, names: Sequence[str], places: Positions, tables: Tables,
+    density: PerEdge | None,
 ) -> None:
     """density: (E,) [veh per lane-km], or None."""
     width, height = np.ptp(streets.centre, axis=0) + 1.0
@@ -32,7 +34,9 @@ def draw_map(
     drawing.savefig(path, dpi=130, metadata={"Software": None})
 
 
-def region_map(ax: Axes, streets: Streets, regions: np.ndarray, names: Sequence[str], places: np.ndarray) -> Axes:
+def region_map(
+    ax: Axes, streets: Streets, regions: EdgeNumbers, names: Sequence[str], places: Positions,
+) -> Axes:
     """Every street in the colour of its region, with a scale bar."""
     _streets(ax, streets, colors=[colour(region) for region in regions[streets.drivable]])
     for region, (x, y) in enumerate(places):

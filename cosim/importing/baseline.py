@@ -9,9 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import sumo
+from jaxtyping import Float
 
 from cosim.importing.streets import Streets
+from cosim.sumo.arrays import EdgeNumbers, PerEdge
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
+from nmfd.arrays import PerRegion, PerTurn
 from nmfd.errors import InputError
 from nmfd.runs.scratch import Scratch
 
@@ -31,7 +34,7 @@ class Baseline:
     dropped: vehicles of the demand that SUMO gave up without a word
     """
 
-    presence: np.ndarray
+    presence: Float[np.ndarray, "K E"]
     ways: Mapping[tuple[tuple[int, ...], int], int]
     teleports: int
     waiting: int
@@ -45,7 +48,7 @@ class Baseline:
         needed = sum(vehicles * free[list(way)].sum() for (way, _), vehicles in self.ways.items())
         return float(self.presence.sum() + self.delay) / max(float(needed), 1.0)
 
-    def density(self, streets: Streets) -> np.ndarray:
+    def density(self, streets: Streets) -> PerEdge:
         """(E,) [veh/m of lane] in the quarter of an hour with the most vehicles; 0 on edges without car lanes."""
         total = self.presence.sum(axis=1)
         sums = np.convolve(total, np.ones(min(PEAK, len(total))), mode="valid")
@@ -61,7 +64,7 @@ class Baseline:
                 found[pair] += count
         return found
 
-    def crossings(self, regions: np.ndarray) -> np.ndarray:
+    def crossings(self, regions: EdgeNumbers) -> PerTurn:
         """(R, R, R) [veh], [i, h, j]: from region i to h on the way to j."""
         count = int(regions.max()) + 1
         found = np.zeros((count,) * 3)
@@ -71,7 +74,7 @@ class Baseline:
                 found[seen[n], seen[n + 1], regions[last]] += vehicles
         return found
 
-    def metres_per_visit(self, streets: Streets, regions: np.ndarray) -> np.ndarray:
+    def metres_per_visit(self, streets: Streets, regions: EdgeNumbers) -> PerRegion:
         """(R,) [m] that a vehicle drives in a region from entry or departure to exit or arrival; NaN if none did."""
         count = int(regions.max()) + 1
         metres, visits = np.zeros(count), np.zeros(count)

@@ -15,6 +15,7 @@ from cosim.importing.case import SumoInput, seconds
 from cosim.importing.harmless import silent, softened
 from cosim.importing.od import Cell, read_od, relations, trips
 from cosim.importing.streets import Streets
+from cosim.sumo.arrays import PerTrip, TripNumbers
 from cosim.sumo.recorded_trips import BOUND
 from cosim.sumo.xml_files import Missing, attribute, read_xml
 from nmfd.errors import InputError
@@ -39,9 +40,9 @@ class Traffic:
     """
 
     vehicles: tuple[Element, ...]
-    depart: np.ndarray
-    origin: np.ndarray
-    destination: np.ndarray
+    depart: PerTrip
+    origin: TripNumbers
+    destination: TripNumbers
     background: tuple[Element, ...] = ()
     shared: tuple[Element, ...] = ()
     switched: tuple[str, ...] = ()

@@ -9,11 +9,12 @@ from matplotlib.path import Path as Outline
 
 from cosim.importing.layers import area
 from cosim.importing.streets import Streets
+from cosim.sumo.arrays import EdgeNumbers
 from cosim.sumo.xml_files import read_xml
 from nmfd.errors import InputError
 
 
-def read_given(streets: Streets, path: Path, method: str) -> np.ndarray:
+def read_given(streets: Streets, path: Path, method: str) -> EdgeNumbers:
     """(E,) region of every edge, -1 where the file names none. Raises InputError.
 
     method: "edges", a csv with the columns edge,region, regions from 0 without a gap; "taz" and "polygons", additional

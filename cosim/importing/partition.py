@@ -15,6 +15,7 @@ from cosim.importing.given import read_given
 from cosim.importing.refine import best, prices
 from cosim.importing.regions import finish
 from cosim.importing.streets import Streets
+from cosim.sumo.arrays import EdgeNumbers
 from nmfd.errors import InputError
 
 STARTS = 4  # of k-means, from which the partition is refined
@@ -40,7 +41,7 @@ class Drawn:
 
 def partition(
     streets: Streets, baseline: Baseline | None, cut: Clustered | Drawn, *, seed: int, left_alone: Collection[str] = (),
-) -> tuple[np.ndarray, int, int]:
+) -> tuple[EdgeNumbers, int, int]:
     """(E,) region of every edge, numbered from 0, how many were asked for, and how many streets are in another one than
     a file of the user's says.
 

@@ -9,6 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from cosim.importing.baseline import Baseline
 from cosim.importing.streets import Streets, graph
+from cosim.sumo.arrays import EdgeMask, EdgeNumbers
 from cosim.sumo.net import City
 from nmfd.runs.tables import text_table
 
@@ -34,7 +35,7 @@ class Tables:
 
 
 def tables(
-    streets: Streets, regions: np.ndarray, names: Sequence[str], city: City, baseline: Baseline | None,
+    streets: Streets, regions: EdgeNumbers, names: Sequence[str], city: City, baseline: Baseline | None,
     left_alone: Mapping[str, str],
 ) -> Tables:
     """left_alone: signal -> why perimeter control does not touch it."""
@@ -83,7 +84,7 @@ def _variance(density: np.ndarray, streets: Streets, members: np.ndarray) -> tup
     return mean, float(np.average((density[members] - mean) ** 2, weights=weight))
 
 
-def pieces(streets: Streets, members: np.ndarray) -> int:
+def pieces(streets: Streets, members: EdgeMask) -> int:
     """The parts into which some edges fall by the connections between them; 1 is connected."""
     numbers = np.cumsum(members) - 1
     links = streets.links[members[streets.links].all(axis=1)]

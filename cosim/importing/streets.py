@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from cosim.importing.case import seconds
+from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge, Points
 from cosim.sumo.net import for_cars, size
 from cosim.sumo.xml_files import BROKEN, attribute, opened, read_xml
 from nmfd.errors import InputError
@@ -46,16 +48,16 @@ class Streets:
 
     path: Path
     edges: tuple[str, ...]
-    drivable: np.ndarray
-    length: np.ndarray
-    lanes: np.ndarray
-    speed: np.ndarray
-    shapes: tuple[np.ndarray, ...]
-    centre: np.ndarray
-    junctions: np.ndarray
+    drivable: EdgeMask
+    length: PerEdge
+    lanes: EdgeNumbers
+    speed: PerEdge
+    shapes: tuple[Points, ...]
+    centre: Float[np.ndarray, "E 2"]
+    junctions: Int[np.ndarray, "E 2"]
     places: Mapping[str, int]
-    links: np.ndarray
-    all_links: np.ndarray
+    links: Int[np.ndarray, "L 2"]
+    all_links: Int[np.ndarray, "_ 2"]
     link_signals: tuple[str | None, ...]
     roundabouts: tuple[tuple[int, ...], ...]
     logics: Mapping[str, tuple[Logic, ...]]
@@ -67,31 +69,31 @@ class Streets:
         return {edge: n for n, edge in enumerate(self.edges)}
 
     @property
-    def lane_metres(self) -> np.ndarray:
+    def lane_metres(self) -> PerEdge:
         """(E,) [m]: length times lanes for cars."""
         return self.length * self.lanes
 
     @cached_property
-    def main_part(self) -> np.ndarray:
+    def main_part(self) -> EdgeMask:
         """(E,) bool: the drivable edges of the part, connected somehow, with the most lane metres."""
         return self._largest("weak")
 
     @cached_property
-    def core(self) -> np.ndarray:
+    def core(self) -> EdgeMask:
         """(E,) bool: the largest set of edges of which each can be reached from each."""
         return self._largest("strong")
 
     @cached_property
-    def onward(self) -> np.ndarray:
+    def onward(self) -> EdgeMask:
         """(E,) bool: the edges from which the core can be reached."""
         return self._reached(self.links[:, ::-1])
 
     @cached_property
-    def reached(self) -> np.ndarray:
+    def reached(self) -> EdgeMask:
         """(E,) bool: the edges that can be reached from the core."""
         return self._reached(self.links)
 
-    def _reached(self, links: np.ndarray) -> np.ndarray:
+    def _reached(self, links: Int[np.ndarray, "L 2"]) -> EdgeMask:
         found = np.zeros(len(self.edges), dtype=bool)
         found[breadth_first_order(graph(links, len(self.edges)), int(np.argmax(self.core)),
                                   return_predecessors=False)] = True
@@ -111,13 +113,13 @@ class Streets:
             found |= {(first, last): bool(reached[last]) for last in ends}
         return found
 
-    def _largest(self, kind: str) -> np.ndarray:
+    def _largest(self, kind: str) -> EdgeMask:
         count, part = connected_components(graph(self.links, len(self.edges)), directed=True, connection=kind)
         weight = np.bincount(part, self.lane_metres * self.drivable, count)
         return (part == np.argmax(weight)) & self.drivable
 
 
-def graph(pairs: np.ndarray, size: int) -> csr_array:
+def graph(pairs: Int[np.ndarray, "_ 2"], size: int) -> csr_array:
     """(size, size) with a one for every pair (n, 2)."""
     return csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
 
@@ -128,7 +130,7 @@ class _Edge(NamedTuple):
     cars: frozenset[int]
     length: float
     speed: float
-    shape: np.ndarray
+    shape: Points
     start: str
     end: str
 
@@ -237,7 +239,7 @@ def _streets(
         logics={signal: tuple(found) for signal, found in sorted(logics.items())}, left_hand=left_hand)
 
 
-def _middle(shape: np.ndarray) -> np.ndarray:
+def _middle(shape: Points) -> Float[np.ndarray, " 2"]:
     """The point half way along a line (n, 2)."""
     steps = np.hypot(*np.diff(shape, axis=0).T) if len(shape) > 1 else np.zeros(0)
     along = np.concatenate([[0.0], np.cumsum(steps)])

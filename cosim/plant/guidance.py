@@ -31,8 +31,10 @@ import numpy as np
 
 from cosim.plant.meter import Event
 from cosim.plant.shortest_paths import Home, Moves, Ways
+from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
+from nmfd.arrays import PerTurn
 
 SMOOTHING = 0.5            # weight of the newest travel times
 DRIVER_CLASSES = 4         # groups of drivers who see different travel times: were all sent one way, it would jam
@@ -76,7 +78,7 @@ class Guide:
     """
 
     def __init__(
-        self, session: Session, city: City, own: np.ndarray, *, compliance: float, most_detour: float,
+        self, session: Session, city: City, own: PerTurn, *, compliance: float, most_detour: float,
         random: np.random.Generator, ways_return: bool = False, period: float = 0.0,
     ):
         """own: (R, R, R) [-], the drivers' own split ratios, which controllers mean as well"""
@@ -118,7 +120,7 @@ class Guide:
         self.realised = np.zeros((city.regions,) * 3, dtype=int)
         self.refused = 0
 
-    def command(self, splits: np.ndarray | None, speed: np.ndarray | None) -> None:
+    def command(self, splits: PerTurn | None, speed: PerEdge | None) -> None:
         """Take over theta (R, R, R) [-] for the next control interval; None: no guidance.
 
         speed: (E,) [m/s] of the city's edges, the mean over the last interval and NaN on empty ones; None: as before.
@@ -237,7 +239,7 @@ class Guide:
         way = [number for edge in route if (number := self._index.get(edge)) is not None]
         return way if len(way) == len(route) else None
 
-    def _takes(self, present: list[int] | None, here: int, time: np.ndarray) -> tuple[float, bool]:
+    def _takes(self, present: list[int] | None, here: int, time: PerEdge) -> tuple[float, bool]:
         """[s] from the end of edge `here` to the end of the present way, if it begins there, at `time` (E,) [s]; and
         whether it is a way that a search would find: by known moves and, unless ways may return, out of the region of
         `here` and never back."""

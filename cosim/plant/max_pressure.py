@@ -20,6 +20,7 @@ from cosim.plant.perimeter import yellow_time
 from cosim.sumo.net import City, gateway_movements
 from cosim.sumo.session import Phase, Session
 from cosim.sumo.signals import GREEN, Link, Signal, is_stage
+from nmfd.arrays import PerPair
 
 EVERY = 5.0       # s between two decisions: about two vehicles per lane
 PERMISSIVE = 0.3  # saturation flow of a movement that must give way (g), as a share of a protected one
@@ -46,7 +47,7 @@ class MaxPressure:
         for junction in self._junctions:
             show(junction.signal, junction.state)
 
-    def command(self, share: np.ndarray, opened: Mapping[str, Collection[int]]) -> None:
+    def command(self, share: PerPair, opened: Mapping[str, Collection[int]]) -> None:
         """share: (R, R) [-], (u - u_min) / (u_max - u_min); opened: signal -> gateway links without a ration."""
         for junction in self._rationed:
             junction.command(share, opened.get(junction.signal, ()))
@@ -108,7 +109,7 @@ class Junction:
         """Whether commands limit the green of a link here."""
         return bool(self._rations)
 
-    def command(self, share: np.ndarray, opened: Collection[int] = ()) -> None:
+    def command(self, share: PerPair, opened: Collection[int] = ()) -> None:
         """(R, R) [-], as GatewaySignal.command in cosim.plant.perimeter."""
         for link, ration in self._rations.items():
             ration.command(1.0 if link in opened else float(share[ration.pair]))

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cosim.sumo.arrays import PerGateway
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
+from nmfd.arrays import PerPair
 from nmfd.ledger import LedgerError
 from nmfd.types import State
 
@@ -85,7 +87,7 @@ class Meter:
             step=step, time=time, accumulation=self.accumulation(step), backlog=self.backlog(),
             completed=float(self.arrivals.sum()))
 
-    def gateway_flow(self) -> np.ndarray:
+    def gateway_flow(self) -> PerGateway:
         """(G,) [veh] over each gateway of the city since the beginning."""
         return np.array([
             self.entry_flow[g.source, g.to_edge] / self._alike[g.source, g.to_edge] for g in self._city.gateways])
@@ -129,7 +131,7 @@ class Meter:
         events.sort(key=lambda event: (event.source is not None, event.vehicle))  # set order is not reproducible
         return events
 
-    def accumulation(self, step: int = 0) -> np.ndarray:
+    def accumulation(self, step: int = 0) -> PerPair:
         """x_ij (R, R) [veh]: every vehicle counted where it is now, on junctions too. LedgerError if the count differs
         from departures minus arrivals, in total or in any (i, j) as followed from crossing to crossing; it names the
         control step `step`."""
@@ -164,7 +166,7 @@ class Meter:
         under_way = {vehicle for vehicle, known in self._vehicles.items() if known.region is not None}
         return under_way.difference(on_road, self._teleporting).intersection(self._session.known())
 
-    def backlog(self) -> np.ndarray:
+    def backlog(self) -> PerPair:
         """(R, R) [veh]: due to depart from i for j, but not inserted yet."""
         waiting = np.zeros(self._running.shape)
         for vehicle in self._session.pending():
@@ -172,7 +174,7 @@ class Meter:
             waiting[known.origin, known.destination] += 1
         return waiting
 
-    def probes(self) -> np.ndarray:
+    def probes(self) -> PerPair:
         """(R, R) [veh]: the probes among the accumulation, where it last counted them."""
         counted = np.zeros(self._running.shape)
         for vehicle in self._probes & self._vehicles.keys():
@@ -181,7 +183,7 @@ class Meter:
                 counted[known.region, known.destination] += 1
         return counted
 
-    def probe_backlog(self) -> np.ndarray:
+    def probe_backlog(self) -> PerPair:
         """(R, R) [veh]: the probes among the backlog."""
         waiting = np.zeros(self._running.shape)
         for vehicle in self._probes.intersection(self._session.pending()):

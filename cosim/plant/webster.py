@@ -24,6 +24,7 @@ from cosim.plant.offsets import offsets
 from cosim.sumo.net import City
 from cosim.sumo.session import Phase
 from cosim.sumo.signals import Signal, programme_row, write_programmes
+from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
 
 CYCLES = (40, 50, 60, 70, 80, 90, 100, 110, 120)  # s
@@ -67,7 +68,7 @@ def optimised(city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, s
 
 
 def plan(
-    city: City, signals: Sequence[Signal], demand: np.ndarray, step: float, *, folder: Path,
+    city: City, signals: Sequence[Signal], demand: PairsOverTime, step: float, *, folder: Path,
     flows: Mapping[tuple[str, str], float] | None = None,
 ) -> Path:
     """The additional file for SUMO with `signals` optimised for the peak of `demand` (T, R, R) [veh/s], or for `flows`

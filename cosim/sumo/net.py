@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
+from cosim.sumo.arrays import PerEdge, Points
 from cosim.sumo.xml_files import BROKEN, attribute, opened
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
@@ -136,9 +138,9 @@ def check_adjacency(city: City, network: RegionalModel) -> None:
             f"remove it, add no_way_to = [{h}], or change the regions of edges")
 
 
-def edge_shapes(city: City) -> list[np.ndarray]:
+def edge_shapes(city: City) -> list[Points]:
     """(n, 2) [m] for every edge of the city: its line on the map, midway between its outermost lanes."""
-    shapes: dict[str, np.ndarray] = {}
+    shapes: dict[str, Points] = {}
     with opened(city.net_file) as stream:
         for _, element in ElementTree.iterparse(stream):
             if element.tag == "edge":
@@ -278,12 +280,14 @@ def gateway_movements(city: City) -> dict[str, dict[int, tuple[int, int]]]:
     return movements
 
 
-def edge_room(city: City) -> np.ndarray:
+def edge_room(city: City) -> PerEdge:
     """(E,) [veh]: how many stand on each edge at JAM_SPACING."""
     return np.array([max(city.lanes[edge] * city.length[edge] / JAM_SPACING, 1.0) for edge in city.edges])
 
 
-def gateway_room_taken(edge_vehicles: np.ndarray, city: City) -> np.ndarray:
+def gateway_room_taken(
+    edge_vehicles: Float[np.ndarray, "*intervals E"], city: City,
+) -> Float[np.ndarray, "*intervals G"]:
     """(..., G) [-]: the share of the room on the edge before each gateway that edge_vehicles (..., E) [veh] take."""
     index = {edge: n for n, edge in enumerate(city.edges)}
     before = [index[gateway.from_edge] for gateway in city.gateways]

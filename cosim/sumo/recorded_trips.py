@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cosim.sumo.arrays import PerTrip
 from cosim.sumo.net import City
 from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.errors import InputError
@@ -25,7 +26,7 @@ BOUND = frozenset({
 class RecordedTrips:
     """N vehicles or trips. depart: (N,) [s]; elements: their XML, without anything that another one repeats."""
 
-    depart: np.ndarray
+    depart: PerTrip
     elements: tuple[ElementTree.Element, ...]
 
 

@@ -11,7 +11,9 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from cosim.sumo.arrays import PerTrip, TripNumbers
 from cosim.sumo.net import City
+from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
 
 STREAM = 7101       # keeps the random numbers of trips apart from others of the same seed
@@ -30,14 +32,14 @@ class Trips:
     arrival: (N,) [m], position on the last edge at which the trip ends
     """
 
-    depart: np.ndarray
-    origin: np.ndarray
-    destination: np.ndarray
+    depart: PerTrip
+    origin: TripNumbers
+    destination: TripNumbers
     routes: tuple[tuple[str, ...], ...]
-    arrival: np.ndarray
+    arrival: PerTrip
 
 
-def write_trips(city: City, demand: np.ndarray, step: float, seed: int, path: Path) -> int:
+def write_trips(city: City, demand: PairsOverTime, step: float, seed: int, path: Path) -> int:
     """Write the trips of `demand` (T, R, R) [veh/s], intervals of `step` [s], to a SUMO route file; returns how many.
 
     The vehicles are v0, v1, ... by departure; the same seed gives the same bytes.
@@ -58,7 +60,7 @@ def write_trips(city: City, demand: np.ndarray, step: float, seed: int, path: Pa
     return len(trips.routes)
 
 
-def make_trips(city: City, demand: np.ndarray, step: float, seed: int) -> Trips:
+def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Trips:
     """Individual trips of `demand` (T, R, R) [veh/s], intervals of `step` [s].
 
     Every pair of regions gets its number of vehicles to within one, at the times at which its cumulated demand passes
@@ -96,8 +98,8 @@ def make_trips(city: City, demand: np.ndarray, step: float, seed: int) -> Trips:
 
 
 def _departures(
-    demand: np.ndarray, step: float, rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    demand: PairsOverTime, step: float, rng: np.random.Generator,
+) -> tuple[PerTrip, TripNumbers, TripNumbers]:
     """(times, origins, destinations), sorted by time, rounded to 0.01 s."""
     clock = step * np.arange(len(demand) + 1)
     times, origins, destinations = [], [], []
@@ -178,7 +180,7 @@ class Ways:
         self._time = np.array([city.length[edge] / city.speed[edge] for edge in city.edges])
         self._noise = np.exp(CLASS_SPREAD * rng.standard_normal((DRIVER_CLASSES, len(city.edges))))
 
-    def routes(self, first: np.ndarray, last: np.ndarray, tastes: np.ndarray) -> list[tuple[str, ...]]:
+    def routes(self, first: TripNumbers, last: TripNumbers, tastes: TripNumbers) -> list[tuple[str, ...]]:
         """The route of every trip; empty where there is none."""
         found: list[tuple[str, ...]] = [()] * len(first)
         count = len(self.city.edges)
