@@ -30,7 +30,7 @@ _PLACES = {
     "settings": "plant.settings.settings", "Sweep": "evaluation.sweeps.Sweep", "sweep": "evaluation.sweeps.sweep"}
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> object:
     if name not in _PLACES:
         raise AttributeError(f"module 'cosim' has no attribute {name!r}")
     module, _, attribute = _PLACES[name].rpartition(".")

@@ -6,6 +6,7 @@ instead of 3 s.
 
 import os
 from pathlib import Path
+from typing import Literal
 
 import click
 
@@ -106,10 +107,10 @@ def identify(
 @click.option("--no-run", is_flag=True, help="Do not simulate the city first: no densities and no flows.")
 @click.option("--force", is_flag=True, help="Replace a network and scenario that are there.")
 def import_(
-    source: Path, regions: int | None, out: Path, scenario: Path | None, method: str, edges: Path | None,
-    taz: Path | None, polygons: Path | None, routes: tuple[Path, ...], od: tuple[Path, ...], zones: tuple[Path, ...],
-    demand: str | None, level: str, mesoscopic: bool, begin: str | None, end: str | None, seed: int, no_run: bool,
-    force: bool,
+    source: Path, regions: int | None, out: Path, scenario: Path | None, method: Literal["density", "geometric"],
+    edges: Path | None, taz: Path | None, polygons: Path | None, routes: tuple[Path, ...], od: tuple[Path, ...],
+    zones: tuple[Path, ...], demand: str | None, level: str, mesoscopic: bool, begin: str | None, end: str | None,
+    seed: int, no_run: bool, force: bool,
 ) -> None:
     """Turn any SUMO city into a network and a scenario: regions, gateways, demand by pair of regions, map.
 
@@ -123,15 +124,18 @@ def import_(
       cosim import city.sumocfg --taz districts.taz.xml --out networks/mycity --begin 7:00:00 --end 9:00:00
     """
     from cosim.importing.importer import ImportOptions, import_city, parse_time  # heavy
+    from cosim.importing.partition import Clustered, Drawn
 
-    own = {key: file for key, file in (("edges", edges), ("taz", taz), ("polygons", polygons)) if file}
-    if len(own) + (regions is not None) != 1:
+    cuts: list[Clustered | Drawn] = [] if regions is None else [Clustered(method=method, regions=regions)]
+    cuts += [Drawn(method="edges", file=edges)] if edges else []
+    cuts += [Drawn(method="taz", file=taz)] if taz else []
+    cuts += [Drawn(method="polygons", file=polygons)] if polygons else []
+    if len(cuts) != 1:
         raise InputError("--regions: give a number of regions, or else one of --edges, --taz and --polygons")
-    if no_run and method == "density" and not own:
+    if no_run and cuts[0].method == "density":
         raise InputError("--no-run: the densities come from that run; add --method geometric")
-    method, given = next(iter(own.items()), (method, None))
     order = ImportOptions(
-        source=source, regions=regions, out=out, method=method, given=given, seed=seed, run=not no_run, force=force,
+        source=source, out=out, cut=cuts[0], seed=seed, run=not no_run, force=force,
         peak=demand is not None, level=parsed_level(level, no_run), mesoscopic=mesoscopic,
         scenario=scenario or out.parent.parent / "scenarios" / out.name,
         begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"), routes=routes, od=od,

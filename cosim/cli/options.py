@@ -50,4 +50,5 @@ def parsed_compliance(text: str | None) -> tuple[float, ...]:
 
 
 def tell(line: str) -> None:
+    """Print a line about the work, apart from its results."""
     click.echo(f"cosim: {line}", err=True)

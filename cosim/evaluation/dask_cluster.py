@@ -4,12 +4,16 @@ import logging
 import os
 from collections.abc import Iterator, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 from cosim.evaluation import dask_worker
 from cosim.evaluation.simulate import Result, Task
 from nmfd.errors import InputError
 from nmfd.extras import need
 from nmfd.runs.workers import Failure
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 PATIENCE = 10.0  # s, for the scheduler to answer
 
@@ -43,7 +47,7 @@ def outcomes(address: str, tasks: Sequence[Task]) -> Iterator[tuple[Task, Result
         client.close()
 
 
-def connect(address: str):
+def connect(address: str) -> "Client":
     """A distributed.Client. Raises InputError."""
     need("--scheduler", "dask", "distributed")
     from distributed import Client  # of an extra: not there for everybody

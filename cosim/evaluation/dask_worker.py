@@ -25,6 +25,7 @@ def run(task: Task, folder: str) -> Result | Failure:
         [sys.executable, "-m", "cosim.evaluation.dask_worker"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         cwd=folder, env=environment)
     with process:
+        assert process.stdin is not None and process.stdout is not None  # they are pipes
         message = pickle.dumps(task)
         try:
             process.stdin.write(len(message).to_bytes(HEADER) + message)

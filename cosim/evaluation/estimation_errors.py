@@ -71,5 +71,5 @@ def error_table(rows: pd.DataFrame) -> str:
     return text_columns(headings, shown.to_numpy(), CAPTION)
 
 
-def _rms(values) -> float:
+def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if np.size(values) else 0.0

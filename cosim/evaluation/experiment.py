@@ -13,7 +13,7 @@ import pandas as pd
 from cosim.evaluation import estimation_errors
 from cosim.evaluation.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.plant import incidents
-from cosim.plant.launch import own_vehicles
+from cosim.plant.launch import own_files, own_vehicles
 from cosim.plant.record import Record
 from cosim.plant.settings import FILES, Settings, settings
 from cosim.plant.strategy import MAX_PRESSURE, configured, parse
@@ -34,6 +34,8 @@ from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
 from nmfd.studies.benchmark import REFERENCE, draw_accumulations, interval
 
+Progress = Callable[[int, int, str], None]  # takes what is done, what there is to do, and what is running
+Outcomes = Iterator[tuple[Task, Result | Failure]]
 # Of loading runs: whether they guide routes, and so depend on the drivers' own split ratios.
 LOADING = {"probing-pc": False, "probing-pcrg": True, "route-guidance": True}
 CAPTION = (
@@ -42,7 +44,7 @@ CAPTION = (
 
 
 def experiment(
-    tasks: Sequence[Task], *, out: Path, workers: int = 1, progress: Callable[[int, int, str], None] | None = None,
+    tasks: Sequence[Task], *, out: Path, workers: int = 1, progress: Progress | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Run the tasks that are not yet in the run folder `out`; returns `overview` of all that is there.
@@ -62,9 +64,9 @@ def experiment(
 
 def perform(
     plan: Sequence[tuple[Path, Task]], *, workers: int = 1, fresh: bool = False,
-    progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
+    progress: Progress | None = None, tell: Callable[[str], None] | None = None,
     kept: Callable[[], object] | None = None, failed: Callable[[Task, str], None] | None = None,
-    source: Callable[[Sequence[Task]], Iterator[tuple[Task, Result | Failure]]] | None = None,
+    source: Callable[[Sequence[Task]], Outcomes] | None = None,
 ) -> list[tuple[Task, Failure]]:
     """Run every task, in this order, that is not yet in its run folder; returns those that failed, and why.
 
@@ -78,7 +80,6 @@ def perform(
     these would have to be proven the same to the byte, to save the minute or two that it takes.
 
     fresh: every run in a process of its own
-    progress: called with what is done and to do, and what is running
     tell: takes one line where the runs of a controller do not count any more because it changed; None: an InputError
     kept: called after every run that was kept; failed: with every one that failed, and why
     source: runs the tasks elsewhere and gives their outcomes as they finish, instead of `workers` processes here
@@ -116,6 +117,7 @@ def perform(
 
 
 def label(task: Task) -> str:
+    """A task in words, for messages and progress."""
     demand = "" if task.demand_factor == 1.0 else f", demand times {task.demand_factor:g}"
     return f"controller {task.controller}, seed {task.seed}{demand}"
 
@@ -163,29 +165,29 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
     own_vehicles(scenario, chosen, city)
     everywhere = MAX_PRESSURE in {parse(name).overrides.get("signals", chosen.signals) for name in controllers}
     incidents.check(scenario.ordered_faults, city, "faults", [signal.id for signal in simple] if everywhere else ())
-    for name in (*chosen.background, *chosen.additional):
-        read_xml(scenario.folder / name)
+    for path in own_files(scenario, (*chosen.background, *chosen.additional)):
+        read_xml(path)
     configuration = {
         "scenario": scenario.name, "network": scenario.network.name, "plant": "sumo", "step_s": scenario.step,
         "steps": scenario.steps, "demand_factor": first.demand_factor,
         "demand_hash": hashlib.sha256(np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16],
         "net_file_hash": disk.file_hash(files.net_file), "regions_hash": disk.file_hash(files.regions_csv),
-        "measurement_std_veh": scenario.measurement_std, "sumo": _plain(chosen, scenario.folder),
+        "measurement_std_veh": scenario.measurement_std, "sumo": _plain(chosen, scenario),
         "libsumo": metadata.version("libsumo"), **({"faults": list(scenario.faults)} if scenario.faults else {})}
     return configuration, controllers
 
 
-def _plain(chosen: Settings, folder: Path | None) -> dict:
+def _plain(chosen: Settings, scenario: Scenario) -> dict:
     """The settings that are not the default ones; of the files that they name, fingerprints.
 
     Only these, so that a new kind of setting does not make old runs another city's.
     """
     found = chosen.model_dump(mode="json", exclude_defaults=True)
-    hashes = {key: [disk.file_hash(folder / name) for name in found[key]] for key in FILES if key in found}
+    hashes = {key: [disk.file_hash(path) for path in own_files(scenario, found[key])] for key in FILES if key in found}
     return {**found, **hashes}
 
 
-def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress) -> Iterator[tuple]:
+def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress: Progress | None) -> Outcomes:
     """(task, Result or Failure); in this process, which reports every control interval, if one run is all there is."""
     if len(todo) != 1 or fresh:
         yield from _reported(lambda tasks: outcomes(simulate, tasks, workers, fresh=fresh), todo, progress)
@@ -197,7 +199,9 @@ def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress) -> Iter
     yield todo[0], attempt(lambda task: simulate(task, tick if progress else None), todo[0])
 
 
-def _reported(source, todo: Sequence[Task], progress) -> Iterator[tuple]:
+def _reported(
+    source: Callable[[Sequence[Task]], Outcomes], todo: Sequence[Task], progress: Progress | None,
+) -> Outcomes:
     """What comes from `source`, with a word to `progress` of each."""
     report = progress or (lambda done, total, note: None)
     report(0, len(todo), "")

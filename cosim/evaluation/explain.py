@@ -10,9 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Int
 
 from cosim.evaluation import experiment, statistics
 from cosim.plant.strategy import model_free
+from nmfd.arrays import PerRegion
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import run_folder
 from nmfd.studies.benchmark import REFERENCE
@@ -30,12 +32,12 @@ class Loading:
     """Of R regions: most (R,), the highest accumulation over the critical one, mean over the runs; beyond (R,), the
     share of the time beyond it; inside (R,), the share of the vehicles there that had started there, NaN if unknown."""
 
-    most: np.ndarray
-    beyond: np.ndarray
-    inside: np.ndarray
+    most: PerRegion
+    beyond: PerRegion
+    inside: PerRegion
 
     @property
-    def critical(self) -> np.ndarray:
+    def critical(self) -> Int[np.ndarray, " _"]:
         """The regions that were beyond their critical accumulation for more than a moment."""
         return np.flatnonzero(self.beyond > HARDLY)
 
@@ -65,6 +67,7 @@ class ControlActivity:
     guided: float
 
     def __str__(self) -> str:
+        """As the end of a sentence about the controller."""
         parts = [f"it held back in {_share(self.held)} of its commands"] if self.held >= HARDLY else []
         if self.guided > 0:
             parts.append(f"it guided {self.guided:.1f} times per trip")

@@ -7,7 +7,7 @@ runs by prediction error (nmfd.model.identification).
 
 import csv
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +16,10 @@ import numpy as np
 from cosim.evaluation import experiment, mfd_bands
 from cosim.evaluation.model_validation import SPILLBACK, draw_mfds, outflow_samples
 from cosim.evaluation.simulate import Result, Task
+from cosim.sumo.arrays import Points
+from cosim.sumo.build import network_folder
 from nmfd.api import load_scenario
+from nmfd.arrays import StatesOverTime
 from nmfd.errors import InputError
 from nmfd.model import identification, mfd
 from nmfd.model.identification import Observed, observed_split_ratios
@@ -57,10 +60,11 @@ class Loading:
         return "+".join([first, *self.options]), "+".join([second, *self.options])
 
     def target(self, scenario: Scenario) -> Path:
-        """The folder whose network.toml is written."""
-        own = scenario.network.folder
-        alone = self.guided and not self.options and without_model(scenario)
-        return self.network or (own / GUIDED if alone else own)
+        """The folder whose network.toml is written. Raises InputError for a network without one."""
+        if self.network is not None:
+            return self.network
+        own = network_folder(scenario.network)
+        return own / GUIDED if self.guided and not self.options and without_model(scenario) else own
 
 
 def without_model(scenario: Scenario) -> bool:
@@ -71,7 +75,7 @@ def without_model(scenario: Scenario) -> bool:
 
 def identify(
     scenario: Path, loading: Loading, *, out: Path, workers: int = 1,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: experiment.Progress | None = None,
 ) -> str:
     """Load the city of `scenario`, fit its regional model, and write the network.toml of `loading`.
 
@@ -80,8 +84,8 @@ def identify(
     the same call goes on where it was interrupted, and gives the same model.
     """
     loaded = load_scenario(scenario)
-    target = loading.target(loaded)
-    if (loading.guided or loading.options) and target.resolve() == loaded.network.folder.resolve():
+    target, own = loading.target(loaded), network_folder(loaded.network)
+    if (loading.guided or loading.options) and target.resolve() == own.resolve():
         raise InputError(
             f"{'--guided' if loading.guided else '--with'}: {loaded.name} runs on {target}, whose model must stay that "
             "of its own drivers and signals; name another folder with --network")
@@ -97,8 +101,9 @@ def identify(
     scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
     def fitted(results: Sequence[Result], samples: Sequence[dict], what: str) -> RegionalModel:
-        def tell(done, total, note):
-            progress(done, total, f"{what}, {note}")
+        def tell(done: int, total: int, note: str) -> None:
+            if progress is not None:
+                progress(done, total, f"{what}, {note}")
 
         return as_it_was(network, identification.fit(
             network, [observed(result) for result in results], iterations=loading.iterations,
@@ -118,14 +123,15 @@ def identify(
     levels, seeds = ", ".join(f"{level:g}" for level in loading.levels), f"{min(loading.seeds)} to {max(loading.seeds)}"
     target.mkdir(parents=True, exist_ok=True)
     files.write_text(target / "network.toml", network_toml(
-        model, _sumo_table(loaded.network.folder, target),
+        model, _sumo_table(own, target),
         f"Regional model: written by cosim identify from {len(found)} loading runs of {loaded.name} under {first} and\n"
         f"# {second}, demand times {levels}, seeds {seeds}."))
     return text
 
 
 def _load(
-    scenario: Path, loading: Loading, controller: str, options: dict, out: Path, workers: int, progress,
+    scenario: Path, loading: Loading, controller: str, options: dict, out: Path, workers: int,
+    progress: experiment.Progress | None,
 ) -> list[Result]:
     """The loading runs of one controller at all levels, those that are kept or new ones."""
     plan = [
@@ -158,7 +164,7 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
     return replace(network, observed_split_ratios=observed_split_ratios(network, crossings))
 
 
-def samples_of(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, np.ndarray]]:
+def samples_of(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, Points]]:
     """Outflow samples of every region (cosim.evaluation.model_validation.outflow_samples)."""
     return [
         outflow_samples(
@@ -174,7 +180,7 @@ def observed(result: Result) -> Observed:
         perimeter=trajectory.perimeter, splits=trajectory.splits, crossings=record["crossings"].sum(axis=3))
 
 
-def nearly_empty(samples: Sequence[dict[str, np.ndarray]]) -> list[int]:
+def nearly_empty(samples: Sequence[dict[str, Points]]) -> list[int]:
     """The regions with too few samples to fit anything to."""
     return [region for region, cloud in enumerate(samples) if len(own_points(cloud)) < SAMPLES]
 
@@ -189,12 +195,12 @@ def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[in
         storage=np.where(alone, np.maximum(model.storage, [mfd.jam for mfd in mfds]), model.storage))
 
 
-def own_points(cloud: dict[str, np.ndarray]) -> np.ndarray:
+def own_points(cloud: dict[str, Points]) -> Points:
     """(n, 2): the samples that the region's own MFD explains."""
     return np.concatenate([points for label, points in cloud.items() if label != SPILLBACK])
 
 
-def hysteresis(cloud: dict[str, np.ndarray]) -> float:
+def hysteresis(cloud: dict[str, Points]) -> float:
     """How much larger the outflow is while loading than while unloading at the same accumulation, as a share of it [-].
 
     The mean over bins of accumulation with both, weighted by the outflow; NaN where there is none.
@@ -230,7 +236,7 @@ def fit_table(network: RegionalModel, samples: Sequence[dict]) -> str:
     return "\n".join(lines)
 
 
-def unreached(network: RegionalModel, accumulations: Sequence[np.ndarray]) -> str:
+def unreached(network: RegionalModel, accumulations: Sequence[StatesOverTime]) -> str:
     """A line on the regions whose critical accumulation no loading run reached, each run (T+1, R, R) [veh]; or none."""
     most = np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
     short = [f"{region} {network.region_names[region]} ({100 * most[region] / curve.critical:.0f} % of it)"

@@ -4,17 +4,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 
+from cosim.sumo.arrays import Points
 from nmfd.model.regional_model import RegionalModel
 from nmfd.studies import plots
 from nmfd.studies.benchmark import interval
 
 BINS = 12    # of accumulation
 FEWEST = 3   # runs in a bin
+Band = Float[np.ndarray, "_ 3"]  # bins of accumulation
 
 
-def band(runs: Sequence[np.ndarray]) -> np.ndarray:
+def band(runs: Sequence[Points]) -> Band:
     """(n, 3): accumulation [veh], mean over runs, and half of its 95 % interval (Student's t).
 
     runs: (m, 2) of accumulation and outflow or production. The samples of one run hang together, therefore every run
@@ -32,7 +35,7 @@ def band(runs: Sequence[np.ndarray]) -> np.ndarray:
     return np.array(rows).reshape(-1, 3)
 
 
-def draw_band(ax: Axes, found: np.ndarray) -> Axes:
+def draw_band(ax: Axes, found: Band) -> Axes:
     """A shaded band and its middle; found: (n, 3) as `band` gives it."""
     x, mean, half = found.T
     ax.fill_between(x, mean - half, mean + half, color="tab:blue", alpha=0.25, linewidth=0, zorder=3,
@@ -41,7 +44,7 @@ def draw_band(ax: Axes, found: np.ndarray) -> Axes:
     return ax
 
 
-def production_samples(record: Mapping[str, np.ndarray], region: int) -> dict[str, np.ndarray]:
+def production_samples(record: Mapping[str, np.ndarray], region: int) -> dict[str, Points]:
     """label -> (n, 2) of accumulation [veh] and production [veh m/s], loading and unloading, of one run."""
     accumulation, production = record["mean_accumulation"][:, region], record["production"][:, region]
     rising = np.diff(accumulation, prepend=0.0) >= 0

@@ -7,10 +7,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
+from jaxtyping import Bool, Float
 
 from cosim.evaluation import mfd_bands
 from cosim.evaluation.simulate import Result
+from cosim.sumo.arrays import Points, RegionCounts, Series
 from nmfd import closed_loop
+from nmfd.arrays import Adjacency
 from nmfd.model.dynamics import advance, parameters
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import RegionalModel
@@ -31,15 +34,17 @@ CAPTION = (
 
 
 class Replay:
-    """The recorded controls of a trajectory, as a controller."""
+    """The recorded controls of a trajectory, as a controller (nmfd.types.Controller)."""
 
     def __init__(self, trajectory: Trajectory):
+        """trajectory: with as many intervals as are to be controlled"""
         self.name, self._trajectory = trajectory.controller, trajectory
 
     def reset(self, seed: int = 0) -> None:
-        pass
+        """There is nothing to reset."""
 
     def act(self, observation: Observation) -> Controls:
+        """The controls that were recorded for this control step, whatever is observed."""
         k = observation.step
         return Controls(perimeter=self._trajectory.perimeter[k], splits=self._trajectory.splits[k])
 
@@ -56,7 +61,7 @@ def predict(scenario: Scenario, result: Result) -> Trajectory:
     return replace(trajectory, plant="nmfd")
 
 
-def predict_next(scenario: Scenario, result: Result, intervals: int = 1) -> np.ndarray:
+def predict_next(scenario: Scenario, result: Result, intervals: int = 1) -> Float[np.ndarray, "K R"]:
     """(T + 1 - intervals, R) [veh]: accumulations `intervals` ahead of every recorded state, by the regional model."""
     trajectory, steps = result.trajectory, len(result.trajectory.perimeter)
     x = torch.from_numpy(trajectory.accumulation[: steps + 1 - intervals])
@@ -87,7 +92,10 @@ def errors(scenario: Scenario, result: Result, predicted: Trajectory) -> list[di
     return [*rows, _row("all", "all regions", critical.sum(), simulated.sum(1), whole.sum(1), ahead.sum(1))]
 
 
-def _row(region, name, critical, simulated, whole, ahead) -> dict:
+def _row(
+    region: int | str, name: str, critical: float, simulated: Float[np.ndarray, " S"],
+    whole: Float[np.ndarray, " S"], ahead: Series,
+) -> dict:
     rmse, next_rmse = float(np.sqrt((whole**2).mean())), float(np.sqrt((ahead**2).mean()))
     return dict(zip(COLUMNS, (
         region, name, float(critical), float(simulated.mean()), rmse, rmse / critical, float(whole.mean()), next_rmse,
@@ -95,8 +103,8 @@ def _row(region, name, critical, simulated, whole, ahead) -> dict:
 
 
 def outflow_samples(
-    trajectories: Sequence[Trajectory], records: Sequence[dict], u_max: float, region: int, adjacency: np.ndarray,
-) -> dict[str, np.ndarray]:
+    trajectories: Sequence[Trajectory], records: Sequence[dict], u_max: float, region: int, adjacency: Adjacency,
+) -> dict[str, Points]:
     """MFD samples of one region: label -> (n, 2) of accumulation [veh] and outflow [veh/s].
 
     Labels: "loading" and "unloading", and SPILLBACK for intervals in which a neighbour's congestion, not the region's
@@ -106,7 +114,7 @@ def outflow_samples(
     it as counted, the transfers divided by the u of the interval where it was below the bound that is meant by the
     original programme. In the model x_ii leaves at q x_ii and x_ij at u q x_ij, so q = outflow / (x_ii + u x_i,other).
     """
-    samples: dict[str, list[np.ndarray]] = {"loading": [], "unloading": [], SPILLBACK: []}
+    samples: dict[str, list[Points]] = {"loading": [], "unloading": [], SPILLBACK: []}
     for trajectory, record in zip(trajectories, records, strict=True):
         x = 0.5 * (trajectory.accumulation[1:] + trajectory.accumulation[:-1])
         total, own = x.sum(2), x[:, range(x.shape[1]), range(x.shape[1])]
@@ -123,7 +131,9 @@ def outflow_samples(
     return {label: np.concatenate(clouds) for label, clouds in samples.items()}
 
 
-def held_up(accumulation: np.ndarray, outflow: np.ndarray, adjacency: np.ndarray) -> np.ndarray:
+def held_up(
+    accumulation: RegionCounts, outflow: RegionCounts, adjacency: Adjacency,
+) -> Bool[np.ndarray, "T R"]:
     """(T, R) bool: a neighbour that collapsed before the region did is collapsed in this interval.
 
     Collapsed: holding more vehicles (T, R) than when its outflow (T, R) was largest so far, and letting out less than
@@ -179,7 +189,8 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
 
 
 def draw_mfds(
-    path: Path, network: RegionalModel, samples: Sequence[Mapping[str, np.ndarray]], found: Sequence[np.ndarray] = (),
+    path: Path, network: RegionalModel, samples: Sequence[Mapping[str, Points]],
+    found: Sequence[Float[np.ndarray, "_ 3"]] = (),
 ) -> None:
     """The MFD of every region over its outflow samples, as one picture. found: by region, a `bands.band` to draw."""
     drawing, axes = plots.panels(network.regions)

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 
 from cosim.evaluation import experiment
 from cosim.evaluation.identify import AHEAD, observed
 from cosim.evaluation.results import Finished
 from cosim.plant.strategy import planning_of
+from nmfd.arrays import PerRegion
 from nmfd.errors import InputError
 from nmfd.model import identification
 from nmfd.model.regional_model import RegionalModel
@@ -40,10 +42,10 @@ class ModelError:
     controller: str
     runs: int
     model: Path | None
-    critical: np.ndarray
-    most: np.ndarray
+    critical: PerRegion
+    most: PerRegion
     ahead: float
-    errors: np.ndarray
+    errors: Float[np.ndarray, "2 R"]
 
 
 def prediction_errors(found: Finished, model: Path | None = None) -> list[ModelError]:

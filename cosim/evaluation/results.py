@@ -44,11 +44,19 @@ class Finished:
 
     @property
     def rows(self) -> pd.DataFrame:
+        """Of all levels, one below the other."""
         return pd.concat([level.rows for level in self.levels], ignore_index=True)
 
     @property
     def name(self) -> str:
+        """Of the folder."""
         return self.path.resolve().name
+
+    def map(self) -> City:
+        """The city. Raises InputError where it is no longer that of the runs."""
+        if self.city is None:
+            raise InputError(f"{self.path}: {self.changed}: there is no map of the runs any more; run them again")
+        return self.city
 
     def level(self, demand: float | None) -> Level:
         """That of a demand, or the one nearest to the scenario's own. Raises InputError."""

@@ -3,8 +3,10 @@
 from collections.abc import Collection
 
 import numpy as np
+from jaxtyping import Bool
 
 from cosim.plant.record import Record
+from cosim.sumo.arrays import EdgesOverTime
 from cosim.sumo.net import City, Gateway, gateway_room_taken
 from cosim.sumo.tripinfo import TripFacts
 
@@ -41,7 +43,7 @@ def upstream_gateways(city: City) -> list[int]:
     return list(first.values())
 
 
-def gateway_full(edge_vehicles: np.ndarray, city: City) -> np.ndarray:
+def gateway_full(edge_vehicles: EdgesOverTime, city: City) -> Bool[np.ndarray, "T G"]:
     """(T, G) bool: the edge before the gateway holds at least FULL of its room, by edge_vehicles (T, E) [veh]."""
     return gateway_room_taken(edge_vehicles.astype(float), city) >= FULL
 

@@ -43,6 +43,7 @@ class Paired:
 
     @property
     def excludes_zero(self) -> bool:
+        """Whether the interval does."""
         return abs(self.percent) > self.percent_half  # never of a single seed
 
 
@@ -82,8 +83,8 @@ def statistics(rows: pd.DataFrame, reference: str | None = None) -> pd.DataFrame
                 "demand": level, "controller": name, "seeds": len(part), f"mean_{TTS}": part[TTS].mean(),
                 f"half_interval_{TTS}": interval(list(part[TTS]))}
             for label, other in (("change", REFERENCE), ("change_to_reference", reference)):
-                pair = paired(by_seed(rows, level, name), by_seed(rows, level, other)) if other else None
-                shown = pair is not None and pair.seeds > 0 and name != other
+                pair = paired(by_seed(rows, level, name), by_seed(rows, level, other) if other else {})
+                shown = pair.seeds > 0 and name != other
                 row |= {
                     f"{label}_percent": pair.percent if shown else math.nan,
                     f"{label}_half_interval_percent": pair.percent_half if shown else math.nan,

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,12 +11,14 @@ from matplotlib.collections import LineCollection
 from cosim.importing.layers import colour
 from cosim.importing.quality import Tables
 from cosim.importing.streets import Streets
+from cosim.sumo.arrays import EdgeNumbers, PerEdge
+from nmfd.arrays import Positions
 from nmfd.studies import plots
 
 
 def draw_map(
-    path: Path, streets: Streets, regions: np.ndarray, names: Sequence[str], places: np.ndarray, tables: Tables,
-    density: np.ndarray | None,
+    path: Path, streets: Streets, regions: EdgeNumbers, names: Sequence[str], places: Positions, tables: Tables,
+    density: PerEdge | None,
 ) -> None:
     """density: (E,) [veh per lane-km], or None."""
     width, height = np.ptp(streets.centre, axis=0) + 1.0
@@ -31,7 +34,9 @@ def draw_map(
     drawing.savefig(path, dpi=130, metadata={"Software": None})
 
 
-def region_map(ax: Axes, streets: Streets, regions: np.ndarray, names: Sequence[str], places: np.ndarray) -> Axes:
+def region_map(
+    ax: Axes, streets: Streets, regions: EdgeNumbers, names: Sequence[str], places: Positions,
+) -> Axes:
     """Every street in the colour of its region, with a scale bar."""
     _streets(ax, streets, colors=[colour(region) for region in regions[streets.drivable]])
     for region, (x, y) in enumerate(places):
@@ -60,7 +65,7 @@ def gateway_marks(ax: Axes, streets: Streets, tables: Tables) -> Axes:
     return ax
 
 
-def _streets(ax: Axes, streets: Streets, array: np.ndarray | None = None, **style) -> LineCollection:
+def _streets(ax: Axes, streets: Streets, array: np.ndarray | None = None, **style: Any) -> LineCollection:
     members = np.flatnonzero(streets.drivable)
     lines = LineCollection(
         [streets.shapes[n] for n in members], linewidths=0.6 + 0.5 * np.minimum(streets.lanes[members], 4),

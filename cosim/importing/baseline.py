@@ -9,9 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import sumo
+from jaxtyping import Float
 
 from cosim.importing.streets import Streets
-from cosim.sumo.xml_files import file_list, read_xml
+from cosim.sumo.arrays import EdgeNumbers, PerEdge
+from cosim.sumo.xml_files import attribute, child, file_list, read_xml
+from nmfd.arrays import PerRegion, PerTurn
 from nmfd.errors import InputError
 from nmfd.runs.scratch import Scratch
 
@@ -31,7 +34,7 @@ class Baseline:
     dropped: vehicles of the demand that SUMO gave up without a word
     """
 
-    presence: np.ndarray
+    presence: Float[np.ndarray, "K E"]
     ways: Mapping[tuple[tuple[int, ...], int], int]
     teleports: int
     waiting: int
@@ -45,7 +48,7 @@ class Baseline:
         needed = sum(vehicles * free[list(way)].sum() for (way, _), vehicles in self.ways.items())
         return float(self.presence.sum() + self.delay) / max(float(needed), 1.0)
 
-    def density(self, streets: Streets) -> np.ndarray:
+    def density(self, streets: Streets) -> PerEdge:
         """(E,) [veh/m of lane] in the quarter of an hour with the most vehicles; 0 on edges without car lanes."""
         total = self.presence.sum(axis=1)
         sums = np.convolve(total, np.ones(min(PEAK, len(total))), mode="valid")
@@ -53,7 +56,7 @@ class Baseline:
         mean = self.presence[first : first + PEAK].sum(axis=0) / (INTERVAL * min(PEAK, len(total)))
         return np.where(streets.lane_metres > 0, mean / np.maximum(streets.lane_metres, 1.0), 0.0)
 
-    def moves(self) -> Counter:
+    def moves(self) -> Counter[tuple[int, int]]:
         """(edge, next edge) -> vehicles that went from one to the other."""
         found: Counter[tuple[int, int]] = Counter()
         for (way, _), count in self.ways.items():
@@ -61,7 +64,7 @@ class Baseline:
                 found[pair] += count
         return found
 
-    def crossings(self, regions: np.ndarray) -> np.ndarray:
+    def crossings(self, regions: EdgeNumbers) -> PerTurn:
         """(R, R, R) [veh], [i, h, j]: from region i to h on the way to j."""
         count = int(regions.max()) + 1
         found = np.zeros((count,) * 3)
@@ -71,7 +74,7 @@ class Baseline:
                 found[seen[n], seen[n + 1], regions[last]] += vehicles
         return found
 
-    def metres_per_visit(self, streets: Streets, regions: np.ndarray) -> np.ndarray:
+    def metres_per_visit(self, streets: Streets, regions: EdgeNumbers) -> PerRegion:
         """(R,) [m] that a vehicle drives in a region from entry or departure to exit or arrival; NaN if none did."""
         count = int(regions.max()) + 1
         metres, visits = np.zeros(count), np.zeros(count)
@@ -104,14 +107,15 @@ def run_baseline(
             "--duration-log.statistics", "true",
             *options, where=str(streets.path))
         statistic = ElementTree.parse(folder / "statistic.xml").getroot()
-        counts, trips = statistic.find("vehicles"), statistic.find("vehicleTripStatistics")
-        waiting = int(counts.get("waiting"))
+        counts, trips = child(statistic, "vehicles"), child(statistic, "vehicleTripStatistics")
+        waiting = int(attribute(counts, "waiting"))
         ways, driven = _ways(folder / "ways.xml", streets)
         return Baseline(
             presence=_presence(edges, streets, begin, end), ways=ways,
-            teleports=int(statistic.find("teleports").get("total")), waiting=waiting,
-            running=int(counts.get("running")), dropped=max(len(set(vehicles) - driven) - waiting, 0),
-            delay=float(trips.get("totalDepartDelay")) + waiting * max(float(trips.get("departDelayWaiting")), 0.0))
+            teleports=int(attribute(child(statistic, "teleports"), "total")), waiting=waiting,
+            running=int(attribute(counts, "running")), dropped=max(len(set(vehicles) - driven) - waiting, 0),
+            delay=float(attribute(trips, "totalDepartDelay"))
+            + waiting * max(float(attribute(trips, "departDelayWaiting")), 0.0))
 
 
 def run_sumo(program: str, *arguments: str, where: str) -> None:
@@ -127,24 +131,24 @@ def _presence(path: Path, streets: Streets, begin: float, end: float) -> np.ndar
     presence = np.zeros((max(1, int(np.ceil((end - begin) / INTERVAL))), len(streets.edges)))
     for _, element in ElementTree.iterparse(path):
         if element.tag == "interval":
-            k = int((float(element.get("begin")) - begin) / INTERVAL + 0.5)
+            k = int((float(attribute(element, "begin")) - begin) / INTERVAL + 0.5)
             for edge in element:
-                if (n := streets.number.get(edge.get("id"))) is not None and k < len(presence):
-                    presence[k, n] += float(edge.get("sampledSeconds"))
+                if (n := streets.number.get(attribute(edge, "id"))) is not None and k < len(presence):
+                    presence[k, n] += float(attribute(edge, "sampledSeconds"))
             element.clear()
     return presence
 
 
-def _ways(path: Path, streets: Streets) -> tuple[Counter, set[str]]:
+def _ways(path: Path, streets: Streets) -> tuple[Counter[tuple[tuple[int, ...], int]], set[str]]:
     """(Baseline.ways, the vehicles that drove)"""
     ways: Counter[tuple[tuple[int, ...], int]] = Counter()
     driven_by = set()
     for _, element in ElementTree.iterparse(path):
         if element.tag == "vehicle":
-            driven_by.add(element.get("id"))
+            driven_by.add(attribute(element, "id"))
             route = element.find("route")
-            if route is not None and route.get("edges"):
-                edges = [streets.number.get(edge, -1) for edge in route.get("edges").split()]
+            if route is not None and (names := route.get("edges")):
+                edges = [streets.number.get(edge, -1) for edge in names.split()]
                 left = [float(time) >= 0 for time in route.get("exitTimes", "").split()] or (
                     [element.get("arrival") is not None] * len(edges))
                 driven = tuple(n for n, gone in zip(edges, left, strict=False) if gone and n >= 0)

@@ -6,12 +6,14 @@ A street, both directions, is one block, and so is a roundabout: no boundary sho
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from cosim.importing.layers import sampled
 from cosim.importing.streets import Streets
+from cosim.sumo.arrays import PerEdge
 
 ASIDE = 30.0      # m between the carriageways of one street, at most
 OPPOSED = -0.9    # cosine of the angle between their directions, at most
@@ -29,14 +31,14 @@ class Blocks:
     joins: (B, B) symmetric, how many connections join them
     """
 
-    of: np.ndarray
-    weight: np.ndarray
-    core: np.ndarray
-    position: np.ndarray
+    of: Int[np.ndarray, " E"]
+    weight: Float[np.ndarray, " B"]
+    core: Float[np.ndarray, " B"]
+    position: Float[np.ndarray, "B 2"]
     near: csr_array
     joins: csr_array
 
-    def mean(self, value: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    def mean(self, value: PerEdge, weight: PerEdge) -> Float[np.ndarray, " B"]:
         """(B,): the mean of `value` (E,) over the edges of each block, by `weight` (E,)."""
         inside = self.of >= 0
         total = np.bincount(self.of[inside], (value * weight)[inside], len(self.weight))
@@ -89,7 +91,8 @@ def _carriageways(streets: Streets, label: np.ndarray) -> np.ndarray:
     count = np.bincount(of, minlength=len(label))
     edges = edges[votes > 0.5 * count[edges[:, 0]]]
     size, limit = np.bincount(label, streets.lane_metres), LARGEST * streets.lane_metres.sum()
-    label, group = label.copy(), {}
+    label = label.copy()
+    group: dict[int, list[int]] = {}
     for n, name in enumerate(label):
         group.setdefault(int(name), []).append(n)
     for a, b in edges:

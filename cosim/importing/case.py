@@ -66,6 +66,7 @@ class SumoInput:
 
     @property
     def mesoscopic(self) -> bool:
+        """Whether it runs SUMO's queue model."""
         return self.options.get("mesosim", "false").lower() in ("true", "1", "yes", "on", "x")
 
     @property

@@ -8,6 +8,7 @@ first; the place counts too, or regions would be threads along the congested roa
 import heapq
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from cosim.importing.blocks import Blocks
 
@@ -17,7 +18,7 @@ HIGHEST = 0.15      # veh/m; denser is as dense
 SMALLEST = 0.4      # of the mean size, of Blocks.core: a cluster below is none of the regions that were asked for
 
 
-def features(blocks: Blocks, density: np.ndarray) -> np.ndarray:
+def features(blocks: Blocks, density: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 3"]:
     """(B, 3): density of the neighbourhood, and place, each with variance 1 over the lanes of the city."""
     weight, joins = blocks.weight, (blocks.joins > 0).astype(float)
     smooth = np.minimum(density, HIGHEST)
@@ -29,7 +30,7 @@ def features(blocks: Blocks, density: np.ndarray) -> np.ndarray:
     return np.column_stack([smooth / max(spread, 1e-9), PLACE * place / max(radius, 1e-9)])
 
 
-def agglomerate(blocks: Blocks, feature: np.ndarray, regions: int) -> np.ndarray:
+def agglomerate(blocks: Blocks, feature: Float[np.ndarray, "B F"], regions: int) -> Int[np.ndarray, " B"]:
     """(B,) region of every block, 0 to regions - 1 (fewer where there are not enough blocks of a size)."""
     merges = _merges(blocks, feature)
     least = SMALLEST * float(blocks.core.sum()) / regions
@@ -55,8 +56,9 @@ def _merges(blocks: Blocks, feature: np.ndarray) -> list[tuple[int, int, int]]:
     """All merges (cluster, cluster, new cluster), the cheapest first."""
     count = len(blocks.weight)
     weight, mean = list(blocks.weight), [row for row in feature]
-    near: list[set[int] | None] = [
-        set(blocks.joins.indices[blocks.joins.indptr[n] : blocks.joins.indptr[n + 1]].tolist()) for n in range(count)]
+    near: dict[int, set[int]] = {  # of every cluster that is not part of a larger one yet
+        n: set(blocks.joins.indices[blocks.joins.indptr[n] : blocks.joins.indptr[n + 1]].tolist())
+        for n in range(count)}
 
     def cost(a: int, b: int) -> float:
         gap = mean[a] - mean[b]
@@ -67,15 +69,13 @@ def _merges(blocks: Blocks, feature: np.ndarray) -> list[tuple[int, int, int]]:
     merges = []
     while heap:
         _, a, b = heapq.heappop(heap)
-        if near[a] is None or near[b] is None:
+        if a not in near or b not in near:
             continue
         new, total = len(weight), weight[a] + weight[b]
         merges.append((a, b, new))
         mean.append((weight[a] * mean[a] + weight[b] * mean[b]) / total)
         weight.append(total)
-        around = (near[a] | near[b]) - {a, b}
-        near.append(around)
-        near[a] = near[b] = None
+        near[new] = around = (near.pop(a) | near.pop(b)) - {a, b}
         for other in sorted(around):
             near[other] = (near[other] - {a, b}) | {new}
             heapq.heappush(heap, (cost(other, new), other, new))

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeVar
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -14,8 +15,9 @@ from cosim.importing.case import SumoInput, seconds
 from cosim.importing.harmless import silent, softened
 from cosim.importing.od import Cell, read_od, relations, trips
 from cosim.importing.streets import Streets
+from cosim.sumo.arrays import PerTrip, TripNumbers
 from cosim.sumo.recorded_trips import BOUND
-from cosim.sumo.xml_files import read_xml
+from cosim.sumo.xml_files import Missing, attribute, read_xml
 from nmfd.errors import InputError
 
 DRIVERS = ("vehicle", "trip", "flow")
@@ -23,6 +25,7 @@ OTHERS = ("person", "personFlow", "container", "containerFlow")
 DROPPED = ("poly", "poi", "edgeData", "laneData", "timedEvent", "vTypeProbe")  # only draw or write
 FLOW = ("begin", "end", "number", "period", "vehsPerHour", "perHour", "probability")
 ENDS = {"from": ("fromTaz", "fromJunction"), "to": ("toTaz", "toJunction")}
+What = TypeVar("What")
 OPEN_END = 3600.0  # s, of a flow that never ends in a simulation that never ends
 
 
@@ -37,9 +40,9 @@ class Traffic:
     """
 
     vehicles: tuple[Element, ...]
-    depart: np.ndarray
-    origin: np.ndarray
-    destination: np.ndarray
+    depart: PerTrip
+    origin: TripNumbers
+    destination: TripNumbers
     background: tuple[Element, ...] = ()
     shared: tuple[Element, ...] = ()
     switched: tuple[str, ...] = ()
@@ -65,7 +68,10 @@ class _Reader:
         self._notes: Counter[str] = Counter()
 
     def read(self, od: Sequence[Path], zones: Sequence[Path]) -> Traffic:
-        shared, drivers, others, switched = [], [], [], []
+        drivers: list[tuple[Element, Path]] = []
+        shared: list[Element] = []
+        others: list[Element] = []
+        switched: set[str] = set()
         cells: list[Cell] = []
         for path in zones:
             self._learn(read_xml(path), path)
@@ -79,7 +85,7 @@ class _Reader:
                     cells += relations(wrapped([element], "data"), path)
                 elif element.tag not in DROPPED:
                     self._learn(element, path)
-                    switched += [e.get("junctionID") for e in element.iter("wautJunction")]
+                    switched |= {name for e in element.iter("wautJunction") if (name := e.get("junctionID"))}
                     shared.append(element)
         vehicles, background = [], others
         for element, path in drivers:
@@ -117,31 +123,33 @@ class _Reader:
         """Types, routes and zones that vehicles refer to."""
         try:
             self._learn_one(element)
+        except Missing as error:
+            raise InputError(f"{path}: {error}; add it") from None
         except ValueError as error:
             raise _no_number(element, path, error) from None
 
     def _learn_one(self, element: Element) -> None:
         if element.tag == "vType":
-            self._classes[element.get("id")] = element.get("vClass", "passenger")
+            self._classes[attribute(element, "id")] = element.get("vClass", "passenger")
         elif element.tag == "vTypeDistribution":
             members = [e.get("vClass", "passenger") for e in element.iter("vType")]
             members += [self._classes.get(name, "passenger") for name in element.get("vTypes", "").split()]
             first = members[0] if members else "passenger"
             if first == "passenger":  # what lorries among them may drive is not held against the cars
                 first = next((kind for kind in members if kind not in (first, *BOUND)), first)
-            self._classes[element.get("id")] = first
+            self._classes[attribute(element, "id")] = first
             for member in element.iter("vType"):
-                self._classes[member.get("id")] = member.get("vClass", "passenger")
+                self._classes[attribute(member, "id")] = member.get("vClass", "passenger")
         elif element.tag in ("route", "routeDistribution"):
             for route in element.iter("route"):
-                if route.get("edges"):
-                    self._routes[route.get("id", "")] = route.get("edges").split()
+                if edges := route.get("edges"):
+                    self._routes[route.get("id", "")] = edges.split()
             if element.tag == "routeDistribution":
-                self._routes[element.get("id")] = self._likeliest(element)
+                self._routes[attribute(element, "id")] = self._likeliest(element)
         for zone in element.iter("taz"):
             inside = [(edge, 1.0) for edge in zone.get("edges", "").split()]
-            self._zones[zone.get("id")] = {
-                key: inside + [(e.get("id"), float(e.get("weight", 1.0))) for e in zone.iter(tag)]
+            self._zones[attribute(zone, "id")] = {
+                key: inside + [(attribute(e, "id"), float(e.get("weight", 1.0))) for e in zone.iter(tag)]
                 for key, tag in (("from", "tazSource"), ("to", "tazSink"))}
 
     def _likeliest(self, distribution: Element) -> list[str]:
@@ -156,31 +164,36 @@ class _Reader:
         shares = [float(p) for p in distribution.get("probabilities", "").split()] or [1.0] * len(names)
         return routes + [(p, self._routes.get(name, [])) for p, name in zip(shares, names, strict=False)]
 
-    def _expand(self, flow: Element, path) -> list[Element]:
+    def _expand(self, flow: Element, path: Path) -> list[Element]:
         """The single vehicles of a flow."""
         where = f"{path}: flow {flow.get('id')}"
         begin = seconds(flow.get("begin", str(self._case.begin)), f"{where}: begin")
-        end = seconds(flow.get("end"), f"{where}: end") if flow.get("end") else None
+        end = seconds(text, f"{where}: end") if (text := flow.get("end")) else None
         stop = min(end if end is not None else self._case.end or begin + OPEN_END, self._case.end or np.inf)
         per_hour, period = flow.get("vehsPerHour") or flow.get("perHour"), flow.get("period")
+        probability = flow.get("probability")
         try:
-            number = int(flow.get("number")) if flow.get("number") else None
-            if number == 0 or 0.0 in [float(rate) for rate in (per_hour, flow.get("probability")) if rate]:
+            number = int(text) if (text := flow.get("number")) else None
+            if number == 0 or 0.0 in [float(rate) for rate in (per_hour, probability) if rate]:
                 return []
             if match := re.fullmatch(r"exp\((.+)\)", period or ""):
                 rate = float(match[1])
                 gaps = self._random.exponential(1.0 / rate, size=number or int(3 * rate * (stop - begin) + 30))
                 times = begin + np.cumsum(gaps) - (gaps[0] if number else 0.0)
-            elif flow.get("probability"):
+            elif probability:
                 seconds_of = np.arange(begin, stop)
-                times = seconds_of[self._random.random(len(seconds_of)) < float(flow.get("probability"))]
+                times = seconds_of[self._random.random(len(seconds_of)) < float(probability)]
             else:
-                if per_hour or period:
-                    gap = 3600.0 / float(per_hour) if per_hour else float(period)
+                if per_hour:
+                    gap = 3600.0 / float(per_hour)
+                elif period:
+                    gap = float(period)
+                elif number is None:
+                    raise ValueError
                 else:
                     gap = ((end if end is not None else stop) - begin) / number
                 times = begin + gap * np.arange(int(np.ceil((stop - begin) / gap - 1e-9)))
-        except (TypeError, ValueError, ZeroDivisionError):
+        except (ValueError, ZeroDivisionError):
             raise InputError(
                 f"{where}: expected a number, period, vehsPerHour or probability above 0; correct it") from None
         times = times[times < stop][:number]
@@ -195,11 +208,15 @@ class _Reader:
         self._notes["vehicles from flows"] += len(singles)
         return singles
 
-    def _checked(self, vehicles, background, shared, switched) -> Traffic:
+    def _checked(
+        self, vehicles: Iterable[tuple[Element, Path]], background: list[Element], shared: Sequence[Element],
+        switched: Iterable[str],
+    ) -> Traffic:
         """Only what can be driven from its first to its last edge within the simulation."""
-        kept, number = [], self._streets.number
+        number = self._streets.number
+        kept: list[tuple[float, int, int, bool, Element]] = []
         begin, end = self._case.begin, np.inf if self._case.end is None else self._case.end
-        files: dict[str | None, Path] = {}
+        files: dict[str, Path] = {}
         for element, path in vehicles:
             try:
                 depart = begin if element.get("depart") == "begin" else seconds(element.get("depart", ""), "")
@@ -211,7 +228,7 @@ class _Reader:
                 self._notes["vehicles outside the simulated time, left out"] += 1
                 continue
             try:
-                edges, driven = self._edges(element, path)
+                edges, driven = self._edges(element)
             except ValueError as error:
                 raise _no_number(element, path, error) from None
             if not edges and any(key.endswith(("XY", "LonLat")) for key in element.keys()):
@@ -240,7 +257,7 @@ class _Reader:
         depart, origin, destination = columns
         return Traffic(
             vehicles=tuple(row[4] for row in kept), depart=depart, origin=origin, destination=destination,
-            background=tuple(background), shared=tuple(shared), switched=tuple(sorted(set(switched))),
+            background=tuple(background), shared=tuple(shared), switched=tuple(sorted(switched)),
             notes=dict(self._notes))
 
     def _is_car(self, element: Element) -> bool:
@@ -250,7 +267,7 @@ class _Reader:
         return bool(self._streets.drivable[list(edges)].all()) and (
             not driven or self._car_moves.issuperset(pairwise(edges)))
 
-    def _edges(self, element: Element, path) -> tuple[list[str], bool]:
+    def _edges(self, element: Element) -> tuple[list[str], bool]:
         """(the edges of a vehicle's route, True), or (those that a trip must pass, False)."""
         nested = element.find("routeDistribution")
         route = element.find("route") if nested is None else None
@@ -264,8 +281,8 @@ class _Reader:
         if route is not None:
             route.attrib.pop("id", None)
             return route.get("edges", "").split(), True
-        if element.get("route"):
-            return self._routes.get(element.get("route"), []), True
+        if name := element.get("route"):
+            return self._routes.get(name, []), True
         for key, alike in ENDS.items():
             if not element.get(key):
                 chosen = self._draw(element, key, alike)
@@ -274,7 +291,7 @@ class _Reader:
                 if chosen is None:
                     return [], False
                 element.set(key, chosen)
-        return [element.get("from"), *element.get("via", "").split(), element.get("to")], False
+        return [attribute(element, "from"), *element.get("via", "").split(), attribute(element, "to")], False
 
     def _draw(self, element: Element, key: str, alike: tuple[str, str]) -> str | None:
         """An edge of the zone, or at the junction, where a trip begins or ends."""
@@ -287,7 +304,7 @@ class _Reader:
             options = [(self._streets.edges[n], 1.0) for n in np.flatnonzero(at & self._streets.drivable)]
         return self._pick(options)
 
-    def _pick(self, options: Sequence[tuple]):
+    def _pick(self, options: Sequence[tuple[What, float]]) -> What | None:
         """One of (what, weight), drawn by weight; None where there is none."""
         weights = np.cumsum([weight for _, weight in options])
         if not options or weights[-1] <= 0:
@@ -301,7 +318,9 @@ class _Reader:
                    if edge in number and self._streets.drivable[number[edge]]]
         return [option for option in options if joined[number[option[0]]]] or options
 
-    def _reachable(self, kept: list[tuple]) -> list[tuple]:
+    def _reachable(
+        self, kept: list[tuple[float, int, int, bool, Element]],
+    ) -> list[tuple[float, int, int, bool, Element]]:
         """Without trips whose end cannot be reached from their beginning by any vehicle, or that of cars by cars."""
         lost = set()
         for cars in (False, True):

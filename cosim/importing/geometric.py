@@ -4,6 +4,7 @@ of regions that are too large. Such regions are connected, compact and of simila
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Int
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -14,7 +15,7 @@ GAIN = 0.3  # of the handicap's growth per round, in mean radii
 THINNEST = 0.05  # width over length that a city counts with at least: one along a straight road has no area
 
 
-def k_means(blocks: Blocks, regions: int, seed: int) -> np.ndarray:
+def k_means(blocks: Blocks, regions: int, seed: int) -> Int[np.ndarray, " B"]:
     """(B,) region of every block, 0 to regions - 1. The best of all rounds: sizes alike first, then compact."""
     random = np.random.default_rng([seed, 0x6B6D])
     blocks = replace(blocks, weight=blocks.core + 0.1 * blocks.weight)  # ways in and out make no region

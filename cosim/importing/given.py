@@ -9,11 +9,12 @@ from matplotlib.path import Path as Outline
 
 from cosim.importing.layers import area
 from cosim.importing.streets import Streets
+from cosim.sumo.arrays import EdgeNumbers
 from cosim.sumo.xml_files import read_xml
 from nmfd.errors import InputError
 
 
-def read_given(streets: Streets, path: Path, method: str) -> np.ndarray:
+def read_given(streets: Streets, path: Path, method: str) -> EdgeNumbers:
     """(E,) region of every edge, -1 where the file names none. Raises InputError.
 
     method: "edges", a csv with the columns edge,region, regions from 0 without a gap; "taz" and "polygons", additional
@@ -71,7 +72,9 @@ def _assign(labels: np.ndarray, streets: Streets, edge: str, region: int, where:
 
 def _polygons(streets: Streets, path: Path) -> np.ndarray:
     """An edge is in the region in which its middle lies; the smallest polygon counts where several do."""
-    labels, regions, found = np.full(len(streets.edges), -1), {}, []
+    labels = np.full(len(streets.edges), -1)
+    regions: dict[str, int] = {}
+    found: list[tuple[float, int, int, np.ndarray]] = []
     for polygon in read_xml(path).iter("poly"):
         region = regions.setdefault(polygon.get("id", "").partition(".")[0], len(regions))
         corners = _corners(polygon, path, streets)

@@ -1,7 +1,7 @@
 """`cosim import`: from a sumocfg to networks/NAME and scenarios/NAME."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from cosim.importing.baseline import Baseline, run_baseline
 from cosim.importing.case import SumoInput, read_sumo_input, seconds
 from cosim.importing.demand import Traffic, read_traffic
 from cosim.importing.generated import morning_peak
-from cosim.importing.partition import partition
+from cosim.importing.partition import Clustered, Drawn, partition
 from cosim.importing.regions import positions
 from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.net import City, load_city
@@ -31,7 +31,7 @@ LITTLE = 0.3  # of the flow over the boundaries passes no signal under control: 
 class ImportOptions:
     """What the user asked for.
 
-    method: see partition.METHODS; given: the file of regions of a method that reads one
+    cut: how to come by regions
     run: simulate the city without control first
     peak: generate a morning peak, instead of route files
     level: times the vehicles, or the usual peak; None for the lowest that congests (cosim.importing.level)
@@ -41,11 +41,9 @@ class ImportOptions:
     """
 
     source: Path
-    regions: int | None
     out: Path
     scenario: Path
-    method: str
-    given: Path | None = None
+    cut: Clustered | Drawn
     seed: int = 0
     run: bool = True
     peak: bool = False
@@ -87,9 +85,7 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
             baseline = simulate.run(factor, mesoscopic)
         left = left_alone(streets, traffic)
         tell("partition")
-        regions, asked, moved = partition(
-            streets, baseline, regions=order.regions, method=order.method, given=order.given, seed=order.seed,
-            left_alone=left)
+        regions, asked, moved = partition(streets, baseline, order.cut, seed=order.seed, left_alone=left)
         name = order.out.name
         network = model.network_of(streets, regions, name, baseline)
         written.write_net(case.net, net_folder / written.NET)
@@ -106,9 +102,9 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
             protected=_protected(streets, regions, baseline, network), factor=factor, mesoscopic=order.mesoscopic))
         report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
         report += _level_line(order, factor, congests)
-        if moved:
-            report += (f"\n{moved:,} streets are in other regions than {order.given.name} says: theirs was in several "
-                       "pieces, or could not be reached from the rest")
+        if moved and isinstance(order.cut, Drawn):
+            report += (f"\n{moved:,} streets are in other regions than {order.cut.file.name} says: theirs was in "
+                       "several pieces, or could not be reached from the rest")
         if scale != 1.0:
             report += f"\nvehicles times {scale:g}, the scale in {case.source.name}"
         left_out = [*case.left_out, *(
@@ -124,7 +120,9 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
 
 def _traffic(case: SumoInput, streets: Streets, order: ImportOptions) -> Traffic:
     """The city's own vehicles, or a generated demand beside what else its files hold."""
-    zones = order.zones or ((order.given,) if order.od and order.method == "taz" else ())
+    zones = order.zones
+    if order.od and not zones and isinstance(order.cut, Drawn) and order.cut.method == "taz":
+        zones = (order.cut.file,)
     traffic = read_traffic(case, streets, order.seed, order.od, zones)
     if not order.peak:
         if not len(traffic.depart):
@@ -179,14 +177,14 @@ def _windowed(case: SumoInput, order: ImportOptions) -> SumoInput:
 
 
 @contextmanager
-def _folders(order: ImportOptions):
+def _folders(order: ImportOptions) -> Iterator[tuple[Path, Path]]:
     """Temporary folders for network and scenario, which take their places together at the end."""
     with ExitStack() as stack:
         made: list[tuple[Path, Path]] = []
         for folder in (order.out, order.scenario):
             folder.parent.mkdir(parents=True, exist_ok=True)
             made.append((stack.enter_context(Scratch(f".{folder.name}-", where=folder.parent)), folder))
-        yield tuple(temporary for temporary, _ in made)
+        yield made[0][0], made[1][0]
         for temporary, folder in made:
             folder.mkdir(exist_ok=True)
             # Without its toml file a folder counts as nothing: it goes first and comes last.
@@ -213,6 +211,7 @@ class _Baselines:
         self._last: tuple[tuple[float, bool], Baseline] | None = None
 
     def run(self, factor: float, mesoscopic: bool) -> Baseline:
+        """With the demand times `factor`."""
         if self._last is None or self._last[0] != (factor, mesoscopic):
             with Scratch("cosim-") as folder:
                 routes, vehicles = self._routes, self._vehicles
@@ -265,7 +264,7 @@ def _report(
         + (", left-hand traffic" if streets.left_hand else "")
         + f"; {len(signals):,} signals that cars see; {len(traffic.vehicles):,} vehicles in {clock.steps} intervals of "
         f"{clock.step:g} s{_notes(traffic)}",
-        f"{network.regions} regions by method {order.method}, seed {order.seed}"
+        f"{network.regions} regions by method {order.cut.method}, seed {order.seed}"
         + (f"; {asked} were asked for: the others fell apart, or could not be reached from the rest"
            if network.regions < asked else ""),
         quality.text(found)]

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from cosim.importing.streets import Streets
+from cosim.sumo.arrays import EdgeNumbers, Points
 
 CELLS = 160       # along the longer side of the map
 SPACING = 40.0    # m between the points that stand for an edge
@@ -15,10 +16,11 @@ COLOURS = ("#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#b07aa1", "#e
 
 
 def colour(region: int) -> str:
+    """The colour of a region on maps, as #rrggbb."""
     return COLOURS[region % len(COLOURS)]
 
 
-def taz_xml(streets: Streets, regions: np.ndarray, names: tuple[str, ...]) -> str:
+def taz_xml(streets: Streets, regions: EdgeNumbers, names: tuple[str, ...]) -> str:
     """An additional file with a TAZ per region, of all its edges."""
     out = io.StringIO()
     out.write("<additional>\n")
@@ -30,7 +32,7 @@ def taz_xml(streets: Streets, regions: np.ndarray, names: tuple[str, ...]) -> st
     return out.getvalue()
 
 
-def polygons_xml(streets: Streets, regions: np.ndarray, names: tuple[str, ...]) -> str:
+def polygons_xml(streets: Streets, regions: EdgeNumbers, names: tuple[str, ...]) -> str:
     """An additional file with the outline of every region; one of several parts has several polygons."""
     out = io.StringIO()
     out.write("<additional>\n")
@@ -44,7 +46,7 @@ def polygons_xml(streets: Streets, regions: np.ndarray, names: tuple[str, ...]) 
     return out.getvalue()
 
 
-def outlines(streets: Streets, regions: np.ndarray) -> list[list[np.ndarray]]:
+def outlines(streets: Streets, regions: EdgeNumbers) -> list[list[Points]]:
     """Rings (n, 2) [m] round every region, the largest first: the places nearer to its streets than to others'."""
     points, of = sampled(streets, streets.drivable)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -76,7 +78,7 @@ def sampled(streets: Streets, members: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return np.concatenate(points), np.concatenate(of)
 
 
-def area(ring: np.ndarray) -> float:
+def area(ring: Points) -> float:
     """[m^2] of a polygon (n, 2) [m]; negative if it runs clockwise."""
     x, y = ring[:, 0], ring[:, 1]
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2

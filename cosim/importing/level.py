@@ -15,6 +15,7 @@ Pace = Callable[[float, bool], float]
 
 
 def level(n: int) -> float:
+    """The n-th level above 1 [-]; below it for a negative n."""
     return round(RATIO**n, 2)
 
 

@@ -11,7 +11,9 @@ from cosim.importing.case import SumoInput
 from cosim.importing.demand import Traffic
 from cosim.importing.regions import digraph, names, positions
 from cosim.importing.streets import Streets
+from cosim.sumo.arrays import EdgeNumbers
 from cosim.sumo.net import JAM_SPACING
+from nmfd.arrays import PairsOverTime
 from nmfd.model.identification import observed_split_ratios
 from nmfd.model.mfd import Mfd
 from nmfd.model.model_file import network_toml
@@ -58,6 +60,7 @@ class Clock:
 
     @property
     def end(self) -> float:
+        """[s] of SUMO's time."""
         return self.begin + self.steps * self.step
 
 
@@ -71,7 +74,7 @@ def clock(case: SumoInput, streets: Streets, traffic: Traffic) -> Clock:
     """Control intervals of the most common signal cycle, until RECOVERY after the last departure."""
     running = [found[-1] for found in streets.logics.values() if round(found[-1].cycle) > 0]
     cycles = Counter(round(logic.cycle) for logic in running if logic.kind == "static")
-    cycle = float(max(sorted(cycles), key=cycles.get)) if cycles else DEFAULT_CYCLE
+    cycle = float(max(sorted(cycles), key=cycles.__getitem__)) if cycles else DEFAULT_CYCLE
     step = cycle * np.ceil(CYCLES[0] / cycle)
     if step > CYCLES[1]:
         step = DEFAULT_CYCLE
@@ -79,7 +82,7 @@ def clock(case: SumoInput, streets: Streets, traffic: Traffic) -> Clock:
     return Clock(begin=case.begin, step=float(step), steps=int(np.ceil((last - case.begin + RECOVERY) / step)))
 
 
-def region_demand(traffic: Traffic, regions: np.ndarray, clock: Clock) -> np.ndarray:
+def region_demand(traffic: Traffic, regions: EdgeNumbers, clock: Clock) -> PairsOverTime:
     """(T, R, R) [veh/s]: departures by interval and pair of regions."""
     count = int(regions.max()) + 1
     demand = np.zeros((clock.steps, count, count))
@@ -88,7 +91,7 @@ def region_demand(traffic: Traffic, regions: np.ndarray, clock: Clock) -> np.nda
     return demand
 
 
-def network_of(streets: Streets, regions: np.ndarray, name: str, baseline: Baseline | None) -> RegionalModel:
+def network_of(streets: Streets, regions: EdgeNumbers, name: str, baseline: Baseline | None) -> RegionalModel:
     """The regional model: adjacency from the streets, own splits from the baseline, MFDs from lanes and speeds."""
     network = RegionalModel(
         name=name, region_names=names(streets, regions), positions=positions(streets, regions).round(1),
@@ -116,6 +119,7 @@ def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline | No
 
 
 def network_text(network: RegionalModel, sumo: Mapping[str, str], source: str) -> str:
+    """The network.toml. sumo: its table [sumo]; source: what was imported."""
     return network_toml(
         network, sumo,
         f"Imported from {source}. The MFDs are PLACEHOLDERS from lane length and speed limits:\n"

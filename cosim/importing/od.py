@@ -125,10 +125,10 @@ def _hours(text: str, path: Path) -> float:
 
 def _number(text: str | None, where: str) -> float:
     try:
-        value = float(text)
+        value = float(text or "")
         if not 0.0 <= value < np.inf:
             raise ValueError
-    except (TypeError, ValueError):
+    except ValueError:
         raise InputError(f"{where}: expected a number from 0 up, got {text!r} instead") from None
     return value
 
@@ -145,12 +145,12 @@ def trips(cells: Sequence[Cell], random: np.random.Generator, types: Collection[
           note: Callable[[str, int], None]) -> list[Element]:
     """`trip` elements od0, od1, ...; a part of a vehicle drives with that probability. Types that nobody defines are
     left away. note(what, how often) is told what was done."""
-    found = []
+    found: list[Element] = []
     for cell in cells:
         count = int(cell.count + random.random())
         ends = ("fromTaz", "toTaz") if cell.zones else ("from", "to")
         shared = dict(zip(ends, (cell.origin, cell.destination), strict=True))
-        if cell.type in types:
+        if cell.type is not None and cell.type in types:
             shared["type"] = cell.type
         for n in range(count):
             depart = cell.begin + (cell.end - cell.begin) * (n + random.random()) / count

@@ -1,7 +1,9 @@
 """Cutting a city into regions, by one of several methods."""
 
 from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -13,35 +15,45 @@ from cosim.importing.given import read_given
 from cosim.importing.refine import best, prices
 from cosim.importing.regions import finish
 from cosim.importing.streets import Streets
+from cosim.sumo.arrays import EdgeNumbers
 from nmfd.errors import InputError
 
-METHODS = {
-    "density": "clusters of streets with similar densities without control",
-    "geometric": "k-means on the road graph",
-    "edges": "a csv with the columns edge,region",
-    "taz": "a SUMO file with a TAZ per region",
-    "polygons": "a SUMO file with one or more polygons per region",
-}
 STARTS = 4  # of k-means, from which the partition is refined
-GIVEN = ("edges", "taz", "polygons")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clustered:
+    """Into so many regions, by "density": clusters of streets with similar densities without control, or "geometric":
+    k-means on the road graph."""
+
+    method: Literal["density", "geometric"]
+    regions: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """As the user's file says, by method: a csv with the columns edge,region, or a SUMO file with a TAZ, or one or more
+    polygons, per region."""
+
+    method: Literal["edges", "taz", "polygons"]
+    file: Path
 
 
 def partition(
-    streets: Streets, baseline: Baseline | None, *, regions: int | None, method: str, given: Path | None, seed: int,
-    left_alone: Collection[str] = (),
-) -> tuple[np.ndarray, int, int]:
-    """(E,) region of every edge, numbered from 0, by a method of METHODS, how many were asked for, and how many streets
-    are in another one than the file `given` says, for those that read one.
+    streets: Streets, baseline: Baseline | None, cut: Clustered | Drawn, *, seed: int, left_alone: Collection[str] = (),
+) -> tuple[EdgeNumbers, int, int]:
+    """(E,) region of every edge, numbered from 0, how many were asked for, and how many streets are in another one than
+    a file of the user's says.
 
     left_alone: signals that perimeter control cannot use. Regions of the user's own keep their order and edges, but
     edges without a region get one. Raises InputError where there are no two regions to be had.
     """
-    if method in GIVEN:
-        labels = read_given(streets, given, method)
+    if isinstance(cut, Drawn):
+        labels = read_given(streets, cut.file, cut.method)
         found, regions = finish(streets, labels, renumber=False), int(labels.max()) + 1
         moved = _moved(labels, found, streets.drivable & (labels >= 0))
     else:
-        moved = 0
+        regions, moved = cut.regions, 0
         blocks = make_blocks(streets)
         if regions > len(blocks.weight):
             raise InputError(
@@ -49,7 +61,7 @@ def partition(
                 "instead")
         density = np.zeros(len(streets.edges)) if baseline is None else baseline.density(streets)
         feature = features(blocks, blocks.mean(density, streets.lane_metres))
-        if method == "geometric":
+        if cut.method == "geometric":
             feature = feature[:, 1:]
             starts = []
         else:

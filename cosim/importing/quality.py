@@ -9,6 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from cosim.importing.baseline import Baseline
 from cosim.importing.streets import Streets, graph
+from cosim.sumo.arrays import EdgeMask, EdgeNumbers
 from cosim.sumo.net import City
 from nmfd.runs.tables import text_table
 
@@ -34,7 +35,7 @@ class Tables:
 
 
 def tables(
-    streets: Streets, regions: np.ndarray, names: Sequence[str], city: City, baseline: Baseline | None,
+    streets: Streets, regions: EdgeNumbers, names: Sequence[str], city: City, baseline: Baseline | None,
     left_alone: Mapping[str, str],
 ) -> Tables:
     """left_alone: signal -> why perimeter control does not touch it."""
@@ -47,7 +48,7 @@ def tables(
         "source": g.source, "target": g.target, "from_edge": g.from_edge, "to_edge": g.to_edge,
         "lanes": " ".join(map(str, g.lanes)), "shared_lanes": " ".join(map(str, g.shared)), "signal": g.signal or "",
         "links": " ".join(map(str, g.links)),
-        "signal_serves": " ".join(f"{i}-{h}" for i, h in sorted(pairs.get(g.signal, ()))),
+        "signal_serves": " ".join(f"{i}-{h}" for i, h in sorted(pairs.get(g.signal or "", ()))),
         "control": "no signal" if g.signal is None else left_alone.get(g.signal, "controlled"),
         "flow_veh": moves[streets.number[g.from_edge], streets.number[g.to_edge]]} for g in city.gateways]
     density = np.zeros(len(regions)) if baseline is None else 1000.0 * baseline.density(streets)
@@ -83,7 +84,7 @@ def _variance(density: np.ndarray, streets: Streets, members: np.ndarray) -> tup
     return mean, float(np.average((density[members] - mean) ** 2, weights=weight))
 
 
-def pieces(streets: Streets, members: np.ndarray) -> int:
+def pieces(streets: Streets, members: EdgeMask) -> int:
     """The parts into which some edges fall by the connections between them; 1 is connected."""
     numbers = np.cumsum(members) - 1
     links = streets.links[members[streets.links].all(axis=1)]
@@ -97,7 +98,7 @@ def _signals(streets: Streets, regions: np.ndarray, city: City) -> np.ndarray:
         votes.setdefault(signal, Counter())[int(regions[streets.number[edge]])] += 1
     count = np.zeros(int(regions.max()) + 1, dtype=int)
     for found in votes.values():
-        count[max(sorted(found), key=found.get)] += 1
+        count[max(sorted(found), key=found.__getitem__)] += 1
     return count
 
 

@@ -12,6 +12,7 @@ Blocks move one by one, and end in the nearest optimum: the best of several star
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array, csr_array
 
 from cosim.importing.baseline import Baseline
@@ -23,7 +24,9 @@ CONTROLLED, DEAREST = 0.25, 5.0  # price of a controlled connection, and the mos
 PASSES = 12
 
 
-def prices(streets: Streets, blocks: Blocks, controlled: np.ndarray, baseline: Baseline | None) -> csr_array:
+def prices(
+    streets: Streets, blocks: Blocks, controlled: Bool[np.ndarray, " L"], baseline: Baseline | None,
+) -> csr_array:
     """(B, B) symmetric: the price of a boundary between two blocks. controlled: (L,) bool, of streets.links."""
     price = np.ones(len(streets.links))
     if baseline is not None:
@@ -38,7 +41,9 @@ def prices(streets: Streets, blocks: Blocks, controlled: np.ndarray, baseline: B
     return coo_array((np.tile(price, 2), both), shape=(len(blocks.weight),) * 2).tocsr()
 
 
-def refine(blocks: Blocks, labels: np.ndarray, feature: np.ndarray, price: csr_array) -> np.ndarray:
+def refine(
+    blocks: Blocks, labels: Int[np.ndarray, " B"], feature: Float[np.ndarray, "B F"], price: csr_array,
+) -> Int[np.ndarray, " B"]:
     """(B,) better labels; no region is lost or torn apart. feature: (B, F), each with variance 1 over the city."""
     state = _State(blocks, labels, feature, price)
     for _ in range(PASSES):
@@ -50,13 +55,15 @@ def refine(blocks: Blocks, labels: np.ndarray, feature: np.ndarray, price: csr_a
     return state.labels
 
 
-def cut(labels: np.ndarray, price: csr_array) -> float:
+def cut(labels: Int[np.ndarray, " B"], price: csr_array) -> float:
     """The price of the boundaries between the regions."""
     pairs = price.tocoo()
     return float(pairs.data[labels[pairs.row] != labels[pairs.col]].sum()) / 2
 
 
-def best(blocks: Blocks, starts: Sequence[np.ndarray], feature: np.ndarray, price: csr_array) -> np.ndarray:
+def best(
+    blocks: Blocks, starts: Sequence[Int[np.ndarray, " B"]], feature: Float[np.ndarray, "B F"], price: csr_array,
+) -> Int[np.ndarray, " B"]:
     """(B,) the labels of least cost among the refined `starts`, of those that have the most regions. The price of
     boundaries is over that of the first start for all of them."""
     scale, weight = max(cut(starts[0], price), 1e-9), blocks.weight / blocks.weight.sum()
@@ -113,7 +120,7 @@ class _State:
         """What the variance within loses: it is the total minus sum over regions of |sum|^2 / size."""
         weight, part = self._weight[block], self._weight[block] * self._feature[block]
 
-        def between(total, size):
+        def between(total: np.ndarray, size: float) -> float:
             return float(total @ total) / max(size, 1e-12)
 
         before = between(self._sum[here], self._size[here]) + between(self._sum[region], self._size[region])

@@ -1,15 +1,18 @@
 """From labels to regions that can be used: connected, reachable from each other, every edge in one, in order."""
 
 import numpy as np
+from jaxtyping import Int
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from cosim.importing.streets import Streets, graph
+from cosim.sumo.arrays import EdgeNumbers
+from nmfd.arrays import Positions
 
 DIRECTIONS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
 
 
-def finish(streets: Streets, labels: np.ndarray, *, renumber: bool = True) -> np.ndarray:
+def finish(streets: Streets, labels: EdgeNumbers, *, renumber: bool = True) -> EdgeNumbers:
     """(E,) region of every edge, from `labels` (E,) of the edges for cars, -1 where none is known yet.
 
     Every region is made connected by the connections between its edges, and all regions can be reached from each
@@ -30,7 +33,7 @@ def finish(streets: Streets, labels: np.ndarray, *, renumber: bool = True) -> np
     return _numbered(streets, regions) if renumber else np.unique(regions, return_inverse=True)[1]
 
 
-def connect(streets: Streets, regions: np.ndarray) -> np.ndarray:
+def connect(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
     """Leave of every region in the main part its largest connected piece; the others go to the neighbour that most
     connections join them to. Edges outside the main part (`regions` anything) stay as they are."""
     regions, inside = regions.copy(), streets.main_part
@@ -54,11 +57,11 @@ def connect(streets: Streets, regions: np.ndarray) -> np.ndarray:
                 votes.setdefault(piece[a], {}).setdefault(int(regions[b]), 0)
                 votes[piece[a]][int(regions[b])] += 1
         for number, found in votes.items():
-            regions[loose & (piece == number)] = max(sorted(found), key=found.get)
+            regions[loose & (piece == number)] = max(sorted(found), key=found.__getitem__)
     return regions
 
 
-def digraph(streets: Streets, regions: np.ndarray) -> np.ndarray:
+def digraph(streets: Streets, regions: EdgeNumbers) -> Int[np.ndarray, "R R"]:
     """(R, R) int: the connections from an edge of region i to one of region h, i != h."""
     count = int(regions[streets.drivable].max()) + 1
     crossing = np.zeros((count, count), dtype=int)
@@ -117,7 +120,7 @@ def _numbered(streets: Streets, regions: np.ndarray) -> np.ndarray:
     return np.array([place[region] for region in regions])
 
 
-def positions(streets: Streets, regions: np.ndarray) -> np.ndarray:
+def positions(streets: Streets, regions: EdgeNumbers) -> Positions:
     """(R, 2) [m]: where each region's lanes are on average."""
     return np.array([_gravity(streets, regions == region) for region in range(regions.max() + 1)])
 
@@ -127,7 +130,7 @@ def _gravity(streets: Streets, members: np.ndarray) -> np.ndarray:
     return np.average(streets.centre[members], axis=0, weights=weight)
 
 
-def names(streets: Streets, regions: np.ndarray) -> tuple[str, ...]:
+def names(streets: Streets, regions: EdgeNumbers) -> tuple[str, ...]:
     """A name for each region by its place: centre, north, south-west 2, ..."""
     places, middle = positions(streets, regions), _gravity(streets, regions >= 0)
     radius = np.sqrt((((streets.centre - middle) ** 2).sum(axis=1) * streets.lane_metres).sum() / (

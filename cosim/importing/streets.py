@@ -5,14 +5,17 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from cosim.importing.case import seconds
+from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge, Points
 from cosim.sumo.net import for_cars, size
-from cosim.sumo.xml_files import BROKEN, opened, read_xml
+from cosim.sumo.xml_files import BROKEN, attribute, opened, read_xml
 from nmfd.errors import InputError
 
 
@@ -45,16 +48,16 @@ class Streets:
 
     path: Path
     edges: tuple[str, ...]
-    drivable: np.ndarray
-    length: np.ndarray
-    lanes: np.ndarray
-    speed: np.ndarray
-    shapes: tuple[np.ndarray, ...]
-    centre: np.ndarray
-    junctions: np.ndarray
+    drivable: EdgeMask
+    length: PerEdge
+    lanes: EdgeNumbers
+    speed: PerEdge
+    shapes: tuple[Points, ...]
+    centre: Float[np.ndarray, "E 2"]
+    junctions: Int[np.ndarray, "E 2"]
     places: Mapping[str, int]
-    links: np.ndarray
-    all_links: np.ndarray
+    links: Int[np.ndarray, "L 2"]
+    all_links: Int[np.ndarray, "_ 2"]
     link_signals: tuple[str | None, ...]
     roundabouts: tuple[tuple[int, ...], ...]
     logics: Mapping[str, tuple[Logic, ...]]
@@ -66,31 +69,31 @@ class Streets:
         return {edge: n for n, edge in enumerate(self.edges)}
 
     @property
-    def lane_metres(self) -> np.ndarray:
+    def lane_metres(self) -> PerEdge:
         """(E,) [m]: length times lanes for cars."""
         return self.length * self.lanes
 
     @cached_property
-    def main_part(self) -> np.ndarray:
+    def main_part(self) -> EdgeMask:
         """(E,) bool: the drivable edges of the part, connected somehow, with the most lane metres."""
         return self._largest("weak")
 
     @cached_property
-    def core(self) -> np.ndarray:
+    def core(self) -> EdgeMask:
         """(E,) bool: the largest set of edges of which each can be reached from each."""
         return self._largest("strong")
 
     @cached_property
-    def onward(self) -> np.ndarray:
+    def onward(self) -> EdgeMask:
         """(E,) bool: the edges from which the core can be reached."""
         return self._reached(self.links[:, ::-1])
 
     @cached_property
-    def reached(self) -> np.ndarray:
+    def reached(self) -> EdgeMask:
         """(E,) bool: the edges that can be reached from the core."""
         return self._reached(self.links)
 
-    def _reached(self, links: np.ndarray) -> np.ndarray:
+    def _reached(self, links: Int[np.ndarray, "L 2"]) -> EdgeMask:
         found = np.zeros(len(self.edges), dtype=bool)
         found[breadth_first_order(graph(links, len(self.edges)), int(np.argmax(self.core)),
                                   return_predecessors=False)] = True
@@ -103,22 +106,43 @@ class Streets:
         wanted: dict[int, list[int]] = {}
         for first, last in sorted(set(pairs)):
             wanted.setdefault(first, []).append(last)
-        found = {}
+        found: dict[tuple[int, int], bool] = {}
         for first, ends in wanted.items():
             reached = np.zeros(len(self.edges), dtype=bool)
             reached[breadth_first_order(onward, first, return_predecessors=False)] = True
             found |= {(first, last): bool(reached[last]) for last in ends}
         return found
 
-    def _largest(self, kind: str) -> np.ndarray:
+    def _largest(self, kind: str) -> EdgeMask:
         count, part = connected_components(graph(self.links, len(self.edges)), directed=True, connection=kind)
         weight = np.bincount(part, self.lane_metres * self.drivable, count)
         return (part == np.argmax(weight)) & self.drivable
 
 
-def graph(pairs: np.ndarray, size: int) -> csr_array:
+def graph(pairs: Int[np.ndarray, "_ 2"], size: int) -> csr_array:
     """(size, size) with a one for every pair (n, 2)."""
     return csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
+
+
+class _Edge(NamedTuple):
+    """cars: the lanes for them, by index; length [m]; speed [m/s]; shape: (n, 2) [m]; start, end: junctions"""
+
+    cars: frozenset[int]
+    length: float
+    speed: float
+    shape: Points
+    start: str
+    end: str
+
+
+class _Link(NamedTuple):
+    """A connection from a lane of one edge to a lane of another, and its signal."""
+
+    source: str
+    target: str
+    lane: int
+    to_lane: int
+    signal: str | None
 
 
 def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
@@ -126,59 +150,54 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
 
     Raises InputError for a file that is no network, or one without any edge for cars.
     """
-    rows: dict[str, tuple] = {}
-    junctions: dict[str, tuple[float, float]] = {}
-    links: list[tuple] = []
+    rows: dict[str, _Edge] = {}
+    links: list[_Link] = []
     roundabouts: list[list[str]] = []
     logics: dict[str, list[Logic]] = {}
-    left_hand = False
     try:
         with opened(net) as stream:
-            depth, root = 0, None
-            for event, element in ElementTree.iterparse(stream, events=("start", "end")):
-                if event == "start":
-                    depth += 1
-                    if root is None:
-                        root = element
-                        if element.tag != "net":
-                            raise InputError(f"{net}: expected a SUMO network, got a file of <{element.tag}> instead")
-                        left_hand = element.get("lefthand") == "true"
-                    continue
-                depth -= 1
-                if depth != 1:
+            events = ElementTree.iterparse(stream, events=("start", "end"))
+            (_, root), depth = next(events), 1
+            if root.tag != "net":
+                raise InputError(f"{net}: expected a SUMO network, got a file of <{root.tag}> instead")
+            left_hand = root.get("lefthand") == "true"
+            for event, element in events:
+                depth += 1 if event == "start" else -1
+                if event == "start" or depth != 1:
                     continue
                 if element.tag == "edge" and element.get("function", "normal") in ("normal", "connector"):
-                    rows[str(element.attrib["id"])] = _edge(element)
-                elif element.tag == "connection" and not element.get("from").startswith(":"):
-                    links.append((element.get("from"), element.get("to"), int(element.get("fromLane")),
-                                  int(element.get("toLane")), element.get("tl")))
-                elif element.tag == "junction" and element.get("type") != "internal":
-                    junctions[element.get("id")] = float(element.get("x")), float(element.get("y"))
+                    rows[attribute(element, "id")] = _edge(element)
+                elif element.tag == "connection" and not attribute(element, "from").startswith(":"):
+                    links.append(_Link(
+                        attribute(element, "from"), attribute(element, "to"), int(attribute(element, "fromLane")),
+                        int(attribute(element, "toLane")), element.get("tl")))
                 elif element.tag == "roundabout":
                     roundabouts.append(element.get("edges", "").split())
                 elif element.tag == "tlLogic":
-                    logics.setdefault(element.get("id"), []).append(_logic(element, net))
+                    logics.setdefault(attribute(element, "id"), []).append(_logic(element, net))
                 element.clear()
                 root.clear()
-    except (*BROKEN, AttributeError) as error:
+    except BROKEN as error:
         raise InputError(f"{net}: is not a SUMO network ({error}); build it with netconvert") from None
     for path in additional:
         for element in read_xml(path).iter("tlLogic"):
-            logics.setdefault(element.get("id"), []).append(_logic(element, path))
-    if not any(row[0] for row in rows.values()):
+            logic = _logic(element, path)
+            logics.setdefault(logic.signal, []).append(logic)
+    if not any(row.cars for row in rows.values()):
         raise InputError(f"{net}: has no edge that cars may use; give a road network")
-    return _streets(net, rows, junctions, links, roundabouts, logics, left_hand)
+    return _streets(net, rows, links, roundabouts, logics, left_hand)
 
 
-def _edge(element: ElementTree.Element) -> tuple:
-    """(car lanes, length, speed, shape, from, to)"""
+def _edge(element: ElementTree.Element) -> _Edge:
     lanes = list(element.iter("lane"))
-    cars = {int(lane.get("index")): lane for lane in lanes if for_cars(lane)}
+    cars = {int(attribute(lane, "index")): lane for lane in lanes if for_cars(lane)}
     lane = next(iter(cars.values()), lanes[0])
-    shape = element.get("shape") or lanes[len(lanes) // 2].get("shape")
+    shape = element.get("shape") or attribute(lanes[len(lanes) // 2], "shape")
     points = np.array([[float(x) for x in point.split(",")[:2]] for point in shape.split()])
     speed = max(size(lane, "speed") for lane in cars.values() or lanes)
-    return frozenset(cars), size(lane, "length"), speed, points, element.get("from"), element.get("to")
+    return _Edge(
+        cars=frozenset(cars), length=size(lane, "length"), speed=speed, shape=points,
+        start=attribute(element, "from"), end=attribute(element, "to"))
 
 
 def _logic(element: ElementTree.Element, path: Path) -> Logic:
@@ -188,33 +207,39 @@ def _logic(element: ElementTree.Element, path: Path) -> Logic:
     if kind == "static" and any(phase.get("next") for phase in phases):
         kind = "branching"
     return Logic(
-        signal=element.get("id"), programme=element.get("programID", "0"), kind=kind,
+        signal=attribute(element, "id"), programme=element.get("programID", "0"), kind=kind,
         cycle=sum(seconds(phase.get("duration", "0"), where) for phase in phases),
         links=max((len(phase.get("state", "")) for phase in phases), default=0))
 
 
-def _streets(net, rows, junctions, links, roundabouts, logics, left_hand) -> Streets:
+def _streets(
+    net: Path, rows: Mapping[str, _Edge], links: Iterable[_Link], roundabouts: Iterable[Iterable[str]],
+    logics: Mapping[str, list[Logic]], left_hand: bool,
+) -> Streets:
     edges = tuple(sorted(rows))
     number = {edge: n for n, edge in enumerate(edges)}
     places: dict[str, int] = {}
-    ends = np.array([[places.setdefault(name, len(places)) for name in rows[edge][4:6]] for edge in edges])
-    known = [link for link in links if link[0] in number and link[1] in number]
-    every = sorted({(number[a], number[b]) for a, b, *_ in known})
-    signal_of = {(number[a], number[b]): tl for a, b, m, n, tl in known if m in rows[a][0] and n in rows[b][0]}
+    ends = np.array([[places.setdefault(name, len(places)) for name in (rows[edge].start, rows[edge].end)]
+                     for edge in edges])
+    known = [link for link in links if link.source in number and link.target in number]
+    every = sorted({(number[link.source], number[link.target]) for link in known})
+    signal_of = {
+        (number[link.source], number[link.target]): link.signal for link in known
+        if link.lane in rows[link.source].cars and link.to_lane in rows[link.target].cars}
     cars = sorted(signal_of)
-    shapes = tuple(rows[edge][3] for edge in edges)
+    shapes = tuple(rows[edge].shape for edge in edges)
     return Streets(
-        path=net, edges=edges, drivable=np.array([bool(rows[edge][0]) for edge in edges]),
-        length=np.array([rows[edge][1] for edge in edges]), lanes=np.array([len(rows[edge][0]) for edge in edges]),
-        speed=np.array([rows[edge][2] for edge in edges]), shapes=shapes,
-        centre=np.array([_middle(shape) for shape in shapes]), junctions=ends, places=places,
+        path=net, edges=edges, drivable=np.array([bool(rows[edge].cars) for edge in edges]),
+        length=np.array([rows[edge].length for edge in edges]),
+        lanes=np.array([len(rows[edge].cars) for edge in edges]), speed=np.array([rows[edge].speed for edge in edges]),
+        shapes=shapes, centre=np.array([_middle(shape) for shape in shapes]), junctions=ends, places=places,
         links=np.array(cars, dtype=int).reshape(-1, 2), all_links=np.array(every, dtype=int).reshape(-1, 2),
         link_signals=tuple(signal_of[pair] for pair in cars),
         roundabouts=tuple(tuple(number[e] for e in ring if e in number) for ring in roundabouts),
         logics={signal: tuple(found) for signal, found in sorted(logics.items())}, left_hand=left_hand)
 
 
-def _middle(shape: np.ndarray) -> np.ndarray:
+def _middle(shape: Points) -> Float[np.ndarray, " 2"]:
     """The point half way along a line (n, 2)."""
     steps = np.hypot(*np.diff(shape, axis=0).T) if len(shape) > 1 else np.zeros(0)
     along = np.concatenate([[0.0], np.cumsum(steps)])

@@ -13,6 +13,8 @@ from cosim.importing import atlas, layers, model, quality
 from cosim.importing.baseline import Baseline
 from cosim.importing.demand import Traffic, wrapped
 from cosim.importing.streets import Streets
+from cosim.sumo.arrays import EdgeNumbers
+from nmfd.arrays import PairsOverTime
 from nmfd.model.regional_model import RegionalModel
 
 NET = "city.net.xml.gz"
@@ -53,13 +55,13 @@ def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence]) -> 
     path.write_text(out.getvalue(), encoding="utf-8")
 
 
-def write_demand(path: Path, demand: np.ndarray) -> None:
+def write_demand(path: Path, demand: PairsOverTime) -> None:
     """demand: (T, R, R) [veh/s]"""
     write_table(path, ("interval", "from", "to", "veh_s"), (
         (k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)))
 
 
-def write_network(folder: Path, streets: Streets, regions: np.ndarray, network: RegionalModel, found: quality.Tables,
+def write_network(folder: Path, streets: Streets, regions: EdgeNumbers, network: RegionalModel, found: quality.Tables,
                    baseline: Baseline | None, source: str) -> None:
     """network.toml, its tables, layers and map; source: the name of what the user gave."""
     (folder / "network.toml").write_text(model.network_text(

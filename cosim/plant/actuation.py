@@ -16,15 +16,17 @@ from cosim.plant.max_pressure import MaxPressure
 from cosim.plant.perimeter import GREEN, GatewaySignal, GatewaySignals
 from cosim.plant.programmes import CitySignals
 from cosim.plant.settings import Settings
+from cosim.sumo.arrays import PerEdge, PerGateway
 from cosim.sumo.net import City, Gateway, gateway_movements, gateway_room_taken
 from cosim.sumo.session import Phase, Session
+from nmfd.arrays import PerPair
 from nmfd.model.scenario import Scenario
 
 
 class SignalControl(Protocol):
     """What gives some signals of the city their states."""
 
-    def command(self, share: np.ndarray, opened: Mapping[str, Collection[int]]) -> None:
+    def command(self, share: PerPair, opened: Mapping[str, Collection[int]]) -> None:
         """Take over the commands of a control interval.
 
         share: (R, R) [-], [i, h] = (u_ih - u_min) / (u_max - u_min); opened: signal -> links whatever share says
@@ -65,7 +67,7 @@ class Actuation:
         self._commanded = phases.keys()
         self.original_green = _programmed_green(city, phases, scenario.step)
 
-    def command(self, perimeter: np.ndarray, edge_vehicles: np.ndarray | None) -> None:
+    def command(self, perimeter: PerPair, edge_vehicles: PerEdge | None) -> None:
         """Take over u (R, R) [-] for the control interval that begins.
 
         edge_vehicles: (E,) [veh], means of the interval before, for the queue override; None before the first
@@ -83,7 +85,7 @@ class Actuation:
             control.play(now)
         self._incidents.play(now)
 
-    def green_time(self) -> np.ndarray:
+    def green_time(self) -> PerGateway:
         """(G,) [s] of green shown so far per gateway, the mean of its links; NaN where no command arrives."""
         green: dict[str, dict[int, float]] = {}
         for control in self._controls:
@@ -92,7 +94,7 @@ class Actuation:
             sum(green[g.signal][link] for link in g.links) / len(g.links) if g.signal in green else np.nan
             for g in self._city.gateways])
 
-    def as_shown(self, green: np.ndarray) -> np.ndarray:
+    def as_shown(self, green: PerGateway) -> PerGateway:
         """(G,) [s] per gateway in the last control interval, where `green` was meant to be shown: where a signal was
         out of order it was the original one."""
         out = [gateway.signal in self._incidents.refused for gateway in self._city.gateways]
@@ -102,12 +104,14 @@ class Actuation:
         """Gateways that no command reaches."""
         return [gateway for gateway in self._city.gateways if gateway.signal not in self._commanded]
 
-    def _overridden(self, edge_vehicles: np.ndarray) -> dict[str, set[int]]:
+    def _overridden(self, edge_vehicles: PerEdge) -> dict[str, set[int]]:
         """Signal -> links of the gateways that stay open because of their queue."""
-        limit, links = self._queue_override, {}
+        limit = self._queue_override
+        links: dict[str, set[int]] = {}
         for n in np.flatnonzero(gateway_room_taken(edge_vehicles, self._city) >= limit) if limit else ():
             gateway = self._city.gateways[n]
-            links.setdefault(gateway.signal, set()).update(gateway.links)
+            if gateway.signal is not None:
+                links.setdefault(gateway.signal, set()).update(gateway.links)
         return links
 
 
@@ -123,12 +127,12 @@ def _gateway_signals(
     return found
 
 
-def _programmed_green(city: City, phases: Mapping[str, Sequence[Phase]], step: float) -> np.ndarray:
+def _programmed_green(city: City, phases: Mapping[str, Sequence[Phase]], step: float) -> PerGateway:
     """(G,) [s] per control interval `step` [s]; NaN without phases."""
     green = np.full(len(city.gateways), np.nan)
     for n, gateway in enumerate(city.gateways):
-        if gateway.signal in phases:
-            plan = phases[gateway.signal]
+        plan = None if gateway.signal is None else phases.get(gateway.signal)
+        if plan is not None:
             lasting = [phase.duration * (phase.state[link] in GREEN) for phase in plan for link in gateway.links]
             green[n] = sum(lasting) / len(gateway.links) * step / sum(phase.duration for phase in plan)
     return green

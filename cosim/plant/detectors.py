@@ -19,8 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from cosim.plant.meter import Meter
+from cosim.sumo.arrays import GatewayMask, PerGateway
 from cosim.sumo.net import City
 from cosim.sumo.session import Session
+from nmfd.arrays import PerPair
 from nmfd.model.estimation import Instruments, Readings
 
 LAYOUT = 0x6C6F6F70   # seed of the places of the loops: a property of the city, not of a run
@@ -45,7 +47,7 @@ class Layout:
 
     edges: tuple[int, ...]
     positions: tuple[tuple[float, ...], ...]
-    counted: np.ndarray
+    counted: GatewayMask
 
 
 def lay_out(city: City, share: float) -> Layout:
@@ -111,8 +113,10 @@ class Detectors:
     """The readings of one run. `sample` after every EVERY seconds; `readings` at the end of a control interval."""
 
     def __init__(self, session: Session, city: City, layout: Layout, meter: Meter, known: Instruments):
+        """meter: follows the probes; known: what follows from the layout (`instruments`)"""
         self._session, self._meter, self._known, self._layout, self._city = session, meter, known, layout, city
-        self._loops, _, _, edges = zip(*_loops(city, layout), strict=True) if layout.edges else ((),) * 4
+        loops = _loops(city, layout)
+        self._loops, edges = [name for name, *_ in loops], [edge for *_, edge in loops]
         each = dict(zip(layout.edges, map(len, layout.positions), strict=True))
         # The length of lane that a loop stands for.
         self._length = np.array([city.length[city.edges[edge]] / each[edge] for edge in edges])
@@ -126,11 +130,12 @@ class Detectors:
         self._working = np.random.default_rng([LAYOUT, 1]).random(len(self._loops)) >= share
 
     def sample(self) -> None:
+        """Read the loops once."""
         occupancy = self._session.loop_occupancy
         self._occupancy += [occupancy(loop) for loop in self._loops]
         self._samples += 1
 
-    def readings(self, gateway_flow: np.ndarray) -> Readings:
+    def readings(self, gateway_flow: PerGateway) -> Readings:
         """Of the time since the last one. gateway_flow: (G,) [veh] over the city's gateways since then, of which only
         the counted ones are looked at."""
         regions, share = self._city.regions, self._known.detector_share
@@ -153,7 +158,7 @@ class Detectors:
                 probes=self._meter.probes() if self._known.probe_share > 0 else unknown,
                 probe_departures=departed.astype(float) if self._known.probe_share > 0 else unknown)
 
-    def backlog(self) -> np.ndarray:
+    def backlog(self) -> PerPair:
         """(R, R) [veh]: the probes that wait to enter, expanded; zero without probes."""
         return self._meter.probe_backlog() / max(self._known.probe_share, 1e-9)
 

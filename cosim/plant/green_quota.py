@@ -20,6 +20,7 @@ class Ration:
     """
 
     def __init__(self, pair: tuple[int, int], *, cycle: float, min_green: float, yellow: float, start: float):
+        """pair: (i, h), whose command it follows"""
         self.pair, self._green_time = pair, 0.0
         self._cycle, self._min_green, self._yellow = cycle, min(min_green, cycle), yellow
         self._share, self._budget, self._spent = 1.0, NEVER, 0.0

@@ -31,8 +31,10 @@ import numpy as np
 
 from cosim.plant.meter import Event
 from cosim.plant.shortest_paths import Home, Moves, Ways
+from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
+from nmfd.arrays import PerTurn
 
 SMOOTHING = 0.5            # weight of the newest travel times
 DRIVER_CLASSES = 4         # groups of drivers who see different travel times: were all sent one way, it would jam
@@ -76,7 +78,7 @@ class Guide:
     """
 
     def __init__(
-        self, session: Session, city: City, own: np.ndarray, *, compliance: float, most_detour: float,
+        self, session: Session, city: City, own: PerTurn, *, compliance: float, most_detour: float,
         random: np.random.Generator, ways_return: bool = False, period: float = 0.0,
     ):
         """own: (R, R, R) [-], the drivers' own split ratios, which controllers mean as well"""
@@ -113,19 +115,20 @@ class Guide:
         self._ahead: dict[tuple[int, int], np.ndarray] = {}
         self._ways: dict[tuple[int, int], Ways] = {}
         self._homes: dict[tuple[int, int], Home] = {}
-        self._splits: np.ndarray | None = None
+        self._guides, self._splits = False, own
         self._assigned, self._wished = np.zeros((2, *(city.regions,) * 3))
         self.realised = np.zeros((city.regions,) * 3, dtype=int)
         self.refused = 0
 
-    def command(self, splits: np.ndarray | None, speed: np.ndarray | None) -> None:
+    def command(self, splits: PerTurn | None, speed: PerEdge | None) -> None:
         """Take over theta (R, R, R) [-] for the next control interval; None: no guidance.
 
         speed: (E,) [m/s] of the city's edges, the mean over the last interval and NaN on empty ones; None: as before.
         A mean, because the speed at one instant is that of a red or a green signal, every time the same one.
         """
-        self._splits = splits
+        self._guides = splits is not None
         if splits is not None:
+            self._splits = splits
             self._interval += 1
             if speed is not None:
                 now = np.where(np.isnan(speed), self._free, self._length / np.maximum(speed, SLOWEST))
@@ -136,7 +139,7 @@ class Guide:
 
     def apply(self, events: list[Event]) -> None:
         """Guide the vehicles that departed or entered a region in the last step, and those whose time has come."""
-        if self._splits is None:
+        if not self._guides:
             return
         self._steps += 1
         for event in events:
@@ -233,10 +236,10 @@ class Guide:
     def _present(self, vehicle: str) -> list[int] | None:
         """The edges of the driver's present way from where they are; None where it uses roads closed to cars."""
         route = self._session.route(vehicle)[self._session.route_index(vehicle):]
-        way = list(map(self._index.get, route))
-        return None if None in way else way
+        way = [number for edge in route if (number := self._index.get(edge)) is not None]
+        return way if len(way) == len(route) else None
 
-    def _takes(self, present: list[int] | None, here: int, time: np.ndarray) -> tuple[float, bool]:
+    def _takes(self, present: list[int] | None, here: int, time: PerEdge) -> tuple[float, bool]:
         """[s] from the end of edge `here` to the end of the present way, if it begins there, at `time` (E,) [s]; and
         whether it is a way that a search would find: by known moves and, unless ways may return, out of the region of
         `here` and never back."""

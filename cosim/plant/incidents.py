@@ -5,6 +5,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from cosim.plant.perimeter import GREEN, YELLOW
+from cosim.sumo.arrays import EdgeMask
 from cosim.sumo.net import City
 from cosim.sumo.session import Session
 from nmfd.errors import InputError
@@ -34,6 +35,7 @@ class Incidents:
     """
 
     def __init__(self, faults: Sequence[Fault], session: Session, city: City):
+        """faults: of the city, already checked (`check`)"""
         self._faults, self._session, self._city = faults, session, city
         self._limits: dict[str, list[float]] = {}  # closed edge -> what its lanes allowed before
         self._own = {fault.name: session.programme_id(fault.name) for fault in faults if fault.kind == "signal"}
@@ -44,7 +46,7 @@ class Incidents:
         self.silent_loops = 0.0                    # share of the loop detectors that tell nothing
 
     @property
-    def closed(self) -> np.ndarray:
+    def closed(self) -> EdgeMask:
         """(E,) bool, of the city's edges."""
         return np.array([edge in self._limits for edge in self._city.edges], dtype=bool)
 

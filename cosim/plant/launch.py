@@ -1,11 +1,11 @@
 """What SUMO is started with: the vehicles of a run, the files beside them, and the command line."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from cosim.plant.detectors import Layout, write_loops
 from cosim.plant.programmes import CitySignals, write_signal_programmes
-from cosim.plant.settings import ESTIMATE, Settings
+from cosim.plant.settings import ESTIMATE, Settings, scenario_file
 from cosim.sumo import outputs as sumo_output
 from cosim.sumo.net import City
 from cosim.sumo.recorded_trips import (
@@ -33,12 +33,12 @@ REROUTING = (
 
 def own_vehicles(scenario: Scenario, chosen: Settings, city: City) -> RecordedTrips:
     """The vehicles of the route files that [sumo] names. Raises InputError."""
-    originals = read_recorded_trips([scenario.folder / name for name in chosen.routes])
-    check_edges(originals, city, f"{scenario.folder / 'scenario.toml'}: sumo.routes")
+    originals = read_recorded_trips(own_files(scenario, chosen.routes))
+    check_edges(originals, city, f"{scenario_file(scenario)}: sumo.routes")
     return originals
 
 
-def own_files(scenario: Scenario, names: tuple[str, ...]) -> list[Path]:
+def own_files(scenario: Scenario, names: Sequence[str]) -> list[Path]:
     """Files of [sumo] beside scenario.toml; none of a scenario without a folder."""
     return [scenario.folder / name for name in names] if scenario.folder is not None else []
 
@@ -77,6 +77,7 @@ class Launch:
         return turning_flows(self._city, self._scenario.demand, self._scenario.step) if flows is None else flows
 
     def close(self) -> None:
+        """Remove the scratch folder."""
         self._scratch.close()
 
     def _options(self) -> list[str]:

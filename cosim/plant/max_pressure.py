@@ -20,6 +20,7 @@ from cosim.plant.perimeter import yellow_time
 from cosim.sumo.net import City, gateway_movements
 from cosim.sumo.session import Phase, Session
 from cosim.sumo.signals import GREEN, Link, Signal, is_stage
+from nmfd.arrays import PerPair
 
 EVERY = 5.0       # s between two decisions: about two vehicles per lane
 PERMISSIVE = 0.3  # saturation flow of a movement that must give way (g), as a share of a protected one
@@ -46,7 +47,7 @@ class MaxPressure:
         for junction in self._junctions:
             show(junction.signal, junction.state)
 
-    def command(self, share: np.ndarray, opened: Mapping[str, Collection[int]]) -> None:
+    def command(self, share: PerPair, opened: Mapping[str, Collection[int]]) -> None:
         """share: (R, R) [-], (u - u_min) / (u_max - u_min); opened: signal -> gateway links without a ration."""
         for junction in self._rationed:
             junction.command(share, opened.get(junction.signal, ()))
@@ -105,9 +106,11 @@ class Junction:
 
     @property
     def rationed(self) -> bool:
+        """Whether commands limit the green of a link here."""
         return bool(self._rations)
 
-    def command(self, share: np.ndarray, opened: Collection[int] = ()) -> None:
+    def command(self, share: PerPair, opened: Collection[int] = ()) -> None:
+        """(R, R) [-], as GatewaySignal.command in cosim.plant.perimeter."""
         for link, ration in self._rations.items():
             ration.command(1.0 if link in opened else float(share[ration.pair]))
 
@@ -116,9 +119,11 @@ class Junction:
         return {self._movement[link] for link, ration in self._rations.items() if ration.exhausted}
 
     def green_time(self, now: float) -> dict[int, float]:
+        """Seconds of green that every gateway link has shown before `now` [s]."""
         return {link: ration.green_time(now) for link, ration in self._rations.items()}
 
     def may_switch(self, now: float) -> bool:
+        """Whether the stage that is shown may be left at `now` [s]."""
         return not self._coming and now >= self._green_since + self._min_green - 1e-6
 
     def switch(self, stage: int, now: float) -> str:
@@ -180,6 +185,7 @@ class Roads:
     """
 
     def __init__(self, city: City, signals: Iterable[Signal], flows: Mapping[tuple[str, str], float]):
+        """flows: (edge, next edge) -> any measure of flow, from which turning shares follow"""
         self._city, self._flows = city, flows
         self._before: dict[str, list[str]] = {edge: [] for edge in city.edges}
         for edge, after in city.successors.items():
@@ -193,7 +199,7 @@ class Roads:
                 self._links.setdefault(link.from_edge, []).append(link)
         movements = sorted({(link.from_edge, link.to_edge) for links in self._links.values() for link in links})
         self.movements = {movement: n for n, movement in enumerate(movements)}
-        rows = []
+        rows: list[dict[int, float]] = []
         for edge, target in self.movements:
             row = self._queue(edge, target)
             end = self._chain(target)[-1]
@@ -205,11 +211,13 @@ class Roads:
 
     def stages(self, signals: Iterable[Signal]) -> tuple[csr_array, list[int]]:
         """(S, M) saturation flows [lanes] of the movements in the stages, and the number of each signal's first one."""
-        rows, begins = [], []
+        rows: list[dict[int, float]] = []
+        begins: list[int] = []
         for signal in signals:
             begins.append(len(rows))
             for number in signal.stages:
-                state, row = signal.phases[number].state, {}
+                state = signal.phases[number].state
+                row: dict[int, float] = {}
                 for link in {(k.from_edge, k.lane, k.to_edge): k for k in signal.links}.values():
                     if state[link.index] in GREEN:
                         share = self._lane_shares(link.from_edge, link.lane)[link.to_edge]
@@ -226,8 +234,10 @@ class Roads:
         for lane in range(self._city.lanes[edge]):
             if own := self._lane_shares(edge, lane).get(to) if edge in self._links else share:
                 queue[self._index[f"{edge}_{lane}"]] = own
-        while (edge := self._upstream(edge)) is not None:
-            queue |= {self._index[f"{edge}_{lane}"]: share for lane in range(self._city.lanes[edge])}
+        before = self._upstream(edge)
+        while before is not None:
+            queue |= {self._index[f"{before}_{lane}"]: share for lane in range(self._city.lanes[before])}
+            before = self._upstream(before)
         return queue
 
     def _lane_shares(self, edge: str, lane: int) -> dict[str, float]:

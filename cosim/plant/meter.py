@@ -7,24 +7,33 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cosim.sumo.arrays import PerGateway
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
+from nmfd.arrays import PerPair
 from nmfd.ledger import LedgerError
 from nmfd.types import State
 
 
 @dataclass
 class _Vehicle:
-    """origin, destination: regions; edge: the last edge of its route; free: guidance may reroute it; region: where it
-    is now, None before the departure; announced: the region of its last Event (on a junction it may be ahead of
-    that)."""
+    """origin, destination: regions; edge: the last edge of its route; announced: the region of its last Event (on a
+    junction it may be ahead of that), its origin before the first; free: guidance may reroute it; region: where it is
+    now, None before the departure."""
 
     origin: int
     destination: int
     edge: str
+    announced: int
     free: bool = True
     region: int | None = None
-    announced: int | None = None
+
+    @property
+    def here(self) -> int:
+        """The region, of one that has departed."""
+        if self.region is None:
+            raise RuntimeError(f"a vehicle bound for {self.edge} is on the road, but was never seen to depart")
+        return self.region
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +61,7 @@ class Meter:
     """
 
     def __init__(self, session: Session, city: City, probes: frozenset[str] = frozenset()):
+        """probes: vehicles that are counted apart, too"""
         self._session, self._city, self._probes = session, city, probes
         self._vehicles: dict[str, _Vehicle] = {}
         self._teleporting: set[str] = set()
@@ -77,7 +87,7 @@ class Meter:
             step=step, time=time, accumulation=self.accumulation(step), backlog=self.backlog(),
             completed=float(self.arrivals.sum()))
 
-    def gateway_flow(self) -> np.ndarray:
+    def gateway_flow(self) -> PerGateway:
         """(G,) [veh] over each gateway of the city since the beginning."""
         return np.array([
             self.entry_flow[g.source, g.to_edge] / self._alike[g.source, g.to_edge] for g in self._city.gateways])
@@ -121,7 +131,7 @@ class Meter:
         events.sort(key=lambda event: (event.source is not None, event.vehicle))  # set order is not reproducible
         return events
 
-    def accumulation(self, step: int = 0) -> np.ndarray:
+    def accumulation(self, step: int = 0) -> PerPair:
         """x_ij (R, R) [veh]: every vehicle counted where it is now, on junctions too. LedgerError if the count differs
         from departures minus arrivals, in total or in any (i, j) as followed from crossing to crossing; it names the
         control step `step`."""
@@ -130,7 +140,7 @@ class Meter:
         on_road = self._session.running()
         for vehicle in on_road:
             known = self._vehicles[vehicle]
-            region = self._city.region_of.get(self._session.road(vehicle), known.region)
+            region = self._city.region_of.get(self._session.road(vehicle), known.here)
             self._cross(known, region)
             counted[region, known.destination] += 1
         for vehicle in self._teleporting.difference(on_road):
@@ -156,7 +166,7 @@ class Meter:
         under_way = {vehicle for vehicle, known in self._vehicles.items() if known.region is not None}
         return under_way.difference(on_road, self._teleporting).intersection(self._session.known())
 
-    def backlog(self) -> np.ndarray:
+    def backlog(self) -> PerPair:
         """(R, R) [veh]: due to depart from i for j, but not inserted yet."""
         waiting = np.zeros(self._running.shape)
         for vehicle in self._session.pending():
@@ -164,7 +174,7 @@ class Meter:
             waiting[known.origin, known.destination] += 1
         return waiting
 
-    def probes(self) -> np.ndarray:
+    def probes(self) -> PerPair:
         """(R, R) [veh]: the probes among the accumulation, where it last counted them."""
         counted = np.zeros(self._running.shape)
         for vehicle in self._probes & self._vehicles.keys():
@@ -173,7 +183,7 @@ class Meter:
                 counted[known.region, known.destination] += 1
         return counted
 
-    def probe_backlog(self) -> np.ndarray:
+    def probe_backlog(self) -> PerPair:
         """(R, R) [veh]: the probes among the backlog."""
         waiting = np.zeros(self._running.shape)
         for vehicle in self._probes.intersection(self._session.pending()):
@@ -184,8 +194,9 @@ class Meter:
     def _load(self, vehicle: str) -> _Vehicle:
         if vehicle not in self._vehicles:
             route, region_of = self._session.route(vehicle), self._city.region_of
+            origin = region_of.get(route[0], 0)
             self._vehicles[vehicle] = _Vehicle(
-                origin=region_of.get(route[0], 0), destination=region_of.get(route[-1], 0), edge=route[-1],
+                origin=origin, destination=region_of.get(route[-1], 0), edge=route[-1], announced=origin,
                 free=self._session.is_free(vehicle))
         return self._vehicles[vehicle]
 
@@ -193,7 +204,7 @@ class Meter:
         known = self._vehicles[vehicle]
         if vehicle in self._teleporting or known.region == known.announced == region:
             return None
-        source = known.announced if known.region == region else known.region
+        source = known.announced if known.region == region else known.here
         self._cross(known, region)
         known.announced = region
         self.entry_flow[source, edge] += 1

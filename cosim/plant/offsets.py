@@ -5,7 +5,7 @@ other; their delay depends only on the difference of the two offsets. The sum ov
 one signal's offset after another. Platoons do not disperse: the roads are short.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -44,10 +44,13 @@ def offsets(city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, str
     return [replace(signal, offset=float(offset)) for signal, offset in zip(signals, chosen, strict=True)]
 
 
-def _costs(city, signals, flows, saturation, cycle) -> dict[tuple[int, int], np.ndarray]:
+def _costs(
+    city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, str], float], saturation: float, cycle: int,
+) -> dict[tuple[int, int], np.ndarray]:
     """(signal, next signal) -> (cycle,) queueing on the road between them [veh s per cycle], by the later offset minus
     the earlier one."""
-    into, out_of = {}, {}
+    into: dict[str, list[tuple[int, np.ndarray]]] = {}
+    out_of: dict[str, list[tuple[int, np.ndarray, float, float]]] = {}
     for n, signal in enumerate(signals):
         for edge, to, lanes, green in _movements(signal):
             if flow := flows.get((edge, to), 0.0):
@@ -74,7 +77,7 @@ def _costs(city, signals, flows, saturation, cycle) -> dict[tuple[int, int], np.
     return cost
 
 
-def _movements(signal: Signal):
+def _movements(signal: Signal) -> Iterator[tuple[str, str, int, np.ndarray]]:
     """(edge, next edge, lanes, (cycle,) green as 0 or 1) of every movement."""
     lanes: dict[tuple[str, str], dict[int, int]] = {}
     for link in signal.links:
@@ -95,7 +98,7 @@ def _discharge(green: np.ndarray, flow: float, rate: float) -> np.ndarray:
     return left if left.any() else np.full(len(green), flow)
 
 
-def _road(city: City, edge: str, ends) -> tuple[str | None, float]:
+def _road(city: City, edge: str, ends: Collection[str]) -> tuple[str | None, float]:
     """The edge before the next signal, from `edge` on, and the free-flow time to its end [s]; None at a fork."""
     time, seen = 0.0, set()
     while edge not in seen:

@@ -18,6 +18,7 @@ import numpy as np
 
 from cosim.plant.strategy import HOLD_BACK
 from cosim.sumo.session import Phase, Programme
+from nmfd.arrays import PerPair
 
 YELLOW = 3.0  # s, where the original programme has none after a green
 GREEN = frozenset("Gg")
@@ -35,6 +36,7 @@ class GatewaySignal:
         self, programme: Programme, movements: Mapping[int, tuple[int, int]], *, min_green: float, mode: str,
         start: float,
     ):
+        """mode: HOLD_BACK or REDISTRIBUTE of cosim.plant.strategy"""
         self.signal, self.phases = programme.signal, programme.phases
         self._states = [phase.state for phase in programme.phases]
         self._original = [phase.duration for phase in programme.phases]
@@ -46,7 +48,7 @@ class GatewaySignal:
         self._ends = list(accumulate(self._original))
         self._shown, self._since, self.next_change = "", start, start
 
-    def command(self, share: np.ndarray, opened: Collection[int] = ()) -> None:
+    def command(self, share: PerPair, opened: Collection[int] = ()) -> None:
         """(R, R) [-]: (u - u_min) / (u_max - u_min) for the windows (hold-back) or cycles that begin from now on.
 
         opened: links that keep their original green whatever `share` says
@@ -185,7 +187,7 @@ class GatewaySignals:
         """show(signal, state) puts a state on a signal."""
         self._signals, self._show = signals, show
 
-    def command(self, share: np.ndarray, opened: Mapping[str, Collection[int]]) -> None:
+    def command(self, share: PerPair, opened: Mapping[str, Collection[int]]) -> None:
         """share: (R, R) [-], [i, h] = (u_ih - u_min) / (u_max - u_min); opened: signal -> links that it spares."""
         for signal in self._signals:
             signal.command(share, opened.get(signal.signal, ()))

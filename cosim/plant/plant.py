@@ -14,7 +14,7 @@ from cosim.plant.meter import Meter
 from cosim.plant.programmes import city_signals
 from cosim.plant.record import Record, Recorder
 from cosim.plant.sensing import Estimation, Sensing
-from cosim.plant.settings import ESTIMATE, Settings, settings
+from cosim.plant.settings import ESTIMATE, Settings, scenario_file, settings
 from cosim.plant.strategy import MAX_PRESSURE
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, Gateway, check_adjacency, load_city
@@ -64,7 +64,7 @@ class SumoPlant:
         """Trips, drivers and reroutes all follow from `seed`."""
         self._end_session()
         self._k, self._session = 0, self._launch.start(seed)
-        self._incidents = Incidents(self._scenario.ordered_faults, self._session, self.city)
+        self._incidents = Incidents(self._scenario.ordered_faults, self.session, self.city)
         self._sensing = self._new_sensing(seed)
         self._guide = self._new_guide(seed)
         self._actuation = self._new_actuation()
@@ -74,21 +74,22 @@ class SumoPlant:
 
     def step(self, controls: Controls) -> State:
         """One control interval: in every simulation step actuate, simulate, measure and guide; then record."""
-        end, streets = self._session.time + self._scenario.step, self._sensing.streets
+        session, streets = self.session, self._sensing.streets
+        end = session.time + self._scenario.step
         vehicles, speed = (None, None) if streets is None else (streets.vehicles, streets.speed)
         self._incidents.begin(self._k)
         self._actuation.command(controls.perimeter, vehicles)
         self._guide.command(controls.splits, speed)
         self._sensing.begin()
-        for _ in range(round(self._scenario.step / self._session.step_length)):
+        for _ in range(round(self._scenario.step / session.step_length)):
             self._actuation.play()
-            self._session.step()
+            session.step()
             entered = self._sensing.measure()
             self._guide.apply(entered)
-        assert abs(self._session.time - end) < 1e-6
+        assert abs(session.time - end) < 1e-6
         self._k += 1
-        state = self._sensing.finish(self._k, controls)
-        self._recorder.add(self._sensing.streets)
+        state, means = self._sensing.finish(self._k, controls)
+        self._recorder.add(means)
         return state
 
     def observe(self) -> Observation | None:
@@ -96,6 +97,7 @@ class SumoPlant:
         return self._sensing.observation(self._k)
 
     def close(self) -> None:
+        """End the simulation and remove the scratch folder."""
         self._end_session()
         self._launch.close()
 
@@ -110,11 +112,14 @@ class SumoPlant:
 
     @property
     def sumo_time(self) -> float:
-        return self._session.sumo_time
+        """[s] of wall time inside SUMO's own step since the reset."""
+        return self.session.sumo_time
 
     @property
     def session(self) -> Session:
-        """The running simulation, for tests and for watching."""
+        """The running simulation. Raises RuntimeError before the first reset and after the end."""
+        if self._session is None:
+            raise RuntimeError("no simulation is running; call reset(seed) first")
         return self._session
 
     def leaks(self) -> list[Gateway]:
@@ -132,23 +137,23 @@ class SumoPlant:
     def _new_sensing(self, seed: int) -> Sensing:
         chosen = self._settings
         if chosen.measurement != ESTIMATE:
-            meter, estimation = Meter(self._session, self.city), None
+            meter, estimation = Meter(self.session, self.city), None
         else:
-            meter = Meter(self._session, self.city, probes(self._launch.vehicles, chosen.probe_share, seed))
-            estimation = Estimation(self._session, self.city, self._layout, meter, self._instruments, self._planning)
-        return Sensing(self._scenario, self._session, self.city, self._incidents, meter, estimation)
+            meter = Meter(self.session, self.city, probes(self._launch.vehicles, chosen.probe_share, seed))
+            estimation = Estimation(self.session, self.city, self._layout, meter, self._instruments, self._planning)
+        return Sensing(self._scenario, self.session, self.city, self._incidents, meter, estimation)
 
     def _new_guide(self, seed: int) -> Guide:
         chosen = self._settings
         return Guide(
-            self._session, self.city, self._scenario.network.nominal_splits, compliance=chosen.compliance,
+            self.session, self.city, self._scenario.network.nominal_splits, compliance=chosen.compliance,
             most_detour=chosen.most_detour, ways_return=chosen.ways_return, period=chosen.guidance_period,
             random=np.random.default_rng([seed, GUIDANCE]))
 
     def _new_actuation(self) -> Actuation:
         flows = self._launch.turning_flows() if self._settings.signals == MAX_PRESSURE else None
         return Actuation(
-            self._session, self.city, self._scenario, self._settings, self._signals, self._incidents, flows)
+            self.session, self.city, self._scenario, self._settings, self._signals, self._incidents, flows)
 
     def _end_session(self) -> None:
         if self._session is not None:
@@ -161,7 +166,6 @@ def _check_mesoscopic(scenario: Scenario, chosen: Settings) -> None:
     for key, value, what in (("signals", MAX_PRESSURE, "counts vehicles lane by lane"),
                              ("measurement", ESTIMATE, "needs loop detectors on lanes")):
         if chosen.mesoscopic and getattr(chosen, key) == value:
-            where = "scenario.toml" if scenario.folder is None else scenario.folder / "scenario.toml"
             raise InputError(
-                f"{where}: sumo.{key}: {value} {what}, but SUMO's mesoscopic model has no lanes; omit it, or set "
-                "mesoscopic = false (import the city without --mesoscopic)")
+                f"{scenario_file(scenario)}: sumo.{key}: {value} {what}, but SUMO's mesoscopic model has no lanes; "
+                "omit it, or set mesoscopic = false (import the city without --mesoscopic)")

@@ -8,6 +8,7 @@ from cosim.plant import webster
 from cosim.plant.actuated import actuated_row
 from cosim.plant.settings import Settings
 from cosim.plant.strategy import ACTUATED, FIXED, WEBSTER
+from cosim.sumo.build import network_folder
 from cosim.sumo.net import City
 from cosim.sumo.signals import Signal, read_signals, write_programmes
 from nmfd.errors import InputError
@@ -49,7 +50,7 @@ def write_signal_programmes(
     """
     if chosen.signals == WEBSTER:
         return [webster.plan(
-            city, signals.simple, scenario.demand, scenario.step, folder=scenario.network.folder / "build",
+            city, signals.simple, scenario.demand, scenario.step, folder=network_folder(scenario.network) / "build",
             flows=own_flows)]
     if chosen.signals == ACTUATED:
         path = folder / "actuated.add.xml"

@@ -8,6 +8,7 @@ from cosim.plant.actuation import Actuation
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Meter
 from cosim.plant.sampling import StreetMeans
+from cosim.sumo.arrays import EdgesOverTime, GatewaysOverTime, PairCounts, RegionCounts, Series, TurnCounts
 from nmfd.quantities import quantity
 
 
@@ -18,26 +19,27 @@ class Record:
     Gateways that share the edge before them share its queue.
     """
 
-    departures: np.ndarray = quantity("interval", "region", "destination", unit="veh", text="trips begun")
-    arrivals: np.ndarray = quantity("interval", "destination", unit="veh", text="trips ended")
-    crossings: np.ndarray = quantity(
+    departures: PairCounts = quantity("interval", "region", "destination", unit="veh", text="trips begun")
+    arrivals: RegionCounts = quantity("interval", "destination", unit="veh", text="trips ended")
+    crossings: TurnCounts = quantity(
         "interval", "region", "next_region", "destination", unit="veh", text="vehicles that crossed a boundary")
-    production: np.ndarray = quantity("interval", "region", unit="veh m/s", text="travel production, mean of samples")
-    mean_accumulation: np.ndarray = quantity(
+    production: RegionCounts = quantity("interval", "region", unit="veh m/s", text="travel production, mean of samples")
+    mean_accumulation: RegionCounts = quantity(
         "interval", "region", unit="veh", text="vehicles inside, mean of the same samples")
-    edge_vehicles: np.ndarray = quantity(
+    edge_vehicles: EdgesOverTime = quantity(
         "interval", "edge", unit="veh", text="vehicles on the edge to 0.1 %, mean of the same samples")
-    gateway_green: np.ndarray = quantity(
+    gateway_green: GatewaysOverTime = quantity(
         "interval", "gateway", unit="s", text="green shown, mean of the gateway's links; NaN without a signal")
-    gateway_original_green: np.ndarray = quantity(
+    gateway_original_green: GatewaysOverTime = quantity(
         "interval", "gateway", unit="s", text="green in the original programme, mean of the gateway's links")
-    gateway_flow: np.ndarray = quantity("interval", "gateway", unit="veh", text="vehicles that crossed the boundary")
-    gateway_queue: np.ndarray = quantity(
+    gateway_flow: GatewaysOverTime = quantity(
+        "interval", "gateway", unit="veh", text="vehicles that crossed the boundary")
+    gateway_queue: GatewaysOverTime = quantity(
         "interval", "gateway", unit="veh", text="vehicles halting on the edge before it, mean of samples")
-    gateway_queue_max: np.ndarray = quantity(
+    gateway_queue_max: GatewaysOverTime = quantity(
         "interval", "gateway", unit="veh", text="vehicles halting on the edge before it, largest of samples")
-    teleports: np.ndarray = quantity("interval", unit="1", text="vehicles that SUMO took out of a jam")
-    guided: np.ndarray = quantity(
+    teleports: Series = quantity("interval", unit="1", text="vehicles that SUMO took out of a jam")
+    guided: TurnCounts = quantity(
         "interval", "region", "next_region", "destination", unit="veh", text="reroutes by route guidance")
 
 
@@ -45,6 +47,7 @@ class Recorder:
     """Adds up a record: `add` at the end of every control interval."""
 
     def __init__(self, meter: Meter, guide: Guide, actuation: Actuation):
+        """What they have counted until now belongs to no interval."""
         self._meter, self._guide, self._actuation = meter, guide, actuation
         self._rows: list[dict[str, np.ndarray]] = []
         self._before = self._totals()

@@ -3,9 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Real
 
+from cosim.sumo.arrays import EdgeMask, PerEdge, PerGateway
 from cosim.sumo.net import City
 from cosim.sumo.session import Session
+from nmfd.arrays import PerRegion
 
 EVERY = 10.0  # s, between two samples
 
@@ -19,12 +22,12 @@ class StreetMeans:
     queue, queue_max: (G,) [veh] halting on the edge before a gateway, mean and largest
     """
 
-    vehicles: np.ndarray
-    speed: np.ndarray
-    accumulation: np.ndarray
-    production: np.ndarray
-    queue: np.ndarray
-    queue_max: np.ndarray
+    vehicles: PerEdge
+    speed: PerEdge
+    accumulation: PerRegion
+    production: PerRegion
+    queue: PerGateway
+    queue_max: Real[np.ndarray, " G"]
 
 
 def samples_apart(seconds: float, session: Session, steps: int) -> int:
@@ -36,6 +39,7 @@ class StreetSampler:
     """The samples of one control interval: `sample` as often as they are due, `finish` at its end."""
 
     def __init__(self, session: Session, city: City):
+        """Samples are of the city's normal edges, and of those before its gateways."""
         self._session, self._city = session, city
         self._number = {edge: n for n, edge in enumerate(city.edges)}
         self._region = np.array([city.region_of[edge] for edge in city.edges])
@@ -48,11 +52,12 @@ class StreetSampler:
         self._queues: list[list[int]] = []
 
     def sample(self) -> None:
+        """Take one sample."""
         counts, speeds = self.present()
         self._vehicles, self._metres = self._vehicles + counts, self._metres + counts * speeds
         self._queues.append([self._session.halting(edge) for edge in self._upstream])
 
-    def finish(self, closed: np.ndarray) -> StreetMeans:
+    def finish(self, closed: EdgeMask) -> StreetMeans:
         """The means since the last call; new ones begin. closed: (E,) bool, streets on which nobody may drive"""
         samples, vehicles, metres = len(self._queues), self._vehicles, self._metres
         queues = np.array(self._queues).reshape(samples, len(self._upstream))
@@ -67,7 +72,7 @@ class StreetSampler:
             vehicles=vehicles / samples, speed=speed, accumulation=accumulation, production=production, queue=mean,
             queue_max=largest)
 
-    def present(self) -> tuple[np.ndarray, np.ndarray]:
+    def present(self) -> tuple[PerEdge, PerEdge]:
         """Vehicles (E,) [veh] and mean speed (E,) [m/s] by edge, now."""
         count, mean_speed, edges = self._session.vehicle_count, self._session.mean_speed, self._city.edges
         counts, speeds = np.zeros((2, len(edges)))

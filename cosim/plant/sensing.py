@@ -60,6 +60,7 @@ class Sensing:
         self, scenario: Scenario, session: Session, city: City, incidents: Incidents, meter: Meter,
         estimation: Estimation | None,
     ):
+        """estimation: None where controllers see the exact state"""
         self._interval, self._incidents, self._estimation = scenario.step, incidents, estimation
         self._sampler = StreetSampler(session, city)
         steps = round(scenario.step / session.step_length)
@@ -93,10 +94,11 @@ class Sensing:
             self._sampler.sample()
         return events
 
-    def finish(self, step: int, controls: Controls) -> State:
-        """The state at the end of a control interval under `controls`; control step `step` begins now."""
+    def finish(self, step: int, controls: Controls) -> tuple[State, StreetMeans]:
+        """The state at the end of a control interval under `controls`, and the means of the interval; control step
+        `step` begins now. LedgerError."""
         state = self.state(step)
-        self.streets = self._sampler.finish(self._incidents.closed)
+        self.streets = means = self._sampler.finish(self._incidents.closed)
         if self._estimation:
             self._estimation.update(controls)
-        return replace(state, problem=self._incidents.problem(estimating=self._estimation is not None))
+        return replace(state, problem=self._incidents.problem(estimating=self._estimation is not None)), means

@@ -1,7 +1,7 @@
 """The table [sumo] of scenario.toml: how the city is simulated, actuated and measured."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import model_validator
 
@@ -56,7 +56,7 @@ class SumoTable(config.Settings):
         False)
 
     @model_validator(mode="after")
-    def _is_measured(self):
+    def _is_measured(self) -> Self:
         if self.measurement == ESTIMATE and self.detector_share == self.probe_share == 0:
             raise Problem("measurement", "\"estimate\" needs detectors or probes, but sumo.detector_share and "
                           "sumo.probe_share are both 0; raise one of them")
@@ -73,11 +73,16 @@ class Settings(SumoTable):
     gateways_fixed: bool = True
 
 
+def scenario_file(scenario: Scenario) -> Path:
+    """The scenario.toml, to name it in errors; without a folder, of a scenario that was not loaded from one."""
+    return (scenario.folder or Path()) / "scenario.toml"
+
+
 def settings(scenario: Scenario) -> Settings:
     """Read and check the table [sumo] of the scenario. Raises InputError."""
     if scenario.folder is None:
         return Settings()
-    path = scenario.folder / "scenario.toml"
+    path = scenario_file(scenario)
     chosen = Settings(**vars(config.checked(SumoTable, read_tables(scenario.folder).get("sumo", {}), path, "sumo.")))
     for key in FILES:
         for name in getattr(chosen, key):

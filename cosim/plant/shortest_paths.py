@@ -1,8 +1,11 @@
 """Searches for fastest ways in a city of regions, at given travel times."""
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
+
+from cosim.sumo.arrays import EdgeMask, GatewayMask, PerEdge, PerGateway
 
 FAR = 1e9  # s, longer than any way
 
@@ -13,7 +16,10 @@ class Moves:
     number: edge -> its node, -1 for edges that are not allowed
     """
 
-    def __init__(self, first: np.ndarray, second: np.ndarray, turn: np.ndarray, *, allowed: np.ndarray, reverse: bool):
+    def __init__(
+        self, first: Int[np.ndarray, " M"], second: Int[np.ndarray, " M"], turn: Float[np.ndarray, " M"], *,
+        allowed: EdgeMask, reverse: bool,
+    ):
         """turn: [s], the time of a move; allowed: (E,), edges"""
         self.edges = np.flatnonzero(allowed)
         self.number = np.full(len(allowed), -1)
@@ -25,7 +31,7 @@ class Moves:
         self._begins = np.searchsorted(rows[kept], np.arange(len(self.edges) + 1)).astype(np.int32)
         self._ids = self.edges.tolist()
 
-    def costing(self, time: np.ndarray, ahead: np.ndarray | None = None) -> csr_array:
+    def costing(self, time: PerEdge, ahead: Float[np.ndarray, " nodes"] | None = None) -> csr_array:
         """A move costs the time of the turn and `time` (E,) [s] of the edge that it leads to; less the time by which
         it comes nearer, of `ahead` (nodes,) [s], if that is given: then a search from t finds cost + ahead - ahead[t],
         and what leads astray last (A*)."""
@@ -34,8 +40,8 @@ class Moves:
             cost += ahead[self._columns] - np.repeat(ahead, np.diff(self._begins))
         return csr_array((cost, self._columns, self._begins), shape=(len(self.edges),) * 2)
 
-    def leading_to(self, nodes: np.ndarray) -> np.ndarray:
-        """(nodes, len(nodes)) bool: from which of all nodes each of `nodes` can be reached."""
+    def leading_to(self, nodes: Int[np.ndarray, " G"]) -> Bool[np.ndarray, "nodes G"]:
+        """(all nodes, G) bool: from which of all nodes each of `nodes` (G,) can be reached."""
         moves = csr_array(
             (np.ones(len(self._columns)), self._columns, self._begins), shape=(len(self.edges),) * 2)
         # Nodes that lead to each other are reached from the same ones: in most cities nearly all.
@@ -43,13 +49,13 @@ class Moves:
         _, once, which = np.unique(part[nodes], return_index=True, return_inverse=True)
         return np.isfinite(dijkstra(moves.T.tocsr(), indices=nodes[once], unweighted=True)).T[:, which]
 
-    def ahead(self, nodes: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """(nodes,) [s]: hardly less than the time from each to the nearest of `nodes` at `time` (E,) [s], and FAR where
-        none can be reached."""
+    def ahead(self, nodes: Int[np.ndarray, " G"], time: PerEdge) -> Float[np.ndarray, " nodes"]:
+        """(all nodes,) [s]: hardly less than the time from each to the nearest of `nodes` (G,) at `time` (E,) [s], and
+        FAR where none can be reached."""
         least = dijkstra(self.costing(time).T.tocsr(), indices=nodes, min_only=True)
         return np.where(np.isfinite(least), (1.0 - 1e-6) * least, FAR)  # less, for no move may cost nothing
 
-    def path(self, before: np.ndarray, first: int, last: int) -> list[int]:
+    def path(self, before: Int[np.ndarray, " nodes"], first: int, last: int) -> list[int]:
         """The edges from node `first` to node `last` by the predecessors `before` of a search from `last`."""
         way = [self._ids[first]]
         while first != last:
@@ -61,7 +67,7 @@ class Moves:
 class Home:
     """Fastest ways to single edges by `moves`, searched back from them when somebody first goes there."""
 
-    def __init__(self, moves: Moves, time: np.ndarray):
+    def __init__(self, moves: Moves, time: PerEdge):
         """time: (E,) [s]"""
         self.time, self._moves, self._costs = time, moves, moves.costing(time)
         self._found: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
@@ -89,8 +95,9 @@ class Ways:
     """
 
     def __init__(
-        self, first, second, next_region, *, inside: Moves, outside: Moves, reached: np.ndarray, ahead: np.ndarray,
-        time: np.ndarray,
+        self, first: Int[np.ndarray, " G"], second: Int[np.ndarray, " G"], next_region: Int[np.ndarray, " G"], *,
+        inside: Moves, outside: Moves, reached: Bool[np.ndarray, "nodes G"], ahead: Float[np.ndarray, " nodes"],
+        time: PerEdge,
     ):
         """first, second, next_region: (G,), the last in rising order; inside: moves in the region; outside: those
         elsewhere, back; reached: (nodes of `outside`, G), which edges can be reached from second[g]; ahead: (nodes of
@@ -103,7 +110,7 @@ class Ways:
         self._there: dict[int, tuple[np.ndarray, np.ndarray, float, np.ndarray]] = {}
         self._onward: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
 
-    def cost(self, here: int, target: int, most: float) -> tuple[np.ndarray, np.ndarray]:
+    def cost(self, here: int, target: int, most: float) -> tuple[PerGateway, GatewayMask]:
         """(G,) [s] from the end of edge `here` to the end of edge `target`, infinite if it is more than `most`, and
         (G,) bool, whether there is a way at all."""
         if here not in self._there:

@@ -6,6 +6,7 @@ near or above capacity, and for left turns that are permitted in one stage and p
 """
 
 import hashlib
+import inspect
 import math
 import sys
 from collections.abc import Mapping, Sequence
@@ -23,6 +24,7 @@ from cosim.plant.offsets import offsets
 from cosim.sumo.net import City
 from cosim.sumo.session import Phase
 from cosim.sumo.signals import Signal, programme_row, write_programmes
+from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
 
 CYCLES = (40, 50, 60, 70, 80, 90, 100, 110, 120)  # s
@@ -55,8 +57,8 @@ def optimised(city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, s
     lanes = {signal.id: _lanes(signal, flows) for signal in signals}
     best, plan = math.inf, list(signals)
     for cycle in CYCLES:
-        found = [_split(signal, lanes[signal.id], cycle) for signal in signals]
-        if not all(found):  # too short
+        found = [split for signal in signals if (split := _split(signal, lanes[signal.id], cycle)) is not None]
+        if len(found) < len(signals):  # too short
             continue
         total = sum(delay for _, delay in found)
         if total >= best:  # longer ones are worse still
@@ -66,7 +68,7 @@ def optimised(city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, s
 
 
 def plan(
-    city: City, signals: Sequence[Signal], demand: np.ndarray, step: float, *, folder: Path,
+    city: City, signals: Sequence[Signal], demand: PairsOverTime, step: float, *, folder: Path,
     flows: Mapping[tuple[str, str], float] | None = None,
 ) -> Path:
     """The additional file for SUMO with `signals` optimised for the peak of `demand` (T, R, R) [veh/s], or for `flows`
@@ -78,7 +80,7 @@ def plan(
     sources = (
         cosim.sumo.turning_flows, cosim.plant.offsets, cosim.sumo.signals, cosim.sumo.trips, sys.modules[__name__])
     for source in sources:
-        content.update(Path(source.__file__).read_bytes())
+        content.update(Path(inspect.getfile(source)).read_bytes())
     content.update(city.net_file.read_bytes())
     content.update(repr((step, sorted(city.region_of.items()))).encode())
     content.update(np.ascontiguousarray(demand).tobytes())
@@ -149,8 +151,11 @@ def _opposing(signal: Signal, lanes: list[_Lane]) -> dict[tuple[int, str], tuple
     return found
 
 
-def _delay(signal: Signal, durations: list[float], lanes: list[_Lane], opposing, cycle: float) -> float:
-    """Sum over the lanes of flow times delay [veh s/s]."""
+def _delay(
+    signal: Signal, durations: list[float], lanes: list[_Lane], opposing: Mapping[tuple[int, str], tuple[float, float]],
+    cycle: float,
+) -> float:
+    """Sum over the lanes of flow times delay [veh s/s]; opposing: see `_opposing`."""
     total = 0.0
     for lane in lanes:
         served, served_before = 0.0, math.inf  # veh per cycle that could pass; headway in the phase before

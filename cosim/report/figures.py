@@ -3,12 +3,14 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float, Real
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 
+from cosim.sumo.arrays import EdgeNumbers, PerEdge, Points, Series
 from nmfd.studies import plots
 
 JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
@@ -21,7 +23,7 @@ COMMANDED, GREEN_SHOWN, FLOWED = "#333333", "#009e73", "#0059a8"
 
 
 def link_densities(
-    ax: Axes, shapes: Sequence[np.ndarray], density: np.ndarray, lanes: np.ndarray, region: np.ndarray,
+    ax: Axes, shapes: Sequence[Points], density: PerEdge, lanes: EdgeNumbers, region: EdgeNumbers,
 ) -> Axes:
     """A map of the edges in the colours of DENSITIES.
 
@@ -43,13 +45,13 @@ def link_densities(
     return ax
 
 
-def _to_the_right(shape: np.ndarray, distance: float) -> np.ndarray:
+def _to_the_right(shape: Points, distance: float) -> Points:
     """The line moved sideways, as seen in its direction."""
     along = shape[-1] - shape[0]
     return shape + distance * np.array([along[1], -along[0]]) / max(np.hypot(*along), 1e-9)
 
 
-def perimeter(ax: Axes, step: float, commanded: np.ndarray, green: np.ndarray, flow: np.ndarray) -> Axes:
+def perimeter(ax: Axes, step: float, commanded: Series, green: Series, flow: Series) -> Axes:
     """One boundary over time: u (T,) as commanded, green as a share of the original programme's, and flow as a share
     of what passes in that at saturation."""
     time = plots.time_axis(ax, step * np.arange(len(commanded) + 1))
@@ -63,7 +65,9 @@ def perimeter(ax: Axes, step: float, commanded: np.ndarray, green: np.ndarray, f
     return ax
 
 
-def green_against_command(ax: Axes, commanded: np.ndarray, green: np.ndarray) -> Axes:
+def green_against_command(
+    ax: Axes, commanded: Float[np.ndarray, " n"], green: Float[np.ndarray, " n"],
+) -> Axes:
     """Every boundary and interval: share of the original green that was shown against the commanded u, both (n,)."""
     ax.scatter(commanded, green, s=5, color=GREEN_SHOWN, alpha=0.35, linewidths=0)
     ax.set_xlabel("commanded u")
@@ -74,7 +78,10 @@ def green_against_command(ax: Axes, commanded: np.ndarray, green: np.ndarray) ->
     return ax
 
 
-def splits(ax: Axes, step: float, commanded: np.ndarray, realised: np.ndarray, neighbours: Sequence[int]) -> Axes:
+def splits(
+    ax: Axes, step: float, commanded: Float[np.ndarray, "T H"], realised: Float[np.ndarray, "T H"],
+    neighbours: Sequence[int],
+) -> Axes:
     """The vehicles of one region for one destination over time: theta (T, H) as commanded (lines) and the shares that
     left by each of the H neighbours (dots; NaN where nobody left)."""
     time = plots.time_axis(ax, step * np.arange(len(commanded) + 1))
@@ -88,7 +95,9 @@ def splits(ax: Axes, step: float, commanded: np.ndarray, realised: np.ndarray, n
     return ax
 
 
-def split_totals(ax: Axes, commanded: np.ndarray, realised: np.ndarray, vehicles: np.ndarray) -> Axes:
+def split_totals(
+    ax: Axes, commanded: Float[np.ndarray, " n"], realised: Float[np.ndarray, " n"], vehicles: Real[np.ndarray, " n"],
+) -> Axes:
     """theta as commanded against as realised, (n,) each, over the whole run; area by `vehicles` (n,)."""
     ax.plot([0, 1], [0, 1], color="#bbbbbb", linewidth=1.0, zorder=1)
     ax.scatter(commanded, realised, s=90.0 * vehicles / max(vehicles.max(initial=0.0), 1.0) + 3.0, color=FLOWED,
@@ -102,7 +111,7 @@ def split_totals(ax: Axes, commanded: np.ndarray, realised: np.ndarray, vehicles
 
 
 def gateway_queues(
-    ax: Axes, step: float, queue: np.ndarray, labels: Sequence[str], *, most: float,
+    ax: Axes, step: float, queue: Real[np.ndarray, "T N"], labels: Sequence[str], *, most: float,
 ) -> Axes:
     """Vehicles halting before gateways over time: queue (T, N) [veh], one row per edge, white where there is none.
 

@@ -141,6 +141,7 @@ def _pictures(folder: Path, wanted: Sequence[tuple[str, str]], before: str = "")
 
 
 def picture(path: Path, caption: str) -> Picture:
+    """A png file as a picture of the page."""
     content = path.read_bytes()
     return Picture(
         uri=f"data:image/png;base64,{base64.b64encode(content).decode()}", caption=caption,

@@ -44,7 +44,9 @@ def draw(
                   key=lambda t: (order.index(t.controller), t.seed))
     note = teleports(rows)
     draw_accumulations(out, scenario, runs, seed=seed, title=f"seed {seed}, shaded: all seeds; {note}")
-    results = {} if city is None else {
+    if city is None:
+        return
+    results = {
         name: result for name, result in recorded(folder, rows, seed).items() if set(DRAWN) <= set(result.record)}
     best = next((name for name in names if name != REFERENCE and name in results), None)
     pair = {name: results[name] for name in (REFERENCE, best) if name in results}
@@ -79,7 +81,7 @@ def ranked(rows: pd.DataFrame) -> list[str]:
         values = statistics.by_seed(rows, level, name)
         pair = statistics.paired(values, reference)
         score[name] = pair.percent if pair.seeds else float(np.mean(list(values.values())))
-    return sorted(score, key=score.get)
+    return sorted(score, key=score.__getitem__)
 
 
 def shown_seed(rows: pd.DataFrame) -> int:

@@ -77,7 +77,10 @@ def _certainty(pair: statistics.Paired) -> str:
 
 def _beyond_chance(rows: pd.DataFrame) -> str:
     """Which strategies differ from no control by more than chance."""
-    level, better, worse, open_ = rows["demand"].iloc[0], [], [], []
+    level = rows["demand"].iloc[0]
+    better: list[str] = []
+    worse: list[str] = []
+    open_: list[str] = []
     for name in pictures.ranked(rows):
         pair = statistics.paired(statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, REFERENCE))
         if name != REFERENCE and pair.seeds > 1:

@@ -1,12 +1,13 @@
 """A film of link densities over the time of a run, from its record; of two runs side by side."""
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 from matplotlib import animation, rc_context
+from matplotlib.figure import Figure
 
 from cosim.evaluation.experiment import read_run
 from cosim.evaluation.results import Finished, Level
@@ -23,10 +24,11 @@ SUFFIXES = (".gif", ".mp4")
 FFMPEG_HINT = "install ffmpeg, or pip install 'perimeter-cosim[video]', or choose a name that ends in .gif"
 
 
-def choose(finished: Finished, level: Level, controller: str | None, against: str | None, seed: int | None) -> tuple:
+def choose(finished: Finished, level: Level, controller: str | None, against: str | None, seed: int | None,
+           ) -> tuple[list[str], int]:
     """Names and seed of the runs to show: the best controller, and the first seed that all of them have.
 
-    Raises InputError.
+    Raises InputError, also where there is no map to show them on.
     """
     rows, option = level.rows, "--controller"
     names = [controller or pictures.ranked(rows)[0]]
@@ -44,12 +46,12 @@ def choose(finished: Finished, level: Level, controller: str | None, against: st
     if seed is not None and seed not in common:
         raise InputError(f"--seed: {level.folder} has no run of {' and '.join(names)} with seed {seed}; choose from "
                          f"{', '.join(map(str, sorted(common)))}")
-    if finished.city is None:
-        raise InputError(f"{finished.path}: {finished.changed}: there is no map of the runs any more; run them again")
+    finished.map()
     return names, int(min(common) if seed is None else seed)
 
 
 def default_path(level: Level, names: Sequence[str], seed: int) -> Path:
+    """Where a film goes that is given no place of its own."""
     return level.folder / f"video-{file_name('-against-'.join(names))}-{seed}.gif"
 
 
@@ -63,7 +65,7 @@ def film(
     """
     with _writer(path, rate) as writer:
         results = {name: read_run(level.folder, name, seed) for name in names}
-        drawing, update = scene(finished.city, results, f"{finished.scenario.name}, demand times {level.demand:g}")
+        drawing, update = scene(finished.map(), results, f"{finished.scenario.name}, demand times {level.demand:g}")
         steps = min(len(result.record["edge_vehicles"]) for result in results.values())
         shown = range(0, steps, -(-steps // FRAMES))
         with atomic(path) as temporary, writer.saving(drawing, str(temporary), DPI):
@@ -75,7 +77,7 @@ def film(
     return path
 
 
-def scene(city: City, results: dict[str, Result], title: str) -> tuple:
+def scene(city: City, results: dict[str, Result], title: str) -> tuple[Figure, Callable[[int], None]]:
     """A figure of a map per run over the total accumulation, and a function that sets it to control interval k."""
     shapes, lanes = edge_shapes(city), np.array([city.lanes[edge] for edge in city.edges])
     km = np.array([city.length[edge] for edge in city.edges]) / 1000.0
@@ -116,7 +118,7 @@ def scene(city: City, results: dict[str, Result], title: str) -> tuple:
 
 
 @contextmanager
-def _writer(path: Path, rate: int):
+def _writer(path: Path, rate: int) -> Iterator[animation.AbstractMovieWriter]:
     """matplotlib's writer for the suffix of `path`. Raises InputError."""
     if path.suffix == ".gif":
         yield animation.PillowWriter(fps=rate)

@@ -13,6 +13,7 @@ from cosim.importing.layers import colour as region_colour
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.plant.strategy import configured, parse, planning_of
+from cosim.sumo.arrays import Points
 from cosim.sumo.net import City, Gateway, edge_shapes
 from cosim.sumo.session import LOST, Window
 from nmfd import closed_loop
@@ -94,16 +95,19 @@ class Painted:
     """A SUMO plant (nmfd.types.Plant) whose gateways are painted with every command."""
 
     def __init__(self, plant: SumoPlant, network: RegionalModel):
+        """plant: started with a window that has the marks of `marked`; network: whose bounds u has"""
         self._plant, self._network = plant, network
         self._marked = marked(plant.city)
 
     def reset(self, seed: int) -> State:
+        """As the plant does."""
         state = self._plant.reset(seed)
         leaks = set(self._plant.leaks())
         self._controlled = {mark: gateway for mark, gateway in self._marked.items() if gateway not in leaks}
         return state
 
     def step(self, controls: Controls) -> State:
+        """Paint the gateways that a command reaches, then simulate a control interval."""
         low, high = self._network.u_min, self._network.u_max
         self._plant.session.paint({
             mark: colour((controls.perimeter[g.source, g.target] - low) / (high - low))
@@ -111,9 +115,11 @@ class Painted:
         return self._plant.step(controls)
 
     def observe(self) -> Observation | None:
+        """As the plant does."""
         return self._plant.observe()
 
     def close(self) -> None:
+        """As the plant does."""
         self._plant.close()
 
 
@@ -133,18 +139,18 @@ def marked(city: City) -> dict[str, Gateway]:
     return {f"gateway{n}": gateway for n, gateway in enumerate(first.values())}
 
 
-def extent(shapes: Sequence[np.ndarray]) -> float:
+def extent(shapes: Sequence[Points]) -> float:
     """Of the map, the longer side [m]."""
     return float(np.ptp(np.concatenate(shapes), axis=0).max())
 
 
-def view_xml(shapes: Sequence[np.ndarray], delay: float) -> str:
+def view_xml(shapes: Sequence[Points], delay: float) -> str:
     """sumo-gui's settings: vehicles in the colour of their speed, larger than they are in a large city."""
     size = extent(shapes)
     return VIEW.format(delay=delay, vehicles=min(max(size / 500.0, 1.0), 10.0), marks=MARK * size / POI_RADIUS)
 
 
-def layers_xml(city: City, shapes: Sequence[np.ndarray]) -> str:
+def layers_xml(city: City, shapes: Sequence[Points]) -> str:
     """An additional file: a band under every edge in the colour of its region, and a grey mark where an edge ends at a
     boundary. shapes: of the edges, (n, 2) [m]."""
     width, lines_of = BAND * extent(shapes), dict(zip(city.edges, shapes, strict=True))

@@ -67,22 +67,29 @@ class Recipe:
     streets: list[tuple[str, str]]
 
 
+def network_folder(network: RegionalModel) -> Path:
+    """Where `network` was loaded from. Raises InputError for one that was not loaded."""
+    if network.folder is None:
+        raise InputError(f"network {network.name}: was not loaded from a folder; load it with load_network")
+    return network.folder
+
+
 def ensure_built(network: RegionalModel) -> SumoFiles:
     """The SUMO files of `network`, built first if they are missing or the recipe has changed.
 
     Raises InputError if network.toml has no [sumo] table, a key of it or a file it names is wrong, or netconvert fails.
     """
-    if network.folder is None:
-        raise InputError(f"network {network.name}: was not loaded from a folder; load it with load_network")
-    path = network.folder / "network.toml"
+    folder = network_folder(network)
+    path = folder / "network.toml"
     content = config.read(path)
     if "sumo" not in content:
         raise InputError(
             f'{path}: sumo: missing; this network has no city to simulate: add [sumo] with recipe = "city.toml"')
     table = config.checked(CityTable, content["sumo"], path, "sumo.")
     if table.recipe is not None:
-        return _built(network.folder / table.recipe, network)
-    files = SumoFiles(net_file=network.folder / table.net, regions_csv=network.folder / table.regions)
+        return _built(folder / table.recipe, network)
+    assert table.net is not None and table.regions is not None  # CityTable takes no table without either
+    files = SumoFiles(net_file=folder / table.net, regions_csv=folder / table.regions)
     for key, file in (("net", files.net_file), ("regions", files.regions_csv)):
         if not file.is_file():
             raise config.error(path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one")
@@ -237,7 +244,7 @@ def _into(turn: str, lanes: int, target_lanes: int) -> list[range]:
     return [range(target_lanes)]
 
 
-def _row(tag: str, **attributes) -> str:
+def _row(tag: str, **attributes: str | float) -> str:
     return f"  <{tag} {' '.join(f'{key}={quoteattr(str(value))}' for key, value in attributes.items())}/>\n"
 
 

@@ -3,13 +3,15 @@
 import csv
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
-from cosim.sumo.xml_files import BROKEN, opened
+from cosim.sumo.arrays import PerEdge, Points
+from cosim.sumo.xml_files import BROKEN, attribute, opened
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
 
@@ -136,23 +138,24 @@ def check_adjacency(city: City, network: RegionalModel) -> None:
             f"remove it, add no_way_to = [{h}], or change the regions of edges")
 
 
-def edge_shapes(city: City) -> list[np.ndarray]:
+def edge_shapes(city: City) -> list[Points]:
     """(n, 2) [m] for every edge of the city: its line on the map, midway between its outermost lanes."""
-    shapes: dict[str, np.ndarray] = {}
+    shapes: dict[str, Points] = {}
     with opened(city.net_file) as stream:
         for _, element in ElementTree.iterparse(stream):
             if element.tag == "edge":
                 lanes = [
-                    np.array([point.split(",")[:2] for point in lane.get("shape").split()], dtype=float)
+                    np.array([point.split(",")[:2] for point in attribute(lane, "shape").split()], dtype=float)
                     for lane in element.iter("lane") if for_cars(lane)]
                 if lanes:
                     same = len(lanes[0]) == len(lanes[-1])
-                    shapes[element.get("id")] = (lanes[0] + lanes[-1]) / 2 if same else lanes[0]
+                    shapes[attribute(element, "id")] = (lanes[0] + lanes[-1]) / 2 if same else lanes[0]
                 element.clear()
     return [shapes[edge] for edge in city.edges]
 
 
-def _read_net(path: Path):
+def _read_net(path: Path) -> tuple[
+        dict[str, list[tuple[float, float, str]]], set[tuple[str, int]], dict[str, float], list[_Connection]]:
     """(edge -> [(length, speed, id) of each car lane], the car lanes, internal edge -> free-flow time [s], links)."""
     cars: set[tuple[str, int]] = set()
     lanes_of: dict[str, list[tuple[float, float, str]]] = {}
@@ -162,21 +165,22 @@ def _read_net(path: Path):
         with opened(path) as stream:
             for _, element in ElementTree.iterparse(stream):
                 if element.tag == "edge":
-                    lanes = [(size(lane, "length"), size(lane, "speed"), lane.attrib["id"])
+                    lanes = [(size(lane, "length"), size(lane, "speed"), attribute(lane, "id"))
                              for lane in element.iter("lane") if for_cars(lane)]
                     if element.get("function", "normal") in ("normal", "connector"):
-                        lanes_of[element.attrib["id"]] = lanes
-                        cars |= {(element.get("id"), int(lane.get("index")))
+                        edge = attribute(element, "id")
+                        lanes_of[edge] = lanes
+                        cars |= {(edge, int(attribute(lane, "index")))
                                  for lane in element.iter("lane") if for_cars(lane)}
                     else:
-                        internal[element.attrib["id"]] = max(
+                        internal[attribute(element, "id")] = max(
                             (length / speed for length, speed, _ in lanes), default=0.0)
                     element.clear()
                 elif element.tag == "connection":
                     connections.append(_Connection(
-                        element.attrib["from"], element.attrib["to"], element.get("via"), element.get("tl"),
-                        int(element.get("linkIndex", -1)), int(element.get("fromLane")),
-                        int(element.get("toLane"))))
+                        attribute(element, "from"), attribute(element, "to"), element.get("via"), element.get("tl"),
+                        int(element.get("linkIndex", -1)), int(attribute(element, "fromLane")),
+                        int(attribute(element, "toLane"))))
                     element.clear()
                 elif element.tag in ("junction", "tlLogic"):
                     element.clear()
@@ -194,7 +198,7 @@ def _read_net(path: Path):
 
 def size(lane: ElementTree.Element, name: str) -> float:
     """The length [m] or speed [m/s] of a <lane>; ValueError unless it is above 0 and finite."""
-    value = float(lane.attrib[name])
+    value = float(attribute(lane, name))
     if not 0.0 < value < math.inf:
         raise ValueError(f"lane {lane.get('id')}: {name}: expected a number above 0, got {value:g} instead")
     return value
@@ -202,8 +206,8 @@ def size(lane: ElementTree.Element, name: str) -> float:
 
 def for_cars(lane: ElementTree.Element) -> bool:
     """Whether cars may use a <lane>."""
-    if lane.get("allow") is not None:
-        return bool({"all", "passenger"} & set(lane.get("allow").split()))
+    if (allowed := lane.get("allow")) is not None:
+        return bool({"all", "passenger"} & set(allowed.split()))
     return not {"all", "passenger"} & set(lane.get("disallow", "").split())
 
 
@@ -230,7 +234,9 @@ def _read_regions(path: Path, regions: int) -> dict[str, int]:
     return region_of
 
 
-def _internal_regions(connections, region_of: dict[str, int], internal: dict[str, float]) -> dict[str, int]:
+def _internal_regions(
+    connections: Sequence[_Connection], region_of: Mapping[str, int], internal: Mapping[str, float],
+) -> dict[str, int]:
     """Internal edge -> region of the edge it leads to; crossings and walking areas, without cars, that of any edge of
     their junction."""
     regions: dict[str, int] = {}
@@ -249,7 +255,7 @@ def _internal_regions(connections, region_of: dict[str, int], internal: dict[str
 
 
 def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gateway, ...]:
-    movements: dict[tuple, list[_Connection]] = {}
+    movements: dict[tuple[int, int, str, str], list[_Connection]] = {}
     onward: dict[tuple[str, int], set[str]] = {}
     for link in links:
         onward.setdefault((link.source, link.lane), set()).add(link.target)
@@ -274,12 +280,14 @@ def gateway_movements(city: City) -> dict[str, dict[int, tuple[int, int]]]:
     return movements
 
 
-def edge_room(city: City) -> np.ndarray:
+def edge_room(city: City) -> PerEdge:
     """(E,) [veh]: how many stand on each edge at JAM_SPACING."""
     return np.array([max(city.lanes[edge] * city.length[edge] / JAM_SPACING, 1.0) for edge in city.edges])
 
 
-def gateway_room_taken(edge_vehicles: np.ndarray, city: City) -> np.ndarray:
+def gateway_room_taken(
+    edge_vehicles: Float[np.ndarray, "*intervals E"], city: City,
+) -> Float[np.ndarray, "*intervals G"]:
     """(..., G) [-]: the share of the room on the edge before each gateway that edge_vehicles (..., E) [veh] take."""
     index = {edge: n for n, edge in enumerate(city.edges)}
     before = [index[gateway.from_edge] for gateway in city.gateways]

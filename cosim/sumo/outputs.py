@@ -1,7 +1,7 @@
 """SUMO's own output files of a run, on request: for tools that read them, beside what is recorded here."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -23,7 +23,8 @@ def parse(text: str) -> tuple[str, ...]:
     return kinds
 
 
-def check(kinds) -> None:
+def check(kinds: Iterable[str]) -> None:
+    """InputError for a kind that there is not."""
     for kind in kinds:
         if kind not in KINDS:
             raise InputError(f"--sumo-output: {kind!r} is unknown; choose from {', '.join(KINDS)}, separated by commas")

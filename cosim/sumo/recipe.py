@@ -1,6 +1,6 @@
 """The table [sumo] of network.toml, and the recipe of a city (city.toml) that it may name, declared."""
 
-from typing import Annotated
+from typing import Annotated, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -15,7 +15,7 @@ class CityTable(Settings):
     regions: Text | None = setting("with net: csv with the columns edge, region", None)
 
     @model_validator(mode="after")
-    def _one_or_the_other(self):
+    def _one_or_the_other(self) -> Self:
         given = self.model_fields_set
         if self.recipe is not None and len(given) > 1:
             raise Problem("recipe", "a city has a recipe, or net and regions; remove one of them")
@@ -60,7 +60,7 @@ class OuterTable(Streets):
         return [line.split() for line in self.regions.splitlines() if line.strip()]
 
     @model_validator(mode="after")
-    def _fits_the_lines(self):
+    def _fits_the_lines(self) -> Self:
         if [len(row) for row in self.picture] != [len(self.x)] * len(self.y):
             raise Problem(
                 "regions", f"expected {len(self.y)} rows of {len(self.x)} regions or dots; correct it")

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from cosim.sumo.arrays import PerTrip
 from cosim.sumo.net import City
-from cosim.sumo.xml_files import read_xml
+from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.errors import InputError
 from nmfd.runs import files
 
@@ -25,7 +26,7 @@ BOUND = frozenset({
 class RecordedTrips:
     """N vehicles or trips. depart: (N,) [s]; elements: their XML, without anything that another one repeats."""
 
-    depart: np.ndarray
+    depart: PerTrip
     elements: tuple[ElementTree.Element, ...]
 
 
@@ -81,13 +82,14 @@ def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
     for path in paths:
         root = read_xml(path)
         for route in root.iter("route"):
-            if route.get("id") and route.get("edges"):
-                found[route.get("id")] = tuple(route.get("edges").split())
+            name, edges = route.get("id"), route.get("edges")
+            if name and edges:
+                found[name] = tuple(edges.split())
         for distribution in root.iter("routeDistribution"):
-            routes = [tuple(r.get("edges").split()) for r in distribution.iter("route") if r.get("edges")]
+            routes = [tuple(edges.split()) for r in distribution.iter("route") if (edges := r.get("edges"))]
             routes += [found[name] for name in distribution.get("routes", "").split() if name in found]
-            if routes:
-                found[distribution.get("id")] = routes[0]
+            if routes and (name := distribution.get("id")):
+                found[name] = routes[0]
     return found
 
 
@@ -105,10 +107,11 @@ def draw(
     chosen = np.full(count, int(factor))
     chosen[rng.permutation(count)[: round((factor - int(factor)) * count)]] += 1
     shifts = rng.uniform(-jitter, jitter, size=(max(int(chosen.max(initial=0)), 1), count))
-    taken = {element.get("id") for element in originals.elements}
+    names = [attribute(element, "id") for element in originals.elements]
+    taken = set(names)
     drawn = []
     for n, times in enumerate(chosen):
-        name = originals.elements[n].get("id")
+        name = names[n]
         for copy in range(times):
             depart = max(float(originals.depart[n] + shifts[copy, n]), min(begin, float(originals.depart[n])))
             drawn.append((round(depart, 2), n, _copy(name, copy, taken) if copy else name))

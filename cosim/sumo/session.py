@@ -113,6 +113,7 @@ class Session:
         self.loop_occupancy = sumo.inductionloop.getLastStepOccupancy
 
     def close(self) -> None:
+        """End the simulation, which completes SUMO's own outputs; a second time it does nothing."""
         if Session._open:
             Session._open = False
             with suppress(*LOST):  # the window may be gone
@@ -133,18 +134,23 @@ class Session:
     # Vehicles: what happened in the last step.
 
     def loaded(self) -> tuple[str, ...]:
+        """Read from the route files, to depart then or later."""
         return self._sumo.simulation.getLoadedIDList()
 
     def departed(self) -> tuple[str, ...]:
+        """Inserted into the network."""
         return self._sumo.simulation.getDepartedIDList()
 
     def arrived(self) -> tuple[str, ...]:
+        """At the end of their trips, or given up by SUMO."""
         return self._sumo.simulation.getArrivedIDList()
 
     def started_teleport(self) -> tuple[str, ...]:
+        """Taken off the road, to be moved on."""
         return self._sumo.simulation.getStartingTeleportIDList()
 
     def ended_teleport(self) -> tuple[str, ...]:
+        """Back on the road, or gone for good."""
         return self._sumo.simulation.getEndingTeleportIDList()
 
     # Vehicles: the present state.
@@ -176,6 +182,7 @@ class Session:
         return self._sumo.vehicle.getRouteIndex(vehicle)
 
     def emission_class(self, vehicle_type: str) -> str:
+        """Of SUMO's emission model, as HBEFA4/PC_petrol_Euro-4."""
         return self._sumo.vehicletype.getEmissionClass(vehicle_type)
 
     def set_route(self, vehicle: str, edges: list[str]) -> bool:
@@ -207,9 +214,11 @@ class Session:
         raise RuntimeError(f"signal {signal} has no programme {active}")
 
     def signals(self) -> tuple[str, ...]:
+        """All of the network."""
         return self._sumo.trafficlight.getIDList()
 
     def signal_state(self, signal: str) -> str:
+        """What it shows now, a character per link."""
         return self._sumo.trafficlight.getRedYellowGreenState(signal)
 
     def set_signal_state(self, signal: str, state: str) -> bool:

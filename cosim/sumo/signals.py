@@ -8,7 +8,7 @@ from xml.sax.saxutils import quoteattr
 
 from cosim.sumo.net import City
 from cosim.sumo.session import Phase
-from cosim.sumo.xml_files import BROKEN, read_xml
+from cosim.sumo.xml_files import BROKEN, attribute, read_xml
 from nmfd.errors import InputError
 from nmfd.runs import files
 
@@ -41,10 +41,12 @@ class Signal:
 
     @property
     def stages(self) -> tuple[int, ...]:
+        """The numbers of the phases that are stages."""
         return tuple(n for n, phase in enumerate(self.phases) if is_stage(phase.state))
 
 
 def is_stage(state: str) -> bool:
+    """Whether a phase of this state is green for somebody and yellow for nobody."""
     return bool(GREEN & set(state)) and "y" not in state
 
 
@@ -65,12 +67,16 @@ def _signals(city: City, additional: Iterable[Path]) -> tuple[list[Signal], list
     root = read_xml(city.net_file)
     links: dict[str, list[Link]] = {}
     for connection in root.iter("connection"):
-        ends = connection.get("from"), connection.get("to")
-        if connection.get("tl") is not None and set(ends) <= city.lanes.keys():
-            links.setdefault(connection.get("tl"), []).append(Link(
-                index=int(connection.get("linkIndex")), from_edge=ends[0], lane=int(connection.get("fromLane")),
-                to_edge=ends[1], turn=connection.get("dir", "s").lower()))
-    logics = {logic.get("id"): logic for file in (root, *map(read_xml, additional)) for logic in file.iter("tlLogic")}
+        source, target = attribute(connection, "from"), attribute(connection, "to")
+        signal = connection.get("tl")
+        if signal is not None and source in city.lanes and target in city.lanes:
+            links.setdefault(signal, []).append(Link(
+                index=int(attribute(connection, "linkIndex")), from_edge=source,
+                lane=int(attribute(connection, "fromLane")), to_edge=target,
+                turn=connection.get("dir", "s").lower()))
+    logics = {
+        attribute(logic, "id"): logic
+        for file in (root, *map(read_xml, additional)) for logic in file.iter("tlLogic")}
     simple, others = [], []
     for name, logic in logics.items():
         found = _simple(logic, tuple(links.get(name, ())))
@@ -85,8 +91,8 @@ def _simple(logic: ElementTree.Element, links: tuple[Link, ...]) -> Signal | Non
     rows = list(logic.iter("phase"))
     if logic.get("type", "static") != "static" or any(row.get("next") for row in rows) or not links:
         return None
-    phases = tuple(Phase(duration=float(row.get("duration")), state=row.get("state")) for row in rows)
-    signal = Signal(id=logic.get("id"), offset=float(logic.get("offset", 0.0)), phases=phases, links=links)
+    phases = tuple(Phase(duration=float(attribute(row, "duration")), state=attribute(row, "state")) for row in rows)
+    signal = Signal(id=attribute(logic, "id"), offset=float(logic.get("offset", 0.0)), phases=phases, links=links)
     plain = set("".join(phase.state for phase in phases)) <= set("Ggyr")
     return signal if plain and len(signal.stages) > 1 else None
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cosim.sumo.outputs import unfinished
-from cosim.sumo.xml_files import BROKEN
+from cosim.sumo.xml_files import BROKEN, attribute
 
 CLASS = "HBEFA4/PC_petrol_Euro-4"
 MILLIGRAMS = 1e-6  # kg
@@ -53,12 +53,12 @@ def _read(path: Path) -> TripFacts:
     for _, element in ElementTree.iterparse(path):
         if element.tag == "tripinfo":
             trips += 1
-            completed += float(element.get("arrival")) >= 0
-            travel_time += max(float(element.get("duration")), 0.0)
-            departure_delay += float(element.get("departDelay"))
+            completed += float(attribute(element, "arrival")) >= 0
+            travel_time += max(float(attribute(element, "duration")), 0.0)
+            departure_delay += float(attribute(element, "departDelay"))
             for emissions in element.iter("emissions"):
-                co2 += MILLIGRAMS * float(emissions.get("CO2_abs"))
-                fuel += MILLIGRAMS * float(emissions.get("fuel_abs"))
+                co2 += MILLIGRAMS * float(attribute(emissions, "CO2_abs"))
+                fuel += MILLIGRAMS * float(attribute(emissions, "fuel_abs"))
             element.clear()
     return TripFacts(
         trips=trips, completed=completed, travel_time=travel_time, departure_delay=departure_delay, co2=co2, fuel=fuel)

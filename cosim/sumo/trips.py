@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -10,7 +11,9 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from cosim.sumo.arrays import PerTrip, TripNumbers
 from cosim.sumo.net import City
+from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
 
 STREAM = 7101       # keeps the random numbers of trips apart from others of the same seed
@@ -29,14 +32,14 @@ class Trips:
     arrival: (N,) [m], position on the last edge at which the trip ends
     """
 
-    depart: np.ndarray
-    origin: np.ndarray
-    destination: np.ndarray
+    depart: PerTrip
+    origin: TripNumbers
+    destination: TripNumbers
     routes: tuple[tuple[str, ...], ...]
-    arrival: np.ndarray
+    arrival: PerTrip
 
 
-def write_trips(city: City, demand: np.ndarray, step: float, seed: int, path: Path) -> int:
+def write_trips(city: City, demand: PairsOverTime, step: float, seed: int, path: Path) -> int:
     """Write the trips of `demand` (T, R, R) [veh/s], intervals of `step` [s], to a SUMO route file; returns how many.
 
     The vehicles are v0, v1, ... by departure; the same seed gives the same bytes.
@@ -57,7 +60,7 @@ def write_trips(city: City, demand: np.ndarray, step: float, seed: int, path: Pa
     return len(trips.routes)
 
 
-def make_trips(city: City, demand: np.ndarray, step: float, seed: int) -> Trips:
+def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Trips:
     """Individual trips of `demand` (T, R, R) [veh/s], intervals of `step` [s].
 
     Every pair of regions gets its number of vehicles to within one, at the times at which its cumulated demand passes
@@ -94,7 +97,9 @@ def make_trips(city: City, demand: np.ndarray, step: float, seed: int) -> Trips:
                  arrival=lengths * (0.1 + 0.8 * positions))
 
 
-def _departures(demand: np.ndarray, step: float, rng) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _departures(
+    demand: PairsOverTime, step: float, rng: np.random.Generator,
+) -> tuple[PerTrip, TripNumbers, TripNumbers]:
     """(times, origins, destinations), sorted by time, rounded to 0.01 s."""
     clock = step * np.arange(len(demand) + 1)
     times, origins, destinations = [], [], []
@@ -123,7 +128,7 @@ def _ends(city: City, region: int, *, departing: bool) -> tuple[list[str], np.nd
     """
     edges = [edge for edge in city.edges if city.region_of[edge] == region]
     before = _predecessors(city)
-    onward = city.successors if departing else before
+    onward: Mapping[str, Sequence[str]] = city.successors if departing else before
     good = [edge for edge in edges if _stays(city, edge, onward) and city.length[edge] >= SHORT
             and not _is_pocket(city, edge, before[edge])]
     chosen = good if len(good) >= 2 else edges
@@ -139,7 +144,7 @@ def _predecessors(city: City) -> dict[str, list[str]]:
     return before
 
 
-def _stays(city: City, edge: str, onward) -> bool:
+def _stays(city: City, edge: str, onward: Mapping[str, Sequence[str]]) -> bool:
     """Whether some way on from the edge stays in its region; a dead end does not."""
     seen = {edge}
     here = edge
@@ -165,7 +170,8 @@ def _draw(ends: tuple[list[str], np.ndarray], uniform: float) -> str:
 class Ways:
     """Shortest paths over the edges as nodes: an arc costs the junction and the edge after it."""
 
-    def __init__(self, city: City, rng):
+    def __init__(self, city: City, rng: np.random.Generator):
+        """rng: draws how each group of drivers sees the travel times"""
         self.city = city
         number = {edge: n for n, edge in enumerate(city.edges)}
         arcs = [(number[a], number[b], city.turn_time[a, b]) for a, after in city.successors.items() for b in after]
@@ -174,7 +180,7 @@ class Ways:
         self._time = np.array([city.length[edge] / city.speed[edge] for edge in city.edges])
         self._noise = np.exp(CLASS_SPREAD * rng.standard_normal((DRIVER_CLASSES, len(city.edges))))
 
-    def routes(self, first: np.ndarray, last: np.ndarray, tastes: np.ndarray) -> list[tuple[str, ...]]:
+    def routes(self, first: TripNumbers, last: TripNumbers, tastes: TripNumbers) -> list[tuple[str, ...]]:
         """The route of every trip; empty where there is none."""
         found: list[tuple[str, ...]] = [()] * len(first)
         count = len(self.city.edges)

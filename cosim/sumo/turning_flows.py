@@ -10,13 +10,14 @@ import numpy as np
 from cosim.sumo.net import City
 from cosim.sumo.recorded_trips import RecordedTrips
 from cosim.sumo.trips import DRIVER_CLASSES, Ways, make_trips
+from nmfd.arrays import PairsOverTime
 
 # Of the trips that plans are made for. No seeds of an evaluation: a plan knows the demand, not the day's drivers.
 PLANNING_SEEDS = (778_001, 778_002, 778_003, 778_004)
 PEAK = 900.0  # s; the Highway Capacity Manual designs for the busiest quarter of the peak hour
 
 
-def turning_flows(city: City, demand: np.ndarray, step: float) -> Mapping[tuple[str, str], float]:
+def turning_flows(city: City, demand: PairsOverTime, step: float) -> Mapping[tuple[str, str], float]:
     """(edge, next edge) -> flow [veh/s] of the trips that depart in the busiest quarter of an hour of `demand`
     (T, R, R) [veh/s], or in all of it where that is shorter; on static routes, without delays, the mean of several
     planning seeds. Movements that nobody uses are missing."""
@@ -64,6 +65,6 @@ def _edges(element: ElementTree.Element, routes: Mapping[str, Sequence[str]]) ->
     route = element.find("route")
     if route is not None:
         return route.get("edges", "").split(), True
-    if element.get("route"):
-        return routes.get(element.get("route"), ()), True
+    if name := element.get("route"):
+        return routes.get(name, ()), True
     return [edge for key in ("from", "via", "to") for edge in element.get(key, "").split()], False

@@ -1,6 +1,7 @@
 """SUMO's XML files: opening them, gzipped or not, all that reading a broken one can raise, naming several to SUMO."""
 
 import gzip
+import io
 import xml.etree.ElementTree as ElementTree
 import zlib
 from collections.abc import Sequence
@@ -13,9 +14,30 @@ BROKEN = (OSError, EOFError, zlib.error, ElementTree.ParseError, LookupError, Ty
 DEEPEST = 20  # of files that include each other
 
 
-def opened(path: Path):
-    """A binary stream of a file, unzipped if its name ends in .gz."""
-    return (gzip.open if path.suffix == ".gz" else open)(path, "rb")
+def opened(path: Path) -> io.BufferedIOBase:
+    """A binary stream of a file, unzipped if its name ends in .gz. Raises one of BROKEN."""
+    return gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb")
+
+
+class Missing(ValueError):
+    """An XML element without something that it must have."""
+
+
+def attribute(element: ElementTree.Element, name: str) -> str:
+    """The text of an attribute that must be there. Raises Missing, one of BROKEN, which names element and attribute:
+    whoever knows the file makes an InputError of it."""
+    value = element.get(name)
+    if value is None:
+        raise Missing(f"{element.tag} {element.get('id', '')}".rstrip() + f": {name}: missing")
+    return value
+
+
+def child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
+    """The first element `tag` directly below one that must have it. Raises Missing, one of BROKEN."""
+    found = element.find(tag)
+    if found is None:
+        raise Missing(f"{element.tag}: {tag}: missing")
+    return found
 
 
 def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:

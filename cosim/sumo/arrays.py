@@ -1,0 +1,23 @@
+"""The shapes of a city's arrays, for annotations, beside those of nmfd.arrays; units are said where they are used.
+
+E edges, G gateways, R regions, T control intervals, N trips. One letter is one number within a call or an object.
+Checked while testing (tests/conftest.py).
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Real
+
+PerEdge = Float[np.ndarray, " E"]
+EdgeMask = Bool[np.ndarray, " E"]
+EdgeNumbers = Int[np.ndarray, " E"]
+PerGateway = Float[np.ndarray, " G"]
+GatewayMask = Bool[np.ndarray, " G"]
+PerTrip = Float[np.ndarray, " N"]
+TripNumbers = Int[np.ndarray, " N"]
+Points = Float[np.ndarray, "_ 2"]  # of a line on the map [m], or samples of accumulation and outflow
+Series = Real[np.ndarray, " T"]
+RegionCounts = Real[np.ndarray, "T R"]
+PairCounts = Real[np.ndarray, "T R R"]
+TurnCounts = Real[np.ndarray, "T R R R"]
+EdgesOverTime = Float[np.ndarray, "T E"]
+GatewaysOverTime = Real[np.ndarray, "T G"]
