@@ -194,9 +194,10 @@ def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress: Progres
         return
 
     def tick(k: int, steps: int) -> None:
-        progress(k, steps, f"{todo[0].controller}, seed {todo[0].seed}")
+        if progress:
+            progress(k, steps, f"{todo[0].controller}, seed {todo[0].seed}")
 
-    yield todo[0], attempt(lambda task: simulate(task, tick if progress else None), todo[0])
+    yield todo[0], attempt(lambda task: simulate(task, tick), todo[0])
 
 
 def _reported(
