@@ -3,10 +3,8 @@
 from collections.abc import Callable
 from typing import Any, get_args
 
-from beartype import BeartypeConf, beartype
+from annotations import check
 from jaxtyping import AbstractArray
-
-checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 
 def arrays(function: Callable) -> Callable:
@@ -15,7 +13,7 @@ def arrays(function: Callable) -> Callable:
     if not kept:
         return function
     function.__annotations__ = kept
-    return checked(function)
+    return check(function)
 
 
 def _holds_arrays(hint: Any) -> bool:
