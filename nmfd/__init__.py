@@ -12,7 +12,7 @@ new-controller` writes a template). Names here are imported when they are first 
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from nmfd.api import benchmark, controller, load_scenario, run, train
@@ -41,7 +41,7 @@ __all__ = [
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'nmfd' has no attribute {name!r}")
     return getattr(import_module(f"nmfd.{_MODULE_OF[name]}"), name)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from nmfd import faults
+from nmfd.arrays import PerPair
 from nmfd.model.scenario import Scenario
 from nmfd.threads import one_thread
 from nmfd.types import Controller, Controls, Observation, Plant, State, Status, Trajectory
@@ -78,7 +79,7 @@ def noise_of(seed: int) -> np.random.Generator:
     return np.random.default_rng([seed, 0x6E6F6973])
 
 
-def noisy(state: State, noise: np.ndarray) -> Observation:
+def noisy(state: State, noise: PerPair) -> Observation:
     """The state as it is measured with `noise` (R, R) [veh] on the accumulation."""
     return Observation(
         step=state.step, time=state.time, accumulation=state.accumulation + noise, backlog=state.backlog)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from nmfd.arrays import PerPair
 from nmfd.errors import InputError, did_you_mean
 from nmfd.types import Controller, Controls, Observation, Status
 
@@ -37,6 +38,7 @@ class Fault:
     end: int = 10**9
 
     def active(self, k: int) -> bool:
+        """Whether it is there in control interval k."""
         return self.begin <= k < self.end
 
 
@@ -148,7 +150,7 @@ class Supervised:
     Controls that are no numbers are replaced by the open perimeter, without route guidance.
     """
 
-    def __init__(self, controller: Controller, faults: Sequence[Fault], opened: np.ndarray):
+    def __init__(self, controller: Controller, faults: Sequence[Fault], opened: PerPair):
         """opened: (R, R) [-], the perimeter that is taken instead"""
         self.name, self._controller, self._opened = controller.name, controller, opened
         self._faults = [fault for fault in faults if fault.kind in COMPUTING]

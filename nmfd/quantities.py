@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 
-def quantity(*dimensions: str, unit: str, text: str, attributes: Mapping | None = None, **options) -> Any:
+def quantity(*dimensions: str, unit: str, text: str, attributes: Mapping | None = None, **options: Any) -> Any:
     """A dataclass field that holds an array with these named axes; options: of dataclasses.field.
 
     unit: "" of texts; attributes: more of them, for the file

@@ -2,15 +2,16 @@
 
 from dataclasses import dataclass
 from enum import Flag
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
+from nmfd.arrays import Cumulative, Flags, Intervals, PairsOverTime, PerPair, PerTurn, StatesOverTime, TurnsOverTime
 from nmfd.quantities import quantity, variables
 
 if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
+    import pandas
+    import xarray
 
 
 class Status(Flag):
@@ -47,8 +48,8 @@ class State:
 
     step: int
     time: float
-    accumulation: np.ndarray
-    backlog: np.ndarray
+    accumulation: PerPair
+    backlog: PerPair
     completed: float
     problem: str = ""
 
@@ -64,8 +65,8 @@ class Observation:
 
     step: int
     time: float
-    accumulation: np.ndarray
-    backlog: np.ndarray
+    accumulation: PerPair
+    backlog: PerPair
 
     def copy(self) -> "Observation":
         """The same with arrays of its own."""
@@ -84,12 +85,13 @@ class Controls:
     status: OK, or what these controls are instead; note: the same in words, "" if OK
     """
 
-    perimeter: np.ndarray
-    splits: np.ndarray | None
+    perimeter: PerPair
+    splits: PerTurn | None
     status: Status = Status.OK
     note: str = ""
 
 
+@runtime_checkable
 class Plant(Protocol):
     """A city, regional or microscopic. `step` is one control interval."""
 
@@ -106,6 +108,7 @@ class Plant(Protocol):
         """Release what the plant holds; nothing may be called afterwards but `reset`."""
 
 
+@runtime_checkable
 class Controller(Protocol):
     """Anything that turns observations into controls."""
 
@@ -134,22 +137,22 @@ class Trajectory:
     step: float
     estimated: bool
     wall_time: float
-    accumulation: np.ndarray = quantity("time", "region", "destination", unit="veh", text="vehicles inside")
-    backlog: np.ndarray = quantity("time", "region", "destination", unit="veh", text="vehicles waiting to enter")
-    completed: np.ndarray = quantity("time", unit="veh", text="trips ended, cumulative")
-    observed: np.ndarray = quantity(
+    accumulation: StatesOverTime = quantity("time", "region", "destination", unit="veh", text="vehicles inside")
+    backlog: StatesOverTime = quantity("time", "region", "destination", unit="veh", text="vehicles waiting to enter")
+    completed: Cumulative = quantity("time", unit="veh", text="trips ended, cumulative")
+    observed: StatesOverTime = quantity(
         "time", "region", "destination", unit="veh",
         text="vehicles inside as the controller was given them; the last as it would have been")
-    observed_backlog: np.ndarray = quantity(
+    observed_backlog: StatesOverTime = quantity(
         "time", "region", "destination", unit="veh", text="vehicles waiting to enter as the controller was given them")
-    perimeter: np.ndarray = quantity(
+    perimeter: PairsOverTime = quantity(
         "interval", "region", "next_region", unit="1",
         text="share of the desired transfer flow that may pass; 0 between regions that are not adjacent")
-    splits: np.ndarray = quantity(
+    splits: TurnsOverTime = quantity(
         "interval", "region", "next_region", "destination", unit="1",
         text="share of the vehicles that heads for the next region; nominal where there was no route guidance")
-    decision_time: np.ndarray = quantity("interval", unit="s", text="wall time of Controller.act; not in files")
-    status: np.ndarray = quantity(
+    decision_time: Intervals = quantity("interval", unit="s", text="wall time of Controller.act; not in files")
+    status: Flags = quantity(
         "interval", unit="1", text="what was not as it should be with the decision, 0 if nothing (nmfd.types.Status)",
         attributes={"flag_masks": [kind.value for kind in Status],
                     "flag_meanings": " ".join(str(kind.name).lower() for kind in Status)})
@@ -171,13 +174,13 @@ class Trajectory:
             "controller": self.controller, "plant": self.plant, "seed": self.seed, "step": self.step,
             "estimated": int(self.estimated)}
 
-    def to_dataset(self) -> "xr.Dataset":
+    def to_dataset(self) -> "xarray.Dataset":
         """Everything but `wall_time`, with named dimensions, times in seconds, and units as attributes."""
-        import xarray as xr  # with the pandas under it half a second of the start-up, which few commands need
+        import xarray  # with the pandas under it half a second of the start-up, which few commands need
 
-        return xr.Dataset(self.variables, attrs=self.labels)
+        return xarray.Dataset(self.variables, attrs=self.labels)
 
-    def to_frame(self) -> "pd.DataFrame":
+    def to_frame(self) -> "pandas.DataFrame":
         """The states as a table: one row per time and pair of regions, (T+1) R R rows.
 
         Columns controller, plant, seed; time_s; region, destination (x_ij: in region i, bound for j);
@@ -185,7 +188,7 @@ class Trajectory:
         """
         return self._table({"time": "time_s", "accumulation": "accumulation_veh", "backlog": "backlog_veh"})
 
-    def controls_frame(self) -> "pd.DataFrame":
+    def controls_frame(self) -> "pandas.DataFrame":
         """The perimeter controls as a table: one row per control interval and pair of regions, T R R rows.
 
         Columns controller, plant, seed; time_s, when the interval begins; region, next_region (u_ih: from i to h);
@@ -193,7 +196,7 @@ class Trajectory:
         """
         return self._table({"interval": "time_s", "perimeter": "perimeter"})
 
-    def _table(self, columns: dict[str, str]) -> "pd.DataFrame":
+    def _table(self, columns: dict[str, str]) -> "pandas.DataFrame":
         data = self.to_dataset()
         rows = data[[name for name in columns if name in data.data_vars]].to_dataframe().reset_index()
         for place, name in enumerate(("controller", "plant", "seed")):

@@ -5,17 +5,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from jaxtyping import install_import_hook
+from jaxtyping import config, install_import_hook
 from xdist.workermanage import NodeManager
 
 sys.dont_write_bytecode = False  # else every process rewrites the asserts of all files anew, for 6 s
 # Here and in the commands that tests call: workers must not fight for cores. Torch reads it when it is imported.
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-# What the annotations say of the shapes of arrays is checked at every call.
-install_import_hook(
-    ["cosim.evaluation", "cosim.importing", "cosim.plant", "cosim.report", "cosim.sumo.net", "cosim.sumo.trips"],
-    "array_checks.arrays")
-
+# Where arrays have shapes; of the other modules, many functions are called for every vehicle or line of a file.
+SHAPED = ["cosim.evaluation", "cosim.importing", "cosim.plant", "cosim.report", "cosim.sumo.net", "cosim.sumo.trips"]
 # Reasons for which a test may be skipped all the same; benchmarks run when they are asked for.
 ALLOWED = ("no GPU", "no real city", "--benchmark-skip active")
 
@@ -27,10 +24,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--may-skip", action="append", default=[*ALLOWED], metavar="REASON", help="nor does it fail for this reason")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Annotations are checked at every call, but where times are measured, and mutmut has wrapped every function."""
+    if not config.getoption("benchmark_only") and "MUTANT_UNDER_TEST" not in os.environ:
+        install_import_hook("nmfd", "annotations.check")
+        install_import_hook(SHAPED, "annotations.check_arrays")
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """The city that most tests drive is built once, before workers use and copy it."""
     if not hasattr(session.config, "workerinput") and not session.config.option.collectonly:
-        from cosim.sumo.build import ensure_built  # after the hook, as all imports of what it checks
+        from cosim.sumo.build import ensure_built  # not before annotations are checked
         from nmfd.model.regional_model import load_network
 
         ensure_built(load_network(Path(__file__).parents[1] / "networks" / "grid7"))
@@ -45,6 +49,12 @@ def _fail_if_skipped(report: pytest.TestReport | pytest.CollectReport, config: p
         reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
         if not any(allowed in reason for allowed in config.getoption("may_skip")):
             report.outcome, report.longrepr = "failed", f"--no-skips: {reason}"
+
+
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No check of annotations: for tests of what users are told who give something of a wrong type."""
+    monkeypatch.setattr(config, "jaxtyping_disable", True)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -102,6 +102,7 @@ def test_a_controller_and_a_plant_as_objects(tmp_path):
     ((Half(),), {"policy": "x.pt"}, "policy: x.pt: is for a controller by name"),
     ((3,), {}, "got 3 without reset"),
 ])
+@pytest.mark.usefixtures("unchecked")
 def test_mistakes_are_input_errors(tmp_path, arguments, options, expected):
     with pytest.raises(nmfd.InputError, match=re.escape(expected)):
         nmfd.run(tiny.write(tmp_path), *arguments, **options)

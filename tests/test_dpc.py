@@ -143,7 +143,7 @@ def test_a_policy_for_another_network_is_refused(tmp_path, scenario):
 def test_a_policy_of_the_other_kind_is_refused(tmp_path, scenario):
     path = saved(tmp_path / "p.pt", policy(guidance=False, network=scenario.network), scenario.network)
     with pytest.raises(InputError, match="dpc-pc policy, not dpc-pcrg") as caught:
-        dpc.load(path, scenario, guidance=True)
+        dpc.load(path, planning_model(scenario), guidance=True)
     one_line(caught, path)
 
 
@@ -183,7 +183,8 @@ def test_a_resumed_training_is_the_uninterrupted_one(tmp_path, scenario, monkeyp
     for name, tensor in weights(straight).items():
         assert torch.equal(tensor, weights(broken)[name]), name
     assert not list(tmp_path.glob("*.resume"))
-    assert dpc.load(broken, scenario, guidance=training.NAMES[controller]).name == controller.removesuffix("-robust")
+    loaded = dpc.load(broken, planning_model(scenario), guidance=training.NAMES[controller])
+    assert loaded.name == controller.removesuffix("-robust")
 
 
 def test_another_seed_is_another_policy(tmp_path, scenario):

@@ -1,6 +1,6 @@
 """Identification on runs whose truth is known: made by the regional model itself, under the probing controller."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,11 @@ def observe(scenario, seed, factor):
         accumulation=trajectory.accumulation, demand=demanded.demand[:demanded.steps],
         perimeter=trajectory.perimeter, splits=trajectory.splits,
         crossings=np.full((demanded.steps, 7, 7), 60.0))
+
+
+def first_of(run, intervals):
+    kept = {f.name: getattr(run, f.name)[:intervals] for f in fields(run)}
+    return Observed(**{**kept, "accumulation": run.accumulation[:intervals + 1]})
 
 
 @pytest.fixture(scope="module")
@@ -163,11 +168,10 @@ def test_the_sign_of_a_prediction_error(scenario, runs):
 
 @pytest.mark.parametrize("ahead, step, expected", [(600.0, 90.0, 7), (10.0, 90.0, 1), (90_000.0, 90.0, 120)])
 def test_intervals_within_a_time(runs, ahead, step, expected):
-    short = replace(runs[0], demand=runs[0].demand[:3])
+    short = first_of(runs[0], 3)
     assert identification.intervals_within(ahead, step, [*runs, short]) == expected
 
 
 def test_a_run_shorter_than_the_horizon_is_left_out(runs):
-    short = Observed(**{name: getattr(runs[0], name)[:4] for name in Observed.__dataclass_fields__})
-    short = replace(short, demand=short.demand[:3])
+    short = first_of(runs[0], 3)
     assert len(identification.windows([short, runs[0]], 5)[0]) == len(identification.windows(runs[:1], 5)[0])

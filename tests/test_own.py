@@ -129,6 +129,7 @@ def test_in_strategies(place, name, controller, options):
     (GOOD.replace("splits=None", "splits=np.ones((2, 2, 2))"), "splits[0, 0, 0]: expected 0 (no way), got 1 instead"),
     (GOOD.replace("return Controls(", "return dict("), "act: expected nmfd.Controls, got dict instead"),
 ])
+@pytest.mark.usefixtures("unchecked")
 def test_mistakes(place, source, expected):
     if source is not None:
         (place / "mine.py").write_text(source)

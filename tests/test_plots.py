@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from trajectories import trajectory
+from trajectories import made
 
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
@@ -28,8 +28,9 @@ def ax():
 def runs_of(scenario, *, plants=("nmfd",), controllers=("no-control",), seeds=(0,), hours=2.0):
     steps, regions = int(hours * 120), scenario.network.regions
     return [
-        replace(trajectory(controller, seed), plant=plant, accumulation=np.full((steps + 1, regions, regions), 10.0),
-                backlog=np.ones((steps + 1, regions, regions)))
+        made(controller=controller, plant=plant, seed=seed, step=30.0, completed=np.zeros(steps + 1),
+             accumulation=np.full((steps + 1, regions, regions), 10.0), backlog=np.ones((steps + 1, regions, regions)),
+             perimeter=np.zeros((steps, regions, regions)), splits=np.zeros((steps, regions, regions, regions)))
         for plant in plants for controller in controllers for seed in seeds]
 
 
@@ -42,7 +43,7 @@ def test_every_controller_has_its_own_colour():
 def test_optimal_band_is_within_ten_percent_of_the_maximum(scenario):
     mfd = scenario.network.mfds[0]
     low, high = plots.optimal_band(mfd)
-    assert mfd.outflow([low, high]) == pytest.approx(0.9 * mfd.capacity, rel=1e-3)
+    assert mfd.outflow(np.array([low, high])) == pytest.approx(0.9 * mfd.capacity, rel=1e-3)
     assert low < mfd.critical < high
 
 

@@ -220,6 +220,7 @@ class Terminal(io.StringIO):
         return True
 
 
+@pytest.mark.usefixtures("unchecked")  # a StringIO is no typing.TextIO
 def test_progress_is_shown_on_a_terminal_only_and_wiped():
     with progress_line("x", io.StringIO()) as show:
         assert show is None
@@ -241,6 +242,7 @@ def test_progress_line_fits_the_terminal():
     assert max(map(len, drawn)) < 30 and any("training" in line for line in drawn)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_progress_begins_again_with_another_total():
     """Studies count runs, then iterations: the remaining time is that of what is shown."""
     stream = Terminal()

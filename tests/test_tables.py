@@ -7,6 +7,7 @@ import pytest
 from made_up import rows_of
 
 from cosim.evaluation import statistics
+from nmfd.runs.tables import text_table
 
 
 def test_paired_interval_of_a_worked_example():
@@ -63,3 +64,12 @@ def test_tables_show_a_line_per_controller_and_the_teleports(rows, tmp_path):
     assert first.rstrip("| ").endswith("| 0") and "-49.5 ± " in first
     assert len(pd.read_csv(tmp_path / "runs.csv")) == len(rows)
     assert len(pd.read_csv(tmp_path / "evaluate.csv")) == 5
+
+
+def test_numbers_stand_to_the_right_and_captions_are_wrapped():
+    rows = [{"controller": "no-control", "TTS": "1.50e8 ± 2e5", "change": ""},
+            {"controller": "a", "TTS": "9e7", "change": "-1.0 %"}]
+    head, first, second, *caption = text_table(rows, "words " * 50 + "\n  more: " + "words " * 30).splitlines()
+    assert head == "controller           TTS  change" and first == "no-control  1.50e8 ± 2e5"
+    assert second == "a                    9e7  -1.0 %"
+    assert max(map(len, caption)) <= 120 and [line.startswith("  ") for line in caption] == [False] * 3 + [True] * 2

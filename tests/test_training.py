@@ -2,7 +2,7 @@
 
 import math
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ import torch
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc import rollout as rollout_module
 from nmfd.controllers.dpc import training
+from nmfd.controllers.dpc.options import RobustTraining
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.errors import RunFailed
@@ -46,13 +47,13 @@ def made(scenario, *, guidance=False):
 
 def test_every_setting_is_taken_over(scenario):
     wanted = replace(scenario, controller_options={"dpc-pc": CHOSEN})
-    assert asdict(training.settings(wanted, "dpc-pc")) == {**asdict(training.Training()), **CHOSEN}
+    assert training.settings(wanted, "dpc-pc").model_dump() == {**training.Training().model_dump(), **CHOSEN}
     assert training.settings(wanted, "dpc-pc", steps=7).steps == 7
     assert training.settings(wanted, "dpc-pc").levels == (0.75, 1.5)
     gate = replace(scenario, controller_options={"dpc-pc": {"from_gating": True}})
     assert training.settings(gate, "dpc-pc").from_gating
     assert training.settings(scenario, "dpc-pc") == training.Training()
-    assert training.settings(scenario, "dpc-pc-robust") == training.Training(noise=training.ROBUST_NOISE)
+    assert training.settings(scenario, "dpc-pc-robust") == RobustTraining()
 
 
 @pytest.mark.parametrize("key, value", [(key, value) for key, ends in BEYOND.items() for value in ends])

@@ -189,17 +189,12 @@ def _plain(chosen: Settings, scenario: Scenario) -> dict:
 
 def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress: Progress | None) -> Outcomes:
     """(task, Result or Failure); in this process, which reports every control interval, if one run is all there is."""
-    report = progress or (lambda done, total, note: None)
-    if len(todo) == 1 and not fresh:
-        def tick(k: int, steps: int) -> None:
-            report(k, steps, f"{todo[0].controller}, seed {todo[0].seed}")
-
-        yield todo[0], attempt(lambda task: simulate(task, tick), todo[0])
+    if len(todo) != 1 or fresh:
+        yield from _reported(lambda tasks: outcomes(simulate, tasks, workers, fresh=fresh), todo, progress)
         return
-    report(0, len(todo), "")
-    for done, (task, outcome) in enumerate(outcomes(simulate, todo, workers, fresh=fresh), start=1):
-        report(done, len(todo), f"last {label(task)}")
-        yield task, outcome
+    only = todo[0]
+    tick = None if progress is None else lambda k, steps: progress(k, steps, f"{only.controller}, seed {only.seed}")
+    yield only, attempt(lambda task: simulate(task, tick), only)
 
 
 def _reported(

@@ -14,7 +14,7 @@ import pandas as pd
 
 from nmfd.metrics import COUNTED
 from nmfd.runs import files
-from nmfd.runs.tables import text_table, wrapped
+from nmfd.runs.tables import markdown_table, text_table, wrapped
 from nmfd.studies.benchmark import REFERENCE, interval
 
 TTS = "total_time_spent_veh_s"
@@ -167,13 +167,9 @@ def markdown(table: pd.DataFrame, reference: str | None = None) -> str:
     """`statistics` as markdown."""
     parts = []
     for level, part in table.groupby("demand", sort=True):
-        parts += [f"## Demand times {level:g}", *(_markdown(t) for t in shown(part, reference))]
+        parts += [f"## Demand times {level:g}", *(
+            markdown_table(list(rows), rows.to_numpy()) for rows in shown(part, reference))]
     return "\n\n".join([*parts, CAPTION]) + "\n"
-
-
-def _markdown(table: pd.DataFrame) -> str:
-    lines = [list(table.columns), ["---"] * len(table.columns), *table.astype(str).values.tolist()]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def write_tables(folder: Path, rows: pd.DataFrame, reference: str | None = None) -> pd.DataFrame:

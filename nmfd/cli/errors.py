@@ -1,6 +1,8 @@
 """What the command lines `nmfd` and `cosim` share: every user error ends in one clear line and exit status 2."""
 
 import sys
+from collections.abc import Sequence
+from typing import Any, NoReturn
 
 import click
 
@@ -20,7 +22,11 @@ class Commands(click.Group):
     Without arguments the help is shown.
     """
 
-    def main(self, args=None, prog_name=None, **extra):  # type: ignore[override]
+    # Not click's signature: the parameters that it has besides these go through `extra`.
+    def main(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any,
+    ) -> NoReturn:
+        """Run the command that `args` name, and exit."""
         arguments = list(sys.argv[1:] if args is None else args) or ["--help"]
         extra["standalone_mode"] = False
         try:
@@ -34,7 +40,8 @@ class Commands(click.Group):
         # Outside its standalone mode click returns what the command returned, or an exit status.
         sys.exit(result if isinstance(result, int) else 0)
 
-    def invoke(self, ctx):
+    def invoke(self, ctx: click.Context) -> Any:
+        """As click does, but for Ctrl-C."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:  # before click sees it, which would print an empty line first

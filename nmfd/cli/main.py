@@ -119,8 +119,7 @@ def train(
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the policy; make it or choose another --out")
     default = compiled is None
-    if default:
-        compiled = chosen.steps >= training.WORTH_COMPILING
+    compiled = chosen.steps >= training.WORTH_COMPILING if compiled is None else compiled
     if compiled and not rollout.can_compile(device):
         if not default:
             raise InputError("--compile: does not work here, most likely for want of a C++ compiler; install g++ or "

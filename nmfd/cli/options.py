@@ -2,7 +2,9 @@
 
 import math
 import shlex
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -20,7 +22,8 @@ class Positive(click.FloatRange):
     def __init__(self, most: float, *, zero: bool = False):
         super().__init__(0.0, most, min_open=not zero)
 
-    def convert(self, value, param, ctx):
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number. A usage error for one out of the range."""
         number = super().convert(value, param, ctx)
         if math.isnan(number):
             self.fail(f"{value} is not in the range {self._describe_range()}.", param, ctx)
@@ -31,7 +34,7 @@ POSITIVE = Positive(1e6)
 LEVEL = Positive(10.0)  # of demand
 
 
-def fault_option(more: str = ""):
+def fault_option(more: str = "") -> Callable[[Callable], Callable]:
     """--fault, which may be repeated. more: kinds besides those of every plant"""
     kinds = ("frozen, delayed:N, missing:REGION, detectors:SHARE, off:FACTOR, solver-fails, solver-diverges, "
              "solver-late, ")
@@ -69,6 +72,7 @@ def policy_files(options: tuple[str, ...], names: list[str]) -> dict[str, Path]:
 
 
 def quoted(path: Path) -> str:
+    """`path` as a shell reads it."""
     return shlex.quote(str(path))
 
 

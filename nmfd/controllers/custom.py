@@ -12,10 +12,12 @@ import inspect
 import re
 import sys
 import traceback
+from collections.abc import Callable
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -41,9 +43,16 @@ def is_file(name: str) -> bool:
     return FILE_AND_CLASS.fullmatch(name) is not None
 
 
+def _file_and_class(name: str) -> tuple[Path, str]:
+    """The parts of a name that `is_file`."""
+    match = FILE_AND_CLASS.fullmatch(name)
+    assert match is not None
+    return Path(match["file"]), match["cls"]
+
+
 def check(name: str) -> None:
     """InputError unless there is the file of `name`, a controller that `is_file`; the file is not run."""
-    path = Path(FILE_AND_CLASS.fullmatch(name)["file"])
+    path, _ = _file_and_class(name)
     if not path.is_file():
         raise InputError(f"{path}: no such file for controller {name}; write one with: nmfd new-controller {path}")
 
@@ -53,7 +62,7 @@ def fingerprint(name: str) -> dict[str, object]:
     if not is_file(name):
         point = entry_points()[name]
         return {"entry_point": point.value, "package": f"{point.dist.name} {point.dist.version}" if point.dist else ""}
-    path = Path(FILE_AND_CLASS.fullmatch(name)["file"])
+    path, _ = _file_and_class(name)
     beside = [path.parent / file for file in getattr(_class(name), "files", ())]
     return {"source_hash": file_hash(path), **{
         f"{file.name}_hash": file_hash(file) if file.is_file() else None for file in beside}}
@@ -98,7 +107,7 @@ def make(name: str, scenario: Scenario) -> "OwnController":
 class OwnController:
     """A controller of the user's (nmfd.types.Controller) whose mistakes are InputErrors with file and line."""
 
-    def __init__(self, name: str, controller, network: RegionalModel):
+    def __init__(self, name: str, controller: Any, network: RegionalModel):
         self._where, self._controller, self._network = name, controller, network
         self.name = name
 
@@ -110,7 +119,7 @@ class OwnController:
             _guarded(self._where, "act", self._controller.act, observation), self._network, f"{self._where}: act")
 
 
-def checked(controls: Controls, network: RegionalModel, where: str) -> Controls:
+def checked(controls: object, network: RegionalModel, where: str) -> Controls:
     """`controls` as float64 and with rounding errors removed. InputError for another type, shape or range."""
     if not isinstance(controls, Controls):
         raise InputError(f"{where}: expected nmfd.Controls, got {type(controls).__name__} instead; "
@@ -147,7 +156,7 @@ def checked(controls: Controls, network: RegionalModel, where: str) -> Controls:
         note=str(controls.note))
 
 
-def _array(values, shape: tuple[int, ...], where: str) -> np.ndarray:
+def _array(values: object, shape: tuple[int, ...], where: str) -> np.ndarray:
     try:
         array = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
@@ -158,17 +167,17 @@ def _array(values, shape: tuple[int, ...], where: str) -> np.ndarray:
     return array
 
 
-def _class(name: str):
+def _class(name: str) -> Any:
     """The class, or whatever makes a controller, behind `name`."""
     if not is_file(name):
         return _guarded(name, "import", entry_points()[name].load)
     check(name)
-    match = FILE_AND_CLASS.fullmatch(name)
-    module = _module(Path(match["file"]), name)
-    found = getattr(module, match["cls"], None)
+    file, cls = _file_and_class(name)
+    module = _module(file, name)
+    found = getattr(module, cls, None)
     if found is None:
         there = [key for key, value in vars(module).items() if isinstance(value, type) and hasattr(value, "act")]
-        raise InputError(f"{match['file']}: has no class {match['cls']}; " + (
+        raise InputError(f"{file}: has no class {cls}; " + (
             f"choose from {', '.join(there)}" if there else "it has none with a method act: write one"))
     if not callable(found):
         raise InputError(f"{name}: expected a class, got {found!r} instead")
@@ -181,6 +190,7 @@ def _module(path: Path, name: str) -> ModuleType:
     key = "nmfd_own_" + hashlib.sha256(f"{path}{path.stat().st_mtime_ns}".encode()).hexdigest()[:16]
     if key not in sys.modules:
         spec = importlib.util.spec_from_file_location(key, path)
+        assert spec is not None and spec.loader is not None  # of a path that ends in .py
         module = importlib.util.module_from_spec(spec)
         if str(path.parent) not in sys.path:
             sys.path.append(str(path.parent))  # for what lies beside it
@@ -193,7 +203,7 @@ def _module(path: Path, name: str) -> ModuleType:
     return sys.modules[key]
 
 
-def _guarded(name: str, doing: str, function, *arguments):
+def _guarded(name: str, doing: str, function: Callable, *arguments: Any) -> Any:
     """`function(*arguments)`; whatever the user's code raises becomes an InputError with file and line."""
     try:
         return function(*arguments)
@@ -205,7 +215,7 @@ def _guarded(name: str, doing: str, function, *arguments):
         else:
             trace = traceback.extract_tb(error.__traceback__)
             # The last line of the user's own file, if the error came up deeper down.
-            own = str(Path(FILE_AND_CLASS.fullmatch(name)["file"]).resolve()) if is_file(name) else None
+            own = str(_file_and_class(name)[0].resolve()) if is_file(name) else None
             frame = next((f for f in reversed(trace) if f.filename == own), trace[-1])
             file, line = frame.filename, frame.lineno
         raise InputError(f"{file}:{line}: {name}: {doing}: {type(error).__name__}: {error}") from error

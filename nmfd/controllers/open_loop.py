@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nmfd.arrays import PairsOverTime, TurnsOverTime
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import atomic
@@ -25,8 +26,8 @@ class Plan:
     iterations: Adam steps done
     """
 
-    perimeter: np.ndarray
-    splits: np.ndarray | None
+    perimeter: PairsOverTime
+    splits: TurnsOverTime | None
     start: str
     totals: Mapping[str, float]
     iterations: int

@@ -16,6 +16,7 @@ class SetPoint(Options):
         "accumulation of each protected region to hold; without it, from the MFD", None, unit="veh")
 
     def misfit(self, planning: PlanningModel) -> Problem | None:
+        """Another number of set points than of protected regions."""
         count = len(planning.protected)  # without a protected region gating cannot be made, and is not made
         if not count or self.set_point is None or len(self.set_point) == count:
             return None

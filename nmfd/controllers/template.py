@@ -14,6 +14,8 @@ from nmfd import Controls, Observation, PlanningModel
 
 
 class MyController:
+    """Proportional gating of every region."""
+
     # The name of its table of options in scenario.toml, if it has one: [controllers.own.my-controller].
     name = "my-controller"
     # Files beside this one that the results depend on, such as weights: when they change, runs are done again.

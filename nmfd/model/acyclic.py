@@ -17,13 +17,22 @@ next region is taken and counted); the sum that translates back keeps o = j and 
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
+from nmfd.arrays import PerPair, PerRegion, PerTurn
 from nmfd.model.dynamics import SCHEMES
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 # Less than this share of theta left after removing h = g and h = o counts as nothing: what remains is then the
 # rounding of an optimiser or a softmax, and scaling it up to 1 would make a route of noise.
 LEAST_SHARE = 1e-6
+
+PerCell = Float[np.ndarray, " C"]
+PerMove = Float[np.ndarray, " M"]
+CellIndex = Int[np.ndarray, " C"]
+MoveIndex = Int[np.ndarray, " M"]
+CellMask = Bool[np.ndarray, " C"]
+MoveMask = Bool[np.ndarray, " M"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,23 +48,23 @@ class Acyclic:
     exit_rates: (C,) [-]; capacity: (R, R) [veh/s] under u = 1, or None; storage: (R,) [veh] or None
     """
 
-    origin: np.ndarray
-    previous: np.ndarray
-    region: np.ndarray
-    destination: np.ndarray
-    start: np.ndarray
-    move_from: np.ndarray
-    move_to: np.ndarray
-    move_next: np.ndarray
-    move_onward: np.ndarray
-    fallback: np.ndarray
-    a: np.ndarray
-    b: np.ndarray
-    c: np.ndarray
-    jam: np.ndarray
-    exit_rates: np.ndarray
-    capacity: np.ndarray | None
-    storage: np.ndarray | None
+    origin: CellIndex
+    previous: CellIndex
+    region: CellIndex
+    destination: CellIndex
+    start: Int[np.ndarray, "R R"]
+    move_from: MoveIndex
+    move_to: MoveIndex
+    move_next: MoveIndex
+    move_onward: MoveMask
+    fallback: CellIndex
+    a: PerRegion
+    b: PerRegion
+    c: PerRegion
+    jam: PerRegion
+    exit_rates: PerCell
+    capacity: PerPair | None
+    storage: PerRegion | None
 
 
 def build(network: RegionalModel) -> Acyclic:
@@ -66,7 +75,8 @@ def build(network: RegionalModel) -> Acyclic:
         for j in range(network.regions):
             cells[i, i, i, j] = len(cells)
     start = np.arange(network.regions**2).reshape(network.regions, network.regions)
-    queue, moves, fallback = list(cells), [], {}
+    queue, fallback = list(cells), {}
+    moves: list[tuple[int, int, int, bool]] = []
     for cell in queue:      # grows while it is walked
         o, g, i, j = cell
         if i == j:
@@ -95,7 +105,7 @@ def build(network: RegionalModel) -> Acyclic:
         **mfds)
 
 
-def shares(model: Acyclic, splits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def shares(model: Acyclic, splits: PerTurn) -> tuple[PerMove, CellMask]:
     """theta_ogihj of every move (M,) [-], and which cells are forced (C,) bool.
 
     splits: (R, R, R) [-], [i, h, j] = theta_ihj. A cell is forced if theta leaves it nothing but its origin and its
@@ -110,14 +120,14 @@ def shares(model: Acyclic, splits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return theta, forced
 
 
-def rate(model: Acyclic, x: np.ndarray) -> np.ndarray:
+def rate(model: Acyclic, x: PerCell) -> PerRegion:
     """q_i [1/s] (R,) of the state x (C,) [veh], with x_i the sum of all x_ogij in i."""
     accumulation = np.bincount(model.region, x, minlength=len(model.jam))
     body = np.minimum(accumulation, model.jam)
     return ((model.a * body + model.b) * body + model.c) * model.jam / np.maximum(accumulation, model.jam)
 
 
-def derivative(model: Acyclic, x, demand, perimeter, theta) -> np.ndarray:
+def derivative(model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, theta: PerMove) -> PerCell:
     """dx/dt (C,) [veh/s] of x (C,) [veh] under demand (R, R) [veh/s], perimeter (R, R) [-] and theta (M,) [-]."""
     leaving = model.exit_rates * rate(model, x)[model.region] * x
     passing = transfers(model, x, leaving, perimeter, theta)
@@ -128,7 +138,9 @@ def derivative(model: Acyclic, x, demand, perimeter, theta) -> np.ndarray:
     return change
 
 
-def transfers(model: Acyclic, x, leaving, perimeter, theta) -> np.ndarray:
+def transfers(
+    model: Acyclic, x: PerCell, leaving: PerCell, perimeter: PerPair, theta: PerMove,
+) -> PerMove:
     """The flow of every move (M,) [veh/s], of those `leaving` (C,) [veh/s]; capacities as in dynamics.passing."""
     wish, here = theta * leaving[model.move_from], model.region[model.move_from]
     if model.capacity is None:
@@ -140,12 +152,12 @@ def transfers(model: Acyclic, x, leaving, perimeter, theta) -> np.ndarray:
     return (1.0 + (wish_of_pair / limit) ** SHARPNESS)[here, model.move_next] ** (-1.0 / SHARPNESS) * wish
 
 
-def euler(model: Acyclic, x, demand, perimeter, theta, step: float) -> np.ndarray:
+def euler(model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, theta: PerMove, step: float) -> PerCell:
     """x after `step` [s] by forward Euler; keeps x >= 0 where step * q <= 1 and demand >= 0."""
     return x + step * derivative(model, x, demand, perimeter, theta)
 
 
-def rk4(model: Acyclic, x, demand, perimeter, theta, step: float) -> np.ndarray:
+def rk4(model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, theta: PerMove, step: float) -> PerCell:
     """x after `step` [s] by the classical fourth-order Runge-Kutta scheme."""
     k1 = derivative(model, x, demand, perimeter, theta)
     k2 = derivative(model, x + 0.5 * step * k1, demand, perimeter, theta)
@@ -157,7 +169,10 @@ def rk4(model: Acyclic, x, demand, perimeter, theta, step: float) -> np.ndarray:
 INTEGRATORS = {"euler": euler, "rk4": rk4}
 
 
-def advance(model: Acyclic, x, demand, perimeter, theta, step: float, *, integrator="euler", substeps=1) -> np.ndarray:
+def advance(
+    model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, theta: PerMove, step: float, *,
+    integrator: str = "euler", substeps: int = 1,
+) -> PerCell:
     """x after one control interval of `step` [s], in `substeps` equal steps under constant controls and demand."""
     for _ in range(substeps):
         x = INTEGRATORS[integrator](model, x, demand, perimeter, theta, step / substeps)
@@ -165,8 +180,9 @@ def advance(model: Acyclic, x, demand, perimeter, theta, step: float, *, integra
 
 
 def advance_counted(
-    model: Acyclic, x, demand, perimeter, theta, step: float, *, integrator="euler", substeps=1,
-) -> tuple[np.ndarray, float]:
+    model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, theta: PerMove, step: float, *,
+    integrator: str = "euler", substeps: int = 1,
+) -> tuple[PerCell, float]:
     """As `advance`, and the trips [veh] that ended meanwhile, by the same scheme: for the ledger."""
     step, ended, ends = step / substeps, 0.0, model.region == model.destination
     for _ in range(substeps):
@@ -181,7 +197,7 @@ def advance_counted(
     return x, ended
 
 
-def translate(model: Acyclic, x: np.ndarray) -> np.ndarray:
+def translate(model: Acyclic, x: PerCell) -> PerPair:
     """x_ij = sum over o, g of x_ogij (R, R) [veh]; o = j and g = j stay in for i = j, the trips inside a region."""
     regions = len(model.jam)
     flat = np.bincount(model.region * regions + model.destination, x, minlength=regions**2)

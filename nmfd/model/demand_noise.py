@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Bool
 
+from nmfd.arrays import PairsOverTime
 from nmfd.model.scenario import Scenario
 
 # Which entries d_ij(k) of the spawn matrix are perturbed. Clipping lets only the positive half of the noise through
@@ -15,7 +17,7 @@ WHERE = {
 }
 
 
-def entries(demand: np.ndarray, where: str) -> np.ndarray:
+def entries(demand: PairsOverTime, where: str) -> Bool[np.ndarray, "T R R"]:
     """(T, R, R) bool: the entries of `demand` (T, R, R) that `where`, a key of WHERE, perturbs."""
     if where == "planned":
         return demand > 0

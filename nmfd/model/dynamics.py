@@ -18,10 +18,12 @@ perimeter (..., R, R) [-], [i, h]; splits (..., R, R, R) [-], [i, h, j].
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
+from nmfd.tensors import PerPair, PerRegion, PerRollout, PerTurn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,22 +33,25 @@ class Parameters:
     exit_rates: (R, R) [-] or None; capacity: (R, R) [veh/s] under u = 1, or None; storage: (R,) [veh]
     """
 
-    a: torch.Tensor
-    b: torch.Tensor
-    c: torch.Tensor
-    jam: torch.Tensor
-    adjacency: torch.Tensor
-    off_diagonal: torch.Tensor
-    exit_rates: torch.Tensor | None = None
-    capacity: torch.Tensor | None = None
-    storage: torch.Tensor | None = None
+    a: PerRegion
+    b: PerRegion
+    c: PerRegion
+    jam: PerRegion
+    adjacency: PerPair
+    off_diagonal: PerPair
+    exit_rates: PerPair | None = None
+    capacity: PerPair | None = None
+    storage: PerRegion | None = None
 
 
-def parameters(network: RegionalModel, *, dtype=torch.float64, device="cpu") -> Parameters:
-    def tensor(values):
+def parameters(
+    network: RegionalModel, *, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu",
+) -> Parameters:
+    """The network as tensors of `dtype` on `device`."""
+    def tensor(values: Any) -> Any:
         return None if values is None else torch.tensor(values, dtype=dtype, device=device)
 
-    def row(name):
+    def row(name: str) -> Any:
         return tensor([getattr(m, name) for m in network.mfds])
 
     return Parameters(
@@ -55,13 +60,13 @@ def parameters(network: RegionalModel, *, dtype=torch.float64, device="cpu") -> 
         exit_rates=tensor(network.exit_rates), capacity=tensor(network.open_capacity), storage=tensor(network.storage))
 
 
-def rate(p: Parameters, accumulation: torch.Tensor) -> torch.Tensor:
+def rate(p: Parameters, accumulation: PerRegion) -> PerRegion:
     """q_i = g_i(min(x_i, jam_i)) / x_i [1/s], of accumulation (..., R) [veh]; no division by zero at x = 0."""
     body = torch.minimum(accumulation, p.jam)
     return ((p.a * body + p.b) * body + p.c) * p.jam / torch.maximum(accumulation, p.jam)
 
 
-def flows(p: Parameters, x, perimeter, splits) -> tuple[torch.Tensor, torch.Tensor]:
+def flows(p: Parameters, x: PerPair, perimeter: PerPair, splits: PerTurn) -> tuple[PerRegion, PerTurn]:
     """Trip completions m_ii (..., R) and transfer flows (..., R, R, R) [veh/s].
 
     As published, u_ih m_ihj. Not published: with exit rates k_ij, m_ihj = k_ij theta_ihj q_i x_ij, and likewise m_ii;
@@ -79,7 +84,7 @@ def flows(p: Parameters, x, perimeter, splits) -> tuple[torch.Tensor, torch.Tens
     return completions, passing(p, transfers.sum(-1), perimeter, accumulation).unsqueeze(-1) * transfers
 
 
-def passing(p: Parameters, wish, perimeter, accumulation) -> torch.Tensor:
+def passing(p: Parameters, wish: PerPair, perimeter: PerPair, accumulation: PerRegion) -> PerPair:
     """The share of `wish` (..., R, R) [veh/s], from i to h, that passes a boundary with a capacity (..., R, R) [-].
 
     The limit is u_ih times the capacity times the room in h, 1 - x_h / storage_h (boundary capacity that falls with the
@@ -90,18 +95,18 @@ def passing(p: Parameters, wish, perimeter, accumulation) -> torch.Tensor:
     return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
 
 
-def derivative(p: Parameters, x, demand, perimeter, splits) -> torch.Tensor:
+def derivative(p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn) -> PerPair:
     """dx_ij/dt (..., R, R) [veh/s]."""
     completions, transfers = flows(p, x, perimeter, splits)
     return demand - torch.diag_embed(completions) - transfers.sum(-2) + transfers.sum(-3)
 
 
-def euler(p: Parameters, x, demand, perimeter, splits, step: float) -> torch.Tensor:
+def euler(p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float) -> PerPair:
     """x after `step` [s] by forward Euler; keeps x >= 0 where step * q <= 1 and demand >= 0."""
     return x + step * derivative(p, x, demand, perimeter, splits)
 
 
-def rk4(p: Parameters, x, demand, perimeter, splits, step: float) -> torch.Tensor:
+def rk4(p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float) -> PerPair:
     """x after `step` [s] by the classical fourth-order Runge-Kutta scheme."""
     k1 = derivative(p, x, demand, perimeter, splits)
     k2 = derivative(p, x + 0.5 * step * k1, demand, perimeter, splits)
@@ -115,7 +120,10 @@ INTEGRATORS = {"euler": euler, "rk4": rk4}
 SCHEMES = {"euler": ((1.0,), (0.0,)), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0))}
 
 
-def advance(p: Parameters, x, demand, perimeter, splits, step: float, *, integrator="euler", substeps=1):
+def advance(
+    p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float, *,
+    integrator: str = "euler", substeps: int = 1,
+) -> PerPair:
     """x after one control interval of `step` [s], in `substeps` equal steps under constant controls and demand."""
     for _ in range(substeps):
         x = INTEGRATORS[integrator](p, x, demand, perimeter, splits, step / substeps)
@@ -123,8 +131,9 @@ def advance(p: Parameters, x, demand, perimeter, splits, step: float, *, integra
 
 
 def advance_counted(
-    p: Parameters, x, demand, perimeter, splits, step: float, *, integrator="euler", substeps=1,
-) -> tuple[torch.Tensor, torch.Tensor]:
+    p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float, *,
+    integrator: str = "euler", substeps: int = 1,
+) -> tuple[PerPair, PerRollout]:
     """As `advance`, and the trips (...) [veh] that ended meanwhile, by the same scheme: for the ledger."""
     step, ended = step / substeps, torch.zeros(x.shape[:-2], dtype=x.dtype)
     for _ in range(substeps):

@@ -7,11 +7,16 @@ Structural zeros are kept: what x, perimeter or splits leave out of their sparsi
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
 
+from nmfd.arrays import PerTurn
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
+
+Matrix: TypeAlias = ca.SX | ca.MX | ca.DM
+Turns: TypeAlias = Sequence[Matrix]  # R of them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,10 +37,11 @@ class Parameters:
 
 
 def parameters(network: RegionalModel) -> Parameters:
-    def column(name):
+    """The network as constants."""
+    def column(name: str) -> ca.DM:
         return ca.DM([getattr(m, name) for m in network.mfds])
 
-    def matrix(values):
+    def matrix(values: np.ndarray | None) -> ca.DM | None:
         return None if values is None else ca.DM(values)
 
     return Parameters(
@@ -44,18 +50,18 @@ def parameters(network: RegionalModel) -> Parameters:
         capacity=matrix(network.open_capacity), storage=None if network.storage is None else ca.DM(network.storage).T)
 
 
-def splits_list(splits: np.ndarray) -> list[ca.DM]:
+def splits_list(splits: PerTurn) -> list[ca.DM]:
     """theta (R, R, R) [i, h, j] as the R sparse matrices [h, j] that this module takes."""
     return [ca.sparsify(ca.DM(rows)) for rows in splits]
 
 
-def rate(p: Parameters, accumulation):
+def rate(p: Parameters, accumulation: Matrix) -> Matrix:
     """q_i = g_i(min(x_i, jam_i)) / x_i [1/s], of accumulation (R, 1) [veh]; no division by zero at x = 0."""
     body = ca.fmin(accumulation, p.jam)
     return ((p.a * body + p.b) * body + p.c) * p.jam / (accumulation + p.jam - body)
 
 
-def flows(p: Parameters, x, perimeter, splits: Sequence) -> tuple:
+def flows(p: Parameters, x: Matrix, perimeter: Matrix, splits: Turns) -> tuple[Matrix, list[Matrix]]:
     """Trip completions m_ii (R, 1) and transfer flows [veh/s], R matrices (R, R) [h, j]; options as in `dynamics`."""
     regions, accumulation = x.shape[0], ca.sum2(x)
     leaving = ca.repmat(rate(p, accumulation), 1, regions) * x
@@ -73,14 +79,14 @@ def flows(p: Parameters, x, perimeter, splits: Sequence) -> tuple:
         ca.repmat(open_share[i, :].T, 1, regions) * transfer for i, transfer in enumerate(transfers)]
 
 
-def passing(p: Parameters, wish, perimeter, accumulation):
+def passing(p: Parameters, wish: Matrix, perimeter: Matrix, accumulation: Matrix) -> Matrix:
     """The share of `wish` (R, R) [veh/s], from i to h, that passes a boundary with a capacity (R, R) [-]."""
     room = ca.fmax(1.0 - accumulation.T / p.storage, LEAST_ROOM)
     limit = perimeter * p.capacity * ca.repmat(room, wish.shape[0], 1)
     return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
 
 
-def derivative(p: Parameters, x, demand, perimeter, splits: Sequence):
+def derivative(p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns) -> Matrix:
     """dx_ij/dt (R, R) [veh/s]."""
     completions, transfers = flows(p, x, perimeter, splits)
     leaving = ca.vertcat(*(ca.sum1(transfer) for transfer in transfers))
@@ -88,12 +94,12 @@ def derivative(p: Parameters, x, demand, perimeter, splits: Sequence):
     return demand - ca.diag(completions) - leaving + entering
 
 
-def euler(p: Parameters, x, demand, perimeter, splits: Sequence, step: float):
+def euler(p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns, step: float) -> Matrix:
     """x after `step` [s] by forward Euler; keeps x >= 0 where step * q <= 1 and demand >= 0."""
     return x + step * derivative(p, x, demand, perimeter, splits)
 
 
-def rk4(p: Parameters, x, demand, perimeter, splits: Sequence, step: float):
+def rk4(p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns, step: float) -> Matrix:
     """x after `step` [s] by the classical fourth-order Runge-Kutta scheme."""
     k1 = derivative(p, x, demand, perimeter, splits)
     k2 = derivative(p, x + 0.5 * step * k1, demand, perimeter, splits)
@@ -105,7 +111,10 @@ def rk4(p: Parameters, x, demand, perimeter, splits: Sequence, step: float):
 INTEGRATORS = {"euler": euler, "rk4": rk4}
 
 
-def advance(p: Parameters, x, demand, perimeter, splits: Sequence, step: float, *, integrator="euler", substeps=1):
+def advance(
+    p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns, step: float, *,
+    integrator: str = "euler", substeps: int = 1,
+) -> Matrix:
     """x after one control interval of `step` [s], in `substeps` equal steps under constant controls and demand."""
     for _ in range(substeps):
         x = INTEGRATORS[integrator](p, x, demand, perimeter, splits, step / substeps)

@@ -24,12 +24,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float, Real
 from scipy.optimize import nnls
 
+from nmfd import tensors
+from nmfd.arrays import PerPair, PerRegion, PerTurn
 from nmfd.model import dynamics
 from nmfd.model.planning import PlanningModel
 from nmfd.types import Controls
 
+Vector = Float[np.ndarray, " N"]
+Square = Float[np.ndarray, "N N"]
 # The three relative errors: standard deviation [-] (of the expansion it is `Instruments.detector_error`), and the time
 # after which they are forgotten [s]: queues come and go in a quarter of an hour, which links are busy changes slowly.
 MEMORY, EXPANSION_MEMORY = 900.0, 3600.0
@@ -54,11 +59,11 @@ class Instruments:
     probe_share: of all vehicles [-]
     """
 
-    detector_share: np.ndarray
-    detector_error: np.ndarray
-    detector_noise: np.ndarray
-    counted_share: np.ndarray
-    counted_gateways: np.ndarray
+    detector_share: PerRegion
+    detector_error: PerRegion
+    detector_noise: PerRegion
+    counted_share: PerPair
+    counted_gateways: Real[np.ndarray, "R R"]
     probe_share: float
 
 
@@ -72,10 +77,10 @@ class Readings:
     probe_departures: (R, R) [veh], [i, j] = set out during the interval; not expanded
     """
 
-    accumulation: np.ndarray
-    crossings: np.ndarray
-    probes: np.ndarray
-    probe_departures: np.ndarray
+    accumulation: PerRegion
+    crossings: PerPair
+    probes: PerPair
+    probe_departures: PerPair
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,9 +91,9 @@ class Belief:
         average if the covariances are right; NaN without a reading
     """
 
-    mean: np.ndarray
-    covariance: np.ndarray
-    probes: np.ndarray
+    mean: Vector
+    covariance: Square
+    probes: PerPair
     surprise: float
 
 
@@ -102,15 +107,16 @@ class Estimator:
 
     def reset(self) -> None:
         """Begin with an empty network."""
-        self._k, self._seen = 0, []
+        self._k, self._seen = 0, list[np.ndarray]()
         self.belief = self._model.empty()
 
     @property
-    def accumulation(self) -> np.ndarray:
+    def accumulation(self) -> PerPair:
+        """(R, R) [veh]."""
         regions = self._planning.network.regions
         return self.belief.mean[3 * regions :].reshape(regions, regions).copy()
 
-    def step(self, controls: Controls, readings: Readings) -> np.ndarray:
+    def step(self, controls: Controls, readings: Readings) -> PerPair:
         """The estimate at the end of the interval under `controls`; the forecast is the scenario's demand."""
         demand = self._planning.forecast[min(self._k, self._planning.steps - 1)]
         splits = self._planning.network.nominal_splits if controls.splits is None else controls.splits
@@ -179,12 +185,16 @@ class _Model:
         return np.concatenate([place, half, crossing]), np.concatenate([place, departure])
 
     def empty(self) -> Belief:
+        """Of a city without vehicles."""
         mean, variance = np.zeros(self._states), torch.full((self._cells,), FLOOR, dtype=torch.float64)
         return Belief(
             mean=mean, covariance=torch.diag(torch.cat([self._spread**2, variance])).numpy(),
             probes=np.zeros((self._regions, self._regions)), surprise=np.nan)
 
-    def advance(self, belief: Belief, demand, perimeter, splits, readings: Readings, loops) -> Belief:
+    def advance(
+        self, belief: Belief, demand: PerPair, perimeter: PerPair, splits: PerTurn, readings: Readings,
+        loops: PerRegion,
+    ) -> Belief:
         """The belief one control interval later. loops: (R,) [veh], the accumulations that are to be trusted."""
         z, covariance, leaving = self._predicted(belief, demand, perimeter, splits)
         mean, posterior, surprise = z[: self._states], covariance[: self._states, : self._states], np.nan
@@ -211,7 +221,9 @@ class _Model:
         probes = np.minimum(probes, mean[self._x].reshape(known.shape))
         return Belief(mean=mean, covariance=posterior, probes=probes, surprise=surprise)
 
-    def _predicted(self, belief: Belief, demand, perimeter, splits) -> tuple[np.ndarray, torch.Tensor, np.ndarray]:
+    def _predicted(
+        self, belief: Belief, demand: PerPair, perimeter: PerPair, splits: PerTurn,
+    ) -> tuple[np.ndarray, torch.Tensor, np.ndarray]:
         """Z (size,), its covariance, and what leaves every cell (R^2,) [veh]."""
         mean, errors, first = torch.from_numpy(belief.mean), self._x.start, self._expansion.start
         # Of the flows: all inputs but the expansion.
@@ -229,12 +241,14 @@ class _Model:
         covariance[errors:, errors:] += self._flow_noise(belief, moves, seen, leaving)
         return torch.cat([self._kept * mean[:errors], outputs[0]]).numpy(), covariance, leaving.numpy()
 
-    def _rollout(self, points, probes, demand, perimeter, splits) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _rollout(
+        self, points: torch.Tensor, probes: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """All of Z but the relative errors at `points` (B, 2 R + R^2); and the events of the first one, (events,)
         [veh], of all vehicles and of probes."""
         regions, batch = self._regions, len(points)
         duration = self._step / self._substeps
-        perimeter, splits = (torch.tensor(given, dtype=torch.float64) for given in (perimeter, splits))
+        controls = [torch.tensor(given, dtype=torch.float64) for given in (perimeter, splits)]
         x = points[:, 2 * regions :].reshape(batch, regions, regions)
         outflow, wish = (1.0 + points[:, : 2 * regions].reshape(batch, 2, regions)).clamp(min=0.0).unbind(1)
         outflow = outflow.minimum(1.0 / (duration * self._fastest))  # no more leave than there are
@@ -244,7 +258,7 @@ class _Model:
         moves = torch.zeros(2, regions, regions, regions, dtype=x.dtype)
         ends = torch.zeros(2, regions, dtype=x.dtype)
         for _ in range(self._substeps):
-            completions, transfers = dynamics.flows(self._parameters, x + 1e-9, perimeter, splits)
+            completions, transfers = dynamics.flows(self._parameters, x + 1e-9, *controls)
             completions = duration * outflow * completions
             transfers = duration * outflow[:, :, None, None] * transfers
             share = n / (x + 1e-9)
@@ -266,7 +280,9 @@ class _Model:
         every = events[0].clamp(min=0.0)
         return outputs, every, events[1].clamp(min=0.0).minimum(every)
 
-    def _flow_noise(self, belief: Belief, moves, seen, leaving) -> torch.Tensor:
+    def _flow_noise(
+        self, belief: Belief, moves: torch.Tensor, seen: torch.Tensor, leaving: torch.Tensor,
+    ) -> torch.Tensor:
         """The covariance of Z without its relative errors that comes from the flows (events,) [veh] of which `seen` are
         probes: whole vehicles, so Poisson, and other flows than modelled, for probes and others alike."""
         x, turns = torch.from_numpy(belief.mean[self._x]), len(self._turns)
@@ -328,13 +344,13 @@ def _pairs(left: torch.Tensor, right: torch.Tensor) -> tuple:
     return product.shape[:2], index, product[index]
 
 
-def _moved(share, completions, transfers):
+def _moved(share: tensors.PerPair, completions: tensors.PerRegion, transfers: tensors.PerTurn) -> tensors.PerPair:
     """Net change (B, R, R) of what is `share` of the vehicles of every cell."""
     out = share.unsqueeze(2) * transfers
     return out.sum(1) - out.sum(2) - torch.diag_embed(torch.diagonal(share, dim1=1, dim2=2) * completions)
 
 
-def bounded(mean: np.ndarray, covariance: np.ndarray, lower: np.ndarray) -> np.ndarray:
+def bounded(mean: Vector, covariance: Square, lower: Vector) -> Vector:
     """The point nearest to `mean` (n,), in the metric of `covariance` (n, n), that is nowhere below `lower` (n,).
 
     It is mean + C y with multipliers y >= 0 of the bounds: a non-negative least-squares problem in y.

@@ -8,15 +8,19 @@ Identification, 1999, ch. 7; output error over a finite horizon).
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
+from nmfd.arrays import PairsOverTime, PerTurn, StatesOverTime, TurnsOverTime
 from nmfd.model import dynamics
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
+from nmfd.tensors import PerPair
 from nmfd.threads import one_thread
 
 HORIZON = 10         # control intervals
@@ -39,11 +43,11 @@ class Observed:
     splits: (T, R, R, R) [-]; crossings: (T, R, R) [veh], [i, h] from i to h
     """
 
-    accumulation: np.ndarray
-    demand: np.ndarray
-    perimeter: np.ndarray
-    splits: np.ndarray
-    crossings: np.ndarray
+    accumulation: StatesOverTime
+    demand: PairsOverTime
+    perimeter: PairsOverTime
+    splits: TurnsOverTime
+    crossings: PairsOverTime
 
 
 class _Model(torch.nn.Module):
@@ -52,7 +56,7 @@ class _Model(torch.nn.Module):
     def __init__(self, network: RegionalModel, runs: Sequence[Observed], step: float, fastest: float):
         super().__init__()
 
-        def free(values):
+        def free(values: Any) -> torch.nn.Parameter:
             return torch.nn.Parameter(torch.as_tensor(np.asarray(values), dtype=torch.float32).clone())
 
         self.adjacency, self._fastest = torch.tensor(network.adjacency, dtype=torch.float32), fastest
@@ -73,7 +77,8 @@ class _Model(torch.nn.Module):
         first = 2.0 * drop * torch.sigmoid(self.bend)
         return self.free_rate.exp(), first, drop - first, self.jam.exp()
 
-    def parameters_of(self, off_diagonal: torch.Tensor) -> dynamics.Parameters:
+    def parameters_of(self, off_diagonal: PerPair) -> dynamics.Parameters:
+        """With `off_diagonal`, 1 but for zeros on the diagonal."""
         c, first, second, jam = self.shape()
         rates = EXIT_RATES ** torch.tanh(self.exit_rates)
         rates = torch.minimum(rates, 0.999 * self._fastest / c.unsqueeze(-1))
@@ -83,11 +88,12 @@ class _Model(torch.nn.Module):
             storage=self.storage.exp())
 
     def penalty(self) -> torch.Tensor:
+        """What it costs to depart from where the search starts."""
         moved = (self.capacity - self._first_capacity) * self.adjacency
         return RIDGE * ((self.exit_rates**2).mean() + (moved**2).mean())
 
 
-def observed_split_ratios(network: RegionalModel, crossings: np.ndarray) -> dict[tuple[int, int], dict[int, float]]:
+def observed_split_ratios(network: RegionalModel, crossings: PerTurn) -> dict[tuple[int, int], dict[int, float]]:
     """(i, j) -> {h: share}: by which neighbour h the vehicles in i bound for j went on in fact.
 
     crossings: (R, R, R) [veh], [i, h, j] = from i to h, bound for j
@@ -145,7 +151,9 @@ def windows(runs: Sequence[Observed], horizon: int) -> list[torch.Tensor]:
     return [stack("accumulation", horizon + 1), *(stack(name, horizon) for name in ("demand", "perimeter", "splits"))]
 
 
-def _misfit(p: dynamics.Parameters, data, scale: torch.Tensor, scheme) -> torch.Tensor:
+def _misfit(
+    p: dynamics.Parameters, data: Sequence[torch.Tensor], scale: torch.Tensor, scheme: Mapping[str, Any],
+) -> torch.Tensor:
     """The mean Huber loss of the errors of x_i and x_ij over the horizon, in units of `scale` (R,) [veh]."""
     observed, demand, perimeter, splits = data
     x, total = observed[:, 0], 0.0
@@ -166,6 +174,7 @@ def _network(
     """The fitted numbers, scaled such that the exit rates of a region are 1 on the average of its vehicles."""
     with torch.no_grad():
         p = model.parameters_of(off_diagonal)
+    assert p.exit_rates is not None and p.capacity is not None and p.storage is not None  # `_Model` has them all
     rates = p.exit_rates.double().numpy()
     weight = sum(run.accumulation.sum(axis=0) for run in runs)
     weight[weight.sum(axis=1) == 0] = 1.0  # nobody was ever there
@@ -181,7 +190,7 @@ def _network(
 def prediction_errors(
     network: RegionalModel, runs: Sequence[Observed], intervals: int, *, step: float, substeps: int = 1,
     integrator: str = "euler",
-) -> np.ndarray:
+) -> Float[np.ndarray, "N R"]:
     """(N, R) [veh]: predicted minus observed accumulation, `intervals` ahead of every observed state of `runs`."""
     p = dynamics.parameters(network, dtype=torch.float32)
     observed, demand, perimeter, splits = windows(runs, intervals)
@@ -199,8 +208,8 @@ def intervals_within(ahead: float, step: float, runs: Sequence[Observed]) -> int
 
 
 def prediction_shares(
-    network: RegionalModel, runs: Sequence[Observed], intervals: Sequence[int], **scheme,
-) -> np.ndarray:
+    network: RegionalModel, runs: Sequence[Observed], intervals: Sequence[int], **scheme: Any,
+) -> Float[np.ndarray, "L R"]:
     """(len(intervals), R) [-]: RMSE of `prediction_errors`, as a share of the critical accumulation."""
     errors = [prediction_errors(network, runs, n, **scheme) for n in intervals]
     return np.sqrt([(error**2).mean(axis=0) for error in errors]) / [curve.critical for curve in network.mfds]

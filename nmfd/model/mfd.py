@@ -8,6 +8,10 @@ the published figures hang together.
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Real
+
+Values = Float[np.ndarray | np.floating, "*B"]
+Samples = Real[np.ndarray, " N"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,14 +27,14 @@ class Mfd:
     c: float
     jam: float
 
-    def rate(self, accumulation):
+    def rate(self, accumulation: Values | float) -> Values:
         """Outflow per vehicle q(x) = g(x)/x [1/s] of `accumulation` (...) [veh]; c at x = 0."""
         x = np.asarray(accumulation, dtype=float)
         body = np.minimum(x, self.jam)
         q = (self.a * body + self.b) * body + self.c
         return np.where(x > self.jam, q * self.jam / np.maximum(x, self.jam), q) if np.isfinite(self.jam) else q
 
-    def outflow(self, accumulation):
+    def outflow(self, accumulation: Values | float) -> Values:
         """g(x) [veh/s] of `accumulation` (...) [veh]."""
         return self.rate(accumulation) * np.asarray(accumulation, dtype=float)
 
@@ -67,7 +71,7 @@ class Mfd:
         return None
 
 
-def fit(accumulation, outflow, *, max_rate: float = np.inf, bins: int = 24) -> Mfd:
+def fit(accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bins: int = 24) -> Mfd:
     """The curve closest to samples (n,) [veh], (n,) [veh/s] that is safe to use: least squares over bin medians.
 
     The rate q(x) = a x^2 + b x + c is kept positive and falling up to the jam accumulation and at most `max_rate`

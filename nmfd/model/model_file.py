@@ -40,7 +40,7 @@ def _options(network: RegionalModel, region: int) -> str:
     lines = ""
     if network.exit_rates is not None:
         lines += f"exit_rates = [{', '.join(f'{value:.4g}' for value in network.exit_rates[region])}]\n"
-    if network.capacity is not None:
+    if network.capacity is not None and network.storage is not None:
         passing = network.capacity[region, network.adjacency[region]]
         lines += (
             f"capacity = [{', '.join(f'{value:.4g}' for value in passing)}]\n"

@@ -19,7 +19,7 @@ class PerimeterTable(Settings):
     max: Share = setting("largest control, more than min")
 
     @model_validator(mode="after")
-    def _ordered(self):
+    def _ordered(self) -> "PerimeterTable":
         if self.min >= self.max:
             raise Problem("", f"min must be less than max, got min = {self.min:g} and max = {self.max:g}")
         return self
@@ -34,13 +34,14 @@ class MfdTable(Settings):
     jam: float = setting("accumulation beyond which the outflow stays what it is there", unit="veh", gt=0.0, le=MOST)
 
     @model_validator(mode="after")
-    def _is_one(self):
+    def _is_one(self) -> "MfdTable":
         if problem := self.mfd.problem():
             raise Problem("c" if self.c <= 0 else "jam", problem)
         return self
 
     @property
     def mfd(self) -> Mfd:
+        """The curve."""
         return Mfd(**vars(self))
 
 
@@ -63,7 +64,7 @@ class RegionTable(Settings):
         gt=0.0, le=MOST)
 
     @model_validator(mode="after")
-    def _complete(self):
+    def _complete(self) -> "RegionTable":
         if unknown := sorted(set(self.no_way_to) - set(self.adjacent)):
             raise Problem("no_way_to", got(f"some of the adjacent regions {list(self.adjacent)}", unknown[0]))
         for key, other in (("storage", "capacity"), ("capacity", "storage")):
@@ -97,8 +98,14 @@ class NetworkTable(Settings):
     observed_split_ratios: Rows[SplitsTable] = setting("one table per region and destination", ())
     sumo: dict[str, Any] = setting("the city to simulate, for cosim", {})
 
+    def mfd_of(self, row: RegionTable) -> Mfd:
+        """The curve of a region."""
+        table = row.mfd or self.mfd
+        assert table is not None  # `_check_region`
+        return table.mfd
+
     @model_validator(mode="after")
-    def _fits_together(self):
+    def _fits_together(self) -> "NetworkTable":
         most = len(self.regions) - 1
         for number, row in enumerate(self.regions):
             if max(row.adjacent, default=0) > most:

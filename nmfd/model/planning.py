@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel, check_step, load_network
 from nmfd.model.scenario import Scenario
@@ -42,7 +43,7 @@ class PlanningModel:
     network: RegionalModel
     step: float
     steps: int
-    forecast: np.ndarray
+    forecast: PairsOverTime
     measurement_std: float = 0.0
     integrator: str = "euler"
     substeps: int = 1
@@ -70,6 +71,7 @@ def planning_model(scenario: Scenario, controller: str = "") -> PlanningModel:
     if "model" in options and scenario.folder is not None:
         where, prefix = scenario.folder / "scenario.toml", f"controllers.{controller}."
         model = config.checked(PlanningOptions, {"model": options.pop("model")}, where, prefix).model
+        assert model is not None  # TOML has no null
         network = other_model(scenario, scenario.folder / model, f"{where}: {prefix}model")
     elif name.startswith(GUIDING) and (folder := guided_model(scenario.network)) is not None:
         network = other_model(scenario, folder)

@@ -24,6 +24,7 @@ class NmfdPlant:
         return self._state()
 
     def step(self, controls: Controls) -> State:
+        """One control interval. LedgerError if vehicles appear or vanish."""
         demand = self._demand[self._k]
         splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
         self._x, ended = dynamics.advance_counted(
@@ -64,7 +65,7 @@ class AcyclicPlant:
         return self._state()
 
     @property
-    def state(self) -> np.ndarray:
+    def state(self) -> acyclic.PerCell:
         """x_ogij (C,) [veh], in the cells of `nmfd.model.acyclic.build`."""
         return self._x.copy()
 
@@ -77,6 +78,7 @@ class AcyclicPlant:
         return self._forced
 
     def step(self, controls: Controls) -> State:
+        """One control interval. LedgerError if vehicles appear or vanish."""
         scenario, model = self._scenario, self._model
         demand = scenario.demand[self._k]
         splits = scenario.network.nominal_splits if controls.splits is None else controls.splits

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse import csgraph
 
+from nmfd.arrays import Adjacency, Hops, PerPair, PerRegion, PerTurn, Positions, TurnMask
 from nmfd.errors import InputError
 from nmfd.model.mfd import Mfd
 from nmfd.model.network_file import NetworkTable
@@ -45,15 +46,15 @@ class RegionalModel:
 
     name: str
     region_names: tuple[str, ...]
-    positions: np.ndarray
-    adjacency: np.ndarray
+    positions: Positions
+    adjacency: Adjacency
     mfds: tuple[Mfd, ...]
     u_min: float
     u_max: float
     observed_split_ratios: Mapping[tuple[int, int], Mapping[int, float]] = field(default_factory=dict)
-    exit_rates: np.ndarray | None = None
-    capacity: np.ndarray | None = None
-    storage: np.ndarray | None = None
+    exit_rates: PerPair | None = None
+    capacity: PerPair | None = None
+    storage: PerRegion | None = None
     folder: Path | None = None
 
     @property
@@ -62,12 +63,12 @@ class RegionalModel:
         return len(self.region_names)
 
     @cached_property
-    def hops(self) -> np.ndarray:
+    def hops(self) -> Hops:
         """(R, R) int: boundaries to cross on a shortest way; -1 where there is none."""
         return _hops(self.adjacency)
 
     @cached_property
-    def split_mask(self) -> np.ndarray:
+    def split_mask(self) -> TurnMask:
         """(R, R, R) bool, [i, h, j]: theta_ihj may be positive.
 
         h must be adjacent to i, j != i, and j must be reachable from h without coming back to i.
@@ -81,7 +82,7 @@ class RegionalModel:
         return mask
 
     @cached_property
-    def nominal_splits(self) -> np.ndarray:
+    def nominal_splits(self) -> PerTurn:
         """(R, R, R), [i, h, j]: theta without guidance [-]: `observed_split_ratios`, else the fewest boundaries,
         equally where there are several such ways."""
         closer = self.hops[None, :, :] == self.hops[:, None, :] - 1
@@ -93,7 +94,7 @@ class RegionalModel:
         return theta / np.where(sums > 0, sums, 1.0)
 
     @property
-    def open_capacity(self) -> np.ndarray | None:
+    def open_capacity(self) -> PerPair | None:
         """(R, R) [veh/s]: `capacity` for u = 1."""
         return None if self.capacity is None else self.capacity / self.u_max
 
@@ -108,7 +109,7 @@ class RegionalModel:
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
-def _hops(adjacency: np.ndarray) -> np.ndarray:
+def _hops(adjacency: Adjacency) -> Hops:
     hops = csgraph.shortest_path(adjacency, unweighted=True)
     return np.where(np.isfinite(hops), hops, -1).astype(int)
 
@@ -134,7 +135,7 @@ def load_network(folder: Path | str) -> RegionalModel:
     network = RegionalModel(
         name=table.name, region_names=tuple(row.name or str(number) for number, row in enumerate(rows)),
         positions=np.array([row.position for row in rows]), adjacency=adjacency,
-        mfds=tuple((row.mfd or table.mfd).mfd for row in rows), u_min=table.perimeter.min, u_max=table.perimeter.max,
+        mfds=tuple(table.mfd_of(row) for row in rows), u_min=table.perimeter.min, u_max=table.perimeter.max,
         observed_split_ratios={(row.region, row.destination): dict(zip(row.next, row.share, strict=True))
                     for row in table.observed_split_ratios},
         exit_rates=None if rows[0].exit_rates is None else np.array([row.exit_rates for row in rows]),

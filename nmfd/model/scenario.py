@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nmfd.arrays import Intervals, PairsOverTime
 from nmfd.errors import InputError
 from nmfd.faults import Fault, parse
 from nmfd.model.regional_model import RegionalModel, check_step, load_network
@@ -41,7 +42,7 @@ class Scenario:
     network: RegionalModel
     step: float
     steps: int
-    demand: np.ndarray
+    demand: PairsOverTime
     measurement_std: float = 0.0
     integrator: str = "euler"
     substeps: int = 1
@@ -54,7 +55,7 @@ class Scenario:
     folder: Path | None = None
 
     @cached_property
-    def forecast(self) -> np.ndarray:
+    def forecast(self) -> PairsOverTime:
         """(T, R, R) [veh/s]: the demand as controllers that look ahead know it.
 
         Each pair is off by a factor for the whole run and one per interval, lognormal with mean 1, which share the
@@ -95,7 +96,9 @@ def with_faults(scenario: Scenario, texts: Sequence[str]) -> Scenario:
     return replace(scenario, faults=(*scenario.faults, *texts))
 
 
-def trapezoid(time: np.ndarray, *, start: float, peak: float, ramp_up: float, flat: float, ramp_down: float):
+def trapezoid(
+    time: Intervals, *, start: float, peak: float, ramp_up: float, flat: float, ramp_down: float,
+) -> Intervals:
     """Demand [veh/s] at `time` (T,) [s]: rises from 0 at `start`, stays at `peak` for `flat` and falls to 0."""
     end = start + ramp_up + flat + ramp_down
     rising = (time - start) / ramp_up if ramp_up > 0 else np.where(time >= start, 1.0, 0.0)
@@ -141,7 +144,7 @@ def _check_regions(table: ScenarioTable, network: RegionalModel, path: Path) -> 
             f"a whole number from 1 to {MOST_NUMBERS // network.regions**2}", table.steps))
 
 
-def _trapezoids(table: ScenarioTable, regions: int) -> np.ndarray:
+def _trapezoids(table: ScenarioTable, regions: int) -> PairsOverTime:
     """(T, R, R) [veh/s]: the flows of [[demand]]."""
     demand = np.zeros((table.steps, regions, regions))
     time = table.step * np.arange(table.steps)
@@ -153,7 +156,7 @@ def _trapezoids(table: ScenarioTable, regions: int) -> np.ndarray:
     return demand
 
 
-def _demand_file(path: Path, steps: int, regions: int) -> np.ndarray:
+def _demand_file(path: Path, steps: int, regions: int) -> PairsOverTime:
     """(T, R, R) [veh/s] of a csv with the columns interval, from, to, veh_s; intervals beyond T are left out.
 
     Raises InputError.

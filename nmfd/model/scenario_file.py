@@ -71,7 +71,7 @@ class ScenarioTable(Settings):
     sumo: dict[str, Any] = setting("how the city is simulated, for cosim", {})
 
     @model_validator(mode="after")
-    def _has_demand(self):
+    def _has_demand(self) -> "ScenarioTable":
         if self.demand is None and self.demand_file is None:
             raise Problem("demand", "missing; add a list of tables [[demand]], or demand_file")
         return self
@@ -106,9 +106,10 @@ def _name_from(own: dict, folder: Path, here: Path) -> None:
         if isinstance(own.get(key), str):
             own[key] = seen(own[key])
     sumo = own.get("sumo")
-    for key in ("routes", "background", "additional") if isinstance(sumo, dict) else ():
-        if isinstance(sumo.get(key), list) and all(isinstance(name, str) for name in sumo[key]):
-            sumo[key] = [seen(name) for name in sumo[key]]
+    if isinstance(sumo, dict):
+        for key in ("routes", "background", "additional"):
+            if isinstance(sumo.get(key), list) and all(isinstance(name, str) for name in sumo[key]):
+                sumo[key] = [seen(name) for name in sumo[key]]
     controllers = own.get("controllers")
     for options in controllers.values() if isinstance(controllers, dict) else ():
         if isinstance(options, dict) and isinstance(options.get("model"), str):

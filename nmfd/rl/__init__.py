@@ -10,7 +10,7 @@ Names are imported when they are first used. scenarios/economic_mpc/ppo.py is an
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from nmfd.extras import need
 
@@ -27,7 +27,7 @@ _PLACES = {  # name -> its module, and the libraries that it needs
     "RegionsEnv": ("agents", "gymnasium", "pettingzoo"), "Sb3VecEnv": ("sb3", "gymnasium", "stable_baselines3")}
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     if name not in _PLACES:
         raise AttributeError(f"module 'nmfd.rl' has no attribute {name!r}")
     module, *libraries = _PLACES[name]

@@ -1,12 +1,15 @@
 """A scenario as a gymnasium environment: one agent for all regions."""
 
+from typing import Any
+
 import gymnasium
 import numpy as np
+from jaxtyping import Float
 
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.rl.interface import Episode, Interface
-from nmfd.types import Plant
+from nmfd.types import Observation, Plant
 
 
 class RegionalEnv(gymnasium.Env):
@@ -22,7 +25,7 @@ class RegionalEnv(gymnasium.Env):
     nmfd.run with it.
     """
 
-    metadata = {"render_modes": []}
+    metadata: dict[str, Any] = {"render_modes": []}
 
     def __init__(
         self, scenario: Scenario, plant: Plant | None = None, *, guidance: bool = False, metering: bool = False,
@@ -33,20 +36,24 @@ class RegionalEnv(gymnasium.Env):
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.interface.observation_size,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.interface.action_size,), np.float32)
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Float[np.ndarray, " O"], dict]:
         """Without a seed, the next one of the sequence that the last seed began."""
         super().reset(seed=seed)
         seen = self._episode.reset(int(self.np_random.integers(2**31)) if seed is None else seed)
         self._spent = 0.0
         return self.interface.observed(seen), self._info(seen)
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+    def step(
+        self, action: Float[np.ndarray, " A"],
+    ) -> tuple[Float[np.ndarray, " O"], float, bool, bool, dict]:
+        """One control interval under `action`."""
         seen, vehicles, over = self._episode.step(self.interface.controls(action))
         self._spent += self._episode.scenario.step * float(vehicles.sum())
         return self.interface.observed(seen), -float(vehicles.sum()) / self.unit, False, over, self._info(seen)
 
     def close(self) -> None:
+        """Close the plant."""
         self._episode.close()
 
-    def _info(self, seen) -> dict:
+    def _info(self, seen: Observation) -> dict:
         return {"time_s": seen.time, "total_time_spent_veh_s": self._spent, "completed_veh": self._episode.completed}

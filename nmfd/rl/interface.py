@@ -3,10 +3,16 @@
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
+from nmfd.arrays import PerRegion
 from nmfd.closed_loop import noise_of, noisy
 from nmfd.model.regional_model import RegionalModel
-from nmfd.types import Controls, Observation
+from nmfd.model.scenario import Scenario
+from nmfd.types import Controls, Observation, Plant
+
+Pairs = Float[np.ndarray, "*#B R R"]  # of some states or controls, or of one
+Actions = Float[np.ndarray, "*B A"]
 
 LOGITS = 5.0  # actions in [-1, 1] times this are the logits of the split ratios: up to e^10 between two ways
 
@@ -28,7 +34,7 @@ class Interface:
         self, network: RegionalModel, *, guidance: bool = False, metering: bool = False,
         regions: Sequence[int] | None = None,
     ):
-        self._network, self._guidance = network, guidance
+        self._network = network
         chosen = np.arange(network.regions) if regions is None else np.array(regions)
         self._chosen, self._all = chosen, regions is None
         self._critical = np.array([mfd.critical for mfd in network.mfds])
@@ -39,13 +45,13 @@ class Interface:
         entered, gate = np.unique(self._boundaries[1], return_inverse=True)
         self._gate = gate if metering else np.arange(len(gate))  # which number of an action is u of each boundary
         self._count = len(entered) if metering else len(gate)
-        self.action_size = self._count + (len(self._ways[0]) if guidance else 0)
+        self.action_size = self._count + (0 if self._ways is None else len(self._ways[0]))
         self.observation_size = len(chosen) * (network.regions + 1) + (0 if self._all else network.regions)
         self._open = np.where(network.adjacency, network.u_max, 0.0)
         # The split ratios of these regions that no action decides: where there is one way only.
         self._rest = np.where(network.split_mask & ~choice & mine[:, None, None], network.nominal_splits, 0.0)
 
-    def observation(self, accumulation: np.ndarray, backlog: np.ndarray) -> np.ndarray:
+    def observation(self, accumulation: Pairs, backlog: Pairs) -> Float[np.ndarray, "*B O"]:
         """(..., observation_size) of accumulation (..., R, R) and backlog (..., R, R) [veh]."""
         batch, chosen = accumulation.shape[:-2], self._chosen
         parts = [
@@ -55,11 +61,11 @@ class Interface:
             parts.append(accumulation.sum(axis=-1) / self._critical)
         return np.concatenate(parts, axis=-1, dtype=np.float32)
 
-    def observed(self, observation: Observation) -> np.ndarray:
+    def observed(self, observation: Observation) -> Float[np.ndarray, " O"]:
         """(observation_size,) of what a controller sees."""
         return self.observation(observation.accumulation, observation.backlog)
 
-    def perimeter(self, action: np.ndarray) -> np.ndarray:
+    def perimeter(self, action: Actions) -> Pairs:
         """(..., R, R) [-] of actions (..., action_size); u_max at the boundaries of other regions."""
         network = self._network
         share = 0.5 * (np.clip(np.asarray(action, dtype=float)[..., :self._count], -1.0, 1.0) + 1.0)
@@ -68,9 +74,9 @@ class Interface:
             network.u_min + (network.u_max - network.u_min) * share[..., self._gate])
         return perimeter
 
-    def splits(self, action: np.ndarray) -> np.ndarray | None:
+    def splits(self, action: Actions) -> Float[np.ndarray, "*B R R R"] | None:
         """(..., R, R, R) [-] of actions (..., action_size), 0 in other regions; None without guidance."""
-        if not self._guidance:
+        if self._ways is None:
             return None
         action = np.clip(np.asarray(action, dtype=float)[..., self._count:], -1.0, 1.0)
         weight = np.zeros((*action.shape[:-1], *self._rest.shape))
@@ -78,7 +84,7 @@ class Interface:
         sums = weight.sum(axis=-2, keepdims=True)
         return self._rest + weight / np.where(sums > 0, sums, 1.0)
 
-    def controls(self, action: np.ndarray) -> Controls:
+    def controls(self, action: Float[np.ndarray, " A"]) -> Controls:
         """Of one action (action_size,)."""
         return Controls(perimeter=self.perimeter(action), splits=self.splits(action))
 
@@ -97,10 +103,9 @@ def combined(parts: dict[int, Controls], network: RegionalModel) -> Controls:
 class Episode:
     """A closed loop that is stepped from outside, with the noise and states of nmfd.closed_loop.run of one seed."""
 
-    def __init__(self, scenario, plant):
-        self.scenario, self._plant = scenario, plant
+    def __init__(self, scenario: Scenario, plant: Plant):
+        self.scenario, self._plant, self._closed = scenario, plant, False
         self.unit = sum(mfd.critical for mfd in scenario.network.mfds)  # [veh]
-        self._state = None
 
     def reset(self, seed: int) -> Observation:
         """What the agent sees at the beginning."""
@@ -108,7 +113,7 @@ class Episode:
         self._state, self.steps = self._plant.reset(seed), 0
         return self._seen()
 
-    def step(self, controls: Controls) -> tuple[Observation, np.ndarray, bool]:
+    def step(self, controls: Controls) -> tuple[Observation, PerRegion, bool]:
         """What the agent sees next; vehicles (R,) [veh] in and before each region when the interval began; the end."""
         spent = (self._state.accumulation + self._state.backlog).sum(axis=1)
         self._state = self._plant.step(controls)
@@ -121,9 +126,10 @@ class Episode:
         return self._state.completed
 
     def close(self) -> None:
-        if self._plant is not None:
+        """Close the plant, once."""
+        if not self._closed:
             self._plant.close()
-            self._plant = None
+            self._closed = True
 
     def _seen(self) -> Observation:
         noise = self.scenario.measurement_std * self._random.standard_normal(self._state.accumulation.shape)

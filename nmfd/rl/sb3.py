@@ -1,9 +1,14 @@
 """The vectorised environment as Stable-Baselines3 wants it."""
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from nmfd.rl.vector import NmfdVectorEnv
+
+Indices = int | Iterable[int] | None
 
 
 class Sb3VecEnv(VecEnv):
@@ -38,14 +43,14 @@ class Sb3VecEnv(VecEnv):
     def close(self) -> None:
         self.env.close()
 
-    def get_attr(self, attr_name: str, indices=None) -> list:
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list:
         return [getattr(self.env, attr_name, None)] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, attr_name: str, value, indices=None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         setattr(self.env, attr_name, value)
 
-    def env_method(self, method_name: str, *method_args, indices=None, **method_kwargs) -> list:
+    def env_method(self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any) -> list:
         return [getattr(self.env, method_name)(*method_args, **method_kwargs)]
 
-    def env_is_wrapped(self, wrapper_class, indices=None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[bool]:
         return [False] * len(list(self._get_indices(indices)))

@@ -7,12 +7,16 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from jaxtyping import Bool, Float
 
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.model import dynamics
 from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.rl.interface import Interface
+
+Observations = Float[np.ndarray, "N O"]
+Ends = Bool[np.ndarray, " N"]
 
 
 class NmfdVectorEnv(VectorEnv):
@@ -41,7 +45,8 @@ class NmfdVectorEnv(VectorEnv):
         self._spread, self._share = demand_spread, initial_share
         self._backlog = np.zeros((num_envs, scenario.network.regions, scenario.network.regions))
 
-    def reset(self, *, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[Observations, dict]:
+        """All episodes anew: of seeds s, s + 1, ..., or of these; without, the next ones of the sequence."""
         if seed is not None:
             seeds = [seed + n for n in range(self.num_envs)] if isinstance(seed, int) else list(seed)
             self._np_random, self._np_random_seed = np.random.default_rng(seeds), seeds[0]
@@ -57,7 +62,10 @@ class NmfdVectorEnv(VectorEnv):
         self._k, self._spent = 0, np.zeros(self.num_envs)
         return self._observations(), self._info()
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
+    def step(
+        self, actions: Float[np.ndarray, "N A"],
+    ) -> tuple[Observations, Float[np.ndarray, " N"], Ends, Ends, dict]:
+        """One control interval of all episodes; none is ever terminated, all are truncated at once."""
         scenario = self.scenario
         splits = self.interface.splits(actions)
         vehicles = self._x.sum((1, 2)).numpy()
@@ -78,7 +86,7 @@ class NmfdVectorEnv(VectorEnv):
             info |= {"final_obs": rows, "_final_obs": every, "final_info": final[1], "_final_info": every}
         return observations, -vehicles / self.unit, np.zeros(self.num_envs, bool), np.full(self.num_envs, over), info
 
-    def _observations(self) -> np.ndarray:
+    def _observations(self) -> Observations:
         shape = self._x.shape[1:]
         noise = np.stack([random.standard_normal(shape) for random in self._random])
         return self.interface.observation(self._x.numpy() + self.scenario.measurement_std * noise, self._backlog)

@@ -7,7 +7,7 @@ JSON schemas for editors come from it (nmfd.runs.reference).
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -18,6 +18,7 @@ MOST = 10**9        # of a whole number without a limit of its own
 LONGEST = 1000      # characters of a text
 LONGEST_NAME = 100  # characters: names become file names
 SHOWN = 60          # characters of a wrong value that a message repeats
+S = TypeVar("S", bound="Settings")
 
 
 def setting(text: str, default: Any = ..., *, unit: str = "", **limits: Any) -> Any:
@@ -27,7 +28,9 @@ def setting(text: str, default: Any = ..., *, unit: str = "", **limits: Any) -> 
     return Field(default, description=text, **limits)
 
 
-def whole(text: str, default: Any = ..., *, low: int = 0, high: int = MOST, unit: str = "", alias: str | None = None):
+def whole(
+    text: str, default: Any = ..., *, low: int = 0, high: int = MOST, unit: str = "", alias: str | None = None,
+) -> Any:
     """The same of a whole number from `low` to `high`."""
     return setting(text, default, unit=unit, ge=low, le=high, alias=alias)
 
@@ -45,7 +48,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
-    def changed(self, **changes: Any) -> Self:
+    def changed(self: S, **changes: Any) -> S:
         """A copy with other values, checked like the first. InputError."""
         return checked(type(self), {**vars(self), **changes}, "settings")
 
@@ -73,7 +76,6 @@ PositiveNumbers = Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(str
 Share = Annotated[float, Field(ge=0.0, le=1.0, json_schema_extra={"unit": "-"})]
 Seconds = Annotated[float, Field(ge=0.0, json_schema_extra={"unit": "s"})]
 Flow = Annotated[float, Field(ge=0.0, le=1e6, json_schema_extra={"unit": "veh/s"})]
-S = TypeVar("S", bound=Settings)
 Rows = Annotated[tuple[S, ...], Field(strict=False)]  # a list of tables
 
 

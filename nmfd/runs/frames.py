@@ -23,6 +23,7 @@ def write(folder: Path, trajectories: Sequence[Trajectory], tables: Mapping[str,
 
 
 def write_parquet(path: Path, frame: pd.DataFrame) -> Path:
+    """Write `frame` to `path`, atomically."""
     with atomic(path) as temporary:
         frame.to_parquet(temporary, index=False)
     return path

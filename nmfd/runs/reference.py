@@ -7,9 +7,10 @@ from typing import Any
 
 from nmfd.runs import schema
 from nmfd.runs.schema import Schema
+from nmfd.runs.tables import markdown_table
 
 BEGIN, END = "<!-- begin: written by `cosim reference` -->", "<!-- end -->"
-HEAD = "| key | default | unit | allowed | what it is |\n|---|---|---|---|---|\n"
+HEADINGS = ("key", "default", "unit", "allowed", "what it is")
 
 
 def sections(root: Schema, title: str, prefix: str = "") -> Iterator[str]:
@@ -22,7 +23,7 @@ def sections(root: Schema, title: str, prefix: str = "") -> Iterator[str]:
     while todo:
         title, prefix, table = todo.pop(0)
         rows = [_row(root, key, value, key in table.get("required", ())) for key, value in table["properties"].items()]
-        yield f"### {title}\n\n{_text(table['description'])}\n\n{HEAD}{''.join(rows)}"
+        yield f"### {title}\n\n{_text(table['description'])}\n\n{markdown_table(HEADINGS, rows)}\n"
         for key, value in table["properties"].items():
             listed = "$ref" in value.get("items", {})
             reference = value["items"]["$ref"] if listed else value.get("$ref")
@@ -42,11 +43,10 @@ def placed(page: str, text: str) -> str:
     return re.sub(f"{re.escape(BEGIN)}.*{re.escape(END)}", lambda _: generated, page, flags=re.DOTALL)
 
 
-def _row(root: Schema, key: str, value: Schema, required: bool) -> str:
+def _row(root: Schema, key: str, value: Schema, required: bool) -> tuple[str, ...]:
     here = schema.resolved(root, value)
     default = "**required**" if required else _toml(here.get("default"))
-    cells = (f"`{key}`", default, here.get("unit", ""), schema.allowed(here), _text(value["description"]))
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
+    return f"`{key}`", default, here.get("unit", ""), schema.allowed(here), _text(value["description"])
 
 
 def _toml(value: Any) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
@@ -55,8 +56,10 @@ def write_trajectory(path: Path, trajectory: Trajectory, record: Mapping[str, tu
             raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from None
 
 
-def _write_variable(file: netCDF4.Dataset, name: str, dimensions, values: np.ndarray, attributes: Mapping) -> None:
-    dimensions, text = np.atleast_1d(dimensions), values.dtype.kind == "U"
+def _write_variable(
+    file: netCDF4.Dataset, name: str, axes: str | Sequence[str], values: np.ndarray, attributes: Mapping,
+) -> None:
+    dimensions, text = np.atleast_1d(axes), values.dtype.kind == "U"
     if values.dtype == np.float16:  # netCDF has none; compressed it takes no more room
         values = values.astype(np.float32)
     for dimension, size in zip(dimensions, values.shape, strict=True):
@@ -172,6 +175,7 @@ class RunFolder:
         return [run for run in self._order if run in self._rows and self.trajectory_path(*run).is_file()]
 
     def trajectory_path(self, controller: str, seed: int) -> Path:
+        """Its file, there or not."""
         return run_path(self.path, controller, seed)
 
     def add(self, trajectory: Trajectory, record: Mapping[str, tuple] | None = None) -> None:
@@ -210,18 +214,18 @@ def open_folder(
     summary_path = Path(path) / "summary.csv"
     session = {"seeds": sorted({seed for _, seed in order}), **(session or {})}
 
-    def drop(changed: Mapping[str, str]) -> None:
+    def drop(changed: Mapping[str, str], tell: Callable[[str], None]) -> None:
         rows = read_summary(summary_path) if summary_path.is_file() else []
         for name, what in changed.items():
             if kept := sum(row["controller"] == name for row in rows):
-                renew(f"{path}: {name} has changed ({what}): its {kept} kept runs do not count any more, and those "
+                tell(f"{path}: {name} has changed ({what}): its {kept} kept runs do not count any more, and those "
                       "asked for are run again")
         if rows:
             write_summary(summary_path, [row for row in rows if row["controller"] not in changed])
 
     refuse_old(Path(path))
     with manifest(path, configuration=configuration, controllers=controllers, session=session, results=summary_path,
-                  renew=drop if renew else None):
+                  renew=None if renew is None else partial(drop, tell=renew)):
         folder = RunFolder(Path(path), order, read_summary(summary_path) if summary_path.is_file() else [])
         try:
             yield folder
@@ -262,7 +266,7 @@ def manifest(
             if file.is_file():
                 sessions, controllers, changed = _continued(
                     file, configuration, controllers, renewable=renew is not None)
-                if changed:
+                if changed and renew is not None:
                     renew(changed)
             first = not sessions
             sessions.append({**provenance(), **(session or {})})

@@ -35,13 +35,14 @@ class Scratch:
                 return
 
     def close(self) -> None:
+        """Remove it."""
         self._lock.release()
         self._folder.cleanup()
 
     def __enter__(self) -> Path:
         return self.path
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

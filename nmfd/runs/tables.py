@@ -1,4 +1,4 @@
-"""Tables as text, for the terminal."""
+"""Tables as text, for the terminal and in markdown."""
 
 import re
 import textwrap
@@ -22,6 +22,13 @@ def text_columns(headings: Sequence[str], lines: Iterable[Sequence[object]], cap
     # headings as a line: tabulate makes columns wider than their headings
     table = tabulate(cells, tablefmt="plain", disable_numparse=True, colalign=sides)
     return "\n".join([table, *wrapped(caption)])
+
+
+def markdown_table(headings: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
+    """The cells of each line in markdown; columns are not padded, so that one line more changes no other."""
+    cells = [[str(cell).replace("|", "\\|") for cell in line] for line in (headings, *lines)]
+    cells.insert(1, ["---"] * len(headings))
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
 
 
 def wrapped(caption: str) -> list[str]:

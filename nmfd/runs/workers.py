@@ -10,8 +10,11 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing.connection import wait
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -38,7 +41,7 @@ def cores() -> int:
     return len(mine.cpu_affinity()) if hasattr(mine, "cpu_affinity") else os.cpu_count() or 1  # not on macOS
 
 
-def attempt(function: Callable, task):
+def attempt(function: Callable, task: Any) -> Any:
     """`function(task)`, or the Failure that it ended in."""
     try:
         return function(task)
@@ -63,7 +66,8 @@ def outcomes(
     crash in a library) is the Failure of the task it was at. Closing the iterator ends the processes at once, and so
     does the end of this process, however it comes.
     """
-    todo, busy, deadlines = list(tasks)[::-1], {}, {}
+    todo, deadlines = list(tasks)[::-1], dict[Connection, float]()
+    busy: dict[Connection, tuple[SpawnProcess, Any]] = {}
     try:
         while todo or busy:
             while todo and len(busy) < workers:
@@ -73,7 +77,7 @@ def outcomes(
             first = min(deadlines[connection] for connection in busy) - time.monotonic()
             ready = wait(list(busy), None if math.isinf(first) else max(first, 0.0))
             late = [connection for connection in busy if deadlines[connection] <= time.monotonic()]
-            for connection in {*ready, *late}:
+            for connection in busy.keys() & {*ready, *late}:
                 process, task = busy[connection]
                 if connection in ready:
                     outcome = _receive(connection, process)
@@ -94,13 +98,13 @@ def outcomes(
             process.join()
 
 
-def _hand_over(connection, task):
+def _hand_over(connection: Connection, task: Any) -> Any:
     with suppress(OSError):  # a process that has just died is noticed by _receive
         connection.send(task)
     return task
 
 
-def _receive(connection, process):
+def _receive(connection: Connection, process: SpawnProcess) -> Any:
     try:
         return connection.recv()
     except (EOFError, OSError):
@@ -108,7 +112,7 @@ def _receive(connection, process):
         return Failure(f"its process died (status {process.exitcode})")
 
 
-def _spawn(function: Callable) -> tuple:
+def _spawn(function: Callable) -> tuple[Connection, SpawnProcess]:
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=_serve, args=(function, there), daemon=True)
@@ -118,14 +122,14 @@ def _spawn(function: Callable) -> tuple:
     return here, process
 
 
-def _end_with(parent) -> None:
+def _end_with(parent: BaseProcess) -> None:
     """End this process when its parent has ended, which has no chance to say so when it is killed."""
     wait([parent.sentinel])
     os._exit(1)
 
 
 @contextmanager
-def _interrupts_ignored():
+def _interrupts_ignored() -> Iterator[None]:
     """Processes started in here inherit it: Ctrl-C is the parent's business, and it ends its workers."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -137,7 +141,7 @@ def _interrupts_ignored():
         signal.signal(signal.SIGINT, before)
 
 
-def _serve(function: Callable, connection) -> None:
+def _serve(function: Callable, connection: Connection) -> None:
     threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     while True:
         try:

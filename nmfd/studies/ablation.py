@@ -117,7 +117,7 @@ def horizons(
 
 def _kept(
     out: Path, work: Callable, todo: Sequence[tuple[str, int]], *, columns: Mapping[str, Mapping[str, type]],
-    workers: int, length: int, configuration: Mapping, progress,
+    workers: int, length: int, configuration: Mapping, progress: Callable[[int, int, str], None] | None,
 ) -> dict[str, list[dict]]:
     """All rows of `out`/<name>.csv, each of `columns`, after the runs `todo` = (what, number).
 

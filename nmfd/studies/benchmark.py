@@ -75,7 +75,9 @@ def benchmark(
         return folder.rows()
 
 
-def configuration(scenario: Scenario, controllers, plant: str, policies) -> tuple[dict, dict]:
+def configuration(
+    scenario: Scenario, controllers: Sequence[str], plant: str, policies: Mapping[str, Path],
+) -> tuple[dict, dict]:
     """What all runs have in common, and what each controller depends on besides. InputError for a fault that the
     regional model cannot have."""
     faults.without_city(scenario.ordered_faults, f"{scenario.name}: faults")
@@ -96,7 +98,8 @@ def _label(run: tuple[str, int]) -> str:
 
 
 def results(
-    work: Callable, todo: Sequence[tuple], workers: int, steps: int, progress, *, label: Callable[..., str],
+    work: Callable, todo: Sequence[tuple], workers: int, steps: int,
+    progress: Callable[[int, int, str], None] | None, *, label: Callable[..., str],
 ) -> Iterator[tuple]:
     """(run, result or Failure) of every run, in this process if there is one worker.
 
@@ -111,7 +114,7 @@ def results(
             yield run, outcome
         return
     for done, run in enumerate(todo):
-        def tick(k, _, before=done * steps, run=run):
+        def tick(k: int, _: int, before: int = done * steps, run: tuple = run) -> None:
             report(before + k, total, label(run))
 
         yield run, attempt(partial(work, progress=tick), run)
@@ -185,7 +188,7 @@ def summary_table(rows: Sequence[Mapping]) -> str:
     with_bound = any(name in tts for name in ("bound-pc", "bound-pcrg"))
     lines = []
     for name, group in groups.items():
-        def mean(column, group=group):
+        def mean(column: str, group: Sequence[Mapping] = group) -> float:
             return statistics.fmean(row[column] for row in group)
 
         spread = interval(tts[name])

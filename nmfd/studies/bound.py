@@ -6,10 +6,11 @@ be possible, not one that is proven to be the least.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from nmfd import closed_loop
 from nmfd.controllers import registry
@@ -121,7 +122,7 @@ def solve(
 class _Controls:
     """Admissible controls of T intervals and B plans from logits: a scaled sigmoid and a masked softmax."""
 
-    def __init__(self, network: RegionalModel, steps: int, starts, *, guidance: bool):
+    def __init__(self, network: RegionalModel, steps: int, starts: Iterable[tuple], *, guidance: bool):
         mask = torch.tensor(network.split_mask)
         self._adjacency = torch.tensor(network.adjacency, dtype=torch.float64)
         self._mask, self._bounds = mask.double(), (network.u_min, network.u_max)
@@ -148,7 +149,10 @@ class _Controls:
         return perimeter, torch.softmax(self.logits[1].masked_fill(self._blocked, -torch.inf), dim=-2) * self._mask
 
 
-def _total_time_spent(scenario: Scenario, parameters, demand, perimeter, splits) -> torch.Tensor:
+def _total_time_spent(
+    scenario: Scenario, parameters: dynamics.Parameters, demand: Float[torch.Tensor, "T R R"],
+    perimeter: Float[torch.Tensor, "T B R R"], splits: Float[torch.Tensor, "T b R R R"],  # b: B or 1
+) -> Float[torch.Tensor, " B"]:
     """TTS (B,) [veh s] of plans from the empty network by the definition of nmfd.metrics."""
     x = demand.new_zeros(perimeter.shape[1], *demand.shape[1:])
     states = [x]

@@ -4,18 +4,21 @@
 """
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator, MultipleLocator, StrMethodFormatter
 
+from nmfd.arrays import Adjacency
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
@@ -235,7 +238,10 @@ def demand(ax: Axes, scenario: Scenario) -> Axes:
     return ax
 
 
-def _curves(ax: Axes, trajectories: Sequence[Trajectory], quantity, seed: int | None = None) -> None:
+def _curves(
+    ax: Axes, trajectories: Sequence[Trajectory], quantity: Callable[[Trajectory], np.ndarray],
+    seed: int | None = None,
+) -> None:
     """One curve per controller and plant: the mean over its seeds, or one `seed`, and their range as a shade."""
     groups: dict[tuple[str, str], list[Trajectory]] = {}
     for trajectory in trajectories:
@@ -258,7 +264,7 @@ def _curves(ax: Axes, trajectories: Sequence[Trajectory], quantity, seed: int | 
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def _zones(span, mfd: Mfd, top: float) -> None:
+def _zones(span: Callable, mfd: Mfd, top: float) -> None:
     """Draw the ZONES between accumulation 0 and `top` with `span`, which is ax.axhspan or ax.axvspan."""
     low, high = optimal_band(mfd)
     limits = (low, high, mfd.jam, max(top, mfd.jam))
@@ -277,7 +283,7 @@ def time_axis(ax: Axes, seconds: np.ndarray) -> np.ndarray:
     return seconds / unit
 
 
-def _thousands(axis) -> None:
+def _thousands(axis: Axis) -> None:
     axis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
 
 
@@ -285,7 +291,7 @@ def _tones(count: int) -> list:
     return [colormaps["tab10"](n % 10) for n in range(count)]
 
 
-def _pairs(adjacency: np.ndarray):
+def _pairs(adjacency: Adjacency) -> Int[np.ndarray, "N 2"]:
     return np.argwhere(np.triu(adjacency | adjacency.T))
 
 

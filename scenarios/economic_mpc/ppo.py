@@ -14,14 +14,16 @@ had learnt nothing after 25 rounds.
 import argparse
 from pathlib import Path
 
+import numpy as np
 import torch
+from gymnasium.spaces import Box
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
 import nmfd
-from nmfd.rl import NmfdVectorEnv, RegionalEnv, Sb3VecEnv
+from nmfd.rl import Interface, NmfdVectorEnv, Sb3VecEnv
 
 HERE = Path(__file__).parent
 WEIGHTS = HERE / "ppo.pt"
@@ -36,20 +38,20 @@ class Ppo:
     name = "ppo"
     files = ("ppo.pt",)
 
-    def __init__(self, scenario: nmfd.Scenario):
+    def __init__(self, planning: nmfd.PlanningModel):
         if not WEIGHTS.is_file():
             raise nmfd.InputError(f"{WEIGHTS}: no such file; train it with: python {HERE / 'ppo.py'}")
-        env = RegionalEnv(scenario, metering=True)
-        self._interface = env.interface
-        self._policy = ActorCriticPolicy(
-            env.observation_space, env.action_space, lambda _: 0.0, use_sde=True, **NETWORK)
+        self._interface = Interface(planning.network, metering=True)
+        observations = Box(-np.inf, np.inf, (self._interface.observation_size,), np.float32)
+        actions = Box(-1.0, 1.0, (self._interface.action_size,), np.float32)
+        self._policy = ActorCriticPolicy(observations, actions, lambda _: 0.0, use_sde=True, **NETWORK)
         self._policy.load_state_dict(torch.load(WEIGHTS, weights_only=True))
 
     def reset(self, seed: int = 0) -> None:
         pass
 
-    def act(self, measurement: nmfd.Measurement) -> nmfd.Controls:
-        action, _ = self._policy.predict(self._interface.observed(measurement), deterministic=True)
+    def act(self, observation: nmfd.Observation) -> nmfd.Controls:
+        action, _ = self._policy.predict(self._interface.observed(observation), deterministic=True)
         return self._interface.controls(action)
 
 

@@ -9,7 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
+from nmfd import tensors
+from nmfd.arrays import PerPair
 from nmfd.controllers.dpc.policy import DpcController, Policy, check_guidance, load_policy
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
@@ -28,7 +31,7 @@ LOOK_AHEAD = 40     # control intervals; gating costs something at first, and pa
 MOST_LOSS = 0.05    # of the total time spent without control, in that time
 
 
-def statistics(states: np.ndarray) -> dict[str, torch.Tensor]:
+def statistics(states: Float[np.ndarray, "N C"]) -> dict[str, torch.Tensor]:
     """What a checkpoint keeps of the training states (N, R*R) [-], each divided by the policy's scale.
 
     mean (R*R,), precision (R*R, R*R): of the Mahalanobis distance; limit: the QUANTILE of it in training.
@@ -79,7 +82,7 @@ class Guarded:
         self._error = 0.0       # squared, of the predictions so far
         self._predicted: np.ndarray | None = None  # accumulations (R,) at the end of this interval
 
-    def distance(self, accumulation: np.ndarray) -> float:
+    def distance(self, accumulation: PerPair) -> float:
         """Mahalanobis distance of accumulation (R, R) [veh] from the training states, as a share of its limit."""
         far = (accumulation / self._scale).ravel() - self._mean
         return float(np.sqrt(far @ self._precision @ far)) / self._limit
@@ -139,7 +142,9 @@ class Guarded:
                 torch.from_numpy(controls.perimeter).float(), splits)
         self._predicted = x.sum(-1).numpy().astype(float)
 
-    def _advance(self, x, demand, perimeter, splits) -> torch.Tensor:
+    def _advance(
+        self, x: tensors.PerPair, demand: tensors.PerPair, perimeter: tensors.PerPair, splits: tensors.PerTurn,
+    ) -> tensors.PerPair:
         planning = self._planning
         return dynamics.advance(
             self._model, x, demand, perimeter, splits, planning.step, integrator=planning.integrator,

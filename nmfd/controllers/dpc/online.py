@@ -11,7 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
+from nmfd.arrays import PerPair, PerRegion
 from nmfd.controllers.dpc.options import Online
 from nmfd.controllers.dpc.policy import DpcController, Policy, check_guidance, load_policy
 from nmfd.controllers.dpc.rollout import Rollout
@@ -44,11 +46,12 @@ class ModelEstimate:
         self.reset()
 
     def reset(self) -> None:
+        """Back to the nominal model."""
         self._squares = np.zeros((2 * self._regions,) * 2)
         self._misses = np.zeros(2 * self._regions)
         self.demand, self.outflow = np.ones(self._regions), np.ones(self._regions)
 
-    def update(self, before: np.ndarray, after: np.ndarray, planned: np.ndarray, controls: Controls) -> None:
+    def update(self, before: PerPair, after: PerPair, planned: PerPair, controls: Controls) -> None:
         """before, after: accumulation (R, R) [veh] at two steps, between them `controls` and the demand `planned`."""
         parts = self._contributions(before, planned, controls)
         miss = (after - before - parts.sum(axis=0)).ravel()
@@ -58,7 +61,7 @@ class ModelEstimate:
         factors = 1.0 + np.linalg.solve(self._squares + self._prior, self._misses)
         self.demand, self.outflow = np.split(np.clip(factors, *LIMITS), 2)
 
-    def _contributions(self, before: np.ndarray, planned: np.ndarray, controls: Controls) -> np.ndarray:
+    def _contributions(self, before: PerPair, planned: PerPair, controls: Controls) -> Float[np.ndarray, "M R R"]:
         """(2 R, R, R) [veh]: what the demand of each origin and the outflow of each region add to x in an interval."""
         step, regions = self._planning.step, self._regions
         x = torch.from_numpy(np.maximum(before, 0.0))
@@ -97,11 +100,13 @@ class OnlineDpc:
         self.reset()
 
     @property
-    def demand(self) -> np.ndarray:
+    def demand(self) -> PerRegion:
+        """Of every origin, times its nominal value."""
         return self._estimate.demand
 
     @property
-    def outflow(self) -> np.ndarray:
+    def outflow(self) -> PerRegion:
+        """Of every region, times its nominal value."""
         return self._estimate.outflow
 
     def reset(self, seed: int = 0) -> None:
@@ -141,7 +146,7 @@ class OnlineDpc:
         torch.nn.utils.clip_grad_norm_(self._tuned.parameters(), 1.0)
         self._optimizer.step()
 
-    def _planned(self, step: int) -> np.ndarray:
+    def _planned(self, step: int) -> PerPair:
         """(R, R) [veh/s] in interval `step`; nothing after the end."""
         forecast = self._planning.forecast
         return forecast[step] if step < len(forecast) else np.zeros_like(forecast[0])

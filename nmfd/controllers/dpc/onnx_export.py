@@ -19,6 +19,7 @@ from nmfd.extras import need
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import read_scenario
 from nmfd.runs.files import atomic
+from nmfd.tensors import PerPair, PerTurn
 
 OPSET = 18
 TOLERANCE = 1e-5  # [-], of every output against torch: float32, summed in another order
@@ -85,7 +86,8 @@ class _Outputs(torch.nn.Module):
         super().__init__()
         self.policy = policy
 
-    def forward(self, accumulation: torch.Tensor):
+    def forward(self, accumulation: PerPair) -> PerPair | tuple[PerPair, PerTurn]:
+        """As of nmfd.controllers.dpc.policy.Policy."""
         perimeter, splits = self.policy(accumulation)
         return perimeter if splits is None else (perimeter, splits)
 

@@ -56,18 +56,20 @@ class Training(Options):
         "where the regional model locks whatever small changes do, descent finds no way to a gate by itself", False)
 
     @model_validator(mode="after")
-    def _begins_as_one(self):
+    def _begins_as_one(self) -> "Training":
         if self.from_gating and self.from_no_control:
             raise Problem("from_gating", "a policy cannot begin as both, a gate and no control; omit one")
         return self
 
     def misfit(self, planning: PlanningModel) -> Problem | None:
+        """A gate without a region to protect."""
         if not self.from_gating or planning.protected:
             return None
         return Problem("from_gating", "expected a scenario with protected regions; name them, or omit it")
 
     @property
     def levels(self) -> tuple[float, float]:
+        """Between which the demand is scaled."""
         return self.demand_low, self.demand_high
 
 

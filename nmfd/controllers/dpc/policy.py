@@ -11,12 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import nn
 
+from nmfd.arrays import Adjacency
 from nmfd.controllers.dpc.options import DEEPEST, WIDEST, Activation
 from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
+from nmfd.tensors import PerPair, PerTurn
 from nmfd.types import Controls, Observation, Status
 
 FORMAT = 1
@@ -36,7 +39,8 @@ class SoftExponential(nn.Module):
         super().__init__()
         self.alpha = nn.Parameter(torch.zeros(width))
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x: Float[torch.Tensor, "*B W"]) -> Float[torch.Tensor, "*B W"]:
+        """f(alpha, x)."""
         small = self.alpha.abs() < 1e-4
         safe = torch.where(small, torch.full_like(self.alpha, 1e-4), self.alpha)
         rising = torch.expm1((safe * x).clamp(max=20.0)) / safe + safe
@@ -97,7 +101,8 @@ class Policy(nn.Module):
             self.register_buffer("split_mask", mask.float(), persistent=False)
             self.register_buffer("split_bias", bias, persistent=False)
 
-    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def forward(self, x: PerPair) -> tuple[PerPair, PerTurn | None]:
+        """Perimeter and splits of the states x."""
         perimeter, splits = self.listed(x)
         if not self.architecture.sparse:
             return perimeter, splits
@@ -108,7 +113,9 @@ class Policy(nn.Module):
                 -2, onward.unsqueeze(-1).expand_as(splits), splits)
         return perimeter, splits
 
-    def listed(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def listed(
+        self, x: PerPair,
+    ) -> tuple[Float[torch.Tensor, "*#B R D"], Float[torch.Tensor, "*#B R D R"] | None]:
         """Perimeter (..., R, D) and splits (..., R, D, R) towards the regions `onward` (R, D); all D = R if dense."""
         hidden = self.backbone((x / self.scale).flatten(-2))
         shape = self.onward.shape
@@ -120,7 +127,7 @@ class Policy(nn.Module):
         return perimeter, torch.softmax(logits, dim=-2) * self.split_mask
 
 
-def _neighbours(adjacency: np.ndarray) -> np.ndarray:
+def _neighbours(adjacency: Adjacency) -> Int[np.ndarray, "R D"]:
     """(R, D) int: the regions adjacent to each, D the most that any has; shorter rows repeat their last."""
     rows = [np.flatnonzero(row) for row in adjacency]
     most = max(map(len, rows))

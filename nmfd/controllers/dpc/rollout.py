@@ -5,13 +5,20 @@ import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import torch
+from jaxtyping import Float
 
 from nmfd.controllers.dpc.policy import Policy
 from nmfd.model import dynamics
 from nmfd.model.demand_noise import entries
 from nmfd.model.planning import PlanningModel
+from nmfd.tensors import PerPair, PerTurn
+
+States = Float[torch.Tensor, "B R R"]
+Demands = Float[torch.Tensor, "T B R R"]  # or states over time
+Levels = Float[torch.Tensor, " B"]
 
 
 class Rollout:
@@ -20,9 +27,12 @@ class Rollout:
     Random numbers are drawn on the CPU, so that they are the same on every device.
     """
 
-    def __init__(self, planning: PlanningModel, dtype=torch.float32, device="cpu", detour_cost: float = 0.0):
+    def __init__(
+        self, planning: PlanningModel, dtype: torch.dtype = torch.float32, device: str | torch.device = "cpu",
+        detour_cost: float = 0.0,
+    ):
         """detour_cost: what a vehicle loses that is guided off the drivers' own split ratios [s]"""
-        def tensor(values):
+        def tensor(values: Any) -> torch.Tensor:
             return torch.tensor(values, dtype=dtype, device=device)
 
         network = planning.network
@@ -35,15 +45,16 @@ class Rollout:
         self.bound = (self.demand.sum((0, 1)) > 0).to(dtype)
 
     def random_start(
-        self, batch: int, spread: float, share: float, generator, levels: tuple[float, float] = (1.0, 1.0),
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+        self, batch: int, spread: float, share: float, generator: torch.Generator,
+        levels: tuple[float, float] = (1.0, 1.0),
+    ) -> tuple[States, Demands]:
         """Initial states (B, R, R) [veh] and demands (T, B, R, R) [veh/s].
 
         levels: the demand of a whole rollout is multiplied by a number between these
         A share of the rollouts starts at a random time of the scenario from a random state, which fills the regions
         up to between nothing and 80 % of their jam accumulation with vehicles for the destinations in use.
         """
-        def uniform(*shape):
+        def uniform(*shape: int) -> torch.Tensor:
             return torch.rand(*shape, generator=generator, dtype=self.dtype).to(self.device)
 
         steps, regions = self.demand.shape[:2]
@@ -60,7 +71,7 @@ class Rollout:
             demand = demand * (levels[0] + (levels[1] - levels[0]) * uniform(batch, 1, 1))
         return x * (rollout < share * batch)[:, None, None], demand
 
-    def draw_model(self, batch: int, spread: float, generator, scale: float = 1.0) -> None:
+    def draw_model(self, batch: int, spread: float, generator: torch.Generator, scale: float = 1.0) -> None:
         """From now on every one of `batch` rollouts has a regional model of its own, around the nominal one.
 
         spread: standard deviation of the logarithm of every region's accumulation axis (jam and critical accumulation,
@@ -69,7 +80,7 @@ class Rollout:
         """
         p, regions = self._nominal, len(self.jam)
         if spread or scale != 1.0:
-            def factor(*shape, share=1.0):
+            def factor(*shape: int, share: float = 1.0) -> torch.Tensor:
                 normal = torch.randn(batch, *shape, generator=generator, dtype=self.dtype).to(self.device)
                 return torch.exp(share * spread * normal.clamp(-2.0, 2.0))
 
@@ -87,7 +98,9 @@ class Rollout:
         p = self._nominal
         return p.c if p.exit_rates is None else p.c * p.exit_rates.amax(-1)
 
-    def perturb(self, demand: torch.Tensor, level, noise: float, noise_all: float, generator) -> torch.Tensor:
+    def perturb(
+        self, demand: Demands, level: Levels, noise: float, noise_all: float, generator: torch.Generator,
+    ) -> Demands:
         """`demand` (T, B, R, R) [veh/s] with Gaussian noise, clipped at zero.
 
         sigma is `level` (B,) times `noise`, on the pairs with demand (demand_noise.WHERE, "pairs"); in every other
@@ -102,14 +115,16 @@ class Rollout:
         normal = torch.randn(demand.shape, generator=generator, dtype=self.dtype)
         return (demand + (normal * sigma).to(self.device)).clamp(min=0.0)
 
-    def step(self, policy: Policy, x, demand, noise) -> torch.Tensor:
+    def step(self, policy: Policy, x: States, demand: States, noise: States) -> States:
         """The state (B, R, R) [veh] one control interval after x, which `policy` saw with `noise` (B, R, R) [veh]."""
         perimeter, splits = policy(x + noise)
         return dynamics.advance(
             self.parameters, x, demand, perimeter, self.nominal_splits if splits is None else splits,
             self.planning.step, integrator=self.planning.integrator, substeps=self.planning.substeps)
 
-    def states(self, policy: Policy, x, demand, generator, step=None) -> tuple[torch.Tensor, torch.Tensor]:
+    def states(
+        self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None,
+    ) -> tuple[Demands, Demands]:
         """The states (T, B, R, R) [veh] under `policy` from x (B, R, R), and what it saw of them through the noise.
 
         step: what to use instead of `self.step`, such as its compiled form
@@ -122,7 +137,9 @@ class Rollout:
         exact = torch.stack(states)
         return exact, exact + noise
 
-    def total_time_spent(self, policy: Policy, x, demand, generator, step=None) -> torch.Tensor:
+    def total_time_spent(
+        self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None,
+    ) -> Levels:
         """TTS (B,) [veh s] of rollouts from x (B, R, R) under `policy`, with detours; arguments as `states`."""
         exact, seen = self.states(policy, x, demand, generator, step)
         vehicles = exact.sum((0, -2, -1))
@@ -130,7 +147,7 @@ class Rollout:
             vehicles = vehicles + self.detour_cost * self._diverted(exact, policy(seen)[1]).sum((0, -2, -1))
         return self.planning.step * vehicles
 
-    def _diverted(self, x: torch.Tensor, splits: torch.Tensor) -> torch.Tensor:
+    def _diverted(self, x: PerPair, splits: PerTurn) -> PerPair:
         """Vehicles (..., R, R) [veh/s] that leave a region another way than by the drivers' own split ratios."""
         p = self.parameters
         leaving = dynamics.rate(p, x.sum(-1)).unsqueeze(-1) * x

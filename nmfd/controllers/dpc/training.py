@@ -6,11 +6,13 @@ validation on the scenario itself is kept. The same seed gives the same weights.
 
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from nmfd.controllers.dpc import fallback
 from nmfd.controllers.dpc.options import TRAINED, Training
@@ -89,7 +91,7 @@ def train(
         begin_as_gate(policy, rollout, generator)
     advance = compiled_step(rollout.step) if compiled else rollout.step
     optimizer = torch.optim.Adam(policy.parameters(), lr=chosen.learning_rate)
-    first, best, history = 0, float("inf"), []
+    first, best, history = 0, float("inf"), list[list[float]]()
     state_file = out.with_name(out.name + ".resume")
     with locked(out.with_name(f".{out.name}.lock"), out):
         sweep(out.parent, {out.stem, state_file.stem})
@@ -187,7 +189,7 @@ def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> f
     return torch.log(total).mean().exp().item()
 
 
-def visited(policy: Policy, rollout: Rollout, chosen: Training, seed: int) -> np.ndarray:
+def visited(policy: Policy, rollout: Rollout, chosen: Training, seed: int) -> Float[np.ndarray, "N C"]:
     """States (N, R*R) [-], as a share of the policy's scale, that `policy` sees in rollouts like those in training."""
     generator = torch.Generator().manual_seed(seed)
     rollout.draw_model(4 * chosen.batch, chosen.mfd_spread, generator, chosen.mfd_scale)
@@ -200,13 +202,19 @@ def visited(policy: Policy, rollout: Rollout, chosen: Training, seed: int) -> np
         return (seen / policy.scale).flatten(0, 1).flatten(-2).double().cpu().numpy()
 
 
-def _state(configuration, step, best, history, policy, optimizer, generator) -> dict:
+def _state(
+    configuration: Mapping[str, Any], step: int, best: float, history: list[list[float]], policy: Policy,
+    optimizer: torch.optim.Optimizer, generator: torch.Generator,
+) -> dict[str, Any]:
     return {
         "configuration": configuration, "step": step, "best": best, "history": history,
         "policy": policy.state_dict(), "optimizer": optimizer.state_dict(), "generator": generator.get_state()}
 
 
-def _restore(state_file: Path, configuration, policy, optimizer, generator) -> tuple[int, float, list]:
+def _restore(
+    state_file: Path, configuration: Mapping[str, Any], policy: Policy, optimizer: torch.optim.Optimizer,
+    generator: torch.Generator,
+) -> tuple[int, float, list[list[float]]]:
     try:
         state = torch.load(state_file, map_location="cpu", weights_only=True)
     except FileNotFoundError:

@@ -14,7 +14,9 @@ from typing import Literal
 
 import numpy as np
 
-from nmfd.controllers.mpc.edge_model import Turns, affected_vehicles, build, vehicle_steps
+from nmfd.arrays import PerPair, PerTurn
+from nmfd.controllers.mpc import edge_model
+from nmfd.controllers.mpc.edge_model import Decision, Demands, PerCell, Plan, Turns
 from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.mpc.projected_gradient import AT_REST, Minimum, minimise
 from nmfd.controllers.options import Options, options
@@ -58,11 +60,11 @@ class Admissible:
         unused = np.setdiff1d(np.arange(network.regions), model.destinations)
         self._unused = (slice(None), slice(None), unused)
 
-    def open(self, moves: int) -> np.ndarray:
+    def open(self, moves: int) -> Plan:
         """The plan without control: perimeters open, nominal splits."""
         return np.tile(np.concatenate([np.full(self._edges, self._network.u_max), self._model.own]), (moves, 1))
 
-    def project(self, plan: np.ndarray) -> np.ndarray:
+    def project(self, plan: Plan) -> Plan:
         """The nearest admissible plan."""
         perimeter = np.clip(plan[:, :self._edges], self._network.u_min, self._network.u_max)
         if not self._guidance:
@@ -82,7 +84,7 @@ class Admissible:
                 return np.where(positive, value - level, 0.0).reshape(splits.shape)
             positive = still
 
-    def gap(self, plan: np.ndarray, gradient: np.ndarray) -> float:
+    def gap(self, plan: Plan, gradient: Plan) -> float:
         """What the best admissible plan would save if the objective were linear [its unit]."""
         u, of_u = plan[:, :self._edges], gradient[:, :self._edges]
         saved = float((of_u * (u - np.where(of_u > 0, self._network.u_min, self._network.u_max))).sum())
@@ -99,7 +101,7 @@ class Admissible:
         cells = len(self._model.region)
         return (cells * np.arange(moves)[:, None] + self._model.source).ravel()
 
-    def controls(self, decision: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    def controls(self, decision: Decision) -> tuple[PerPair, PerTurn | None]:
         """Perimeter (R, R) and splits (R, R, R), or None without guidance, of one interval (E + V,) of a plan."""
         perimeter = np.where(self._network.adjacency, self._network.u_max, 0.0)
         perimeter[tuple(self._model.edges.T)] = decision[:self._edges]
@@ -110,7 +112,7 @@ class Admissible:
         splits[tuple(self._model.turns.T)] = decision[self._edges:]
         return perimeter, splits
 
-    def decision(self, perimeter: np.ndarray, splits: np.ndarray) -> np.ndarray:
+    def decision(self, perimeter: PerPair, splits: PerTurn) -> Decision:
         """One interval (E + V,) of a plan, of perimeter (R, R) and splits (R, R, R)."""
         return np.concatenate([perimeter[tuple(self._model.edges.T)], splits[tuple(self._model.turns.T)]])
 
@@ -138,12 +140,12 @@ class EconomicMpc:
         # With one Euler step per interval, the last controls move vehicles that the horizon does not see arrive.
         blind = planning.integrator == "euler" and planning.substeps == 1
         self._moves = horizon - 1 if blind else horizon
-        self._model = build(network, self._used, guidance=guidance)
+        self._model = edge_model.build(network, self._used, guidance=guidance)
         rounded = replace(self._model, rounding=ROUNDING * min(mfd.jam for mfd in network.mfds))
         scheme: dict = {"step": planning.step, "substeps": planning.substeps, "integrator": planning.integrator}
-        self._exact: Callable = partial(vehicle_steps, self._model, **scheme)
-        self._rounded: Callable = partial(vehicle_steps, rounded, gradient=True, **scheme)
-        self._affected: Callable = partial(affected_vehicles, self._model, **scheme)
+        self._exact: Callable = partial(edge_model.vehicle_steps, self._model, **scheme)
+        self._rounded: Callable = partial(edge_model.vehicle_steps, rounded, gradient=True, **scheme)
+        self._affected: Callable = partial(edge_model.affected_vehicles, self._model, **scheme)
         self.admissible = Admissible(network, self._model, guidance=guidance)
         self._open = self.admissible.open(self._moves)
         self._gating = PiGating(planning) if planning.protected else None
@@ -169,14 +171,14 @@ class EconomicMpc:
         except (ArithmeticError, ValueError, RuntimeError) as error:  # of NumPy and SciPy, LinAlgError too
             return self._without(observation, last, f"solver failed ({type(error).__name__})")
         known = np.isfinite(found.gap)
-        solved = found.reason is None or (known and found.gap <= ACCEPTABLE * found.value)
-        if not solved and (found.point is last or not known) and found.reason != AT_REST:
-            return self._without(observation, last, found.reason)
+        reason = None if known and found.gap <= ACCEPTABLE * found.value else found.reason
+        if reason is not None and (found.point is last or not known) and reason != AT_REST:
+            return self._without(observation, last, reason)
         self._plan, self._left, self._gates = found.point, self._moves - 1, False
-        return self._first() if solved else self._first(
-            Status.SOLVER_FAILURE, f"{found.reason}: best plan so far used")
+        return self._first() if reason is None else self._first(
+            Status.SOLVER_FAILURE, f"{reason}: best plan so far used")
 
-    def _without(self, observation: Observation, last: np.ndarray, reason: str) -> Controls:
+    def _without(self, observation: Observation, last: Plan, reason: str) -> Controls:
         """The controls of an interval for which no plan was found."""
         self._plan = last
         if self._left:
@@ -196,11 +198,11 @@ class EconomicMpc:
         perimeter, splits = self.admissible.controls(self._plan[0])
         return Controls(perimeter=perimeter, splits=splits, status=status, note=note)
 
-    def cost(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> float:
+    def cost(self, start: PerCell, demand: Demands, plan: Plan) -> float:
         """Total time spent over the horizon [veh s] by the exact model, under a plan (moves, E + V)."""
         return self._step * self._exact(start, demand, plan)[0]
 
-    def forecast(self, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
+    def forecast(self, observation: Observation) -> tuple[PerCell, Demands]:
         """The cells (C,) [veh] now and the demand (horizon, C) [veh/s] of them, as edge_model numbers them."""
         first, horizon = min(observation.step, self._steps), self.options.horizon
         known = self._demand[first:first + horizon]
@@ -210,7 +212,7 @@ class EconomicMpc:
         start = np.maximum(observation.accumulation, 0.0)[:, self._used].ravel()
         return start, demand[:, :, self._used].reshape(horizon, -1)
 
-    def _solve(self, start: np.ndarray, demand: np.ndarray, plan: np.ndarray) -> Minimum:
+    def _solve(self, start: PerCell, demand: Demands, plan: Plan) -> Minimum:
         """The best plan found from `plan` (moves, E + V); its value, in vehicles, is that of the rounded model."""
         if self.fault == "solver-fails":
             raise FloatingPointError("ordered")
@@ -218,20 +220,19 @@ class EconomicMpc:
             return Minimum(point=plan, value=np.inf, gap=np.inf, evaluations=0, reason="time limit")
         objective = _diverging if self.fault == "solver-diverges" else partial(self._rounded, start, demand)
         if self._ipopt is not None and self.fault is None:
-            return self._by_ipopt(start, demand)
+            return self._by_ipopt(self._ipopt, start, demand)
         return minimise(
             objective, self.admissible.project, self.admissible.gap, plan,
             metric=(self._affected(start, demand, plan) + FEW) ** 2, tolerance=TOLERANCE,
             iterations=self.options.max_iterations, seconds=self.options.time_limit or self._step)
 
-
-    def _by_ipopt(self, start: np.ndarray, demand: np.ndarray) -> Minimum:
+    def _by_ipopt(self, solver: Ipopt, start: PerCell, demand: Demands) -> Minimum:
         """The plan of IPOPT, made admissible: it keeps to bounds and sums up to its tolerance only."""
         regions = self._regions
         state, forecast = np.zeros((regions, regions)), np.zeros((len(demand), regions, regions))
         state[:, self._used] = start.reshape(regions, -1)
         forecast[:, :, self._used] = demand.reshape(len(demand), regions, -1)
-        perimeter, splits, reason = self._ipopt.solve(state, forecast)
+        perimeter, splits, reason = solver.solve(state, forecast)
         rows = [self.admissible.decision(u, theta) for u, theta in zip(perimeter, splits, strict=True)]
         plan = self.admissible.project(np.stack(rows[:self._moves]))
         value, gradient = self._rounded(start, demand, plan)
@@ -239,5 +240,5 @@ class EconomicMpc:
             point=plan, value=value, gap=self.admissible.gap(plan, gradient), evaluations=1, reason=reason)
 
 
-def _diverging(plan: np.ndarray) -> tuple[float, np.ndarray]:
+def _diverging(plan: Plan) -> tuple[float, Plan]:
     return np.nan, np.full_like(plan, np.nan)

@@ -9,12 +9,21 @@ cost of two more rollouts.
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
+from nmfd.arrays import PerRegion
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 # Weights of the slopes of an explicit Runge-Kutta scheme, and where each slope but the first is taken, in steps along
 # the slope before it.
 SCHEMES = {"euler": ((1.0,), ()), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.5, 0.5, 1.0))}
+
+PerCell = Float[np.ndarray, " C"]
+PerEdge = Float[np.ndarray, " E"]
+PerTurn = Float[np.ndarray, " V"]
+Demands = Float[np.ndarray, "H C"]
+Plan = Float[np.ndarray, "K D"]  # D = E + V decisions in each interval
+Decision = Float[np.ndarray, " D"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,26 +40,26 @@ class Turns:
     rounding: [veh], width over which the kink of the MFDs at the jam accumulation is rounded off; 0 for the exact model
     """
 
-    destinations: np.ndarray
-    edges: np.ndarray
-    turns: np.ndarray
-    edge: np.ndarray
-    source: np.ndarray
-    target: np.ndarray
-    own: np.ndarray
-    region: np.ndarray
-    ends: np.ndarray
-    a: np.ndarray
-    b: np.ndarray
-    c: np.ndarray
-    jam: np.ndarray
-    exit_rates: np.ndarray
-    capacity: np.ndarray | None
-    storage: np.ndarray | None
+    destinations: Int[np.ndarray, " J"]
+    edges: Int[np.ndarray, "E 2"]
+    turns: Int[np.ndarray, "V 3"]
+    edge: Int[np.ndarray, " V"]
+    source: Int[np.ndarray, " V"]
+    target: Int[np.ndarray, " V"]
+    own: PerTurn
+    region: Int[np.ndarray, " C"]
+    ends: Bool[np.ndarray, " C"]
+    a: PerRegion
+    b: PerRegion
+    c: PerRegion
+    jam: PerRegion
+    exit_rates: PerCell
+    capacity: PerEdge | None
+    storage: PerRegion | None
     rounding: float
 
 
-def build(network: RegionalModel, destinations: np.ndarray, *, guidance: bool) -> Turns:
+def build(network: RegionalModel, destinations: Int[np.ndarray, " J"], *, guidance: bool) -> Turns:
     """The turns of vehicles bound for `destinations` (J,): all possible ones with guidance, else the nominal ones."""
     regions, count = network.regions, len(destinations)
     in_use = np.isin(np.arange(regions), destinations)
@@ -61,9 +70,10 @@ def build(network: RegionalModel, destinations: np.ndarray, *, guidance: bool) -
     edges, edge = np.unique(here * regions + onward, return_inverse=True)
     cells, edges = np.arange(regions * count), np.stack([edges // regions, edges % regions], axis=1)
     rates = np.ones(network.adjacency.shape) if network.exit_rates is None else network.exit_rates
+    capacity = network.open_capacity
     return Turns(
         exit_rates=rates[:, destinations].ravel(), storage=network.storage,
-        capacity=None if network.capacity is None else network.open_capacity[tuple(edges.T)],
+        capacity=None if capacity is None else capacity[tuple(edges.T)],
         destinations=destinations, edges=edges, turns=turns, edge=edge,
         source=here * count + number[bound], target=onward * count + number[bound],
         own=network.nominal_splits[here, onward, bound], region=cells // count,
@@ -72,7 +82,7 @@ def build(network: RegionalModel, destinations: np.ndarray, *, guidance: bool) -
         rounding=0.0)
 
 
-def rate(model: Turns, accumulation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def rate(model: Turns, accumulation: PerRegion) -> tuple[PerRegion, PerRegion]:
     """q_i [1/s] (R,) and dq_i/dx_i [1/(veh s)] (R,) of the accumulations x_i (R,) [veh].
 
     With rounding r, min(x, jam) is (x + jam - sqrt((x - jam)^2 + r^2)) / 2: off by r/2 at the jam accumulation, and by
@@ -88,8 +98,8 @@ def rate(model: Turns, accumulation: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def derivative(
-    model: Turns, x: np.ndarray, demand: np.ndarray, perimeter: np.ndarray, splits: np.ndarray,
-) -> tuple[np.ndarray, tuple]:
+    model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, splits: PerTurn,
+) -> tuple[PerCell, tuple]:
     """dx/dt (C,) [veh/s] of x (C,) [veh] under demand (C,) [veh/s], perimeter (E,) [-] and splits (V,) [-].
 
     Also what `pull_derivative` needs.
@@ -112,9 +122,12 @@ def derivative(
     return change, (x, leaving, q, change_of_q, wish, share, boundary)
 
 
-def _boundary(model: Turns, wish: np.ndarray, perimeter: np.ndarray, accumulation: np.ndarray) -> tuple:
+def _boundary(
+    model: Turns, wish: PerEdge, perimeter: PerEdge, accumulation: PerRegion,
+) -> tuple[PerEdge, PerEdge, PerEdge, PerEdge]:
     """The share of `wish` (E,) [veh/s] that passes (dynamics.passing) [-], and how it changes (E,) with the wish
     [s/veh], with u [-] and with the accumulation of the region ahead [1/veh]."""
+    assert model.capacity is not None and model.storage is not None  # who calls looks at that
     ahead = model.edges[:, 1]
     free = 1.0 - accumulation[ahead] / model.storage[ahead]
     room, open_capacity = np.maximum(free, LEAST_ROOM), model.capacity
@@ -129,8 +142,8 @@ def _boundary(model: Turns, wish: np.ndarray, perimeter: np.ndarray, accumulatio
 
 
 def pull_derivative(
-    model: Turns, adjoint: np.ndarray, perimeter: np.ndarray, splits: np.ndarray, record: tuple,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    model: Turns, adjoint: PerCell, perimeter: PerEdge, splits: PerTurn, record: tuple,
+) -> tuple[PerCell, PerEdge, PerTurn]:
     """The gradient of x (C,), of the perimeter (E,) and the splits (V,), where one of dx/dt has `adjoint` (C,)."""
     x, leaving, q, change_of_q, wish, share, boundary = record
     regions, edges = len(model.jam), len(model.edges)
@@ -149,8 +162,9 @@ def pull_derivative(
 
 
 def advance(
-    model: Turns, x, demand, perimeter, splits, step: float, integrator: str = "euler",
-) -> tuple[np.ndarray, list]:
+    model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, splits: PerTurn, step: float,
+    integrator: str = "euler",
+) -> tuple[PerCell, list]:
     """x (C,) after `step` [s] by one step of the integrator, and what `pull_advance` needs."""
     weights, nodes = SCHEMES[integrator]
     total, records, at = np.zeros_like(x), [], x
@@ -164,11 +178,12 @@ def advance(
 
 
 def pull_advance(
-    model: Turns, adjoint, perimeter, splits, records: list, step: float, integrator: str = "euler",
-) -> tuple[np.ndarray, np.ndarray]:
+    model: Turns, adjoint: PerCell, perimeter: PerEdge, splits: PerTurn, records: list, step: float,
+    integrator: str = "euler",
+) -> tuple[PerCell, Decision]:
     """The gradient of x (C,) and of the decision (E + V,) before a step, where x after it has `adjoint` (C,)."""
     weights, nodes = SCHEMES[integrator]
-    of_x, of_decision, of_node = adjoint, np.zeros(len(perimeter) + len(splits)), None
+    of_x, of_decision, of_node = adjoint, np.zeros(len(perimeter) + len(splits)), np.zeros_like(adjoint)
     for stage in reversed(range(len(weights))):
         of_slope = step * weights[stage] * adjoint
         if stage < len(nodes):
@@ -179,9 +194,9 @@ def pull_advance(
 
 
 def vehicle_steps(
-    model: Turns, start: np.ndarray, demand: np.ndarray, plan: np.ndarray, step: float, *, substeps: int = 1,
+    model: Turns, start: PerCell, demand: Demands, plan: Plan, step: float, *, substeps: int = 1,
     integrator: str = "euler", gradient: bool = False,
-) -> tuple[float, np.ndarray | None]:
+) -> tuple[float, Plan | None]:
     """Vehicles in the network, summed over the ends of H control intervals of `step` [s], and its gradient.
 
     start: (C,) [veh]; demand: (H, C) [veh/s]
@@ -210,9 +225,9 @@ def vehicle_steps(
 
 
 def affected_vehicles(
-    model: Turns, start: np.ndarray, demand: np.ndarray, plan: np.ndarray, step: float, *, substeps: int = 1,
+    model: Turns, start: PerCell, demand: Demands, plan: Plan, step: float, *, substeps: int = 1,
     integrator: str = "euler",
-) -> np.ndarray:
+) -> Plan:
     """How many vehicles every number of the plan decides on (K, E + V) [veh]; arguments as in `vehicle_steps`.
 
     Of an edge, those that want to cross it in that interval; of a turn, those that leave its cell.
@@ -229,6 +244,6 @@ def affected_vehicles(
     return np.concatenate([wish, leaving], axis=1)
 
 
-def _intervals(plan: np.ndarray, horizon: int, substeps: int) -> np.ndarray:
+def _intervals(plan: Plan, horizon: int, substeps: int) -> Int[np.ndarray, " N"]:
     """The row of the plan in force at every integration step."""
     return np.minimum(np.arange(horizon * substeps) // substeps, len(plan) - 1)

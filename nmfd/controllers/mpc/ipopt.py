@@ -8,6 +8,7 @@ orders of magnitude slower than projected_gradient; `solver = "ipopt"` in the op
 import casadi as ca
 import numpy as np
 
+from nmfd.arrays import PairsOverTime, PerPair, TurnsOverTime
 from nmfd.model import dynamics_casadi as model
 from nmfd.model.planning import PlanningModel
 
@@ -47,7 +48,7 @@ class Ipopt:
             "g": ca.vertcat(*constraints)},
             {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", **limits}})
 
-    def solve(self, state: np.ndarray, demand: np.ndarray) -> tuple[np.ndarray, np.ndarray, str | None]:
+    def solve(self, state: PerPair, demand: PairsOverTime) -> tuple[PairsOverTime, TurnsOverTime, str | None]:
         """u (H, R, R) [-], theta (H, R, R, R) [-], and why IPOPT stopped short of convergence, or None.
 
         state: (R, R) [veh]; demand: (H, R, R) [veh/s]
