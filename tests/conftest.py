@@ -11,11 +11,8 @@ from xdist.workermanage import NodeManager
 sys.dont_write_bytecode = False  # else every process rewrites the asserts of all files anew, for 6 s
 # Here and in the commands that tests call: workers must not fight for cores. Torch reads it when it is imported.
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-# What the annotations say of the shapes of arrays is checked at every call.
-install_import_hook(
-    ["cosim.evaluation", "cosim.importing", "cosim.plant", "cosim.report", "cosim.sumo.net", "cosim.sumo.trips"],
-    "array_checks.arrays")
-
+# Where arrays have shapes; of the other modules, many functions are called for every vehicle or line of a file.
+SHAPED = ["cosim.evaluation", "cosim.importing", "cosim.plant", "cosim.report", "cosim.sumo.net", "cosim.sumo.trips"]
 # Reasons for which a test may be skipped all the same; benchmarks run when they are asked for.
 ALLOWED = ("no GPU", "no real city", "--benchmark-skip active")
 
@@ -31,6 +28,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Annotations are checked at every call, but where times are measured, and mutmut has wrapped every function."""
     if not config.getoption("benchmark_only") and "MUTANT_UNDER_TEST" not in os.environ:
         install_import_hook("nmfd", "annotations.check")
+        install_import_hook(SHAPED, "annotations.check_arrays")
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
