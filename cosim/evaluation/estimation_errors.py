@@ -68,7 +68,7 @@ def error_table(rows: pd.DataFrame) -> str:
         shown[column] = [
             f"{100 * value:.1f} %" if column == "rmse_share" else f"{value:.1f}" for value in shown[column]]
     headings = ["controller", "region", "name", "critical", "mean", "RMSE", "of critical", "bias", "x_ij RMSE"]
-    return text_columns(headings, shown.to_numpy(), CAPTION)
+    return text_columns(headings, shown.to_numpy().tolist(), CAPTION)
 
 
 def _rms(values: np.ndarray) -> float:

@@ -163,7 +163,7 @@ def error_table(rows: pd.DataFrame) -> str:
         shown[column] = [f"{100 * value:.1f} %" for value in rows[column]]
     headings = [
         "region", "name", "critical", "mean", "RMSE", "of critical", "bias", "next interval RMSE", "of critical"]
-    return text_columns(headings, shown.to_numpy(), CAPTION)
+    return text_columns(headings, shown.to_numpy().tolist(), CAPTION)
 
 
 def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
