@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from nmfd import api
 from nmfd.api import load_scenario
 from nmfd.cli.main import main
+from nmfd.closed_loop import noisy
 from nmfd.controllers import registry
 from nmfd.controllers.dpc.online import ModelEstimate, OnlineDpc
 from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
@@ -42,13 +43,12 @@ def test_the_estimate_finds_what_changed(case, demand, outflow):
     """From noisy measurements of the loading phase."""
     actual, random = changed(BENCHMARK, case), np.random.default_rng(0)
     plant, controller = NmfdPlant(actual), registry.make("pi-gating", BENCHMARK)
-    estimate, before = ModelEstimate(planning_model(BENCHMARK)), plant.reset(0)
+    estimate, before = ModelEstimate(planning_model(BENCHMARK)), noisy(plant.reset(0), np.zeros((7, 7)))
     for k in range(35):
         controls = controller.act(before)
-        after = plant.step(controls)
-        noisy = replace(after, accumulation=after.accumulation + 0.5 * random.standard_normal((7, 7)))
-        estimate.update(before.accumulation, noisy.accumulation, BENCHMARK.demand[k], controls)
-        before = noisy
+        after = noisy(plant.step(controls), 0.5 * random.standard_normal((7, 7)))
+        estimate.update(before.accumulation, after.accumulation, BENCHMARK.demand[k], controls)
+        before = after
     active = BENCHMARK.demand[:35].sum(axis=(0, 2)) > 100.0
     np.testing.assert_allclose(estimate.demand[active], demand, atol=0.03)
     assert estimate.outflow[3] == pytest.approx(outflow, abs=0.03)  # the centre, through which all go

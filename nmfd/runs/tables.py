@@ -15,7 +15,7 @@ def text_table(rows: Sequence[Mapping[str, object]], caption: str = "") -> str:
     return text_columns(list(rows[0]) if rows else [], [list(row.values()) for row in rows], caption)
 
 
-def text_columns(headings: Sequence[str], lines: Iterable[Sequence[object]], caption: str = "") -> str:
+def text_columns(headings: Sequence[str], lines: Iterable[Iterable[object]], caption: str = "") -> str:
     """As `text_table`, from the cells of each line."""
     cells = [[str(cell) for cell in line] for line in (headings, *lines)]
     sides = ["right" if all(map(NUMBER.fullmatch, column[1:])) else "left" for column in zip(*cells, strict=True)]
@@ -24,7 +24,7 @@ def text_columns(headings: Sequence[str], lines: Iterable[Sequence[object]], cap
     return "\n".join([table, *wrapped(caption)])
 
 
-def markdown_table(headings: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
+def markdown_table(headings: Sequence[str], lines: Iterable[Iterable[object]]) -> str:
     """The cells of each line in markdown; columns are not padded, so that one line more changes no other."""
     cells = [[str(cell).replace("|", "\\|") for cell in line] for line in (headings, *lines)]
     cells.insert(1, ["---"] * len(headings))

@@ -129,8 +129,8 @@ def run_one(case: Case, *, memory_gib: float) -> dict:
         unsolved += controls.status != Status.OK
         splits = city.nominal_splits if controls.splits is None else controls.splits
         x = edge_model.advance(
-            model, x.ravel(), 0.0, controls.perimeter[tuple(model.edges.T)], splits[tuple(model.turns.T)], INTERVAL,
-        )[0].reshape(x.shape)
+            model, x.ravel(), np.zeros(x.size), controls.perimeter[tuple(model.edges.T)],
+            splits[tuple(model.turns.T)], INTERVAL)[0].reshape(x.shape)
     return {
         **case._asdict(), "status": "ok" if not unsolved else controls.note, "set_up_s": set_up,
         "first_decision_s": times[0], "median_decision_s": statistics.median(times[1:]),
