@@ -23,7 +23,7 @@ def test_a_parabola_in_closed_form():
     assert curve.capacity == pytest.approx(1.0)
     assert curve.reaching(0.75) == pytest.approx(250.0, abs=0.1) and curve.reaching(1.0) == curve.critical
     np.testing.assert_allclose(curve.outflow(np.array([0.0, 250.0, 1000.0])), [0.0, 0.75, 0.0], atol=1e-12)
-    np.testing.assert_allclose(curve.rate([0.0, 250.0]), [0.004, 0.003])
+    np.testing.assert_allclose(curve.rate(np.array([0.0, 250.0])), [0.004, 0.003])
 
 
 def test_beyond_the_jam_the_outflow_is_constant():
