@@ -13,6 +13,7 @@ sys.dont_write_bytecode = False  # else every process rewrites the asserts of al
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 # Where arrays have shapes; of the other modules, many functions are called for every vehicle or line of a file.
 SHAPED = ["cosim.evaluation", "cosim.importing", "cosim.plant", "cosim.report", "cosim.sumo.net", "cosim.sumo.trips"]
+
 # Reasons for which a test may be skipped all the same; benchmarks run when they are asked for.
 ALLOWED = ("no GPU", "no real city", "--benchmark-skip active")
 
