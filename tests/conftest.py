@@ -13,6 +13,7 @@ sys.dont_write_bytecode = False  # else every process rewrites the asserts of al
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 # Where arrays have shapes; of the other modules, many functions are called for every vehicle or line of a file.
 SHAPED = ["cosim.evaluation", "cosim.importing", "cosim.plant", "cosim.report", "cosim.sumo.net", "cosim.sumo.trips"]
+
 # Reasons for which a test may be skipped all the same; benchmarks run when they are asked for.
 ALLOWED = ("no GPU", "no real city", "--benchmark-skip active")
 
@@ -22,11 +23,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--no-skips", action="store_true", help="a skipped test fails, unless a GPU or a real city is missing")
     parser.addoption(
         "--may-skip", action="append", default=[*ALLOWED], metavar="REASON", help="nor does it fail for this reason")
+    parser.addoption(
+        "--annotations", choices=("on", "off"), default="on",
+        help="whether types and shapes are checked at every call of nmfd, which costs half as much time again where "
+             "arrays are all there is")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Annotations are checked at every call, but where times are measured, and mutmut has wrapped every function."""
-    if not config.getoption("benchmark_only") and "MUTANT_UNDER_TEST" not in os.environ:
+    """Annotations are checked at every call, but not where times are measured."""
+    if config.getoption("annotations") == "on" and not config.getoption("benchmark_only"):
         install_import_hook("nmfd", "annotations.check")
         install_import_hook(SHAPED, "annotations.check_arrays")
 

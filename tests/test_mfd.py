@@ -22,14 +22,14 @@ def test_a_parabola_in_closed_form():
     assert curve.critical == pytest.approx(500.0, abs=0.1)
     assert curve.capacity == pytest.approx(1.0)
     assert curve.reaching(0.75) == pytest.approx(250.0, abs=0.1) and curve.reaching(1.0) == curve.critical
-    np.testing.assert_allclose(curve.outflow([0.0, 250.0, 1000.0]), [0.0, 0.75, 0.0], atol=1e-12)
-    np.testing.assert_allclose(curve.rate([0.0, 250.0]), [0.004, 0.003])
+    np.testing.assert_allclose(curve.outflow(np.array([0.0, 250.0, 1000.0])), [0.0, 0.75, 0.0], atol=1e-12)
+    np.testing.assert_allclose(curve.rate(np.array([0.0, 250.0])), [0.004, 0.003])
 
 
 def test_beyond_the_jam_the_outflow_is_constant():
     at_jam = TRUTH.outflow(TRUTH.jam)
     assert at_jam == pytest.approx(TRUTH.a * 1e9 + TRUTH.b * 1e6 + TRUTH.c * 1e3)
-    np.testing.assert_allclose(TRUTH.outflow([1000.0, 1500.0, 9000.0]), at_jam)
+    np.testing.assert_allclose(TRUTH.outflow(np.array([1000.0, 1500.0, 9000.0])), at_jam)
     np.testing.assert_allclose(TRUTH.rate(4000.0), at_jam / 4000.0)
 
 
@@ -58,7 +58,7 @@ def test_what_is_no_sample_does_not_count():
     same(fit(x, g), TRUTH)
     for nothing in ([], [np.nan], [0.0]):
         with pytest.raises(ValueError, match="no samples"):
-            fit(nothing, nothing)
+            fit(np.array(nothing), np.array(nothing))
 
 
 def test_every_bin_counts_alike_and_by_its_median():

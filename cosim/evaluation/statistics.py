@@ -168,7 +168,7 @@ def markdown(table: pd.DataFrame, reference: str | None = None) -> str:
     parts = []
     for level, part in table.groupby("demand", sort=True):
         parts += [f"## Demand times {level:g}", *(
-            markdown_table(list(rows), rows.to_numpy()) for rows in shown(part, reference))]
+            markdown_table(list(rows), rows.to_numpy().tolist()) for rows in shown(part, reference))]
     return "\n\n".join([*parts, CAPTION]) + "\n"
 
 

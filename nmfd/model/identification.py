@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Real
 
-from nmfd.arrays import PairsOverTime, PerTurn, StatesOverTime, TurnsOverTime
+from nmfd.arrays import PairsOverTime, StatesOverTime, TurnsOverTime
 from nmfd.model import dynamics
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
@@ -47,7 +47,7 @@ class Observed:
     demand: PairsOverTime
     perimeter: PairsOverTime
     splits: TurnsOverTime
-    crossings: PairsOverTime
+    crossings: Real[np.ndarray, "T R R"]  # counts are whole numbers
 
 
 class _Model(torch.nn.Module):
@@ -93,7 +93,9 @@ class _Model(torch.nn.Module):
         return RIDGE * ((self.exit_rates**2).mean() + (moved**2).mean())
 
 
-def observed_split_ratios(network: RegionalModel, crossings: PerTurn) -> dict[tuple[int, int], dict[int, float]]:
+def observed_split_ratios(
+    network: RegionalModel, crossings: Real[np.ndarray, "R R R"],
+) -> dict[tuple[int, int], dict[int, float]]:
     """(i, j) -> {h: share}: by which neighbour h the vehicles in i bound for j went on in fact.
 
     crossings: (R, R, R) [veh], [i, h, j] = from i to h, bound for j
