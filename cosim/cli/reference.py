@@ -15,6 +15,10 @@ def reference(folder: Path) -> None:
     They go to README.md and *.schema.json in the folders scenarios and networks of FOLDER. What is written by hand in
     the pages stays. Editors that know Taplo, such as VS Code with Even Better TOML, find the schema by the first line
     of a file: #:schema ../scenario.schema.json
+
+    \b
+    Example:
+      cosim reference
     """
     from cosim.report.reference import files  # the declarations of all controllers: torch
 
