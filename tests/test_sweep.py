@@ -98,7 +98,7 @@ def test_more_is_added_and_an_interruption_keeps_what_is_there(peak, tmp_path, r
 
     monkeypatch.setattr(sweeps, "_local", interrupted)
     done = sweep(peak, "--controllers", "pi-gating,max-pressure", "--out", out)
-    assert done.exit_code == 130 and "the same command goes on" in done.stderr
+    assert done.exit_code == 130 and "the same command with --out" in done.stderr
     rows = pd.read_parquet(out / "sweep.parquet")
     assert rows[["controller", "status"]].values.tolist() == [["no-control", "failed"], ["pi-gating", "ok"]]
     assert rows["compliance"].tolist() == [1.0, 1.0]  # the scenario's
