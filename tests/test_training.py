@@ -9,6 +9,7 @@ import pytest
 import tiny
 import torch
 
+from nmfd.errors import InputError
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc import rollout as rollout_module
 from nmfd.controllers.dpc import training
@@ -298,3 +299,18 @@ def test_the_states_that_a_policy_sees(scenario):
     assert seen[0].shape == (20 * 12, 4) and np.isfinite(seen[0]).all()
     assert (seen[0] == seen[1]).all() and (seen[0] != seen[2]).any()
     assert seen[0].std() > 0.0 and np.abs(seen[0]).max() < 10.0
+
+
+def test_what_cannot_be_trained_is_named(scenario):
+    with pytest.raises(InputError, match="'pi-gating' cannot be trained; choose one of dpc-pc"):
+        training.settings(scenario, "pi-gating")
+    with pytest.raises(InputError, match=r"'dpc-pc\+webster' needs a table .*dpc-pc\+webster"):
+        training.settings(scenario, "dpc-pc+webster")
+
+
+def test_a_wrong_setting_names_the_table_of_its_variant(scenario):
+    tables = {"dpc-pc": {"width": 8}, "dpc-pc+webster": {"batch": 0}}
+    with pytest.raises(InputError, match=r"controllers\.dpc-pc\+webster\.batch: "):
+        training.settings(replace(scenario, controller_options=tables), "dpc-pc+webster")
+    with pytest.raises(InputError, match=r"controllers\.dpc-pc\.width: "):
+        training.settings(replace(scenario, controller_options={"dpc-pc": {"width": 0}}), "dpc-pc")
