@@ -9,14 +9,13 @@ import pytest
 import tiny
 import torch
 
-from nmfd.errors import InputError
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc import rollout as rollout_module
 from nmfd.controllers.dpc import training
 from nmfd.controllers.dpc.options import RobustTraining
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.rollout import Rollout
-from nmfd.errors import RunFailed
+from nmfd.errors import InputError, RunFailed
 from nmfd.model.planning import planning_model
 
 # One value that is no default for every setting, and one beyond each end of what is allowed.
