@@ -338,3 +338,13 @@ def test_the_ledger_names_step_and_numbers(play, break_it, numbers):
     break_it(play)
     with pytest.raises(LedgerError, match=f"vehicle ledger broken at control step 7, 1 s: .*{numbers}"):
         play.meter.accumulation(7)
+
+
+def test_the_state_is_all_that_was_counted(play):
+    play.session.routes = {"v": ("a0", "b0", "b1", "c0"), "w": ("b0", "b1"), "u": ("b0", "b1")}
+    play.step(new=["v", "u"], loads=["w"], waiting=["w"])
+    state = play.meter.state(3, 270.0)
+    assert (state.step, state.time, state.completed) == (3, 270.0, 0.0)
+    assert (state.accumulation == x((0, 2), (1, 1))).all() and (state.backlog == x((1, 1))).all()
+    play.step(gone=["u"])
+    assert play.meter.state(4, 360.0).completed == 1.0
