@@ -104,6 +104,7 @@ def test_compare_runs_a_scenario_itself(small, tmp_path):
     assert (tmp_path / "run" / "compare-no-control-0.csv").is_file()
 
 
+@pytest.mark.slow
 def test_identify_writes_a_network_that_loads(small, tmp_path):
     folder = small.parent.parent
     shutil.copytree(folder, tmp_path / "city")
