@@ -17,7 +17,7 @@ from nmfd.cli.errors import Commands
 from nmfd.cli.options import COUNT, FOLDER, SEED, policy_files
 from nmfd.cli.progress import resumable
 from nmfd.errors import InputError, RunFailed
-from nmfd.runs import files as disk
+from nmfd.runs.files import file_name
 from nmfd.runs.workers import cores
 
 
@@ -80,7 +80,7 @@ def evaluate(
     chosen = evaluate.Evaluation(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
         levels=tuple(parsed_levels("--demand", demand)), steps=steps, policies=files, reference=reference,
-        out=Path("runs") / f"{disk.file_name(loaded.name)}-evaluate" if out is None else out)
+        out=Path("runs") / f"{file_name(loaded.name)}-evaluate" if out is None else out)
     workers = cores() if workers is None else workers
     with resumable("evaluate", chosen.out) as progress:
         table, failures = evaluate.evaluate(chosen, workers=workers, progress=progress, tell=tell)
@@ -148,7 +148,7 @@ def sweep(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
         levels=tuple(parsed_levels("--demand", demand)), compliance=parsed_compliance(compliance), steps=steps,
         policies=files,
-        out=Path("runs") / f"{disk.file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
+        out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
     workers = cores() if workers is None else workers
     with resumable("sweep", order.out) as progress:
         rows = sweeps.sweep(order, workers=workers, scheduler=scheduler, progress=progress, tell=tell)

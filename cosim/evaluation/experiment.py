@@ -28,8 +28,8 @@ from nmfd.metrics import COUNTED
 from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.quantities import quantities, variables
-from nmfd.runs import files as disk
 from nmfd.runs import run_folder
+from nmfd.runs.files import file_hash, write_text
 from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
 from nmfd.studies.benchmark import REFERENCE, draw_accumulations, interval
@@ -171,7 +171,7 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
         "scenario": scenario.name, "network": scenario.network.name, "plant": "sumo", "step_s": scenario.step,
         "steps": scenario.steps, "demand_factor": first.demand_factor,
         "demand_hash": hashlib.sha256(np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16],
-        "net_file_hash": disk.file_hash(files.net_file), "regions_hash": disk.file_hash(files.regions_csv),
+        "net_file_hash": file_hash(files.net_file), "regions_hash": file_hash(files.regions_csv),
         "measurement_std_veh": scenario.measurement_std, "sumo": _plain(chosen, scenario),
         "libsumo": metadata.version("libsumo"), **({"faults": list(scenario.faults)} if scenario.faults else {})}
     return configuration, controllers
@@ -183,7 +183,7 @@ def _plain(chosen: Settings, scenario: Scenario) -> dict:
     Only these, so that a new kind of setting does not make old runs another city's.
     """
     found = chosen.model_dump(mode="json", exclude_defaults=True)
-    hashes = {key: [disk.file_hash(path) for path in own_files(scenario, found[key])] for key in FILES if key in found}
+    hashes = {key: [file_hash(path) for path in own_files(scenario, found[key])] for key in FILES if key in found}
     return {**found, **hashes}
 
 
@@ -224,7 +224,7 @@ def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
     rows = read_facts(path) if path.is_file() else pd.DataFrame(columns=FACTS)
     same = (rows["controller"] == result.facts["controller"]) & (rows["seed"] == result.facts["seed"])
     rows = pd.DataFrame([*rows[~same].to_dict("records"), result.facts], columns=FACTS)
-    disk.write_text(path, rows.to_csv(index=False))
+    write_text(path, rows.to_csv(index=False))
 
 
 def overview(folder: Path) -> pd.DataFrame:

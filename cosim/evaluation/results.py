@@ -14,7 +14,7 @@ from cosim.sumo.net import City, load_city
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
-from nmfd.runs import files as disk
+from nmfd.runs.files import file_hash
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,6 +143,6 @@ def _scenario_folder(level: Level) -> Path:
 def _changed(configuration: Mapping, files: SumoFiles) -> str:
     """Why the city is not the one of the runs; empty if it is."""
     for key, file in (("net_file_hash", files.net_file), ("regions_hash", files.regions_csv)):
-        if configuration.get(key) not in (None, disk.file_hash(file)):
+        if configuration.get(key) not in (None, file_hash(file)):
             return f"{file} has changed since the runs were made"
     return ""

@@ -19,8 +19,8 @@ from nmfd.api import load_scenario
 from nmfd.controllers import registry
 from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import Scenario, with_faults
-from nmfd.runs import files as disk
 from nmfd.runs import run_folder
+from nmfd.runs.files import atomic
 from nmfd.types import Controller, Trajectory
 
 # Columns of sumo.csv, beside those of summary.csv.
@@ -97,7 +97,7 @@ def drive(
     """
     begin = time.perf_counter() if begin is None else begin
     with ExitStack() as stack:
-        files = {kind: stack.enter_context(disk.atomic(path)) for kind, path in (outputs or {}).items()}
+        files = {kind: stack.enter_context(atomic(path)) for kind, path in (outputs or {}).items()}
         plant = SumoPlant(
             scenario, overrides=settings(scenario).changed(**strategy.overrides), outputs=files,
             planning=planning)

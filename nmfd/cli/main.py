@@ -165,11 +165,11 @@ def show(scenario: Path, out: Path | None) -> None:
       nmfd show scenarios/economic_mpc --out figures
     """
     from nmfd.api import load_scenario  # heavy
-    from nmfd.runs import files as disk
+    from nmfd.runs.files import file_name
     from nmfd.studies import benchmark as benchmarks
 
     loaded = load_scenario(scenario)
-    out = Path("runs") / f"{disk.file_name(loaded.name)}-show" if out is None else out
+    out = Path("runs") / f"{file_name(loaded.name)}-show" if out is None else out
     out.mkdir(parents=True, exist_ok=True)
     files = benchmarks.draw_scenario(out, loaded)
     total = loaded.step * loaded.demand.sum()

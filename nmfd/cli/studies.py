@@ -94,11 +94,11 @@ def adaptation(
     files = policy_files(policies, names)
 
     from nmfd.api import load_scenario  # heavy
-    from nmfd.runs import files as disk
+    from nmfd.runs.files import file_name
     from nmfd.studies import adaptation as method
 
     loaded = load_scenario(scenario)
-    out = Path("runs") / f"{disk.file_name(loaded.name)}-adaptation" if out is None else out
+    out = Path("runs") / f"{file_name(loaded.name)}-adaptation" if out is None else out
     chosen = list(dict.fromkeys(case.strip() for case in cases.split(",")))
     with resumable("adaptation", out, "adaptation.csv") as progress:
         rows = method.adaptation(

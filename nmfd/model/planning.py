@@ -67,7 +67,6 @@ def planning_model(scenario: Scenario, controller: str = "") -> PlanningModel:
     """
     name, tables = controller.partition("+")[0], scenario.controller_options
     options = {**tables.get(name, {}), **tables.get(controller, {})}
-    network = None
     if "model" in options and scenario.folder is not None:
         where, prefix = scenario.folder / "scenario.toml", f"controllers.{controller}."
         model = config.checked(PlanningOptions, {"model": options.pop("model")}, where, prefix).model
@@ -75,9 +74,11 @@ def planning_model(scenario: Scenario, controller: str = "") -> PlanningModel:
         network = other_model(scenario, scenario.folder / model, f"{where}: {prefix}model")
     elif name.startswith(GUIDING) and (folder := guided_model(scenario.network)) is not None:
         network = other_model(scenario, folder)
+    else:
+        network = copy.deepcopy(scenario.network)
     return PlanningModel(
-        name=scenario.name, network=copy.deepcopy(scenario.network if network is None else network),
-        step=scenario.step, steps=scenario.steps, forecast=scenario.forecast.copy(),
+        name=scenario.name, network=network, step=scenario.step, steps=scenario.steps,
+        forecast=scenario.forecast.copy(),
         measurement_std=scenario.measurement_std, integrator=scenario.integrator, substeps=scenario.substeps,
         protected=scenario.protected, folder=scenario.folder,
         controller_options=copy.deepcopy({**tables, name: options} if name else dict(tables)))
