@@ -13,6 +13,7 @@ from cosim.cli.options import CONTROLLER_HELP, parsed_compliance, parsed_levels,
 from cosim.cli.reference import reference
 from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
+from cosim.cli.search import frontier, tune
 from nmfd.cli.errors import Commands
 from nmfd.cli.options import COUNT, FOLDER, SEED, policy_files
 from nmfd.cli.progress import resumable
@@ -158,5 +159,5 @@ def sweep(
         tell(f"{failed} of {len(rows)} runs failed, see the column reason; the same command tries them again")
 
 
-for command in (run, compare, report, video, watch, identify, import_, reference):
+for command in (run, compare, report, video, watch, identify, import_, reference, tune, frontier):
     main.add_command(command)

@@ -69,9 +69,9 @@ def scenario_of(task: Task) -> Scenario:
         demand_factor=task.demand_factor * scenario.demand_factor)
     if not task.options:
         return scenario
-    controller = parse(task.controller).controller
-    options = {**scenario.controller_options.get(controller, {}), **dict(task.options)}
-    return replace(scenario, controller_options={**scenario.controller_options, controller: options})
+    tables = scenario.controller_options
+    table = configured(task.controller, tables)
+    return replace(scenario, controller_options={**tables, table: {**tables.get(table, {}), **dict(task.options)}})
 
 
 def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> Result:

@@ -48,7 +48,7 @@ class Sweep:
         """Strategy with its compliance -> strategy as asked for; those that guide nobody once only. InputError."""
         ways = [f"+compliance-{100 * share:g}" for share in self.compliance] or [""]
         found = {name + way: name for name in self.controllers for way in ways}
-        guiding = {name: registry.guides(parse(name).controller) for name in found}
+        guiding = {name: parse(name).guides for name in found}
         return {strategy if guiding[strategy] else name: name for strategy, name in found.items()}
 
     def plan(self) -> list[tuple[Path, Task]]:

@@ -20,6 +20,7 @@ from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, Gateway, check_adjacency, load_city
 from cosim.sumo.session import Session, Window
 from cosim.sumo.tripinfo import TripFacts, read_trip_facts
+from nmfd.arrays import PerTurn
 from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
@@ -79,7 +80,7 @@ class SumoPlant:
         vehicles, speed = (None, None) if streets is None else (streets.vehicles, streets.speed)
         self._incidents.begin(self._k)
         self._actuation.command(controls.perimeter, vehicles)
-        self._guide.command(controls.splits, speed)
+        self._guide.command(self._splits(controls), speed)
         self._sensing.begin()
         for _ in range(round(self._scenario.step / session.step_length)):
             self._actuation.play()
@@ -133,6 +134,11 @@ class SumoPlant:
             return len(self._launch.vehicles)
         meter = self._sensing.meter
         return int(meter.departures.sum() + meter.backlog().sum())
+
+    def _splits(self, controls: Controls) -> PerTurn | None:
+        """What drivers are guided by: the drivers' own split ratios mean guidance by travel times alone."""
+        return self._scenario.network.nominal_splits if controls.splits is None and self._settings.guided else (
+            controls.splits)
 
     def _new_sensing(self, seed: int) -> Sensing:
         chosen = self._settings

@@ -68,9 +68,11 @@ class Settings(SumoTable):
 
     gateways_fixed: whether signals with a gateway movement stay fixed-time, for perimeter control, where the others
         are actuated
+    guided: whether drivers are guided by travel times where the controller does not guide routes itself
     """
 
     gateways_fixed: bool = True
+    guided: bool = False
 
 
 def scenario_file(scenario: Scenario) -> Path:

@@ -150,9 +150,10 @@ def begin_as_no_control(policy: Policy, network: RegionalModel) -> None:
 
 
 def begin_as_gate(policy: Policy, rollout: Rollout, generator: torch.Generator) -> None:
-    """Let `policy` close the entries of every protected region as this fills, half at the set point of pi-gating."""
-    network, protected = rollout.planning.network, list(rollout.planning.protected)
-    set_point = torch.tensor(PiGating(rollout.planning).set_point, dtype=rollout.dtype, device=rollout.device)
+    """Let `policy` close the entries of every region that pi-gating holds as this fills, half at its set point."""
+    network, gate = rollout.planning.network, PiGating(rollout.planning)
+    protected = gate.regions.tolist()
+    set_point = torch.tensor(gate.set_point, dtype=rollout.dtype, device=rollout.device)
     counts = rollout.parameters.adjacency.expand(GATE_BATCH, -1, -1)
     optimizer = torch.optim.Adam(policy.parameters(), lr=GATE_RATE)
     for _ in range(GATE_STEPS):
