@@ -47,7 +47,7 @@ def result(task, city) -> Result:
         "production": random.uniform(0.0, 9.0, (steps, regions)), "mean_accumulation": np.ones((steps, regions)),
         "guided": crossings * guides}
     facts = {name: random.uniform(0.1, 100.0) for name in FACTS} | {
-        "controller": task.controller, "seed": task.seed, "trips": 600,
+        "controller": task.controller, "seed": task.seed, "trips": 600, "outside_training": "",
         "teleports": 3 * (task.controller == "pi-gating"), "final_backlog_veh": 20}
     return Result(trajectory=trajectory, record=record, facts=facts)
 

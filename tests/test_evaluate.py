@@ -52,7 +52,8 @@ def made_up(task) -> Result:
         controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=np.ones((3, 7, 7)),
         backlog=np.zeros((3, 7, 7)), completed=np.zeros(3), perimeter=np.ones((2, 7, 7)),
         splits=np.zeros((2, 7, 7, 7)), decision_time=np.zeros(2), wall_time=1.0)
-    facts = {name: 0 for name in FACTS} | {"controller": task.controller, "seed": task.seed}
+    facts = {name: 0 for name in FACTS} | {
+        "outside_training": "", "controller": task.controller, "seed": task.seed}
     return Result(trajectory=trajectory, record=trajectories.record(2, regions=7), facts=facts)
 
 

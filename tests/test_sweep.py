@@ -57,7 +57,7 @@ def made_up(task) -> Result:
         controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=np.ones((3, 7, 7)),
         backlog=np.zeros((3, 7, 7)), completed=np.arange(3.0), perimeter=np.zeros((2, 7, 7)),
         splits=np.zeros((2, 7, 7, 7)), decision_time=np.ones(2), wall_time=1.0)
-    facts = {**dict.fromkeys(FACTS, 1.0), "controller": task.controller, "seed": task.seed}
+    facts = {**dict.fromkeys(FACTS, 1.0), "outside_training": "", "controller": task.controller, "seed": task.seed}
     return Result(trajectory=trajectory, record=trajectories.record(2, regions=7), facts=facts)
 
 

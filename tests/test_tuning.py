@@ -42,7 +42,8 @@ def result(task, tts: float, completed: int = TRIPS) -> Result:
         controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=accumulation,
         backlog=np.zeros((2, 7, 7)), completed=np.array([0.0, completed]), perimeter=np.ones((1, 7, 7)),
         splits=np.zeros((1, 7, 7, 7)), decision_time=np.zeros(1), wall_time=1.0)
-    facts = {name: 0 for name in FACTS} | {"controller": task.controller, "seed": task.seed, "trips": TRIPS}
+    facts = {name: 0 for name in FACTS} | {
+        "outside_training": "", "controller": task.controller, "seed": task.seed, "trips": TRIPS}
     return Result(trajectory=trajectory, record=trajectories.record(1, regions=7), facts=facts)
 
 

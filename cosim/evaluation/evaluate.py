@@ -70,7 +70,10 @@ def evaluate(
         table = statistics.write_tables(out, rows, evaluation.reference)
         scenario = load_scenario(evaluation.scenario)
         why = explain.text(level_folders(out), scenario.network, rows)
-        files.write_text(out / "evaluate.md", statistics.markdown(table, evaluation.reference) + "\n" + why)
+        remarks = "".join(f"- {line}\n" for line in experiment.remarks(rows))
+        files.write_text(
+            out / "evaluate.md", "\n".join(filter(None, (
+                statistics.markdown(table, evaluation.reference), remarks, why))))
     if failures and table.empty and all(failure.mistake for _, failure in failures):
         raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])
     return table, [f"{experiment.label(task)}: {failure.reason}" for task, failure in failures]

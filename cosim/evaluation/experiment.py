@@ -261,4 +261,13 @@ def overview_table(rows: pd.DataFrame) -> str:
             **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
             "wall [s]": f"{group['wall_time_s'].mean():.0f}",
             "outside SUMO": f"{100 * group['overhead_share'].mean():.1f} %"})
-    return text_table(lines, CAPTION)
+    return "\n".join([text_table(lines, CAPTION), *remarks(rows)])
+
+
+def remarks(rows: pd.DataFrame) -> list[str]:
+    """A line for every controller whose policy was run outside of what it was trained on."""
+    if "outside_training" not in rows:  # of an older version
+        return []
+    said = rows[rows["outside_training"].fillna("") != ""]
+    return [f"{name}: {text}" for name, text in dict.fromkeys(
+        zip(said["controller"], said["outside_training"], strict=True))]

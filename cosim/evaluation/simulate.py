@@ -27,9 +27,9 @@ from nmfd.types import Controller, Trajectory
 FACTS = (
     "controller", "seed", "trips", "departed_veh", "final_backlog_veh", "total_backlog_veh_s", "teleports",
     "mean_trip_time_s", "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh",
-    "gateway_queue_max_veh", "gateway_full_share", "notes", "leaking_share",
+    "gateway_queue_max_veh", "gateway_full_share", "notes", "outside_training", "leaking_share",
     "estimate_rmse_share", "estimate_cell_rmse_veh", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s",
-    "signals_left_alone")
+    "signals_left_alone", "booked_intervals")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,10 +78,13 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
     """Run `task` in this process, which must hold no other SUMO session. Raises InputError."""
     begin = time.perf_counter()
     scenario, strategy = scenario_of(task), parse(task.controller)
-    controller = registry.make(configured(task.controller, scenario.controller_options), scenario, policy=task.policy)
-    return drive(
+    variant = configured(task.controller, scenario.controller_options)
+    controller = registry.make(variant, scenario, policy=task.policy)
+    result = drive(
         scenario, strategy, controller, seed=task.seed, progress=progress, begin=begin, outputs=dict(task.sumo_output),
         planning=planning_of(scenario, task.controller))
+    outside = registry.outside_training(variant, scenario, task.demand_factor, file=task.policy)
+    return replace(result, facts={**result.facts, "outside_training": outside})
 
 
 def drive(
@@ -114,11 +117,12 @@ def drive(
             "final_backlog_veh": int(backlog[-1]), "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
             "teleports": int(record.teleports.sum()), **run_metrics.trip_facts(plant.trip_facts()),
             **run_metrics.queue_facts(record, plant.city), "notes": metrics.notes(trajectory),
+            "outside_training": "",
             "leaking_share": run_metrics.leaking_share(record, plant.city, leaks),
             **_estimation(scenario, trajectory), "wall_time_s": trajectory.wall_time, "sumo_time_s": sumo_time,
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
-            "signals_left_alone": len(plant.other_signals)}
+            "signals_left_alone": len(plant.other_signals), "booked_intervals": plant.booked}
         sumo_output.check_whole(files)
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
 

@@ -1,6 +1,7 @@
 """The SUMO city as a plant: the same protocol as the regional plants, the same controllers."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from cosim.plant.programmes import city_signals
 from cosim.plant.record import Record, Recorder
 from cosim.plant.sensing import Estimation, Sensing
 from cosim.plant.settings import ESTIMATE, Settings, scenario_file, settings
+from cosim.plant.standstill import Standstill
 from cosim.plant.strategy import MAX_PRESSURE
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, Gateway, check_adjacency, load_city
@@ -34,7 +36,7 @@ class SumoPlant:
 
     `simple_signals` may get another programme, `other_signals` are left alone (cosim.sumo.signals).
     `record()` tells what happened; `trips` is their number; `sumo_time` [s] is the wall time inside SUMO's own step
-    since the reset.
+    since the reset; `booked` control intervals were not simulated any more (cosim.plant.standstill).
     """
 
     def __init__(
@@ -69,12 +71,17 @@ class SumoPlant:
         self._sensing = self._new_sensing(seed)
         self._guide = self._new_guide(seed)
         self._actuation = self._new_actuation()
-        state = self._sensing.state(0)
+        self._state = state = self._sensing.state(0)
+        self._standstill = Standstill(len(self._launch.vehicles), self._scenario.step, self._scenario.steps)
+        self.booked = 0
+        self._standing = self._stands(state)
         self._recorder = Recorder(self._sensing.meter, self._guide, self._actuation)
         return state
 
     def step(self, controls: Controls) -> State:
         """One control interval: in every simulation step actuate, simulate, measure and guide; then record."""
+        if self._standing:
+            return self._book()
         session, streets = self.session, self._sensing.streets
         end = session.time + self._scenario.step
         vehicles, speed = (None, None) if streets is None else (streets.vehicles, streets.speed)
@@ -89,9 +96,10 @@ class SumoPlant:
             self._guide.apply(entered)
         assert abs(session.time - end) < 1e-6
         self._k += 1
-        state, means = self._sensing.finish(self._k, controls)
+        self._state, means = self._sensing.finish(self._k, controls)
         self._recorder.add(means)
-        return state
+        self._standing = self._stands(self._state)
+        return self._state
 
     def observe(self) -> Observation | None:
         """The estimate, where states are estimated."""
@@ -108,8 +116,14 @@ class SumoPlant:
 
     def trip_facts(self) -> TripFacts:
         """Ends the simulation, for only then does SUMO tell of the trips under way."""
+        booked, state = self.booked * self._scenario.step, self._state
+        emitted = self.session.emitted() if booked else (0.0, 0.0)
         self._end_session()
-        return read_trip_facts(self._launch.trip_file)
+        facts = read_trip_facts(self._launch.trip_file)
+        return replace(
+            facts, travel_time=facts.travel_time + booked * float(state.accumulation.sum()),
+            departure_delay=facts.departure_delay + booked * float(state.backlog.sum()),
+            co2=facts.co2 + booked * emitted[0], fuel=facts.fuel + booked * emitted[1])
 
     @property
     def sumo_time(self) -> float:
@@ -134,6 +148,19 @@ class SumoPlant:
             return len(self._launch.vehicles)
         meter = self._sensing.meter
         return int(meter.departures.sum() + meter.backlog().sum())
+
+    def _stands(self, state: State) -> bool:
+        """Whether what is left of the run may be booked."""
+        standing = self._standstill.reached(state, float(self._sensing.meter.arrivals.sum()))
+        return standing and self._settings.book_standstill and self.session.expected() <= (
+            state.accumulation.sum() + state.backlog.sum())
+
+    def _book(self) -> State:
+        """One control interval in which nothing moves."""
+        self._k, self.booked = self._k + 1, self.booked + 1
+        self._recorder.repeat()
+        self._state = replace(self._state, step=self._k, time=self._k * self._scenario.step)
+        return self._state
 
     def _splits(self, controls: Controls) -> PerTurn | None:
         """What drivers are guided by: the drivers' own split ratios mean guidance by travel times alone."""

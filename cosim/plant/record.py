@@ -64,6 +64,11 @@ class Recorder:
             "gateway_queue": streets.queue, "gateway_queue_max": streets.queue_max})
         self._before = totals
 
+    def repeat(self) -> None:
+        """Another interval in which everything stands and is shown as in the last one, and nothing was counted."""
+        counted = [key for key in self._before if key != "gateway_green"]
+        self._rows.append({**self._rows[-1], **{key: np.zeros_like(self._before[key]) for key in counted}})
+
     def record(self) -> Record:
         """Of all control intervals so far."""
         return Record(**{key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]})

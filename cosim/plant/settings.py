@@ -50,6 +50,9 @@ class SumoTable(config.Settings):
     departure_jitter: Seconds = setting(
         "departures of the city's own vehicles are moved by up to this, either way, by the seed", 10.0)
     leave_signals: Texts = setting("signals that perimeter control leaves alone", ())
+    book_standstill: bool = setting(
+        "once every trip is due and nothing moves any more, the rest of the run is booked without simulating it, "
+        "within 0.1 % of the total time spent", False)
     mesoscopic: bool = setting(
         "SUMO's queue model instead of its car-following, about ten times as fast, for quick studies: no lanes and no "
         "positions on them, queues hold the vehicles that fit on an edge, signals cap the flow by their green share",

@@ -163,6 +163,16 @@ class Session:
         """How many there were so far, by SUMO's own count: the mesoscopic model has no events for them."""
         return int(self._sumo.simulation.getParameter("", "stats.teleports.total"))
 
+    def expected(self) -> int:
+        """Vehicles on the road, and those that SUMO has read and that wait for their departure."""
+        return self._sumo.simulation.getMinExpectedNumber()
+
+    def emitted(self) -> tuple[float, float]:
+        """CO2 and fuel of all vehicles on the road at this moment [kg/s]."""
+        running = self.running()
+        co2, fuel = self._sumo.vehicle.getCO2Emission, self._sumo.vehicle.getFuelConsumption
+        return 1e-6 * sum(map(co2, running)), 1e-6 * sum(map(fuel, running))
+
     def known(self) -> tuple[str, ...]:
         """All that were loaded and have not arrived, wherever they are."""
         return self._sumo.vehicle.getLoadedIDList()

@@ -175,6 +175,16 @@ def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Contro
     return _ENTRIES[first].make(planning) if path is None else _ENTRIES[first].make(path, planning)
 
 
+def outside_training(name: str, scenario: Scenario, level: float, *, file: Path | None = None) -> str:
+    """What to say of a run of `name`, as of `make`, at `level` times the demand of the scenario that a policy was
+    trained on; "" for what it has seen, and for controllers without a policy. Raises InputError as `make`."""
+    path = policy_path(name, scenario, file)
+    if path is None or split(name)[0] not in policy_names():
+        return ""
+    _, content = policy.load_policy(path, planning_model(scenario, _owner(name)).network)
+    return policy.outside_training(content, level)
+
+
 def check_options(scenario: Scenario) -> None:
     """InputError for a wrong option of any controller in the scenario's [controllers], whether it is run or not.
 

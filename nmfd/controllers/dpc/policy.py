@@ -222,6 +222,16 @@ def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
     return policy, content
 
 
+def outside_training(content: Mapping, level: float) -> str:
+    """What to say of a run at `level` times the demand, outside of what the policy of this checkpoint was trained on;
+    "" within it."""
+    low, high = (content["configuration"].get(key, 1.0) for key in ("demand_low", "demand_high"))
+    if low - 1e-9 <= level <= high + 1e-9:
+        return ""
+    trained = f"{low:g} times" if low == high else f"{low:g} to {high:g} times"
+    return f"demand times {level:g} is outside of what the policy was trained on, {trained} that of the scenario"
+
+
 def check_guidance(policy: Policy, path: Path, guidance: bool) -> None:
     """InputError if the policy in `path` is of the other kind."""
     if policy.architecture.guidance != guidance:
