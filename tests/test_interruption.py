@@ -351,3 +351,18 @@ def test_what_is_made_while_others_look_for_old_folders_stays(tmp_path, monkeypa
         sweep(tmp_path, "x-")
         assert list(tmp_path.iterdir()) == [folder]
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_written_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    """After a power loss: the content before the name, and the name before anybody says that it is there."""
+    done, sync, replace = [], os.fsync, os.replace
+
+    def noted(handle):
+        done.append(Path(os.readlink(f"/proc/self/fd/{handle}")))
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    monkeypatch.setattr(os, "replace", lambda source, target: (done.append("replace"), replace(source, target)))
+    files.write_text(tmp_path / "a.csv", "x")
+    assert done == [tmp_path / f".a-{os.getpid()}.tmp.csv", "replace", tmp_path]
+    assert (tmp_path / "a.csv").read_text() == "x"

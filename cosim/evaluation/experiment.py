@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from importlib import metadata
@@ -24,7 +25,7 @@ from cosim.sumo.signals import read_signals
 from cosim.sumo.xml_files import read_xml
 from nmfd.controllers import registry
 from nmfd.errors import InputError
-from nmfd.metrics import COUNTED
+from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.quantities import quantities, variables
@@ -251,7 +252,10 @@ def overview_table(rows: pd.DataFrame) -> str:
     for name, group in rows.groupby("controller", sort=False):
         tts = group["total_time_spent_veh_s"]
         spread = f" ± {interval(list(tts)):.1e}" if len(tts) > 1 else ""
-        change = f"{100 * (tts.mean() / reference.mean() - 1):+.1f} %" if len(reference) and name != REFERENCE else ""
+        change = ""
+        if len(reference) and name != REFERENCE:
+            percent = percent_change(tts.mean(), reference.mean())
+            change = "-" if math.isnan(percent) else f"{percent:+.1f} %"
         lines.append({
             "controller": name, "seeds": len(group), "TTS [veh s]": f"{tts.mean():.4g}{spread}", "change": change,
             "completed": f"{group['completed_veh'].mean():,.0f} of {group['trips'].mean():,.0f}",

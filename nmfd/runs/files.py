@@ -22,19 +22,36 @@ def atomic(path: Path) -> Iterator[Path]:
     """A temporary name in the folder of `path` to write to; it becomes `path` if all goes well, else it goes.
 
     The suffix of `path` is kept, because matplotlib and NumPy choose the format by it. A process that is killed leaves
-    the temporary file behind; `sweep` removes it.
+    the temporary file behind; `sweep` removes it. After a power loss `path` is what it was before or what it became,
+    never empty, and with the end of the block it stays: that takes about 10 ms.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary
+        synced(temporary)
         os.replace(temporary, path)
+        synced(path.parent)
     except BaseException as error:
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):  # a full disk is met without a name
             error.filename = str(path)
         with suppress(OSError):
             temporary.unlink()
         raise
+
+
+def synced(path: Path) -> None:
+    """Have what is in a file, or the names in a folder, on the disk."""
+    if os.name == "nt" and path.is_dir():  # no such thing
+        return
+    handle = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):  # a file system that cannot
+            raise
+    finally:
+        os.close(handle)
 
 
 def sweep(folder: Path, stems: Collection[str] | None = None) -> None:

@@ -261,6 +261,8 @@ def manifest(
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
+        for folder in made:
+            files.synced(folder.parent)
         with files.locked(path / LOCK, path):
             files.sweep(path)
             if file.is_file():

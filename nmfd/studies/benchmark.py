@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 
 from nmfd import closed_loop, faults
 from nmfd.controllers import registry
-from nmfd.metrics import COUNTED
+from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
@@ -173,8 +173,8 @@ def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
 
 
 def interval(values: Sequence[float]) -> float:
-    """Half of the 95 % interval of the mean of `values` (Student's t); NaN of a single one."""
-    if len(values) < 2:
+    """Half of the 95 % interval of the mean of `values` (Student's t); NaN of a single one, or where one is NaN."""
+    if len(values) < 2 or any(map(math.isnan, values)):
         return math.nan
     return float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
 
@@ -212,8 +212,9 @@ def summary_table(rows: Sequence[Mapping]) -> str:
 
 
 def _percent(values: Sequence[float], reference: Sequence[float]) -> str:
-    """How far the mean of `values` is above that of `reference`, like +1.7 %."""
-    return f"{100 * (statistics.fmean(values) / statistics.fmean(reference) - 1):+.1f} %"
+    """How far the mean of `values` is above that of `reference`, like +1.7 %; - where that is 0."""
+    change = percent_change(statistics.fmean(values), statistics.fmean(reference))
+    return "-" if math.isnan(change) else f"{change:+.1f} %"
 
 
 def _scientific(value: float, digits: int = 4) -> str:
