@@ -150,7 +150,7 @@ def _spread(row: Mapping) -> str:
 def _change(row: Mapping, label: str) -> str:
     percent, half = row[f"{label}_percent"], row[f"{label}_half_interval_percent"]
     if math.isnan(percent):
-        return ""
+        return "-" * bool(row[f"{label}_seeds"])
     return f"{percent:+.1f}" + (" %" if math.isnan(half) else f" ± {half:.1f} %{'*' * row[f'{label}_excludes_zero']}")
 
 
