@@ -14,7 +14,7 @@ from cosim.cli.reference import reference
 from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
 from nmfd.cli.errors import Commands
-from nmfd.cli.options import COUNT, FOLDER, SEED, policy_files
+from nmfd.cli.options import COUNT, FOLDER, SEED, policy_files, time_limit_option
 from nmfd.cli.progress import resumable
 from nmfd.errors import InputError, RunFailed
 from nmfd.runs.files import file_name
@@ -47,10 +47,12 @@ def main() -> None:
 @click.option("--workers", type=COUNT, metavar="N",
               help="Runs at a time, each in a process of its own. [default: one per core]")
 @click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
+@time_limit_option()
 @click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-evaluate]")
 def evaluate(
     scenario: Path, controllers: str, seeds: int, first_seed: int, demand: str, reference: str | None,
-    policies: tuple[str, ...], workers: int | None, steps: int | None, out: Path | None,
+    policies: tuple[str, ...], workers: int | None, steps: int | None, time_limit: float | None,
+    out: Path | None,
 ) -> None:
     """Compare controllers in the microsimulation over seeds and demand levels; print and write tables, draw figures.
 
@@ -80,6 +82,7 @@ def evaluate(
     chosen = evaluate.Evaluation(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
         levels=tuple(parsed_levels("--demand", demand)), steps=steps, policies=files, reference=reference,
+        time_limit=time_limit,
         out=Path("runs") / f"{file_name(loaded.name)}-evaluate" if out is None else out)
     workers = cores() if workers is None else workers
     with resumable("evaluate", chosen.out) as progress:
@@ -114,10 +117,12 @@ def evaluate(
               help="Of a Dask cluster that does the runs, such as tcp://host:8786 (extra dask). Its workers need this "
                    "package, and the same files under the same paths.")
 @click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
+@time_limit_option()
 @click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-sweep]")
 def sweep(
     scenario: Path, controllers: str, seeds: int, first_seed: int, demand: str, compliance: str | None,
-    policies: tuple[str, ...], workers: int | None, scheduler: str | None, steps: int | None, out: Path | None,
+    policies: tuple[str, ...], workers: int | None, scheduler: str | None, steps: int | None,
+    time_limit: float | None, out: Path | None,
 ) -> None:
     """Run controllers x seeds x demand levels x compliance; write one table, sweep.parquet.
 
@@ -147,7 +152,7 @@ def sweep(
     order = sweeps.Sweep(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
         levels=tuple(parsed_levels("--demand", demand)), compliance=parsed_compliance(compliance), steps=steps,
-        policies=files,
+        policies=files, time_limit=time_limit,
         out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
     workers = cores() if workers is None else workers
     with resumable("sweep", order.out) as progress:

@@ -131,7 +131,7 @@ def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> d
     InputError for a controller that cannot be made.
     """
     controller, variant = parse(name).controller, configured(name, scenario.controller_options)
-    registry.make(variant, scenario, policy=policy)
+    registry.verify(variant, scenario, policy=policy)
     if controller == REFERENCE:
         return {}
     tables = scenario.controller_options
@@ -189,9 +189,11 @@ def _plain(chosen: Settings, scenario: Scenario) -> dict:
 
 
 def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress: Progress | None) -> Outcomes:
-    """(task, Result or Failure); in this process, which reports every control interval, if one run is all there is."""
-    if len(todo) != 1 or fresh:
-        yield from _reported(lambda tasks: outcomes(simulate, tasks, workers, fresh=fresh), todo, progress)
+    """(task, Result or Failure); in this process, which reports every control interval, if one run is all there is, and
+    not of a controller of the user's own."""
+    if len(todo) != 1 or fresh or _apart(todo[0]):
+        yield from _reported(
+            lambda tasks: outcomes(simulate, tasks, workers, fresh=fresh, group=_apart), todo, progress)
         return
 
     def tick(k: int, steps: int) -> None:
@@ -199,6 +201,11 @@ def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress: Progres
             progress(k, steps, f"{todo[0].controller}, seed {todo[0].seed}")
 
     yield todo[0], attempt(lambda task: simulate(task, tick), todo[0])
+
+
+def _apart(task: Task) -> str:
+    """The controller of the user's own, which has a process to itself, "" for others."""
+    return task.controller if registry.runs_apart(task.controller) else ""
 
 
 def _reported(

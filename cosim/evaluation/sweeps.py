@@ -32,7 +32,8 @@ FIRST = ["strategy", "controller", "seed", "demand", "compliance", "status", "re
 class Sweep:
     """scenario: its folder; controllers: strategies; levels: multiples of the scenario's demand; compliance: shares of
     the drivers' decisions that follow route guidance, the scenario's own where there is none or nobody guides;
-    steps: control intervals, all if None; policies: controller -> file instead of the scenario's own; out: the folder.
+    steps: control intervals, all if None; policies: controller -> file instead of the scenario's own; time_limit: of
+    controllers of the user's own, instead of the scenario's; out: the folder.
     """
 
     scenario: Path
@@ -43,6 +44,7 @@ class Sweep:
     compliance: tuple[float, ...] = ()
     steps: int | None = None
     policies: Mapping[str, Path] = field(default_factory=dict)
+    time_limit: float | None = None
 
     def strategies(self) -> dict[str, str]:
         """Strategy with its compliance -> strategy as asked for; those that guide nobody once only. InputError."""
@@ -56,7 +58,7 @@ class Sweep:
         return [
             (self.out / f"demand-{level:g}", Task(
                 scenario=self.scenario, controller=strategy, seed=seed, policy=self.policies.get(name),
-                steps=self.steps, demand_factor=level))
+                steps=self.steps, demand_factor=level, time_limit=self.time_limit))
             for seed in self.seeds for level in self.levels for strategy, name in self.strategies().items()]
 
 

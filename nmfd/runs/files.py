@@ -6,6 +6,7 @@ import hashlib
 import os
 import platform
 import re
+import stat
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,6 +15,7 @@ from filelock import FileLock, Timeout
 
 from nmfd.errors import InputError
 
+KINDS = {stat.S_ISDIR: "folder", stat.S_ISFIFO: "pipe", stat.S_ISSOCK: "socket"}
 TEMPORARY = re.compile(r"\.(?P<stem>.+)-\d+\.tmp(\.\w+)?")  # names that `atomic` gives
 
 
@@ -126,6 +128,17 @@ def read_rows(path: Path, columns: Mapping[str, type]) -> list[dict]:
         raise InputError(f"{path}: no such file; delete the folder and run again") from None
     except (OSError, TypeError, ValueError, csv.Error) as error:
         raise InputError(f"{path}: {error}; delete the folder and run again") from None
+
+
+def check_file(path: Path, remedy: str = "give a file") -> None:
+    """InputError for what is there but no file: reading a pipe or a device would not end. Nothing there is nothing."""
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):  # whoever opens it says why
+        return
+    if not stat.S_ISREG(mode):
+        kind = next((name for test, name in KINDS.items() if test(mode)), "device")
+        raise InputError(f"{path}: is a {kind}, no file; {remedy}")
 
 
 def file_hash(path: Path) -> str:

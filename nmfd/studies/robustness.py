@@ -65,7 +65,7 @@ def robustness(
     """
     policies, names = policies or {}, [REFERENCE, *(name for name in controllers if name != REFERENCE)]
     for name in names:
-        registry.make(name, scenario, policy=policies.get(name))
+        registry.verify(name, scenario, policy=policies.get(name))
     common, settings = configuration(scenario, names, plant, policies)
     wanted = [Run(sigma, number, name) for sigma in sigmas for number in range(scenarios) for name in names]
     file, failures = out / "robustness.csv", []
