@@ -30,7 +30,7 @@ from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.quantities import quantities, variables
 from nmfd.runs import run_folder
-from nmfd.runs.files import file_hash, write_text
+from nmfd.runs.files import check_file, file_hash, write_text
 from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
 from nmfd.studies.benchmark import REFERENCE, draw_accumulations, interval
@@ -243,6 +243,7 @@ def overview(folder: Path) -> pd.DataFrame:
 
 def read_facts(path: Path) -> pd.DataFrame:
     """The rows of sumo.csv. Raises InputError."""
+    check_file(path, "delete the folder and run again")
     try:
         rows = pd.read_csv(path)
         return rows.astype({"controller": str, "seed": int})

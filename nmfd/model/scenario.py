@@ -16,6 +16,7 @@ from nmfd.faults import Fault, parse
 from nmfd.model.regional_model import RegionalModel, check_step, load_network
 from nmfd.model.scenario_file import MOST_NUMBERS, OWN_TIME_LIMIT, ScenarioTable, read_tables
 from nmfd.runs import config
+from nmfd.runs.files import check_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,6 +171,7 @@ def _demand_file(path: Path, steps: int, regions: int) -> PairsOverTime:
     Raises InputError.
     """
     demand = np.zeros((steps, regions, regions))
+    check_file(path, "give a csv file")
     try:
         with path.open(newline="", encoding="utf-8") as stream:
             rows = list(csv.reader(stream))

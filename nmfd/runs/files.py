@@ -118,6 +118,7 @@ def write_rows(path: Path, columns: Mapping[str, type], rows: Sequence[Mapping])
 
 def read_rows(path: Path, columns: Mapping[str, type]) -> list[dict]:
     """The rows of a csv file with `columns`: name -> type. Raises InputError."""
+    check_file(path, "delete the folder and run again")
     try:
         with Path(path).open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
@@ -142,7 +143,8 @@ def check_file(path: Path, remedy: str = "give a file") -> None:
 
 
 def file_hash(path: Path) -> str:
-    """A fingerprint of the bytes of a file."""
+    """A fingerprint of the bytes of a file. InputError for what is no file."""
+    check_file(path)
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
 
 
