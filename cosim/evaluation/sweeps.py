@@ -63,14 +63,14 @@ class Sweep:
 
 
 def sweep(
-    order: Sweep, *, workers: int = 1, scheduler: str | None = None,
+    order: Sweep, *, workers: int = 1, scheduler: dask_cluster.Scheduler | str | None = None,
     progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Run what is not there yet; returns the table, which is in sweep.parquet, of all runs in the folder.
 
     Columns: strategy, controller (without its compliance), seed, demand, compliance, status ("ok" or "failed"),
     reason, and those of summary.csv and sumo.csv, which are empty where a run failed. Failed runs are tried again at
-    the next call. `scheduler`: the address of a Dask scheduler, whose workers run all of it instead of `workers`
+    the next call. `scheduler`: a Dask scheduler or its address, whose workers run all of it instead of `workers`
     processes here. progress, tell: as in `experiment.perform`. Raises InputError, and
     RunFailed if no run at all went well.
     """
@@ -96,7 +96,11 @@ def sweep(
         write()
 
     if scheduler is not None:
+        if isinstance(scheduler, str):
+            scheduler = dask_cluster.Scheduler(address=scheduler)
         dask_cluster.connect(scheduler).close()  # before anything is written
+        if tell and scheduler.warning:
+            tell(scheduler.warning)
     failed_now = experiment.perform(
         plan, workers=workers, progress=progress, tell=tell, kept=write, failed=failed,
         source=partial(_local, workers=workers) if scheduler is None else partial(dask_cluster.outcomes, scheduler))
