@@ -1,5 +1,6 @@
 """Figures of merit of a trajectory."""
 
+import math
 from collections import Counter
 
 import numpy as np
@@ -10,7 +11,7 @@ from nmfd.types import Status, Trajectory
 COUNTED = {
     "solver_failures": ("failures", "of the solver or policy"),
     "fallbacks": ("fallbacks", "controls of something behind the controller"),
-    "late_decisions": ("late", "decisions longer than the control interval"),
+    "late_decisions": ("late", "decisions after their deadline, at most the control interval"),
     "sensor_faults": ("sensor", "decisions on a wrong or missing measurement"),
     "plant_faults": ("plant", "intervals in which the city could not do what was commanded"),
 }
@@ -25,14 +26,19 @@ def total_time_spent(trajectory: Trajectory) -> float:
     return float(trajectory.step * vehicles)
 
 
+def percent_change(value: float, reference: float) -> float:
+    """How far `value` is above `reference` [%]; NaN, not defined, where that is 0."""
+    return 100.0 * (value / reference - 1.0) if reference else math.nan
+
+
 def decisions(trajectory: Trajectory, kind: Status) -> int:
     """How many decisions have `kind` in their status."""
     return int(((trajectory.status & kind.value) != 0).sum())
 
 
 def late_decisions(trajectory: Trajectory) -> int:
-    """Decisions that took longer than the control interval, by the wall clock."""
-    return int((trajectory.decision_time > trajectory.step).sum())
+    """Decisions that took longer than the control interval or their own deadline, by the wall clock."""
+    return int(((trajectory.decision_time > trajectory.step) | (trajectory.status & Status.LATE.value != 0)).sum())
 
 
 def notes(trajectory: Trajectory, most: int = 3) -> str:

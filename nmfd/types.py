@@ -22,9 +22,8 @@ class Status(Flag):
     FALLBACK: the controls are not those of the controller that was asked for, but of something behind it
     SENSOR_FAULT: the controller was given a wrong, late or incomplete observation
     PLANT_FAULT: the city could not do what was commanded, or was not whole, during the interval
-
-    Decisions that took longer than the control interval are no status, for wall times are not part of a result: they
-    are counted in the tables (nmfd.metrics.late_decisions).
+    LATE: the decision took longer than the control interval, or than the controller's own `deadline` [s], by the clock
+        of the closed loop. The only part of a run's file that depends on wall time
     """
 
     OK = 0
@@ -32,6 +31,7 @@ class Status(Flag):
     FALLBACK = 2
     SENSOR_FAULT = 4
     PLANT_FAULT = 8
+    LATE = 16
 
 
 @dataclass(frozen=True, kw_only=True)

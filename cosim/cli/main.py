@@ -15,7 +15,7 @@ from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
 from cosim.cli.search import frontier, tune
 from nmfd.cli.errors import Commands
-from nmfd.cli.options import COUNT, FOLDER, SEED, policy_files
+from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, policy_files, time_limit_option
 from nmfd.cli.progress import resumable
 from nmfd.errors import InputError, RunFailed
 from nmfd.runs.files import file_name
@@ -48,10 +48,12 @@ def main() -> None:
 @click.option("--workers", type=COUNT, metavar="N",
               help="Runs at a time, each in a process of its own. [default: one per core]")
 @click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
+@time_limit_option()
 @click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-evaluate]")
 def evaluate(
     scenario: Path, controllers: str, seeds: int, first_seed: int, demand: str, reference: str | None,
-    policies: tuple[str, ...], workers: int | None, steps: int | None, out: Path | None,
+    policies: tuple[str, ...], workers: int | None, steps: int | None, time_limit: float | None,
+    out: Path | None,
 ) -> None:
     """Compare controllers in the microsimulation over seeds and demand levels; print and write tables, draw figures.
 
@@ -81,6 +83,7 @@ def evaluate(
     chosen = evaluate.Evaluation(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
         levels=tuple(parsed_levels("--demand", demand)), steps=steps, policies=files, reference=reference,
+        time_limit=time_limit,
         out=Path("runs") / f"{file_name(loaded.name)}-evaluate" if out is None else out)
     workers = cores() if workers is None else workers
     with resumable("evaluate", chosen.out) as progress:
@@ -112,13 +115,21 @@ def evaluate(
 @click.option("--workers", type=COUNT, metavar="N",
               help="Runs at a time, each in a process of its own. [default: one per core]")
 @click.option("--scheduler", metavar="ADDRESS",
-              help="Of a Dask cluster that does the runs, such as tcp://host:8786 (extra dask). Its workers need this "
-                   "package, and the same files under the same paths.")
+              help="Of a Dask cluster that does the runs, such as tls://host:8786 (extra dask). Its workers need this "
+                   "package, and the same files under the same paths. Whoever reaches a tcp:// scheduler runs code on "
+                   "the cluster and here.")
+@click.option("--scheduler-ca", type=FILE, metavar="PEM", help="Authority that a tls:// scheduler is trusted by.")
+@click.option("--scheduler-cert", type=FILE, metavar="PEM", help="Certificate that this side shows to it.")
+@click.option("--scheduler-key", type=FILE, metavar="PEM", help="The key of that certificate. [default, of all three: "
+                                                                "Dask's own configuration, distributed.comm.tls]")
 @click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
+@time_limit_option()
 @click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-sweep]")
 def sweep(
     scenario: Path, controllers: str, seeds: int, first_seed: int, demand: str, compliance: str | None,
-    policies: tuple[str, ...], workers: int | None, scheduler: str | None, steps: int | None, out: Path | None,
+    policies: tuple[str, ...], workers: int | None, scheduler: str | None,
+    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None,
+    time_limit: float | None, out: Path | None,
 ) -> None:
     """Run controllers x seeds x demand levels x compliance; write one table, sweep.parquet.
 
@@ -142,17 +153,22 @@ def sweep(
         raise InputError("--workers: is for processes here, and --scheduler has workers of its own; omit one")
     files = policy_files(policies, names)
 
-    from cosim.evaluation import sweeps  # heavy
+    from cosim.evaluation import dask_cluster, sweeps  # heavy
     from nmfd.api import load_scenario
+
+    cluster = None if scheduler is None else dask_cluster.Scheduler(
+        address=scheduler, ca=scheduler_ca, cert=scheduler_cert, key=scheduler_key)
+    if cluster is None and any((scheduler_ca, scheduler_cert, scheduler_key)):
+        raise InputError("--scheduler: missing; the certificates are those of its connection")
 
     order = sweeps.Sweep(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
         levels=tuple(parsed_levels("--demand", demand)), compliance=parsed_compliance(compliance), steps=steps,
-        policies=files,
+        policies=files, time_limit=time_limit,
         out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
     workers = cores() if workers is None else workers
     with resumable("sweep", order.out) as progress:
-        rows = sweeps.sweep(order, workers=workers, scheduler=scheduler, progress=progress, tell=tell)
+        rows = sweeps.sweep(order, workers=workers, scheduler=cluster, progress=progress, tell=tell)
     click.echo(sweeps.text(rows))
     click.echo(f"Written to {order.out / 'sweep.parquet'}")
     if failed := int((rows["status"] == sweeps.FAILED).sum()):

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from cosim.cli.options import CONTROLLER_HELP, tell
-from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, fault_option
+from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, fault_option, time_limit_option
 from nmfd.cli.progress import resumable
 from nmfd.errors import InputError
 
@@ -28,10 +28,11 @@ from nmfd.errors import InputError
                    "emission (of every vehicle in every step, large).")
 @click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.runs.frames).")
 @fault_option("closed:EDGE, signal:NAME, sumo-exits")
+@time_limit_option()
 @click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
 def run(
     scenario: Path, controller: str, against: str | None, seed: int, steps: int | None, policy: Path | None,
-    sumo_output: str | None, parquet: bool, faults: tuple[str, ...], out: Path | None,
+    sumo_output: str | None, parquet: bool, faults: tuple[str, ...], time_limit: float | None, out: Path | None,
 ) -> None:
     """Run a controller in the microsimulation; print a table and write a run folder.
 
@@ -60,7 +61,7 @@ def run(
 
     tasks = [
         Task(scenario=scenario, controller=name, seed=seed, policy=policy if name == controller else None, steps=steps,
-             faults=faults)
+             faults=faults, time_limit=time_limit)
         for name in names]
     out, rows = _experiment(tasks, out, kinds)
     click.echo(experiment.overview_table(rows))

@@ -27,7 +27,7 @@ FIRST_SEED = 2000  # these seeds are kept for evaluations: nothing was chosen, t
 class Evaluation:
     """scenario: its folder; controllers: strategies; levels: multiples of the scenario's demand; steps: control
     intervals, all if None; policies: controller -> file instead of the scenario's own; reference: a controller to
-    pair with, besides no control; out: the folder of the evaluation."""
+    pair with, besides no control; time_limit: of controllers of the user's own, instead of the scenario's; out: the folder of the evaluation."""
 
     scenario: Path
     controllers: tuple[str, ...]
@@ -36,6 +36,7 @@ class Evaluation:
     levels: tuple[float, ...] = (1.0,)
     steps: int | None = None
     policies: Mapping[str, Path] = field(default_factory=dict)
+    time_limit: float | None = None
     reference: str | None = None
 
     def plan(self) -> list[tuple[Path, Task]]:
@@ -43,7 +44,7 @@ class Evaluation:
         return [
             (self.out / f"demand-{level:g}", Task(
                 scenario=self.scenario, controller=name, seed=seed, policy=self.policies.get(name), steps=self.steps,
-                demand_factor=level))
+                demand_factor=level, time_limit=self.time_limit))
             for seed in self.seeds for level in self.levels for name in self.controllers]
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from importlib import metadata
@@ -24,12 +25,12 @@ from cosim.sumo.signals import read_signals
 from cosim.sumo.xml_files import read_xml
 from nmfd.controllers import registry
 from nmfd.errors import InputError
-from nmfd.metrics import COUNTED
+from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.quantities import quantities, variables
 from nmfd.runs import run_folder
-from nmfd.runs.files import file_hash, write_text
+from nmfd.runs.files import check_file, file_hash, write_text
 from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
 from nmfd.studies.benchmark import REFERENCE, draw_accumulations, interval
@@ -130,7 +131,7 @@ def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> d
     InputError for a controller that cannot be made.
     """
     controller, variant = parse(name).controller, configured(name, scenario.controller_options)
-    registry.make(variant, scenario, policy=policy)
+    registry.verify(variant, scenario, policy=policy)
     if controller == REFERENCE:
         return {}
     tables = scenario.controller_options
@@ -188,9 +189,11 @@ def _plain(chosen: Settings, scenario: Scenario) -> dict:
 
 
 def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress: Progress | None) -> Outcomes:
-    """(task, Result or Failure); in this process, which reports every control interval, if one run is all there is."""
-    if len(todo) != 1 or fresh:
-        yield from _reported(lambda tasks: outcomes(simulate, tasks, workers, fresh=fresh), todo, progress)
+    """(task, Result or Failure); in this process, which reports every control interval, if one run is all there is, and
+    not of a controller of the user's own."""
+    if len(todo) != 1 or fresh or _apart(todo[0]):
+        yield from _reported(
+            lambda tasks: outcomes(simulate, tasks, workers, fresh=fresh, group=_apart), todo, progress)
         return
 
     def tick(k: int, steps: int) -> None:
@@ -198,6 +201,11 @@ def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress: Progres
             progress(k, steps, f"{todo[0].controller}, seed {todo[0].seed}")
 
     yield todo[0], attempt(lambda task: simulate(task, tick), todo[0])
+
+
+def _apart(task: Task) -> str:
+    """The controller of the user's own, which has a process to itself, "" for others."""
+    return task.controller if registry.runs_apart(task.controller) else ""
 
 
 def _reported(
@@ -235,6 +243,7 @@ def overview(folder: Path) -> pd.DataFrame:
 
 def read_facts(path: Path) -> pd.DataFrame:
     """The rows of sumo.csv. Raises InputError."""
+    check_file(path, "delete the folder and run again")
     try:
         rows = pd.read_csv(path)
         return rows.astype({"controller": str, "seed": int})
@@ -251,7 +260,10 @@ def overview_table(rows: pd.DataFrame) -> str:
     for name, group in rows.groupby("controller", sort=False):
         tts = group["total_time_spent_veh_s"]
         spread = f" ± {interval(list(tts)):.1e}" if len(tts) > 1 else ""
-        change = f"{100 * (tts.mean() / reference.mean() - 1):+.1f} %" if len(reference) and name != REFERENCE else ""
+        change = ""
+        if len(reference) and name != REFERENCE:
+            percent = percent_change(tts.mean(), reference.mean())
+            change = "-" if math.isnan(percent) else f"{percent:+.1f} %"
         lines.append({
             "controller": name, "seeds": len(group), "TTS [veh s]": f"{tts.mean():.4g}{spread}", "change": change,
             "completed": f"{group['completed_veh'].mean():,.0f} of {group['trips'].mean():,.0f}",

@@ -125,6 +125,8 @@ def verdict(
     pair = statistics.paired(statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, REFERENCE))
     if not pair.seeds:
         return f"has no common seed with {REFERENCE}, so that nothing can be said: add it to --controllers"
+    if np.isnan(pair.percent):
+        return "is not told in percent: nobody spent any time with what it is compared with"
     spread = f"± {pair.percent_half:.1f} over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed, no proof"
     size = f"{pair.percent:+.1f} % in total time spent {spread}"
     unmodelled = model_free(name)

@@ -14,7 +14,7 @@ from cosim.sumo.net import City, load_city
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
-from nmfd.runs.files import file_hash
+from nmfd.runs.files import check_file, file_hash
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,6 +118,7 @@ def _level(demand: float, folder: Path, order: Sequence[str]) -> Level:
 
 def _manifest(folder: Path) -> dict:
     path = folder / "manifest.json"
+    check_file(path, "give a folder of `cosim run` or `cosim evaluate`")
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
         configuration, scenario = manifest["configuration"], manifest["sessions"][-1]["scenario_folder"]

@@ -37,7 +37,8 @@ class Task:
     """scenario: its folder; controller: a strategy (cosim.plant.strategy); policy: of a DPC controller, instead of the
     scenario's own; steps: control intervals, all if None; demand_factor: multiplies all flows;
     options: of the controller, instead of those of the scenario; sumo_output: kind (cosim.sumo.outputs) and file of
-    SUMO's own outputs; faults: besides those of the scenario."""
+    SUMO's own outputs; faults: besides those of the scenario; time_limit: of a controller of the user's own
+    [s], instead of that of the scenario."""
 
     scenario: Path
     controller: str
@@ -48,6 +49,7 @@ class Task:
     options: tuple[tuple[str, object], ...] = ()
     sumo_output: tuple[tuple[str, Path], ...] = ()
     faults: tuple[str, ...] = ()
+    time_limit: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +68,8 @@ def scenario_of(task: Task) -> Scenario:
     scenario = with_faults(scenario, task.faults)
     scenario = replace(
         scenario, steps=steps, demand=task.demand_factor * scenario.demand[:steps],
-        demand_factor=task.demand_factor * scenario.demand_factor)
+        demand_factor=task.demand_factor * scenario.demand_factor,
+        own_time_limit=scenario.own_time_limit if task.time_limit is None else task.time_limit)
     if not task.options:
         return scenario
     tables = scenario.controller_options

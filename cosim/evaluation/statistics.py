@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nmfd.metrics import COUNTED
+from nmfd.metrics import COUNTED, percent_change
 from nmfd.runs import files
 from nmfd.runs.tables import markdown_table, text_table, wrapped
 from nmfd.studies.benchmark import REFERENCE, interval
@@ -48,9 +48,9 @@ class Paired:
 
 
 def paired(a: Mapping[int, float], b: Mapping[int, float]) -> Paired:
-    """a, b: seed -> value; NaN everywhere without a common seed."""
+    """a, b: seed -> value; NaN everywhere without a common seed, and the percentages where a value of b is 0."""
     seeds = sorted(set(a) & set(b))
-    percent = [100.0 * (a[seed] / b[seed] - 1.0) for seed in seeds]
+    percent = [percent_change(a[seed], b[seed]) for seed in seeds]
     difference = [a[seed] - b[seed] for seed in seeds]
     return Paired(
         seeds=len(seeds), percent=_mean(percent), percent_half=interval(percent), difference=_mean(difference),
@@ -150,7 +150,7 @@ def _spread(row: Mapping) -> str:
 def _change(row: Mapping, label: str) -> str:
     percent, half = row[f"{label}_percent"], row[f"{label}_half_interval_percent"]
     if math.isnan(percent):
-        return ""
+        return "-" * bool(row[f"{label}_seeds"])
     return f"{percent:+.1f}" + (" %" if math.isnan(half) else f" ± {half:.1f} %{'*' * row[f'{label}_excludes_zero']}")
 
 

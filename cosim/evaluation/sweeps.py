@@ -32,7 +32,8 @@ FIRST = ["strategy", "controller", "seed", "demand", "compliance", "status", "re
 class Sweep:
     """scenario: its folder; controllers: strategies; levels: multiples of the scenario's demand; compliance: shares of
     the drivers' decisions that follow route guidance, the scenario's own where there is none or nobody guides;
-    steps: control intervals, all if None; policies: controller -> file instead of the scenario's own; out: the folder.
+    steps: control intervals, all if None; policies: controller -> file instead of the scenario's own; time_limit: of
+    controllers of the user's own, instead of the scenario's; out: the folder.
     """
 
     scenario: Path
@@ -43,6 +44,7 @@ class Sweep:
     compliance: tuple[float, ...] = ()
     steps: int | None = None
     policies: Mapping[str, Path] = field(default_factory=dict)
+    time_limit: float | None = None
 
     def strategies(self) -> dict[str, str]:
         """Strategy with its compliance -> strategy as asked for; those that guide nobody once only. InputError."""
@@ -56,19 +58,19 @@ class Sweep:
         return [
             (self.out / f"demand-{level:g}", Task(
                 scenario=self.scenario, controller=strategy, seed=seed, policy=self.policies.get(name),
-                steps=self.steps, demand_factor=level))
+                steps=self.steps, demand_factor=level, time_limit=self.time_limit))
             for seed in self.seeds for level in self.levels for strategy, name in self.strategies().items()]
 
 
 def sweep(
-    order: Sweep, *, workers: int = 1, scheduler: str | None = None,
+    order: Sweep, *, workers: int = 1, scheduler: dask_cluster.Scheduler | str | None = None,
     progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Run what is not there yet; returns the table, which is in sweep.parquet, of all runs in the folder.
 
     Columns: strategy, controller (without its compliance), seed, demand, compliance, status ("ok" or "failed"),
     reason, and those of summary.csv and sumo.csv, which are empty where a run failed. Failed runs are tried again at
-    the next call. `scheduler`: the address of a Dask scheduler, whose workers run all of it instead of `workers`
+    the next call. `scheduler`: a Dask scheduler or its address, whose workers run all of it instead of `workers`
     processes here. progress, tell: as in `experiment.perform`. Raises InputError, and
     RunFailed if no run at all went well.
     """
@@ -94,7 +96,11 @@ def sweep(
         write()
 
     if scheduler is not None:
+        if isinstance(scheduler, str):
+            scheduler = dask_cluster.Scheduler(address=scheduler)
         dask_cluster.connect(scheduler).close()  # before anything is written
+        if tell and scheduler.warning:
+            tell(scheduler.warning)
     failed_now = experiment.perform(
         plan, workers=workers, progress=progress, tell=tell, kept=write, failed=failed,
         source=partial(_local, workers=workers) if scheduler is None else partial(dask_cluster.outcomes, scheduler))

@@ -160,7 +160,7 @@ def check(order: Tuning) -> None:
         if order.trains:
             training.settings(scenario, variant)
         else:
-            registry.make(variant, scenario)
+            registry.verify(variant, scenario)
 
 
 def tune(

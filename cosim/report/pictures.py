@@ -80,7 +80,7 @@ def ranked(rows: pd.DataFrame) -> list[str]:
     for name in dict.fromkeys(rows["controller"]):
         values = statistics.by_seed(rows, level, name)
         pair = statistics.paired(values, reference)
-        score[name] = pair.percent if pair.seeds else float(np.mean(list(values.values())))
+        score[name] = float(np.mean(list(values.values()))) if np.isnan(pair.percent) else pair.percent
     return sorted(score, key=score.__getitem__)
 
 
@@ -222,7 +222,7 @@ def demand_levels(path: Path, rows: pd.DataFrame) -> None:
     for level, names in statistics.groups(rows).items():
         for name in names:
             pair = statistics.paired(statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, REFERENCE))
-            if name != REFERENCE and pair.seeds:
+            if name != REFERENCE and not np.isnan(pair.percent):
                 ratios.setdefault(name, {})[level] = 1.0 + pair.percent / 100.0, pair.percent_half / 100.0
     if not ratios:
         return

@@ -1,5 +1,6 @@
 """What the runs of a demand level say, in plain words and numbers."""
 
+import math
 from collections.abc import Sequence
 
 import pandas as pd
@@ -47,6 +48,9 @@ def best(rows: pd.DataFrame) -> str:
     if not pair.seeds:
         return (f"The lowest total time spent was that of {first}, {_time(rows, first)}; there is no run of "
                 f"{REFERENCE} with the same seed to compare it with.")
+    if math.isnan(pair.percent):
+        return (f"The total time spent of {REFERENCE} was {_time(rows, REFERENCE)}, that of {first} "
+                f"{_time(rows, first)}: a change in percent is not defined.")
     if pair.percent < 0:
         text = (f"The best strategy was {first}: total time spent {_time(rows, first)}, {-pair.percent:.1f} % less "
                 "than without control.")
@@ -59,7 +63,7 @@ def best(rows: pd.DataFrame) -> str:
                  "flattered; only other seeds would tell its true size.")
         second = others[1]
         lead = statistics.paired(statistics.by_seed(rows, level, first), statistics.by_seed(rows, level, second))
-        if lead.seeds:
+        if lead.seeds and not math.isnan(lead.percent):
             text += (f" Against the second, {second}, total time spent changes by {lead.percent:+.1f} %. "
                      f"{_certainty(lead)}")
     return text
@@ -83,7 +87,7 @@ def _beyond_chance(rows: pd.DataFrame) -> str:
     open_: list[str] = []
     for name in pictures.ranked(rows):
         pair = statistics.paired(statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, REFERENCE))
-        if name != REFERENCE and pair.seeds > 1:
+        if name != REFERENCE and pair.seeds > 1 and not math.isnan(pair.percent):
             (open_ if not pair.excludes_zero else better if pair.percent < 0 else worse).append(name)
     parts = [
         f"{what}: {', '.join(names)}" for what, names in (

@@ -6,7 +6,7 @@ import click
 
 from nmfd.cli.errors import Commands, Interrupted
 from nmfd.cli.exchange import export, new_controller
-from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, controller_names, fault_option, policy_files, quoted
+from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, controller_names, fault_option, policy_files, quoted, time_limit_option
 from nmfd.cli.progress import progress_line, resumable
 from nmfd.cli.studies import ablation, adaptation, bound, robustness, scaling
 from nmfd.errors import InputError
@@ -40,10 +40,11 @@ def main() -> None:
               help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.")
 @click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.runs.frames).")
 @fault_option()
+@time_limit_option()
 @click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
 def benchmark(
     scenario: Path, controllers: str, seeds: int, plant: str, workers: int, policies: tuple[str, ...],
-    parquet: bool, faults: tuple[str, ...], out: Path | None,
+    parquet: bool, faults: tuple[str, ...], time_limit: float | None, out: Path | None,
 ) -> None:
     """Run controllers on a regional model; print a table and write a run folder.
 
@@ -61,11 +62,11 @@ def benchmark(
     files = policy_files(policies, names)
 
     from nmfd.api import load_scenario  # heavy
-    from nmfd.model.scenario import with_faults
+    from nmfd.model.scenario import with_faults, with_time_limit
     from nmfd.runs import run_folder
     from nmfd.studies import benchmark as benchmarks
 
-    loaded = with_faults(load_scenario(scenario), faults)
+    loaded = with_time_limit(with_faults(load_scenario(scenario), faults), time_limit)
     out = run_folder.default_folder(loaded.name) if out is None else out
     with resumable("benchmark", out, "summary.csv") as progress:
         rows = benchmarks.benchmark(

@@ -34,6 +34,14 @@ POSITIVE = Positive(1e6)
 LEVEL = Positive(10.0)  # of demand
 
 
+def time_limit_option() -> Callable[[Callable], Callable]:
+    """--time-limit"""
+    return click.option(
+        "--time-limit", type=Positive(1e6, zero=True), metavar="SECONDS",
+        help="Of every call of a controller of your own, in which its run is ended; 0: none. [default: the scenario's "
+             "own_time_limit, else 600]")
+
+
 def fault_option(more: str = "") -> Callable[[Callable], Callable]:
     """--fault, which may be repeated. more: kinds besides those of every plant"""
     kinds = ("frozen, delayed:N, missing:REGION, detectors:SHARE, off:FACTOR, solver-fails, solver-diverges, "

@@ -4,6 +4,7 @@ A declaration is a subclass of `Settings` whose fields are made by `setting` and
 JSON schemas for editors come from it (nmfd.runs.reference).
 """
 
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,10 +14,12 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from nmfd.errors import InputError, did_you_mean
 from nmfd.runs import schema
+from nmfd.runs.files import check_file
 
 MOST = 10**9        # of a whole number without a limit of its own
 LONGEST = 1000      # characters of a text
 LONGEST_NAME = 100  # characters: names become file names
+DEEP = re.compile(rb"(?:\s*\.\s*[\"']?[\w-]+[\"']?){100}")  # a dotted key of so many parts
 SHOWN = 60          # characters of a wrong value that a message repeats
 S = TypeVar("S", bound="Settings")
 
@@ -82,6 +85,7 @@ Rows = Annotated[tuple[S, ...], Field(strict=False)]  # a list of tables
 def read(path: Path) -> dict[str, Any]:
     """The content of a TOML file; InputError if it is missing or not TOML."""
     path = Path(path)
+    check_file(path, "give a TOML file")
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -90,11 +94,15 @@ def read(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give a readable file") from None
     try:
+        if DEEP.search(content):  # the parser would take hours
+            raise RecursionError
         return tomllib.loads(content.decode())
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not UTF-8 text; save it as UTF-8") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: is not valid TOML: {error}; correct the line named") from None
+    except ValueError:  # of Python, which reads no whole numbers of thousands of digits
+        raise InputError(f"{path}: is not valid TOML: a number of thousands of digits; give a shorter one") from None
     except RecursionError:
         raise InputError(f"{path}: is not valid TOML: nested too deeply; write it anew") from None
 

@@ -10,12 +10,12 @@ from scipy.special import stdtrit
 
 from nmfd import closed_loop, faults
 from nmfd.controllers import registry
-from nmfd.metrics import COUNTED
+from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
 from nmfd.runs.tables import text_table
-from nmfd.runs.workers import Failure, attempt, ended, outcomes
+from nmfd.runs.workers import Failure, Worker, attempt, ended, outcomes
 from nmfd.studies import plots
 from nmfd.types import Plant, Trajectory
 
@@ -54,7 +54,7 @@ def benchmark(
     """
     policies = policies or {}
     for name in controllers:
-        registry.make(name, scenario, policy=policies.get(name))
+        registry.verify(name, scenario, policy=policies.get(name))
     common, settings = configuration(scenario, controllers, plant, policies)
     wanted = [(name, seed) for name in controllers for seed in seeds]
     session = {"scenario_folder": str(scenario.folder), "workers": workers}
@@ -101,7 +101,8 @@ def results(
     work: Callable, todo: Sequence[tuple], workers: int, steps: int,
     progress: Callable[[int, int, str], None] | None, *, label: Callable[..., str],
 ) -> Iterator[tuple]:
-    """(run, result or Failure) of every run, in this process if there is one worker.
+    """(run, result or Failure) of every run, in this process if there is one worker; those of controllers of the
+    user's own in processes of their own.
 
     work(run), or work(run, progress=...) in this process, is one closed loop of `steps` control intervals; progress
     as in `benchmark`, with the `label` of the run.
@@ -109,15 +110,36 @@ def results(
     report = progress or (lambda done, total, note: None)
     total = steps * len(todo)
     if workers > 1:
-        for done, (run, outcome) in enumerate(outcomes(work, todo, min(workers, len(todo))), start=1):
+        found = outcomes(work, todo, min(workers, len(todo)), group=_apart)
+        for done, (run, outcome) in enumerate(found, start=1):
             report(done * steps, total, f"{done}/{len(todo)} runs, last {label(run)}")
             yield run, outcome
         return
-    for done, run in enumerate(todo):
-        def tick(k: int, _: int, before: int = done * steps, run: tuple = run) -> None:
-            report(before + k, total, label(run))
+    apart: dict[str, Worker] = {}
+    try:
+        for done, run in enumerate(todo):
+            def tick(k: int, _: int, before: int = done * steps, run: tuple = run) -> None:
+                report(before + k, total, label(run))
 
-        yield run, attempt(partial(work, progress=tick), run)
+            if name := _apart(run):
+                tick(0, steps)
+                if name not in apart or not apart[name].alive:
+                    apart[name] = Worker(work)
+                apart[name].hand(run)
+                yield run, apart[name].receive()
+            else:
+                yield run, attempt(partial(work, progress=tick), run)
+    finally:
+        for worker in apart.values():
+            worker.terminate()
+            worker.close()
+
+
+def _apart(run: tuple) -> str:
+    """The controller of the user's own, which has a process to itself, "" for others; run: (controller, ...), or with a
+    field of that name."""
+    name = getattr(run, "controller", run[0])
+    return name if registry.runs_apart(name) else ""
 
 
 def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -> None:
@@ -173,8 +195,8 @@ def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
 
 
 def interval(values: Sequence[float]) -> float:
-    """Half of the 95 % interval of the mean of `values` (Student's t); NaN of a single one."""
-    if len(values) < 2:
+    """Half of the 95 % interval of the mean of `values` (Student's t); NaN of a single one, or where one is NaN."""
+    if len(values) < 2 or any(map(math.isnan, values)):
         return math.nan
     return float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
 
@@ -212,8 +234,9 @@ def summary_table(rows: Sequence[Mapping]) -> str:
 
 
 def _percent(values: Sequence[float], reference: Sequence[float]) -> str:
-    """How far the mean of `values` is above that of `reference`, like +1.7 %."""
-    return f"{100 * (statistics.fmean(values) / statistics.fmean(reference) - 1):+.1f} %"
+    """How far the mean of `values` is above that of `reference`, like +1.7 %; - where that is 0."""
+    change = percent_change(statistics.fmean(values), statistics.fmean(reference))
+    return "-" if math.isnan(change) else f"{change:+.1f} %"
 
 
 def _scientific(value: float, digits: int = 4) -> str:

@@ -18,7 +18,7 @@ from nmfd.errors import InputError, RunFailed
 from nmfd.extras import need
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import read_scenario
-from nmfd.runs.files import atomic
+from nmfd.runs.files import atomic, check_file
 from nmfd.tensors import PerPair, PerTurn
 
 OPSET = 18
@@ -53,6 +53,7 @@ def export(policy_file: Path, out: Path, scenario_folder: Path | None = None) ->
 
 def _planning(policy_file: Path, folder: Path | None) -> tuple[PlanningModel, dict]:
     """The planning model that the policy was trained on, and the checkpoint."""
+    check_file(policy_file, "give a policy that 'nmfd train' wrote")
     try:
         content = torch.load(policy_file, map_location="cpu", weights_only=True)
         name = str(content["configuration"].get("controller", ""))

@@ -18,6 +18,7 @@ from nmfd.arrays import Adjacency
 from nmfd.controllers.dpc.options import DEEPEST, WIDEST, Activation
 from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
+from nmfd.runs.files import check_file
 from nmfd.model.regional_model import RegionalModel
 from nmfd.tensors import PerPair, PerTurn
 from nmfd.types import Controls, Observation, Status
@@ -196,6 +197,7 @@ def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
 
     No code of the file is executed (weights_only).
     """
+    check_file(path, "train one with 'nmfd train'")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:

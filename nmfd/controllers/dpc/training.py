@@ -24,7 +24,7 @@ from nmfd.errors import InputError, RunFailed
 from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
-from nmfd.runs.files import atomic, locked, sweep
+from nmfd.runs.files import atomic, check_file, locked, sweep
 from nmfd.threads import one_thread
 
 VALIDATE_EVERY = 20  # Adam steps
@@ -216,6 +216,7 @@ def _restore(
     state_file: Path, configuration: Mapping[str, Any], policy: Policy, optimizer: torch.optim.Optimizer,
     generator: torch.Generator,
 ) -> tuple[int, float, list[list[float]]]:
+    check_file(state_file, "remove it and train without --resume")
     try:
         state = torch.load(state_file, map_location="cpu", weights_only=True)
     except FileNotFoundError:
