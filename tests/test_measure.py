@@ -71,6 +71,9 @@ class Streets:
     def route(self, vehicle):
         return self.routes[vehicle]
 
+    def route_id(self, vehicle):
+        return " ".join(self.routes[vehicle])
+
     def is_free(self, vehicle):
         return vehicle not in self.bound
 

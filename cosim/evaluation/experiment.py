@@ -215,7 +215,8 @@ def read_run(folder: Path, controller: str, seed: int) -> Result:
     """A finished run of the run folder. Raises InputError."""
     with run_folder.opened(run_folder.run_path(folder, controller, seed)) as file:
         return Result(
-            trajectory=run_folder.trajectory_in(file), record={name: file[name][...] for name in quantities(Record)},
+            trajectory=run_folder.trajectory_in(file), record={
+                name: file[name][...] for name in quantities(Record) if name in file.variables},  # older ones have fewer
             facts={})
 
 

@@ -29,7 +29,7 @@ FACTS = (
     "mean_trip_time_s", "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh",
     "gateway_queue_max_veh", "gateway_full_share", "notes", "leaking_share",
     "estimate_rmse_share", "estimate_cell_rmse_veh", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s",
-    "signals_left_alone")
+    "signals_left_alone", "removed_veh", "removed_waiting_veh", "jumps")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,22 +105,32 @@ def drive(
         trajectory = run_folder.labelled(
             closed_loop.run(plant, controller, scenario, seed=seed, progress=progress),
             controller=strategy.name, plant="sumo")
+        trips, sumo_time, leaks, facts = plant.trips, plant.sumo_time, set(plant.leaks()), plant.trip_facts()
         record = plant.record()
-        departed = int(record.departures.sum())
+        trajectory = replace(  # as SUMO told in the end
+            trajectory, completed=_since_start(record.arrivals.sum(axis=1)),
+            removed=_since_start(record.removed + record.given_up))
         backlog = trajectory.backlog.sum(axis=(1, 2))
-        sumo_time, leaks = plant.sumo_time, set(plant.leaks())
         row = {
-            "controller": strategy.name, "seed": seed, "trips": plant.trips, "departed_veh": departed,
+            "controller": strategy.name, "seed": seed, "trips": trips,
+            "departed_veh": int(record.departures.sum()),
             "final_backlog_veh": int(backlog[-1]), "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
-            "teleports": int(record.teleports.sum()), **run_metrics.trip_facts(plant.trip_facts()),
+            "teleports": int(record.teleports.sum()), **run_metrics.trip_facts(facts),
             **run_metrics.queue_facts(record, plant.city), "notes": metrics.notes(trajectory),
             "leaking_share": run_metrics.leaking_share(record, plant.city, leaks),
             **_estimation(scenario, trajectory), "wall_time_s": trajectory.wall_time, "sumo_time_s": sumo_time,
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
-            "signals_left_alone": len(plant.other_signals)}
+            "signals_left_alone": len(plant.other_signals),
+            "removed_veh": int(record.removed.sum() + record.given_up.sum()),
+            "removed_waiting_veh": int(record.given_up.sum()), "jumps": int(record.jumps.sum())}
         sumo_output.check_whole(files)
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
+
+
+def _since_start(counts: np.ndarray) -> np.ndarray:
+    """Of counts (T, ...) by interval, the sums (T + 1, ...) at its beginning and end."""
+    return np.concatenate([np.zeros_like(counts[:1]), counts]).cumsum(axis=0).astype(float)
 
 
 def _estimation(scenario: Scenario, trajectory: Trajectory) -> dict[str, float]:

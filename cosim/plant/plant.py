@@ -19,7 +19,7 @@ from cosim.plant.strategy import MAX_PRESSURE
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, Gateway, check_adjacency, load_city
 from cosim.sumo.session import Session, Window
-from cosim.sumo.tripinfo import TripFacts, read_trip_facts
+from cosim.sumo.tripinfo import TripFacts, TripReader
 from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
@@ -64,6 +64,7 @@ class SumoPlant:
         """Trips, drivers and reroutes all follow from `seed`."""
         self._end_session()
         self._k, self._session = 0, self._launch.start(seed)
+        self._trips = TripReader(self._launch.trip_file, self.session.flush)
         self._incidents = Incidents(self._scenario.ordered_faults, self.session, self.city)
         self._sensing = self._new_sensing(seed)
         self._guide = self._new_guide(seed)
@@ -106,9 +107,13 @@ class SumoPlant:
         return self._recorder.record()
 
     def trip_facts(self) -> TripFacts:
-        """Ends the simulation, for only then does SUMO tell of the trips under way."""
-        self._end_session()
-        return read_trip_facts(self._launch.trip_file)
+        """Ends the simulation, for only then does SUMO tell of the trips under way, and closes the books. LedgerError
+        if they are not SUMO's."""
+        if self._session is not None:
+            self._end_session()
+            self._sensing.meter.close_books()
+            self._recorder.close()
+        return self._trips.facts
 
     @property
     def sumo_time(self) -> float:
@@ -132,14 +137,15 @@ class SumoPlant:
         if not self._settings.routes:
             return len(self._launch.vehicles)
         meter = self._sensing.meter
-        return int(meter.departures.sum() + meter.backlog().sum())
+        return int(meter.departures.sum() + meter.backlog().sum() + meter.given_up.sum())
 
     def _new_sensing(self, seed: int) -> Sensing:
         chosen = self._settings
         if chosen.measurement != ESTIMATE:
-            meter, estimation = Meter(self.session, self.city), None
+            meter, estimation = Meter(self.session, self.city, trips=self._trips), None
         else:
-            meter = Meter(self.session, self.city, probes(self._launch.vehicles, chosen.probe_share, seed))
+            known = probes(self._launch.vehicles, chosen.probe_share, seed)
+            meter = Meter(self.session, self.city, known, self._trips)
             estimation = Estimation(self.session, self.city, self._layout, meter, self._instruments, self._planning)
         return Sensing(self._scenario, self.session, self.city, self._incidents, meter, estimation)
 

@@ -11,6 +11,8 @@ from cosim.plant.sampling import StreetMeans
 from cosim.sumo.arrays import EdgesOverTime, GatewaysOverTime, PairCounts, RegionCounts, Series, TurnCounts
 from nmfd.quantities import quantity
 
+BOOKS = ("departures", "arrivals", "removed", "given_up", "crossings", "jumps", "redirected")  # of the meter
+
 
 @dataclass(frozen=True, kw_only=True)
 class Record:
@@ -20,9 +22,20 @@ class Record:
     """
 
     departures: PairCounts = quantity("interval", "region", "destination", unit="veh", text="trips begun")
-    arrivals: RegionCounts = quantity("interval", "destination", unit="veh", text="trips ended")
+    arrivals: RegionCounts = quantity(
+        "interval", "destination", unit="veh", text="trips completed: on the last edge of their route")
+    removed: PairCounts = quantity(
+        "interval", "region", "destination", unit="veh", text="vehicles taken out on their way, whoever did it")
+    given_up: PairCounts = quantity(
+        "interval", "region", "destination", unit="veh", text="trips that SUMO dropped before they began")
     crossings: TurnCounts = quantity(
         "interval", "region", "next_region", "destination", unit="veh", text="vehicles that crossed a boundary")
+    jumps: TurnCounts = quantity(
+        "interval", "region", "next_region", "destination", unit="veh",
+        text="vehicles that came into another region where no gateway leads there")
+    redirected: TurnCounts = quantity(
+        "interval", "region", "destination", "next_destination", unit="veh",
+        text="vehicles whose route was changed to end in another region")
     production: RegionCounts = quantity("interval", "region", unit="veh m/s", text="travel production, mean of samples")
     mean_accumulation: RegionCounts = quantity(
         "interval", "region", unit="veh", text="vehicles inside, mean of the same samples")
@@ -68,10 +81,16 @@ class Recorder:
         """Of all control intervals so far."""
         return Record(**{key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]})
 
+    def close(self) -> None:
+        """The books were closed: what was booked at last belongs to the last interval."""
+        totals = {name: getattr(self._meter, name).copy() for name in BOOKS}
+        for name in BOOKS if self._rows else ():
+            self._rows[-1][name] = self._rows[-1][name] + totals[name] - self._before[name]
+        self._before |= totals
+
     def _totals(self) -> dict[str, np.ndarray]:
         meter = self._meter
         return {
-            "departures": meter.departures.copy(), "arrivals": meter.arrivals.copy(),
-            "crossings": meter.crossings.copy(), "teleports": np.array(meter.teleports),
+            **{name: getattr(meter, name).copy() for name in BOOKS}, "teleports": np.array(meter.teleports),
             "guided": self._guide.realised.copy(), "gateway_flow": meter.gateway_flow(),
             "gateway_green": self._actuation.green_time()}
