@@ -71,9 +71,6 @@ class Streets:
     def route(self, vehicle):
         return self.routes[vehicle]
 
-    def route_id(self, vehicle):
-        return " ".join(self.routes[vehicle])
-
     def is_free(self, vehicle):
         return vehicle not in self.bound
 

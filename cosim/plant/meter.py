@@ -25,14 +25,13 @@ from nmfd.types import State
 @dataclass
 class _Vehicle:
     """origin, destination: regions; edge: the last edge of its route; announced: the region of its last Event (on a
-    junction it may be ahead of that), its origin before the first; route: the id of its route, as long as that is what
-    it was; free: guidance may reroute it; region: where it is now, None before the departure."""
+    junction it may be ahead of that), its origin before the first; free: guidance may reroute it; region: where it is
+    now, None before the departure."""
 
     origin: int
     destination: int
     edge: str
     announced: int
-    route: str
     free: bool = True
     region: int | None = None
 
@@ -193,7 +192,7 @@ class Meter:
         of every one, or sums up to something else."""
         if self._trips is None:
             return
-        self._settle(self._trips.finish())
+        self._settle(self._trips.finish(self._gone))
         facts, booked = self._trips.facts, (int(self.arrivals.sum()), int(self.removed.sum()))
         if self._gone or (facts.completed, facts.removed) != booked:
             raise LedgerError(
@@ -294,7 +293,7 @@ class Meter:
             origin = region_of.get(route[0], 0)
             self._vehicles[vehicle] = _Vehicle(
                 origin=origin, destination=region_of.get(route[-1], 0), edge=route[-1], announced=origin,
-                route=self._session.route_id(vehicle), free=self._session.is_free(vehicle))
+                free=self._session.is_free(vehicle))
         return self._vehicles[vehicle]
 
     def _depart(self, vehicle: str) -> _Vehicle:
@@ -316,10 +315,10 @@ class Meter:
 
     def _follow(self, vehicle: str, known: _Vehicle) -> None:
         """Whoever has changed its route: to where does it lead?"""
-        if (route := self._session.route_id(vehicle)) == known.route:
+        edge = self._session.route(vehicle)[-1]
+        if edge == known.edge:
             return
-        known.route, known.edge = route, self._session.route(vehicle)[-1]
-        before, known.destination = known.destination, self._city.region_of.get(known.edge, 0)
+        before, known.edge, known.destination = known.destination, edge, self._city.region_of.get(edge, 0)
         if known.region is not None and known.destination != before:
             self.redirected[known.region, before, known.destination] += 1
             self._running[known.region, before] -= 1

@@ -103,9 +103,8 @@ class Session:
         self._flush = _flush_all() if window is None else None
         self.time = sumo.simulation.getTime()
         # Asked so often that a Python call around them would cost as much as SUMO's answer:
-        # road(vehicle), the edge it is on, normal or internal; route(vehicle), its edges; route_id(vehicle), another one
-        # whenever anybody has changed the route.
-        self.road, self.route, self.route_id = sumo.vehicle.getRoadID, sumo.vehicle.getRoute, sumo.vehicle.getRouteID
+        # road(vehicle), the edge it is on, normal or internal; route(vehicle), its edges.
+        self.road, self.route = sumo.vehicle.getRoadID, sumo.vehicle.getRoute
         # Edges: the vehicles on one and their number, mean speed [m/s] (the limit if empty), vehicles under 0.1 m/s.
         self.vehicles_on, self.vehicle_count = sumo.edge.getLastStepVehicleIDs, sumo.edge.getLastStepVehicleNumber
         self.mean_speed, self.halting = sumo.edge.getLastStepMeanSpeed, sumo.edge.getLastStepHaltingNumber

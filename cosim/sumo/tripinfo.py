@@ -9,7 +9,7 @@ collision, by a teleport beyond the end or by another program, and what that rem
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -73,29 +73,36 @@ class TripReader:
         """Of the vehicles that SUMO has written since the last call. Raises RunFailed for a file that is broken."""
         self.prompt = self._flush()
         try:
-            with self._path.open("rb") as stream:
-                stream.seek(self._offset)
-                self._parser.feed(stream.read())
-                self._offset = stream.tell()
-            return self._read()
+            self._feed()
+            return self._read(lambda vehicle: True)
         except BROKEN as error:
             raise unfinished(self._path, error) from None
 
-    def finish(self) -> list[End]:
-        """The last ones, when the simulation has ended. Raises RunFailed for a file that is not whole."""
-        self._flush = lambda: True
-        ends = self.ends()
+    def finish(self, gone: Container[str] = ()) -> list[End]:
+        """The last ones, when the simulation has ended: SUMO has written those under way then, too, but not those of
+        `gone`, who had left before. Raises RunFailed for a file that is not whole."""
         try:
+            self._feed()
             self._parser.close()
-            return [*ends, *self._read()]
+            return self._read(gone.__contains__)
         except BROKEN as error:
             raise unfinished(self._path, error) from None
 
-    def _read(self) -> list[End]:
+    def _feed(self) -> None:
+        with self._path.open("rb") as stream:
+            stream.seek(self._offset)
+            self._parser.feed(stream.read())
+            self._offset = stream.tell()
+
+    def _read(self, left: Callable[[str], bool]) -> list[End]:
+        """left: whether a vehicle has left of which SUMO says that it has not arrived. So it says of one that the
+        mesoscopic model teleports to the end of its route, too."""
         ends = []
         for _, element in self._parser.read_events():
             if element.tag == "tripinfo":
-                ended, reason = float(attribute(element, "arrival")) >= 0, element.get("vaporized", "")
+                ended = float(attribute(element, "arrival")) >= 0 or (
+                    float(attribute(element, "depart")) >= 0 and left(element.get("id", "")))
+                reason = element.get("vaporized", "")
                 self.facts = _added(self.facts, element, ended=ended, completed=ended and not reason)
                 if ended:
                     ends.append(End(
