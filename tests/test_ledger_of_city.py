@@ -126,27 +126,27 @@ CALIBRATORS = "".join(CALIBRATOR.format(edge, 5, flow(30)) for edge in ("B1C1", 
 INSERTING = CALIBRATOR.format("A1B1", 5, 'vehsPerHour="900" speed="10" route="in" type="car"')
 CASES = {
     "plain": Case(expects=("arrivals", "crossings")),
-    "calibrators": Case(additional=CALIBRATORS, expects=("arrivals", "removed")),
+    "calibrators": Case(additional=CALIBRATORS, expects=("arrivals", "removals")),
     "calibrator-that-inserts": Case(
         additional='<route id="in" edges="A1B1 B1C1 C1D1"/><vType id="car"/>' + INSERTING, trips=10,
         expects=("arrivals",)),
     "calibrators-on-last-edges": Case(
         additional="".join(CALIBRATOR.format(edge, 5, flow(20)) for edge in ("C1D1", "C2D2")),
         vehicles='<flow id="f" begin="0" end="150" period="2" from="A1B1" to="C1D1"/>', trips=20,
-        expects=("removed",)),
+        expects=("removals",)),
     "collisions": Case(type=RECKLESS, trips=300, session={"collision_action": "remove"},
-        options=("--collision.check-junctions",), expects=("removed",)),
+        options=("--collision.check-junctions",), expects=("removals",)),
     "collisions-teleport": Case(type=RECKLESS, trips=300, session={"collision_action": "teleport"},
         options=("--collision.check-junctions",)),
-    "removed-by-program": Case(script=remove(3), expects=("arrivals", "removed")),
-    "removed-as-arrived": Case(script=remove(2), expects=("removed",)),
-    "removed-as-teleport": Case(script=remove(0, 4), expects=("removed",)),
-    "removed-as-anything": Case(script=remove(0, 1, 2, 3, 4), expects=("removed",)),
-    "removed-after-the-step": Case(script=remove(3), late=True, expects=("removed",)),
+    "removed-by-program": Case(script=remove(3), expects=("arrivals", "removals")),
+    "removed-as-arrived": Case(script=remove(2), expects=("removals",)),
+    "removed-as-teleport": Case(script=remove(0, 4), expects=("removals",)),
+    "removed-as-anything": Case(script=remove(0, 1, 2, 3, 4), expects=("removals",)),
+    "removed-after-the-step": Case(script=remove(3), late=True, expects=("removals",)),
     "shortened": Case(script=shorten, expects=("arrivals", "redirected")),
     "another-target": Case(script=change_target, expects=("arrivals", "redirected")),
     "added-by-program": Case(script=add, trips=40, expects=("arrivals",)),
-    "ids-used-again": Case(script=reuse, expects=("removed",)),
+    "ids-used-again": Case(script=reuse, expects=("removals",)),
     "moved-by-program": Case(script=move, expects=("jumps",)),
     "taken-back": Case(script=forget, expects=("given_up",)),
     "destination-rerouter": Case(additional=REROUTER.format(
@@ -174,7 +174,7 @@ CASES = {
         f'parking="{n % 2}"/></trip>' for n in range(20)), trips=40, expects=("arrivals",)),
     "teleports": Case(script=block, session={"time_to_teleport": 8.0}),
     "teleports-off-the-net": Case(
-        script=block, session={"time_to_teleport": 8.0}, options=("--time-to-teleport.remove",), expects=("removed",)),
+        script=block, session={"time_to_teleport": 8.0}, options=("--time-to-teleport.remove",), expects=("removals",)),
     "disconnected-teleports": Case(
         vehicles="".join(f'<vehicle id="gap{n}" depart="{4 * n}"><route edges="A1B1 C2D2"/></vehicle>'
                          for n in range(20)),
@@ -205,7 +205,7 @@ CASES = {
         options=("--collision.check-junctions", "--max-depart-delay", "20"), trips=300,
         script=lambda step, random: [tried(part, step, random) for part in (
             remove(0, 1, 2, 3, 4), shorten, change_target, add, reuse, move, block)],
-        expects=("arrivals", "removed", "redirected")),
+        expects=("arrivals", "removals", "redirected")),
 }
 # What SUMO's mesoscopic model does not have: collisions, standing drivers, places on edges, parking rerouters.
 MICRO_ONLY = {"collisions", "collisions-teleport", "teleports", "teleports-off-the-net", "moved-by-program"}
@@ -254,7 +254,7 @@ def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int, prompt: 
                 case.script(step, random)
             meter.observe()
             if (step + 1) % COUNT_EVERY == 0:
-                states.append((meter.state(step, session.time), meter.arrivals.sum(), meter.removed.sum(), told(out)))
+                states.append((meter.state(step, session.time), meter.arrivals.sum(), meter.removals.sum(), told(out)))
                 now = np.zeros((3, 3))
                 for vehicle in libsumo.vehicle.getIDList():
                     road, end = session.road(vehicle), session.route(vehicle)[-1]
@@ -279,7 +279,7 @@ def check(city, meter, states, infos, count):
     """The books are those that SUMO's own tripinfo gives, at the end and at every count."""
     ended = infos[:count]  # what is written after that is of those under way
     good = [not trip.get("vaporized") for trip in ended]
-    assert (meter.arrivals.sum(), meter.removed.sum()) == (sum(good), count - sum(good))
+    assert (meter.arrivals.sum(), meter.removals.sum()) == (sum(good), count - sum(good))
     arrived = np.bincount([
         city.region_of[trip.get("arrivalLane").rpartition("_")[0]] for trip, there in zip(ended, good, strict=True)
         if there and trip.get("arrivalLane")], minlength=3)
@@ -292,10 +292,10 @@ def check(city, meter, states, infos, count):
     joined = {(g.source, g.target) for g in city.gateways}
     touching = np.array([[(i, h) in joined for h in range(3)] for i in range(3)])
     assert not meter.crossings[~touching].any() and not meter.jumps[touching].any()
-    for counts in (meter.arrivals, meter.removed, meter.given_up, meter.crossings, meter.jumps, meter.redirected):
+    for counts in (meter.arrivals, meter.removals, meter.given_up, meter.crossings, meter.jumps, meter.redirected):
         assert (counts >= 0).all()
     # x_ij follows from the books alone.
-    x = meter.departures - meter.removed - np.diag(meter.arrivals) + meter.redirected.sum(axis=1)
+    x = meter.departures - meter.removals - np.diag(meter.arrivals) + meter.redirected.sum(axis=1)
     x = x - meter.redirected.sum(axis=2) + sum(c.sum(axis=0) - c.sum(axis=1) for c in (meter.crossings, meter.jumps))
     assert (x == meter._running).all()
 

@@ -109,7 +109,7 @@ def drive(
         record = plant.record()
         trajectory = replace(  # as SUMO told in the end
             trajectory, completed=_since_start(record.arrivals.sum(axis=1)),
-            removed=_since_start(record.removed + record.given_up))
+            removed=_since_start(record.removals + record.given_up))
         backlog = trajectory.backlog.sum(axis=(1, 2))
         row = {
             "controller": strategy.name, "seed": seed, "trips": trips,
@@ -122,7 +122,7 @@ def drive(
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
             "signals_left_alone": len(plant.other_signals),
-            "removed_veh": int(record.removed.sum() + record.given_up.sum()),
+            "removed_veh": int(record.removals.sum() + record.given_up.sum()),
             "removed_waiting_veh": int(record.given_up.sum()), "jumps": int(record.jumps.sum())}
         sumo_output.check_whole(files)
     return Result(trajectory=trajectory, record=asdict(record), facts=row)

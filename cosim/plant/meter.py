@@ -73,7 +73,7 @@ class Meter:
 
     Since the beginning [veh]:
     departures (R, R); probe_departures (R, R), those of the vehicles `probes`
-    arrivals (R,), trips that were completed; removed (R, R) [i, j], vehicles that were taken out on their way, in i
+    arrivals (R,), trips that were completed; removals (R, R) [i, j], vehicles that were taken out on their way, in i
     given_up (R, R), trips that SUMO dropped before they began
     crossings (R, R, R) [i, h, j] from i to h where a gateway leads there; jumps, the same where none does: by teleport,
         by a street closed to cars, moved by another program, or past a region so fast that nobody saw it there
@@ -99,7 +99,7 @@ class Meter:
         self._steps = 0
         self._seen: dict[str, tuple[str, ...]] = dict.fromkeys(entries, ())
         self.teleports, regions = 0, city.regions
-        self._running, self.departures, self.probe_departures, self.removed, self.given_up = np.zeros(
+        self._running, self.departures, self.probe_departures, self.removals, self.given_up = np.zeros(
             (5, regions, regions), dtype=int)
         self.arrivals = np.zeros(regions, dtype=int)
         self.crossings, self.jumps, self.redirected = np.zeros((3, regions, regions, regions), dtype=int)
@@ -112,7 +112,7 @@ class Meter:
         accumulation, backlog = self.accumulation(step), self.backlog()
         return State(
             step=step, time=time, accumulation=accumulation, backlog=backlog, completed=float(self.arrivals.sum()),
-            removed=(self.removed + self.given_up).astype(float))
+            removed=(self.removals + self.given_up).astype(float))
 
     def gateway_flow(self) -> PerGateway:
         """(G,) [veh] over each gateway of the city since the beginning."""
@@ -177,13 +177,13 @@ class Meter:
             known = self._vehicles[vehicle]
             counted[known.region, known.destination] += 1
         self._guess(step)
-        balance = int(self.departures.sum() - self.arrivals.sum() - self.removed.sum())
+        balance = int(self.departures.sum() - self.arrivals.sum() - self.removals.sum())
         if counted.sum() != balance or (counted != self._running).any():
             i, j = np.unravel_index(int(np.abs(counted - self._running).argmax()), counted.shape)
             raise LedgerError(
                 f"vehicle ledger broken at control step {step}, {self._session.time:g} s: {counted.sum()} vehicles are "
                 f"in the city, but {self.departures.sum()} departures minus {self.arrivals.sum()} arrivals"
-                f"{f' and {self.removed.sum()} removed' if self.removed.any() else ''} are {balance}; in region {i} "
+                f"{f' and {self.removals.sum()} removed' if self.removals.any() else ''} are {balance}; in region {i} "
                 f"bound for {j} there are {counted[i, j]}, and {self._running[i, j]} were followed there")
         return counted.astype(float)
 
@@ -193,7 +193,7 @@ class Meter:
         if self._trips is None:
             return
         self._settle(self._trips.finish(self._gone))
-        facts, booked = self._trips.facts, (int(self.arrivals.sum()), int(self.removed.sum()))
+        facts, booked = self._trips.facts, (int(self.arrivals.sum()), int(self.removals.sum()))
         if self._gone or (facts.completed, facts.removed) != booked:
             raise LedgerError(
                 f"vehicle ledger broken at the end: {booked[0]} completed trips and {booked[1]} removed vehicles were "
@@ -255,7 +255,7 @@ class Meter:
         if h != i:
             (self.crossings if (i, h) in self._joined else self.jumps)[i, h, j] += sign
         if end.reason:
-            self.removed[h, j] += sign
+            self.removals[h, j] += sign
         else:
             self.arrivals[h] += sign
 

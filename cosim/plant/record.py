@@ -11,7 +11,7 @@ from cosim.plant.sampling import StreetMeans
 from cosim.sumo.arrays import EdgesOverTime, GatewaysOverTime, PairCounts, RegionCounts, Series, TurnCounts
 from nmfd.quantities import quantity
 
-BOOKS = ("departures", "arrivals", "removed", "given_up", "crossings", "jumps", "redirected")  # of the meter
+BOOKS = ("departures", "arrivals", "removals", "given_up", "crossings", "jumps", "redirected")  # of the meter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class Record:
     departures: PairCounts = quantity("interval", "region", "destination", unit="veh", text="trips begun")
     arrivals: RegionCounts = quantity(
         "interval", "destination", unit="veh", text="trips completed: on the last edge of their route")
-    removed: PairCounts = quantity(
+    removals: PairCounts = quantity(
         "interval", "region", "destination", unit="veh", text="vehicles taken out on their way, whoever did it")
     given_up: PairCounts = quantity(
         "interval", "region", "destination", unit="veh", text="trips that SUMO dropped before they began")
