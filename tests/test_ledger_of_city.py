@@ -1,7 +1,7 @@
 """The vehicle ledger of generated cities against SUMO's own tripinfo: whoever takes vehicles out, none goes unnoticed.
 
-Every case is a small grid of three regions in a row, random trips, and somebody who meddles: files of SUMO (calibrators,
-rerouters, stops), options of SUMO (collisions, teleports), or another program in the same simulation.
+Every case is a small grid of three regions in a row, random trips, and somebody who meddles: files of SUMO
+(calibrators, rerouters, stops), options of SUMO (collisions, teleports), or another program in the same simulation.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -10,22 +10,29 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import copies
 import libsumo
 import numpy as np
 import pytest
 import tiny_city
+from made_up import rows_of
 
+import cosim
 from cosim.plant.meter import Meter
+from cosim.report import summary_text
 from cosim.sumo.net import load_city
 from cosim.sumo.recorded_trips import MESOSCOPIC
 from cosim.sumo.session import Session, _flush_all
 from cosim.sumo.tripinfo import TripReader, trip_options
+from nmfd import metrics
 from nmfd.ledger import LedgerError
 
 COUNT_EVERY, STEPS = 25, 250
 REGION = {"A": 0, "B": 0, "C": 1, "D": 2}  # by the junction that an edge leads to: 0 and 2 do not touch
-CALIBRATOR = '<calibrator id="c{0}" edge="{0}" pos="{1}" freq="10" jamThreshold="0.99"><flow begin="0" end="900" {2}/></calibrator>'
-REROUTER = '<rerouter id="r" edges="A1B1 B1C1 B2C2 C2B2 C1B1 B1B2 C1C2"><interval begin="0" end="900">{}</interval></rerouter>'
+CALIBRATOR = ('<calibrator id="c{0}" edge="{0}" pos="{1}" freq="10" jamThreshold="0.99"><flow begin="0" end="900" {2}/>'
+              "</calibrator>")
+REROUTER = ('<rerouter id="r" edges="A1B1 B1C1 B2C2 C2B2 C1B1 B1B2 C1C2"><interval begin="0" end="900">{}</interval>'
+            "</rerouter>")
 RECKLESS = ('jmIgnoreFoeProb="1" jmIgnoreFoeSpeed="99" jmIgnoreJunctionFoeProb="1" jmDriveAfterRedTime="999" '
             'collisionMinGapFactor="0"')
 PARKING = "".join(
@@ -209,8 +216,9 @@ CASES = {
 }
 # What SUMO's mesoscopic model does not have: collisions, standing drivers, places on edges, parking rerouters.
 MICRO_ONLY = {"collisions", "collisions-teleport", "teleports", "teleports-off-the-net", "moved-by-program"}
-QUICK = {("calibrators", False), ("collisions", False), ("removed-as-anything", False), ("another-target", True),
-          ("calibrators", True), ("ids-used-again", False), ("long-waits", True), ("moved-by-program", False)}  # in the default suite
+QUICK = {  # in the default suite
+    ("calibrators", False), ("collisions", False), ("removed-as-anything", False), ("another-target", True),
+    ("calibrators", True), ("ids-used-again", False), ("long-waits", True), ("moved-by-program", False)}
 MANY = [pytest.param(name, meso, id=f"{name}-{'meso' if meso else 'micro'}", marks=() if (name, meso) in QUICK else (
     pytest.mark.slow,)) for name in CASES for meso in (False, True) if not (meso and name in MICRO_ONLY)]
 
@@ -324,3 +332,52 @@ def test_a_vehicle_that_sumo_tells_nothing_of_is_an_error(city, tmp_path):
     for prompt in (True, False):
         with pytest.raises(LedgerError, match=r"such as f\.\d\); does their type have has\.tripinfo\.device = false"):
             run(tmp_path, city, silent, mesoscopic=False, seed=1, prompt=prompt)
+
+
+MEDDLER = """
+import libsumo
+import numpy as np
+from nmfd import Controls
+
+class Meddler:
+    name = "meddler"
+
+    def __init__(self, scenario):
+        self._open = np.where(scenario.network.adjacency, scenario.network.u_max, 0.0)
+
+    def reset(self, seed=0):
+        pass
+
+    def act(self, observation):
+        for vehicle in sorted(libsumo.vehicle.getIDList())[:4] if libsumo.isLoaded() else ():
+            libsumo.vehicle.remove(vehicle)
+        return Controls(perimeter=self._open, splits=None)
+"""
+
+
+def test_a_run_says_who_was_removed_and_gains_nothing_by_it(tmp_path):
+    """Calibrators of the city's own files, and a controller that takes out four vehicles in every interval."""
+    scenario = copies.peak(tmp_path)
+    built = tmp_path / "networks" / "grid7" / "build"
+    city = load_city(built / "grid7.net.xml", built / "regions.csv", 7)
+    (scenario / "more.add.xml").write_text("<additional>" + "".join(
+        CALIBRATOR.format(edge, 5, flow(1)) for edge in city.edges[::5]) + "</additional>")
+    text = (scenario / "scenario.toml").read_text()
+    (scenario / "scenario.toml").write_text(text.replace("[sumo]", '[sumo]\nadditional = ["more.add.xml"]'))
+    (tmp_path / "mine.py").write_text(MEDDLER)
+    trips = tmp_path / "trips.xml"
+    run = cosim.run(scenario, f"{tmp_path / 'mine.py'}:Meddler", steps=8, seed=1, sumo_output={"tripinfo": trips})
+    ended = [trip.get("vaporized") for trip in ElementTree.parse(trips).getroot() if float(trip.get("arrival")) >= 0]
+    trajectory, facts, record = run.trajectory, run.facts, run.record
+    assert {"", "traci", "calibrator"} <= set(ended) and ended.count("traci") >= 24
+    assert trajectory.completed[-1] == ended.count("") == record["arrivals"].sum() > 0
+    removed, inside = facts["removed_veh"], trajectory.accumulation[-1].sum()
+    assert removed == len(ended) - ended.count("") == record["removals"].sum() == trajectory.removed[-1].sum()
+    assert facts["departed_veh"] == trajectory.completed[-1] + removed + inside
+    there = (trajectory.accumulation + trajectory.backlog).sum(axis=(1, 2))
+    gone = np.concatenate([[0], record["removals"].sum(axis=(1, 2)).cumsum()])
+    assert metrics.total_time_spent(trajectory) == 90.0 * (there + gone)[:-1].sum()
+    rows = rows_of({(1.0, "no-control"): {1: 1.0}}).assign(removed_veh=removed, teleports=0)
+    assert "removed before the last edge of their route" in summary_text.head(rows)
+    assert f"no-control {removed:,.1f}." in summary_text.head(rows)
+    assert "removed" not in summary_text.head(rows.assign(removed_veh=0))

@@ -11,6 +11,7 @@ import numpy as np
 
 from cosim.evaluation import estimation_errors, run_metrics
 from cosim.plant.plant import SumoPlant
+from cosim.plant.record import settled
 from cosim.plant.settings import settings
 from cosim.plant.strategy import Strategy, configured, parse, planning_of
 from cosim.sumo import outputs as sumo_output
@@ -107,9 +108,7 @@ def drive(
             controller=strategy.name, plant="sumo")
         trips, sumo_time, leaks, facts = plant.trips, plant.sumo_time, set(plant.leaks()), plant.trip_facts()
         record = plant.record()
-        trajectory = replace(  # as SUMO told in the end
-            trajectory, completed=_since_start(record.arrivals.sum(axis=1)),
-            removed=_since_start(record.removals + record.given_up))
+        trajectory = settled(trajectory, record)
         backlog = trajectory.backlog.sum(axis=(1, 2))
         row = {
             "controller": strategy.name, "seed": seed, "trips": trips,
@@ -126,11 +125,6 @@ def drive(
             "removed_waiting_veh": int(record.given_up.sum()), "jumps": int(record.jumps.sum())}
         sumo_output.check_whole(files)
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
-
-
-def _since_start(counts: np.ndarray) -> np.ndarray:
-    """Of counts (T, ...) by interval, the sums (T + 1, ...) at its beginning and end."""
-    return np.concatenate([np.zeros_like(counts[:1]), counts]).cumsum(axis=0).astype(float)
 
 
 def _estimation(scenario: Scenario, trajectory: Trajectory) -> dict[str, float]:
