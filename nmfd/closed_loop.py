@@ -59,7 +59,9 @@ def run(
         perimeter=np.stack([c.perimeter for c in controls]),
         splits=np.stack([network.nominal_splits if c.splits is None else c.splits for c in controls]),
         decision_time=np.array(decision_time), status=np.array([c.status.value for c in controls]),
-        note=tuple(c.note for c in controls), wall_time=time.perf_counter() - begin)
+        note=tuple(c.note for c in controls),
+        removed=np.stack([np.zeros_like(s.backlog) if s.removed is None else s.removed for s in states]),
+        wall_time=time.perf_counter() - begin)
 
 
 class _Sensors:

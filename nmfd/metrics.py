@@ -18,11 +18,14 @@ COUNTED = {
 
 
 def total_time_spent(trajectory: Trajectory) -> float:
-    """dt * sum over k = 0 .. T-1 of all vehicles, running and waiting to enter [veh s].
+    """dt * sum over k = 0 .. T-1 of all vehicles, running, waiting to enter, and removed before that [veh s].
 
-    The objective of Tumu et al., with those who wait outside; the state at the end of the horizon is not counted.
+    The objective of Tumu et al., with those who wait outside; the state at the end of the horizon is not counted. A
+    vehicle that was removed on its way counts as if it were still there until the end of the horizon, the most that it
+    could have spent: a trip that is not made never counts as less than one that is.
     """
-    vehicles = trajectory.accumulation[:-1].sum() + trajectory.backlog[:-1].sum()
+    vehicles = (
+        trajectory.accumulation[:-1].sum() + trajectory.backlog[:-1].sum() + trajectory.removed[:-1].sum())
     return float(trajectory.step * vehicles)
 
 

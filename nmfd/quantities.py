@@ -26,10 +26,11 @@ def quantities(kind: type) -> dict[str, Mapping]:
 
 
 def variables(kind: type, values: Mapping) -> dict[str, tuple]:
-    """The `values` of quantities of `kind` as xarray.Dataset takes them: name -> (dimensions, array, attributes)."""
+    """The `values` of quantities of `kind`, as far as given, as xarray.Dataset takes them: name -> (dimensions, array,
+    attributes)."""
     return {
         name: (about["dimensions"], np.asarray(values[name]), {"long_name": about["text"], **about["attributes"]})
-        for name, about in quantities(kind).items()}
+        for name, about in quantities(kind).items() if name in values}
 
 
 def reference(kind: type) -> str:

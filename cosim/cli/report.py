@@ -108,9 +108,11 @@ def watch(
         scenario=scenario, controller=controller, seed=seed, policy=policy, steps=steps, demand_factor=demand)
     try:
         with progress_line("watch") as progress:
-            row = summary(watch.watch(task, delay=delay, progress=progress))
+            trajectory = watch.watch(task, delay=delay, progress=progress)
+            row = summary(trajectory)
     except watch.WindowClosed:
         click.echo("The window was closed before the end.")
         return
     click.echo(f"{controller}, seed {seed}: total time spent {row['total_time_spent_veh_s']:.4g} veh s, "
-               f"{row['completed_veh']:,.0f} trips completed")
+               f"{row['completed_veh']:,.0f} trips completed"
+               + (f", {removed:,.0f} vehicles removed" if (removed := trajectory.removed[-1].sum()) else ""))

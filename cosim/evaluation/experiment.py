@@ -40,8 +40,9 @@ Outcomes = Iterator[tuple[Task, Result | Failure]]
 # Of loading runs: whether they guide routes, and so depend on the drivers' own split ratios.
 LOADING = {"probing-pc": False, "probing-pcrg": True, "route-guidance": True}
 CAPTION = (
-    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; backlog: not "
-    "inserted at the end; step: median / longest decision; outside SUMO: share of the wall time not in its own step")
+    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; removed: taken out "
+    "before the last edge of their route, in TTS as if they were there to the end; backlog: not inserted at the end; "
+    "step: median / longest decision; outside SUMO: share of the wall time not in its own step")
 
 
 def experiment(
@@ -223,8 +224,8 @@ def read_run(folder: Path, controller: str, seed: int) -> Result:
     """A finished run of the run folder. Raises InputError."""
     with run_folder.opened(run_folder.run_path(folder, controller, seed)) as file:
         return Result(
-            trajectory=run_folder.trajectory_in(file), record={name: file[name][...] for name in quantities(Record)},
-            facts={})
+            trajectory=run_folder.trajectory_in(file), facts={}, record={  # older versions recorded less
+                name: file[name][...] for name in quantities(Record) if name in file.variables})
 
 
 def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
@@ -242,10 +243,11 @@ def overview(folder: Path) -> pd.DataFrame:
 
 
 def read_facts(path: Path) -> pd.DataFrame:
-    """The rows of sumo.csv. Raises InputError."""
+    """The rows of sumo.csv, with NaN for what an older version did not record. Raises InputError."""
     check_file(path, "delete the folder and run again")
     try:
         rows = pd.read_csv(path)
+        rows = rows.reindex(columns=[*rows.columns, *(name for name in FACTS if name not in rows.columns)])
         return rows.astype({"controller": str, "seed": int})
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; delete the folder and run again") from None
@@ -267,6 +269,7 @@ def overview_table(rows: pd.DataFrame) -> str:
         lines.append({
             "controller": name, "seeds": len(group), "TTS [veh s]": f"{tts.mean():.4g}{spread}", "change": change,
             "completed": f"{group['completed_veh'].mean():,.0f} of {group['trips'].mean():,.0f}",
+            "removed": f"{group['removed_veh'].mean():,.0f}",
             "left inside": f"{group['final_accumulation_veh'].mean():,.0f}",
             "backlog": f"{group['final_backlog_veh'].mean():,.0f}", "teleports": int(group["teleports"].sum()),
             "step [ms]": f"{group['control_step_ms_median'].mean():.3g} / {group['control_step_ms_max'].max():.3g}",

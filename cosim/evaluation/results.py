@@ -8,7 +8,6 @@ from pathlib import Path
 import pandas as pd
 
 from cosim.evaluation import evaluate, experiment
-from cosim.evaluation.simulate import FACTS
 from cosim.sumo.build import SumoFiles, ensure_built
 from cosim.sumo.net import City, load_city
 from nmfd.api import load_scenario
@@ -107,7 +106,6 @@ def _level(demand: float, folder: Path, order: Sequence[str]) -> Level:
     rows = experiment.overview(folder)
     if rows.empty:
         raise InputError(f"{folder}: holds no finished runs; run the command that began it again")
-    rows = rows.reindex(columns=[*rows.columns, *(name for name in FACTS if name not in rows.columns)])
     rows.insert(0, "demand", float(demand))
     names = list(dict.fromkeys([*order, *rows["controller"]]))
     rows = rows.sort_values(

@@ -11,6 +11,7 @@ import numpy as np
 
 from cosim.evaluation import estimation_errors, run_metrics
 from cosim.plant.plant import SumoPlant
+from cosim.plant.record import settled
 from cosim.plant.settings import settings
 from cosim.plant.strategy import Strategy, configured, parse, planning_of
 from cosim.sumo import outputs as sumo_output
@@ -29,7 +30,7 @@ FACTS = (
     "mean_trip_time_s", "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh",
     "gateway_queue_max_veh", "gateway_full_share", "notes", "outside_training", "leaking_share",
     "estimate_rmse_share", "estimate_cell_rmse_veh", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s",
-    "signals_left_alone", "booked_intervals")
+    "signals_left_alone", "booked_intervals", "removed_veh", "removed_waiting_veh", "jumps")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,21 +112,24 @@ def drive(
         trajectory = run_folder.labelled(
             closed_loop.run(plant, controller, scenario, seed=seed, progress=progress),
             controller=strategy.name, plant="sumo")
+        trips, sumo_time, leaks, facts = plant.trips, plant.sumo_time, set(plant.leaks()), plant.trip_facts()
         record = plant.record()
-        departed = int(record.departures.sum())
+        trajectory = settled(trajectory, record)
         backlog = trajectory.backlog.sum(axis=(1, 2))
-        sumo_time, leaks = plant.sumo_time, set(plant.leaks())
         row = {
-            "controller": strategy.name, "seed": seed, "trips": plant.trips, "departed_veh": departed,
+            "controller": strategy.name, "seed": seed, "trips": trips,
+            "departed_veh": int(record.departures.sum()),
             "final_backlog_veh": int(backlog[-1]), "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
-            "teleports": int(record.teleports.sum()), **run_metrics.trip_facts(plant.trip_facts()),
+            "teleports": int(record.teleports.sum()), **run_metrics.trip_facts(facts),
             **run_metrics.queue_facts(record, plant.city), "notes": metrics.notes(trajectory),
             "outside_training": "",
             "leaking_share": run_metrics.leaking_share(record, plant.city, leaks),
             **_estimation(scenario, trajectory), "wall_time_s": trajectory.wall_time, "sumo_time_s": sumo_time,
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
-            "signals_left_alone": len(plant.other_signals), "booked_intervals": plant.booked}
+            "signals_left_alone": len(plant.other_signals), "booked_intervals": plant.booked,
+            "removed_veh": int(record.removals.sum() + record.given_up.sum()),
+            "removed_waiting_veh": int(record.given_up.sum()), "jumps": int(record.jumps.sum())}
         sumo_output.check_whole(files)
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
 

@@ -19,12 +19,14 @@ from nmfd.studies.benchmark import REFERENCE, interval
 
 TTS = "total_time_spent_veh_s"
 MEANS = (  # columns of summary.csv and sumo.csv of which an evaluation shows the mean over seeds
-    "completed_veh", "trips", "final_backlog_veh", "total_backlog_veh_s", "mean_trip_time_s", "mean_departure_delay_s",
-    "co2_kg", "fuel_kg", "gateway_queue_mean_veh", "gateway_full_share", "control_step_ms_median", "overhead_share",
-    "wall_time_s")
+    "completed_veh", "removed_veh", "trips", "final_backlog_veh", "total_backlog_veh_s", "mean_trip_time_s",
+    "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh", "gateway_full_share",
+    "control_step_ms_median", "overhead_share", "wall_time_s")
 CAPTION = (
     "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; change: of TTS, "
-    "paired by seed, mean of the percentages ± 95 % interval, * if that excludes zero; backlog: not inserted at the "
+    "paired by seed, mean of the percentages ± 95 % interval, * if that excludes zero; completed: on the last edge of "
+    "their route; removed: by whatever else takes vehicles out of SUMO, in TTS as if they were there to the end; "
+    "backlog: not inserted at the "
     "end, and its time integral; teleports: all seeds; trip, delay: mean time on the road, and between the wanted and "
     "the real departure, of all trips, unfinished ones with what they had spent at the end; queue: halting on the "
     "edges before gateways, mean / longest; full: share of these edges and intervals that were full; decision: median "
@@ -129,7 +131,7 @@ def shown(table: pd.DataFrame, reference: str | None = None) -> tuple[pd.DataFra
             "controller": row["controller"], "seeds": row["seeds"], "TTS [veh s]": _spread(row),
             "change": _change(row, "change"), **against,
             "completed": f"{row['completed_veh']:,.0f} of {row['trips']:,.0f}",
-            "backlog [veh]": f"{row['final_backlog_veh']:,.0f}",
+            "removed [veh]": f"{row['removed_veh']:,.0f}", "backlog [veh]": f"{row['final_backlog_veh']:,.0f}",
             "backlog [veh s]": f"{row['total_backlog_veh_s']:.2e}", "teleports": teleports})
         second.append({
             "controller": row["controller"], "trip [s]": f"{row['mean_trip_time_s']:,.0f}",

@@ -158,6 +158,7 @@ def text(rows: pd.DataFrame) -> str:
     if len(good):
         table["TTS [veh s]"] = good["total_time_spent_veh_s"].mean().map("{:.4g}".format)
         table["completed [veh]"] = good["completed_veh"].mean().map("{:,.0f}".format)
+        table["removed [veh]"] = good["removed_veh"].mean().map("{:,.0f}".format)
         table["trip [s]"] = good["mean_trip_time_s"].mean().map("{:,.0f}".format)
         table["CO2 [kg]"] = good["co2_kg"].mean().map("{:,.0f}".format)
     return text_table(table.reset_index().astype(object).fillna("").to_dict("records"))

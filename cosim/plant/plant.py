@@ -21,7 +21,7 @@ from cosim.plant.strategy import MAX_PRESSURE
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, Gateway, check_adjacency, load_city
 from cosim.sumo.session import Session, Window
-from cosim.sumo.tripinfo import TripFacts, read_trip_facts
+from cosim.sumo.tripinfo import TripFacts, TripReader
 from nmfd.arrays import PerTurn
 from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel, planning_model
@@ -67,13 +67,14 @@ class SumoPlant:
         """Trips, drivers and reroutes all follow from `seed`."""
         self._end_session()
         self._k, self._session = 0, self._launch.start(seed)
+        self._trips = TripReader(self._launch.trip_file, self.session.flush)
         self._incidents = Incidents(self._scenario.ordered_faults, self.session, self.city)
         self._sensing = self._new_sensing(seed)
         self._guide = self._new_guide(seed)
         self._actuation = self._new_actuation()
         self._state = state = self._sensing.state(0)
         self._standstill = Standstill(len(self._launch.vehicles), self._scenario.step, self._scenario.steps)
-        self.booked = 0
+        self.booked, self._facts = 0, TripFacts()
         self._standing = self._stands(state)
         self._recorder = Recorder(self._sensing.meter, self._guide, self._actuation)
         return state
@@ -115,15 +116,15 @@ class SumoPlant:
         return self._recorder.record()
 
     def trip_facts(self) -> TripFacts:
-        """Ends the simulation, for only then does SUMO tell of the trips under way."""
-        booked, state = self.booked * self._scenario.step, self._state
-        emitted = self.session.emitted() if booked else (0.0, 0.0)
-        self._end_session()
-        facts = read_trip_facts(self._launch.trip_file)
-        return replace(
-            facts, travel_time=facts.travel_time + booked * float(state.accumulation.sum()),
-            departure_delay=facts.departure_delay + booked * float(state.backlog.sum()),
-            co2=facts.co2 + booked * emitted[0], fuel=facts.fuel + booked * emitted[1])
+        """Ends the simulation, for only then does SUMO tell of the trips under way, and closes the books. LedgerError
+        if they are not SUMO's."""
+        if self._session is not None:
+            emitted = self.session.emitted() if self.booked else (0.0, 0.0)
+            self._end_session()
+            self._sensing.meter.close_books()
+            self._recorder.close()
+            self._facts = self._with_standstill(self._trips.facts, *emitted)
+        return self._facts
 
     @property
     def sumo_time(self) -> float:
@@ -147,13 +148,23 @@ class SumoPlant:
         if not self._settings.routes:
             return len(self._launch.vehicles)
         meter = self._sensing.meter
-        return int(meter.departures.sum() + meter.backlog().sum())
+        return int(meter.departures.sum() + meter.backlog().sum() + meter.given_up.sum())
 
     def _stands(self, state: State) -> bool:
         """Whether what is left of the run may be booked."""
-        standing = self._standstill.reached(state, float(self._sensing.meter.arrivals.sum()))
+        meter = self._sensing.meter
+        left = meter.arrivals.sum() + meter.removals.sum() + meter.given_up.sum()
+        standing = self._standstill.reached(state, float(left))
         return standing and self._settings.book_standstill and self.session.expected() <= (
             state.accumulation.sum() + state.backlog.sum())
+
+    def _with_standstill(self, facts: TripFacts, co2: float, fuel: float) -> TripFacts:
+        """And what was booked without being simulated. co2, fuel: of everybody on the road at the end [kg/s]"""
+        time, state = self.booked * self._scenario.step, self._state
+        return replace(
+            facts, travel_time=facts.travel_time + time * float(state.accumulation.sum()),
+            departure_delay=facts.departure_delay + time * float(state.backlog.sum()),
+            co2=facts.co2 + time * co2, fuel=facts.fuel + time * fuel)
 
     def _book(self) -> State:
         """One control interval in which nothing moves."""
@@ -170,9 +181,10 @@ class SumoPlant:
     def _new_sensing(self, seed: int) -> Sensing:
         chosen = self._settings
         if chosen.measurement != ESTIMATE:
-            meter, estimation = Meter(self.session, self.city), None
+            meter, estimation = Meter(self.session, self.city, trips=self._trips), None
         else:
-            meter = Meter(self.session, self.city, probes(self._launch.vehicles, chosen.probe_share, seed))
+            known = probes(self._launch.vehicles, chosen.probe_share, seed)
+            meter = Meter(self.session, self.city, known, self._trips)
             estimation = Estimation(self.session, self.city, self._layout, meter, self._instruments, self._planning)
         return Sensing(self._scenario, self.session, self.city, self._incidents, meter, estimation)
 

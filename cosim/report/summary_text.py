@@ -28,7 +28,7 @@ def opening(name: str, steps: int, step: float, levels: int, rows: pd.DataFrame)
 
 def head(rows: pd.DataFrame) -> str:
     """What matters most; `rows` of one demand level, as in cosim.evaluation.statistics."""
-    return f"{best(rows)} {_unfinished(rows)} {_teleports(rows)}"
+    return " ".join(part for part in (best(rows), _unfinished(rows), _removed(rows), _teleports(rows)) if part)
 
 
 def details(rows: pd.DataFrame) -> list[str]:
@@ -116,6 +116,17 @@ def _unfinished(rows: pd.DataFrame) -> str:
         return "Every trip was completed in every run."
     others = " The others completed all." if len(left) < rows["controller"].nunique() else ""
     return f"Trips not completed at the end, mean per run: {'; '.join(left)}.{others}"
+
+
+def _removed(rows: pd.DataFrame) -> str:
+    """Vehicles that somebody took out; nothing where nobody did, or where an older version did not record it."""
+    if "removed_veh" not in rows or not rows["removed_veh"].any():
+        return ""
+    counts = rows.groupby("controller", sort=False)["removed_veh"].mean()
+    parts = ", ".join(f"{name} {count:,.1f}" for name, count in counts.items() if count > 0)
+    return (f"Vehicles removed before the last edge of their route (by calibrators, collisions, teleports off the net, "
+            f"waits too long or other programs), mean per run: {parts}. They are no completed trips, and total time "
+            "spent has them as if they were there to the end; those whom they no longer hinder gain all the same.")
 
 
 def _teleports(rows: pd.DataFrame) -> str:

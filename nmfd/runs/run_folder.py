@@ -78,7 +78,8 @@ def read_trajectory(path: Path) -> Trajectory:
 
 def trajectory_in(file: netCDF4.Dataset) -> Trajectory:
     """That of a run's file (`opened`)."""
-    arrays = {name: file[name][...] for name in quantities(Trajectory) if name != "decision_time"}
+    arrays = {name: file[name][...] for name in quantities(Trajectory)
+              if name != "decision_time" and (name in file.variables or name != "removed")}  # older runs had none
     arrays["note"] = tuple(arrays["note"])
     return Trajectory(
         controller=file.controller, plant=file.plant, seed=int(file.seed), step=float(file.step),
