@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cosim.evaluation import estimation_errors
+from cosim.evaluation import estimation_errors, run_metrics
 from cosim.evaluation.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.plant import incidents
 from cosim.plant.launch import own_files, own_vehicles
@@ -33,6 +33,8 @@ from nmfd.runs.files import file_hash, write_text
 from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
 from nmfd.studies.benchmark import REFERENCE, draw_accumulations, interval
+from nmfd.studies.traffic_states import OutflowOf, RegionalOutflow
+from nmfd.types import Trajectory
 
 Progress = Callable[[int, int, str], None]  # takes what is done, what there is to do, and what is running
 Outcomes = Iterator[tuple[Task, Result | Failure]]
@@ -55,8 +57,9 @@ def experiment(
     failures = perform([(out, task) for task in tasks], workers=workers, fresh=zipped, progress=progress, tell=tell)
     if (out / "summary.csv").is_file() and (kept := run_folder.trajectories(out)):
         scenario = scenario_of(tasks[0])
-        draw_accumulations(out, scenario, kept)
-        estimation_errors.write_errors(out, scenario.network, kept)
+        measured = measured_outflow(out)
+        draw_accumulations(out, scenario, kept, outflow=measured)
+        estimation_errors.write_errors(out, scenario.network, kept, measured)
     if failures:
         raise ended([(label(task), failure) for task, failure in failures])
     return overview(out)
@@ -217,6 +220,19 @@ def read_run(folder: Path, controller: str, seed: int) -> Result:
         return Result(
             trajectory=run_folder.trajectory_in(file), record={name: file[name][...] for name in quantities(Record)},
             facts={})
+
+
+def measured_outflow(folder: Path) -> OutflowOf:
+    """What left every region in a run of the folder, as SUMO counted it (T, R) [veh/s]; None of a run that an older
+    version recorded without it."""
+    def outflow(trajectory: Trajectory) -> RegionalOutflow | None:
+        with run_folder.opened(run_folder.run_path(folder, trajectory.controller, trajectory.seed)) as file:
+            if not {"arrivals", "crossings"} <= set(file.variables):
+                return None
+            return run_metrics.regional_outflow(
+                {name: file[name][...] for name in ("arrivals", "crossings")}, trajectory.step)
+
+    return outflow
 
 
 def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:

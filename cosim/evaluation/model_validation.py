@@ -9,7 +9,7 @@ import pandas as pd
 import torch
 from jaxtyping import Bool, Float
 
-from cosim.evaluation import mfd_bands
+from cosim.evaluation import mfd_bands, run_metrics
 from cosim.evaluation.simulate import Result
 from cosim.sumo.arrays import Points, RegionCounts, Series
 from nmfd import closed_loop
@@ -21,6 +21,7 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
+from nmfd.studies.traffic_states import model_outflow, remembered
 from nmfd.types import Controls, Observation, Trajectory
 
 COLUMNS = (
@@ -118,7 +119,7 @@ def outflow_samples(
     for trajectory, record in zip(trajectories, records, strict=True):
         x = 0.5 * (trajectory.accumulation[1:] + trajectory.accumulation[:-1])
         total, own = x.sum(2), x[:, range(x.shape[1]), range(x.shape[1])]
-        outflow = (record["arrivals"] + record["crossings"].sum(axis=(2, 3))) / trajectory.step
+        outflow = run_metrics.regional_outflow(record, trajectory.step)
         share = np.minimum(trajectory.perimeter[:, region].max(axis=1), u_max)
         weight = own[:, region] + share * (total - own)[:, region]
         points = np.stack(
@@ -173,8 +174,11 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
     name = run_folder.run_name(result.trajectory.controller, result.trajectory.seed)
     files.write_text(folder / f"compare-{name}.csv", rows.to_csv(index=False))
     drawing, axes = plots.panels(scenario.network.regions + 1)
+    measured = run_metrics.regional_outflow(result.record, result.trajectory.step)
+    predicted_outflow = model_outflow(scenario.network)
+    outflow = remembered(lambda t: measured if t.plant == "sumo" else predicted_outflow(t))
     for region, ax in enumerate(axes[:-1]):
-        plots.region_accumulation(ax, scenario.network, region, [result.trajectory, predicted])
+        plots.region_accumulation(ax, scenario.network, region, [result.trajectory, predicted], outflow=outflow)
     plots.total_accumulation(axes[-1], [replace(
         result.trajectory, backlog=np.zeros_like(result.trajectory.backlog)), predicted])
     axes[-1].set_title("all regions", fontsize="medium")

@@ -28,10 +28,12 @@ WORDS = (
 PICTURES = (  # heading, its pictures with captions
     ("Vehicles and regions", (
         ("total_accumulation", "Vehicles in the network with those waiting to enter [veh] over time."),
-        ("region_accumulation", "Vehicles in each region [veh] over time. Green: within 10 % of the largest outflow; "
-         "red: congested."),
+        ("region_accumulation", "Vehicles in each region [veh] over time. The strips above, one per strategy, tell the "
+         "state of the region by the vehicles that left it in that run: light where it flows below the critical "
+         "accumulation, green where the outflow is within 10 % of the largest, red where it is less while the region "
+         "holds more vehicles, dark and hatched where hardly any vehicle leaves."),
         ("mfd", "Macroscopic fundamental diagram of each region: vehicles inside [veh] against vehicles that leave or "
-         "arrive [veh/s]. Dots: one per control interval; line: the regional model."))),
+         "arrive [veh/s]. Dots: one per control interval; line: the regional model; hatched: beyond all dots."))),
     ("Streets", (
         ("link_densities", "Density of every street [vehicles per km and lane] at four times, mean of the control "
          "interval; 133 is a standing queue. The two directions of a street are drawn apart."),)),

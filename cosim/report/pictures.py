@@ -43,7 +43,9 @@ def draw(
     runs = sorted((t for t in run_folder.trajectories(folder) if t.controller in order),
                   key=lambda t: (order.index(t.controller), t.seed))
     note = teleports(rows)
-    draw_accumulations(out, scenario, runs, seed=seed, title=f"seed {seed}, shaded: all seeds; {note}")
+    shaded = ", shaded: all seeds" if rows["seed"].nunique() > 1 else ""
+    draw_accumulations(out, scenario, runs, seed=seed, title=f"seed {seed}{shaded}; {note}",
+                       outflow=experiment.measured_outflow(folder))
     if city is None:
         return
     results = {

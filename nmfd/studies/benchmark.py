@@ -17,6 +17,7 @@ from nmfd.runs import run_folder
 from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
 from nmfd.studies import plots
+from nmfd.studies.traffic_states import OutflowOf, model_outflow, remembered
 from nmfd.types import Plant, Trajectory
 
 PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
@@ -128,11 +129,12 @@ def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -
 
 def draw_accumulations(
     folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory], *, seed: int | None = None,
-    title: str | None = None,
+    title: str | None = None, outflow: OutflowOf | None = None,
 ) -> None:
     """Total and regional accumulation over time, as png files in `folder`.
 
-    seed: shown instead of the mean over seeds; title: above both pictures.
+    seed: shown instead of the mean over seeds; title: above both pictures; outflow: what left every region of a run,
+    where it was measured; else that of the regional model, of runs on it.
     """
     drawing = plots.figure(8.0, 4.6)
     ax = plots.total_accumulation(drawing.subplots(), trajectories, seed)
@@ -140,9 +142,10 @@ def draw_accumulations(
     plots.legend_below(drawing, [ax], columns=6)
     plots.save(drawing, folder / "total_accumulation.png")
     network = scenario.network
+    outflow = remembered(outflow or model_outflow(network))
     drawing, axes = plots.panels(network.regions)
     for region, ax in enumerate(axes):
-        plots.region_accumulation(ax, network, region, trajectories, seed)
+        plots.region_accumulation(ax, network, region, trajectories, seed, outflow)
     drawing.suptitle(title, fontsize="medium")
     plots.legend_below(drawing, axes, columns=3)
     plots.save(drawing, folder / "region_accumulation.png")
