@@ -32,7 +32,7 @@ from nmfd.runs import run_folder
 from nmfd.runs.files import file_hash, write_text
 from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
-from nmfd.studies.benchmark import REFERENCE, draw_accumulations, interval
+from nmfd.studies.benchmark import REFERENCE, compared_with, draw_accumulations, interval
 from nmfd.studies.traffic_states import OutflowOf, RegionalOutflow
 from nmfd.types import Trajectory
 
@@ -41,8 +41,9 @@ Outcomes = Iterator[tuple[Task, Result | Failure]]
 # Of loading runs: whether they guide routes, and so depend on the drivers' own split ratios.
 LOADING = {"probing-pc": False, "probing-pcrg": True, "route-guidance": True}
 CAPTION = (
-    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; backlog: not "
-    "inserted at the end; step: median / longest decision; outside SUMO: share of the wall time not in its own step")
+    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; change: of the mean "
+    "TTS against {against}; backlog: not inserted at the end; step: median / longest decision; outside SUMO: share of "
+    "the wall time not in its own step")
 
 
 def experiment(
@@ -262,12 +263,13 @@ def read_facts(path: Path) -> pd.DataFrame:
 
 def overview_table(rows: pd.DataFrame) -> str:
     """The overview as text: one line per controller, means over seeds, TTS with its 95 % interval."""
-    reference = rows.loc[rows["controller"] == REFERENCE, "total_time_spent_veh_s"]
+    against = compared_with(rows["controller"]) if len(rows) else REFERENCE
+    reference = rows.loc[rows["controller"] == against, "total_time_spent_veh_s"]
     lines = []
     for name, group in rows.groupby("controller", sort=False):
         tts = group["total_time_spent_veh_s"]
         spread = f" ± {interval(list(tts)):.1e}" if len(tts) > 1 else ""
-        change = f"{100 * (tts.mean() / reference.mean() - 1):+.1f} %" if len(reference) and name != REFERENCE else ""
+        change = f"{100 * (tts.mean() / reference.mean() - 1):+.1f} %" if name != against else ""
         lines.append({
             "controller": name, "seeds": len(group), "TTS [veh s]": f"{tts.mean():.4g}{spread}", "change": change,
             "completed": f"{group['completed_veh'].mean():,.0f} of {group['trips'].mean():,.0f}",
@@ -277,4 +279,4 @@ def overview_table(rows: pd.DataFrame) -> str:
             **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
             "wall [s]": f"{group['wall_time_s'].mean():.0f}",
             "outside SUMO": f"{100 * group['overhead_share'].mean():.1f} %"})
-    return text_table(lines, CAPTION)
+    return text_table(lines, CAPTION.format(against=against))

@@ -12,6 +12,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 
 from cosim.sumo.arrays import EdgeNumbers, PerEdge, Points, Series
 from nmfd.studies import plots
+from nmfd.studies.benchmark import REFERENCE
 
 JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
 DENSITIES = ScalarMappable(Normalize(0.0, JAM_DENSITY), LinearSegmentedColormap.from_list(
@@ -145,11 +146,13 @@ def time_full(ax: Axes, hours: Mapping[str, np.ndarray]) -> Axes:
     return ax
 
 
-def over_demand(ax: Axes, ratios: Mapping[str, Mapping[float, tuple[float, float]]]) -> Axes:
-    """Total time spent as a share of no control's against the demand level: controller -> level -> mean over seeds and
-    half of its 95 % interval (NaN of a single seed)."""
-    ax.axhline(1.0, color=plots.CONTROLLER_COLOURS["no-control"], linewidth=1.0)
-    tones = plots.colours(list(ratios))
+def over_demand(
+    ax: Axes, ratios: Mapping[str, Mapping[float, tuple[float, float]]], against: str = REFERENCE,
+) -> Axes:
+    """Total time spent as a share of that of `against`, over the demand level: controller -> level -> mean over seeds
+    and half of its 95 % interval (NaN of a single seed)."""
+    tones = plots.colours([against, *ratios])
+    ax.axhline(1.0, color=tones[against], linewidth=1.0)
     levels = sorted({level for points in ratios.values() for level in points})
     aside = 0.012 * max(levels[-1] - levels[0], 0.1)  # so that intervals do not hide each other
     for number, (controller, points) in enumerate(ratios.items()):
@@ -159,7 +162,7 @@ def over_demand(ax: Axes, ratios: Mapping[str, Mapping[float, tuple[float, float
                     label=controller)
     ax.set_xticks(levels, [f"{level:g}" for level in levels])
     ax.set_xlabel("demand, multiple of the scenario's")
-    ax.set_ylabel("total time spent / that of no control")
+    ax.set_ylabel(f"total time spent / that of {against}")
     ax.set_ylim(bottom=0.0)
     ax.spines[["top", "right"]].set_visible(False)
     return ax

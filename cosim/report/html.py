@@ -17,7 +17,6 @@ from cosim.report import pictures as report
 from cosim.report import summary_text
 from nmfd.runs import files
 from nmfd.runs.scratch import Scratch
-from nmfd.studies.benchmark import REFERENCE
 
 PIXELS = 150.0  # per inch, of the pictures (nmfd.studies.plots.save)
 WORDS = (
@@ -50,7 +49,7 @@ PICTURES = (  # heading, its pictures with captions
          "interval in which it has to be taken."),)))
 REGIONS = (
     "Streets in the colour of their region. Dots: gateways; black ones have a signal that perimeter control can use.")
-DEMAND = "Total time spent as a share of that without control, over the demand, with 95 % intervals."
+DEMAND = "Total time spent as a share of that {than}, over the demand, with 95 % intervals."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +65,7 @@ def write_page(
     path: Path, found: Sequence[Finished], reference: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """The page of the runs, atomically. reference: a strategy to pair with, besides no control."""
+    """The page of the runs, atomically. reference: a strategy to pair with, besides what all are compared with."""
     total, done, runs = sum(len(run.levels) for run in found), 0, []
     for number, run in enumerate(found):
         levels = []
@@ -91,6 +90,7 @@ def write_page(
 def _run(run: Finished) -> dict:
     """What the page shows of a folder before its levels, and its configuration."""
     configuration, rows = run.levels[0].manifest["configuration"], run.rows
+    caption = DEMAND.format(than=statistics.than(statistics.compared_with(rows)))
     first = summary_text.opening(
         run.scenario.name, configuration["steps"], configuration["step_s"], len(run.levels), rows)
     with Scratch("cosim-") as folder:
@@ -98,7 +98,7 @@ def _run(run: Finished) -> dict:
             report.region_map(folder / "regions.png", run.scenario, run.city)
         if len(run.levels) > 1:
             report.demand_levels(folder / "demand.png", rows)
-        pictures = _pictures(folder, (("demand", DEMAND), ("regions", REGIONS)))
+        pictures = _pictures(folder, (("demand", caption), ("regions", REGIONS)))
     return {
         "name": run.name, "story": [first, *(_at(run, level) + summary_text.head(level.rows) for level in run.levels)],
         "pictures": pictures, "configuration": _configuration(run),
@@ -125,8 +125,9 @@ def _level(run: Finished, level: Level, reference: str | None) -> dict:
         pictures = [(heading, _pictures(folder, chosen, f"{title}. ")) for heading, chosen in PICTURES]
     missing = ", ".join(heading.lower() for heading, there in pictures if not there)
     why = run.changed or "there was nothing of the kind in these runs, or an older version did not record it"
-    pair = [name for name in report.ranked(rows) if name != REFERENCE][:1]
-    both = f" and, where two are compared, {REFERENCE} and {pair[0]}" if pair and REFERENCE in names else ""
+    against = statistics.compared_with(rows)
+    pair = [name for name in report.ranked(rows) if name != against][:1]
+    both = f" and, where two are compared, {against} and {pair[0]}" if pair else ""
     return {
         "title": title, "details": summary_text.details(rows), "signals": signals, "reasons": reasons,
         "shown": f"Pictures of single runs show seed {report.shown_seed(rows)}{both}.",

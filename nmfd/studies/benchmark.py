@@ -2,7 +2,7 @@
 
 import math
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -23,11 +23,17 @@ from nmfd.types import Plant, Trajectory
 PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
 CAPTION = (
-    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against no-control; control: time of all "
+    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against {against}; control: time of all "
     "decisions of a run; step: median / longest decision; decisions of all seeds: " + "; ".join(
         f"{heading}: {what}" for heading, what in COUNTED.values()))
 BOUND_CAPTION = (
     "; above bound: TTS against the bound with the same controls, perimeter alone (PC) or with routes (PCRG)")
+
+
+def compared_with(controllers: Iterable[str]) -> str:
+    """What controllers are compared with: no control, or the first of them where that is not among them."""
+    names = list(controllers)
+    return REFERENCE if REFERENCE in names else names[0]
 
 
 def run_one(
@@ -188,6 +194,7 @@ def summary_table(rows: Sequence[Mapping]) -> str:
     for row in rows:
         groups.setdefault(row["controller"], []).append(row)
     tts = {name: [row["total_time_spent_veh_s"] for row in group] for name, group in groups.items()}
+    against = compared_with(tts) if tts else REFERENCE
     with_bound = any(name in tts for name in ("bound-pc", "bound-pcrg"))
     lines = []
     for name, group in groups.items():
@@ -195,9 +202,7 @@ def summary_table(rows: Sequence[Mapping]) -> str:
             return statistics.fmean(row[column] for row in group)
 
         spread = interval(tts[name])
-        change = ""
-        if REFERENCE in tts and name != REFERENCE:
-            change = _percent(tts[name], tts[REFERENCE])
+        change = _percent(tts[name], tts[against]) if name != against else ""
         bound = "bound-pcrg" if "-pcrg" in name else "bound-pc"
         above = _percent(tts[name], tts[bound]) if bound in tts and name != bound else ""
         lines.append({
@@ -211,7 +216,7 @@ def summary_table(rows: Sequence[Mapping]) -> str:
             "step [ms]": f"{mean('control_step_ms_median'):.3g} / "
                          f"{max(row['control_step_ms_max'] for row in group):.3g}",
             **{heading: sum(row[column] for row in group) for column, (heading, _) in COUNTED.items()}})
-    return text_table(lines, CAPTION + BOUND_CAPTION * with_bound)
+    return text_table(lines, CAPTION.format(against=against) + BOUND_CAPTION * with_bound)
 
 
 def _percent(values: Sequence[float], reference: Sequence[float]) -> str:
