@@ -25,13 +25,14 @@ from nmfd.studies.traffic_states import model_outflow, remembered
 from nmfd.types import Controls, Observation, Trajectory
 
 COLUMNS = (
-    "region", "name", "critical_veh", "mean_veh", "rmse_veh", "rmse_share", "bias_veh", "next_interval_rmse_veh",
-    "next_interval_rmse_share")
+    "region", "name", "critical_veh", "mean_veh", "rmse_veh", "rmse_share", "persistence_rmse_veh", "bias_veh",
+    "next_interval_rmse_veh", "next_interval_rmse_share", "next_interval_persistence_rmse_veh")
 COLLAPSED = 0.7  # of the largest outflow so far
 SPILLBACK = "held up by a neighbour"
 CAPTION = (
     "RMSE, bias: of the accumulation that the regional model predicts for the whole run from its start [veh]; next "
-    "interval: predicted one control interval ahead from every recorded state; bias > 0: the model holds too many")
+    "interval: predicted one control interval ahead from every recorded state; if nothing changed: RMSE of the "
+    "prediction that the region keeps what it holds, from the start or for one interval [veh]; bias > 0: the model holds too many")
 
 
 class Replay:
@@ -97,10 +98,11 @@ def _row(
     region: int | str, name: str, critical: float, simulated: Float[np.ndarray, " S"],
     whole: Float[np.ndarray, " S"], ahead: Series,
 ) -> dict:
-    rmse, next_rmse = float(np.sqrt((whole**2).mean())), float(np.sqrt((ahead**2).mean()))
+    rmse, next_rmse, still, next_still = (
+        float(np.sqrt((part**2).mean())) for part in (whole, ahead, simulated[0] - simulated, np.diff(simulated)))
     return dict(zip(COLUMNS, (
-        region, name, float(critical), float(simulated.mean()), rmse, rmse / critical, float(whole.mean()), next_rmse,
-        next_rmse / critical), strict=True))
+        region, name, float(critical), float(simulated.mean()), rmse, rmse / critical, still, float(whole.mean()),
+        next_rmse, next_rmse / critical, next_still), strict=True))
 
 
 def outflow_samples(
@@ -158,12 +160,13 @@ def held_up(
 def error_table(rows: pd.DataFrame) -> str:
     """The errors as text."""
     shown = rows.copy()
-    for column in ("critical_veh", "mean_veh", "rmse_veh", "bias_veh", "next_interval_rmse_veh"):
+    for column in (name for name in COLUMNS if name.endswith("_veh")):
         shown[column] = [f"{value:.1f}" for value in rows[column]]
     for column in ("rmse_share", "next_interval_rmse_share"):
         shown[column] = [f"{100 * value:.1f} %" for value in rows[column]]
     headings = [
-        "region", "name", "critical", "mean", "RMSE", "of critical", "bias", "next interval RMSE", "of critical"]
+        "region", "name", "critical", "mean", "RMSE", "of critical", "if nothing changed", "bias", "next interval RMSE",
+        "of critical", "if nothing changed"]
     return text_columns(headings, shown.to_numpy().tolist(), CAPTION)
 
 

@@ -27,7 +27,8 @@ CAPTION = (
     "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; change: of TTS "
     "against no-control, or against the controller that the heading names, paired by seed, mean of the percentages "
     "± 95 % interval, * if that excludes zero; backlog: not inserted at the end, and its time integral; teleports: all "
-    "seeds; trip, delay: mean time on the road, and between the wanted and the real departure, of all trips, unfinished ones with what they had spent at the end; queue: halting on the "
+    "seeds; trip, delay: mean time on the road, and between the wanted and the real departure, of all trips, "
+    "unfinished ones with what they had spent at the end; queue: halting on the "
     "edges before gateways, mean / longest; full: share of these edges and intervals that were full; decision: median "
     "/ longest; " + "; ".join(f"{heading}: {what}" for heading, what in COUNTED.values()))
 

@@ -3,18 +3,23 @@
 import base64
 import json
 import math
+import os
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from cosim.evaluation import explain, statistics
+from cosim.evaluation import explain, fit_quality, statistics
 from cosim.evaluation.results import Finished, Level
+from cosim.plant.strategy import planning_of
 from cosim.report import pictures as report
 from cosim.report import summary_text
+from nmfd.errors import InputError
+from nmfd.model import authority
 from nmfd.runs import files
 from nmfd.runs.scratch import Scratch
 
@@ -101,10 +106,35 @@ def _run(run: Finished) -> dict:
         pictures = _pictures(folder, (("demand", caption), ("regions", REGIONS)))
     return {
         "name": run.name, "story": [first, *(_at(run, level) + summary_text.head(level.rows) for level in run.levels)],
-        "pictures": pictures, "configuration": _configuration(run),
+        "models": _models(run), "pictures": pictures, "configuration": _configuration(run),
         "strategies": list({
             name: (name, _plain(depends) or "nothing of its own") for level in run.levels
             for name, depends in level.manifest.get("controllers", {}).items()}.values())}
+
+
+def _models(run: Finished) -> list[str]:
+    """What is doubtful about the regional models that controllers plan with, and what was said of perimeter control in
+    this city before anything was trained; a sentence each."""
+    networks = {run.scenario.network.folder: run.scenario.network}
+    for name in dict.fromkeys(run.rows["controller"]):
+        with suppress(InputError):  # a model that is gone by now
+            network = planning_of(run.scenario, name).network
+            networks.setdefault(network.folder, network)
+    lines, kinds = [], []
+    for folder, network in networks.items():
+        title = network.name if folder is None else os.path.normpath(folder)
+        if network.placeholder:
+            lines.append(f"The MFDs of {title} are placeholders from lanes and speed limits, measured in no run.")
+        for region, doubts in zip(network.region_names, network.doubts, strict=False):
+            if doubts:
+                lines.append(f"The model {title} is doubtful in region {region}: {'; '.join(doubts)}.")
+                kinds += doubts
+    lines += fit_quality.meanings(kinds)
+    own = run.scenario.network.folder
+    if own is not None and (own / authority.FILE).is_file():
+        text = (own / authority.FILE).read_text(encoding="utf-8", errors="replace")
+        lines += text.partition("\n\n")[0].splitlines()
+    return lines
 
 
 def _at(run: Finished, level: Level) -> str:
