@@ -73,7 +73,7 @@ def test_pictures_show_both(folder, monkeypatch):
     pictures.demand_levels(folder / "demand.png", results.read(folder).rows)
     assert (folder / "demand.png").stat().st_size > 5000
     ax = figures.over_demand(plots.figure(4, 3).subplots(), {"dpc-pcrg": {1.0: (0.8, 0.1)}}, "pi-gating")
-    assert ax.get_ylabel().endswith("that of pi-gating")
+    assert ax.get_ylabel().endswith("that of pi-gating [-]")
 
 
 def test_a_pair_of_which_none_is_better():

@@ -28,7 +28,8 @@ def of(accumulation, outflow, mfd=MFD):
 @pytest.mark.parametrize("held, share, expected", [
     (339, 1.0, TrafficState.NEAR_CAPACITY), (339, 0.0, TrafficState.STANDING), (339, 0.05, TrafficState.STANDING),
     (380, 0.6, TrafficState.CONGESTED), (700, 0.4, TrafficState.CONGESTED), (700, 1.0, TrafficState.NEAR_CAPACITY),
-    (2000, 0.0, TrafficState.STANDING), (100, 0.5, TrafficState.FLOWING), (100, 0.0, TrafficState.STANDING),
+    (2000, 0.0, TrafficState.STANDING), (100, 0.5, TrafficState.FLOWING), (100, 0.15, TrafficState.CONGESTED),
+    (100, 0.0, TrafficState.STANDING),
     (0, 0.0, TrafficState.FLOWING), (2, 0.0, TrafficState.FLOWING),  # nobody, and too few to tell from chance
 ])
 def test_the_outflow_decides_not_the_accumulation(held, share, expected):

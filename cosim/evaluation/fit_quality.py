@@ -20,16 +20,17 @@ from nmfd.runs.tables import text_table, wrapped
 SAMPLES = 10     # of a region: with fewer it is as good as empty, and keeps the MFD that it has
 BINS = 12        # of accumulation, for the hysteresis
 EXPLAINED = 0.3  # R2: below, the curve says hardly more than the mean outflow
-ALIKE = 0.02     # of the jam accumulation: nearer to it, the critical one is the same
+FALL = 0.05      # of the largest outflow: if it falls less up to the jam accumulation, it does not fall
 AHEAD = 900.0    # s, of the longer prediction that is judged
-FEW, POOR, SHORT, ENDLESS, ALONE = "few samples", "R2", "not reached", "jam = critical", "one seed"
+FEW, POOR, SHORT, ENDLESS, ALONE = "few samples", "R2", "not reached", "no falling branch", "one seed"
 MEANINGS = {  # beginning of a doubt -> what it means, and what would help
     FEW: f"fewer than {SAMPLES} samples, the MFD stays what it was before; higher --levels would load the region",
     POOR: f"below {EXPLAINED:g} the curve explains hardly anything of the outflow, and whoever plans with it is "
           "misled; more --levels and --seeds, or other regions, may tell more",
     SHORT: "no loading run reached the critical accumulation, what lies beyond is a guess; give higher --levels, or "
            "take it that perimeter control has nothing to protect there",
-    ENDLESS: "the fitted outflow never falls, so that nothing tells where congestion begins; give higher --levels",
+    ENDLESS: "the fitted outflow hardly falls up to the jam accumulation, so nothing tells where congestion begins; "
+             "give higher --levels",
     ALONE: "there is no held-out error, and what the model is worth in runs that it has not seen is unknown; give "
            "--seeds 2 or more"}
 
@@ -78,8 +79,8 @@ def region_fits(
             doubts.append(f"{POOR} {explained:.2f}")
         if share < 1.0:
             doubts.append(f"{SHORT} ({100 * share:.0f} % of critical)")
-        if np.isfinite(curve.jam) and curve.critical >= (1.0 - ALIKE) * curve.jam:
-            doubts.append(ENDLESS)
+        if np.isfinite(curve.jam) and curve.outflow(curve.jam) > (1.0 - FALL) * curve.capacity:
+            doubts.append(f"{ENDLESS} (jam {curve.jam:.0f}, critical {curve.critical:.0f} veh)")
         if seeds < 2:
             doubts.append(ALONE)
         found.append(RegionFit(

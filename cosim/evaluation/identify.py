@@ -36,6 +36,7 @@ from nmfd.model.planning import GUIDED, GUIDING
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files
+from nmfd.runs.tables import wrapped
 from nmfd.runs.workers import ended
 
 PATHS = ("recipe", "net", "regions")  # keys of [sumo] in network.toml
@@ -131,7 +132,7 @@ def identify(
     model = replace(model, placeholder=False, doubts=tuple(fit.doubts for fit in fits))
     judged = verdict.of_runs(model, [result for result in found if result.trajectory.controller == first])
     model = replace(model, controllable=judged.boundaries.shares)
-    text += "\n" + "\n".join(judged.sentences)
+    text = "\n".join([text, *wrapped("\n".join(judged.sentences))])
     _write_samples(out / "samples.csv", samples)
     by_run = [[own_points(cloud) for cloud in samples_of(network, [result])] for result in found]
     draw_mfds(out / "mfd.png", model, samples, [mfd_bands.band(runs) for runs in zip(*by_run, strict=True)])

@@ -32,7 +32,8 @@ SPILLBACK = "held up by a neighbour"
 CAPTION = (
     "RMSE, bias: of the accumulation that the regional model predicts for the whole run from its start [veh]; next "
     "interval: predicted one control interval ahead from every recorded state; if nothing changed: RMSE of the "
-    "prediction that the region keeps what it holds, from the start or for one interval [veh]; bias > 0: the model holds too many")
+    "prediction that the region keeps what it holds, from the start or for one interval [veh]; bias > 0: the model "
+    "holds too many")
 
 
 class Replay:

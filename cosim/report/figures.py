@@ -61,7 +61,8 @@ def perimeter(ax: Axes, step: float, commanded: Series, green: Series, flow: Ser
             (green, GREEN_SHOWN, "green shown / original green", 1.6),
             (commanded, COMMANDED, "commanded u", 1.6)):
         ax.stairs(values, time, color=tone, linewidth=width, label=label, baseline=None)
-    ax.set_ylim(0.0, 1.08)
+    ax.set_ylim(0.0, max(1.08, 1.05 * float(np.nanmax([green, flow], initial=1.0))))
+    ax.set_ylabel("share [-]")
     ax.spines[["top", "right"]].set_visible(False)
     return ax
 
@@ -71,10 +72,10 @@ def green_against_command(
 ) -> Axes:
     """Every boundary and interval: share of the original green that was shown against the commanded u, both (n,)."""
     ax.scatter(commanded, green, s=5, color=GREEN_SHOWN, alpha=0.35, linewidths=0)
-    ax.set_xlabel("commanded u")
-    ax.set_ylabel("green shown / original")
+    ax.set_xlabel("commanded u [-]")
+    ax.set_ylabel("green shown / original [-]")
     ax.set_xlim(0.0, 1.0)
-    ax.set_ylim(0.0, 1.08)
+    ax.set_ylim(0.0, max(1.08, 1.05 * float(np.nanmax(green, initial=1.0))))
     ax.spines[["top", "right"]].set_visible(False)
     return ax
 
@@ -103,8 +104,8 @@ def split_totals(
     ax.plot([0, 1], [0, 1], color="#bbbbbb", linewidth=1.0, zorder=1)
     ax.scatter(commanded, realised, s=90.0 * vehicles / max(vehicles.max(initial=0.0), 1.0) + 3.0, color=FLOWED,
                alpha=0.45, linewidths=0, zorder=2)
-    ax.set_xlabel("commanded θ, mean of the run")
-    ax.set_ylabel("share that went there")
+    ax.set_xlabel("commanded θ [-], mean of the run")
+    ax.set_ylabel("share that went there [-]")
     ax.set_xlim(-0.04, 1.04)
     ax.set_ylim(-0.04, 1.04)
     ax.spines[["top", "right"]].set_visible(False)
@@ -162,7 +163,7 @@ def over_demand(
                     label=controller)
     ax.set_xticks(levels, [f"{level:g}" for level in levels])
     ax.set_xlabel("demand, multiple of the scenario's")
-    ax.set_ylabel(f"total time spent / that of {against}")
+    ax.set_ylabel(f"total time spent / that of {against} [-]")
     ax.set_ylim(bottom=0.0)
     ax.spines[["top", "right"]].set_visible(False)
     return ax

@@ -34,8 +34,9 @@ PICTURES = (  # heading, its pictures with captions
         ("total_accumulation", "Vehicles in the network with those waiting to enter [veh] over time."),
         ("region_accumulation", "Vehicles in each region [veh] over time. The strips above, one per strategy, tell the "
          "state of the region by the vehicles that left it in that run: light where it flows below the critical "
-         "accumulation, green where the outflow is within 10 % of the largest, red where it is less while the region "
-         "holds more vehicles, dark and hatched where hardly any vehicle leaves."),
+         "accumulation, green where the outflow is within 10 % of the largest, red where less leaves than so "
+         "many vehicles could, because the region is congested or holds them back, dark and hatched where hardly "
+         "any vehicle leaves."),
         ("mfd", "Macroscopic fundamental diagram of each region: vehicles inside [veh] against vehicles that leave or "
          "arrive [veh/s]. Dots: one per control interval; line: the regional model; hatched: beyond all dots."))),
     ("Streets", (

@@ -136,7 +136,9 @@ def region_accumulation(
     _curves(ax, trajectories, lambda t: t.accumulation[:, region].sum(axis=1), seed)
     left = _strips(ax, mfd, region, trajectories, seed, outflow)
     ax.set_ylabel("accumulation [veh]")
-    ax.set_ylim(0.0, 1.06 * max(highest, 1.25 * mfd.critical) / left)
+    top = 1.06 * max(highest, 1.25 * mfd.critical)
+    ax.set_ylim(0.0, top / left)
+    ax.set_yticks([tick for tick in ax.get_yticks() if 0.0 <= tick <= top])  # none beside the strips
     ax.set_title(_region_title(network, region), fontsize="medium")
     return ax
 

@@ -21,6 +21,7 @@ from nmfd.types import Trajectory
 WINDOW = 3        # control intervals over which accumulation and outflow are averaged: single ones are noisy
 NEAR = 0.9        # of the largest outflow: near capacity
 COLLAPSED = 0.7   # of the largest outflow in the runs, with more vehicles than then: congested, whatever the curve says
+SLOW = 1 / 3      # of what could leave: congested, or held back
 STANDING = 0.1    # of what could leave: the free outflow of so many vehicles, or the largest
 FEWEST = 5.0      # vehicles, for an outflow per vehicle that means something
 EXPECTED = 10.0   # vehicles that would have left if they had been free: with fewer, none may be chance
@@ -44,7 +45,7 @@ class TrafficState(IntEnum):
 LOOKS = {
     TrafficState.FLOWING: ("below critical and flowing", "#dfeee0", ""),
     TrafficState.NEAR_CAPACITY: ("near capacity: outflow within 10 % of the largest", "#6cbf84", ""),
-    TrafficState.CONGESTED: ("congested: more vehicles, less outflow", "#c1440e", ""),
+    TrafficState.CONGESTED: ("congested or held back: less leaves than could", "#c1440e", ""),
     TrafficState.STANDING: ("standing: hardly any vehicle leaves", "#1d0b2e", "////"),
 }
 
@@ -56,7 +57,8 @@ def states(
 
     near capacity: the outflow is within 10 % of the largest, which is that of the curve or, if more, of the runs;
     congested: beyond the critical accumulation with less outflow, or holding more vehicles than at the largest outflow
-    of the runs and letting out less than COLLAPSED of it; standing: less than STANDING of what could leave
+    of the runs and letting out less than COLLAPSED of it, or less than SLOW of what could leave; standing: less than
+    STANDING of that
     """
     x = [_smooth(0.5 * (run[1:] + run[:-1])) for run in accumulation]
     q = [_smooth(run) for run in outflow]
@@ -70,9 +72,11 @@ def states(
     for one, out in zip(x, q, strict=True):
         state = np.full(len(one), int(TrafficState.FLOWING))
         state[(one > mfd.critical) | (told & (one > 1.1 * held) & (out < COLLAPSED * largest))] = TrafficState.CONGESTED
-        state[out >= NEAR * most] = TrafficState.NEAR_CAPACITY
         could = np.minimum(free * one, most)
-        state[(out < STANDING * could) & (could * step * WINDOW >= EXPECTED)] = TrafficState.STANDING
+        enough = could * step * WINDOW >= EXPECTED
+        state[enough & (out < SLOW * could)] = TrafficState.CONGESTED
+        state[out >= NEAR * most] = TrafficState.NEAR_CAPACITY
+        state[enough & (out < STANDING * could)] = TrafficState.STANDING
         found.append(state)
     return found
 
