@@ -36,6 +36,13 @@ def test_the_outflow_decides_not_the_accumulation(held, share, expected):
     assert set(of(held, share * MFD.capacity)) == {expected}
 
 
+def test_who_has_just_come_does_not_stand():
+    """The first vehicles of a morning have had no time to leave."""
+    x = np.minimum(20.0 * np.arange(T + 1), 100.0)
+    found = of(x, np.where(np.arange(T) < 2, 0.0, MFD.outflow(x[:-1])))
+    assert TrafficState.STANDING not in found and found[-1] == TrafficState.FLOWING
+
+
 def test_a_curve_that_never_falls_hides_no_collapse():
     """Fitted to too little, its critical accumulation is its jam; the run lets out less and less all the same."""
     endless = Mfd(a=0.0, b=0.0, c=0.004, jam=5000.0)

@@ -121,7 +121,8 @@ def _models(run: Finished) -> list[str]:
         with suppress(InputError):  # a model that is gone by now
             network = planning_of(run.scenario, name).network
             networks.setdefault(network.folder, network)
-    lines, kinds = [], []
+    lines: list[str] = []
+    kinds: list[str] = []
     for folder, network in networks.items():
         title = network.name if folder is None else os.path.normpath(folder)
         if network.placeholder:

@@ -127,7 +127,7 @@ def region_accumulation(
     seed: shown instead of the mean over seeds; the strips show it or, without one, the first seed. outflow: what left
     every region of a run (T, R) [veh/s], of which the states are told; None, or where it gives None: no strip.
     Trajectories of several plants, such as the microsimulation and the regional model, share the controller's colour
-    and differ in line style.
+    and differ in line style; the marks of strips are hollow for all but the first plant.
     """
     mfd = network.mfds[region]
     highest = max((t.accumulation[:, region].sum(axis=1).max() for t in trajectories), default=0.0)
@@ -158,7 +158,8 @@ def _strips(
                    [out[:, region] for out in known.values()])
     tones = colours([t.controller for t in trajectories])
     time = [time_axis(ax, t.step * np.arange(len(t.accumulation))) for t in shown]
-    return draw_strips(ax, time, found, [tones[t.controller] for t in shown])
+    return draw_strips(
+        ax, time, found, [tones[t.controller] for t in shown], [t.plant != trajectories[0].plant for t in shown])
 
 
 def region_estimate(

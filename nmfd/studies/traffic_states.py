@@ -68,11 +68,11 @@ def states(
     most = max(mfd.capacity, largest)
     free = max([mfd.c, *(every_q / np.maximum(every_x, FEWEST))])
     told = largest * step * WINDOW >= COUNTED
-    found = []
-    for one, out in zip(x, q, strict=True):
+    found, stay = [], 1 + int(np.ceil(1.0 / (free * step)))
+    for run, one, out in zip(accumulation, x, q, strict=True):
         state = np.full(len(one), int(TrafficState.FLOWING))
         state[(one > mfd.critical) | (told & (one > 1.1 * held) & (out < COLLAPSED * largest))] = TrafficState.CONGESTED
-        could = np.minimum(free * one, most)
+        could = np.minimum(free * _for_a_while(one, run[0], stay), most)
         enough = could * step * WINDOW >= EXPECTED
         state[enough & (out < SLOW * could)] = TrafficState.CONGESTED
         state[out >= NEAR * most] = TrafficState.NEAR_CAPACITY
@@ -85,6 +85,11 @@ def _smooth(values: np.ndarray) -> np.ndarray:
     """(T,): means over WINDOW intervals around each, fewer at the ends."""
     window = np.ones(min(WINDOW, len(values)))
     return np.convolve(values, window, mode="same") / np.convolve(np.ones(len(values)), window, mode="same")
+
+
+def _for_a_while(x: np.ndarray, first: float, stay: int) -> np.ndarray:
+    """(T,) [veh]: what a region has held at least for `stay` intervals; who has just come cannot leave yet."""
+    return np.lib.stride_tricks.sliding_window_view(np.concatenate([np.full(stay, first), x]), stay + 1).min(axis=1)
 
 
 def model_outflow(network: RegionalModel) -> OutflowOf:
@@ -118,11 +123,12 @@ def remembered(outflow: OutflowOf) -> OutflowOf:
 
 def draw_strips(
     ax: Axes, time: Sequence[Float[np.ndarray, " S"]], found: Sequence[Int[np.ndarray, " T"]], tones: Sequence[str],
+    hollow: Sequence[bool],
 ) -> float:
-    """A strip per run at the top of `ax` in the colours of its states, a mark in the run's own colour before it;
-    returns the share of the axes that is left below them. time: of the states, in the unit of the axis."""
+    """A strip per run at the top of `ax` in the colours of its states, a mark in the run's own colour before it, or a
+    hollow one; returns the share of the axes that is left below them. time: of the states, in the unit of the axis."""
     height = min(STRIP, STRIPS / max(len(found), 1))
-    for row, (edges, state, tone) in enumerate(zip(time, found, tones, strict=True)):
+    for row, (edges, state, tone, empty) in enumerate(zip(time, found, tones, hollow, strict=True)):
         y = 1.0 - (row + 1) * height
         begin = 0
         for kind, members in groupby(state.tolist()):
@@ -133,6 +139,6 @@ def draw_strips(
                 edgecolor="#ffffff" if hatch else fill, hatch=hatch, linewidth=0.0, label=label,
                 transform=ax.get_xaxis_transform(), zorder=4)
             begin = end
-        ax.scatter([-0.025], [y + 0.5 * height], s=9, marker="s", color=tone, transform=ax.transAxes, clip_on=False,
-                   linewidths=0, zorder=5)
+        ax.scatter([-0.025], [y + 0.5 * height], s=9, marker="s", facecolor="none" if empty else tone,
+                   edgecolor=tone, transform=ax.transAxes, clip_on=False, linewidths=0.8, zorder=5)
     return 1.0 - len(found) * height
