@@ -90,14 +90,16 @@ def benchmark(
 
 def train(
     scenario: Scenario | Path | str, controller: str, *, out: Path | str, seed: int = 0, steps: int | None = None,
-    resume: bool = False, progress: Callable[[int, int, str], None] | None = None,
+    resume: bool = False, anyway: bool = False, progress: Callable[[int, int, str], None] | None = None,
 ) -> Path:
     """`nmfd train` on the CPU: train the DPC policy `controller` and write it to the file `out`, which is returned.
 
-    steps: Adam steps; what scenario.toml says, else 400, if None. Raises InputError.
+    steps: Adam steps; what scenario.toml says, else 400, if None; anyway: even on placeholder MFDs, or where no gateway
+    can be controlled. Raises InputError.
     """
     return training.train(
-        _loaded(scenario), controller, seed=seed, out=Path(out), steps=steps, resume=resume, progress=progress)
+        _loaded(scenario), controller, seed=seed, out=Path(out), steps=steps, resume=resume, anyway=anyway,
+        progress=progress)
 
 
 def named(controller: str | Controller, scenario: Scenario, policy: Path | str | None) -> tuple[str, Controller]:

@@ -42,7 +42,8 @@ def main() -> None:
               help="The seeds are S to S + N - 1. From 2000 on they were never used in development.")
 @click.option("--demand", default="1.0", show_default=True, metavar="A,B,...",
               help="Demand levels: multiples of the scenario's demand.")
-@click.option("--reference", metavar="NAME", help="Pair all controllers with this one too, besides no-control.")
+@click.option("--reference", metavar="NAME",
+              help="Pair all controllers with this one too, besides no-control, or the first one if that is not there.")
 @click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
               help="Policy of a DPC controller, if not SCENARIO/NAME.pt. May be repeated.")
 @click.option("--workers", type=COUNT, metavar="N",

@@ -17,7 +17,8 @@ from nmfd.errors import InputError
 @click.command()
 @click.argument("folders", type=FOLDER, metavar="RUN...", nargs=-1, required=True)
 @click.option("--out", type=FILE, metavar="FILE", help="The page. [default: report.html in the first RUN]")
-@click.option("--reference", metavar="NAME", help="Pair all controllers with this one too, besides no-control.")
+@click.option("--reference", metavar="NAME",
+              help="Pair all controllers with this one too, besides no-control, or the first one if that is not there.")
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="The runs' scenario, if it is no longer where it was.")
 def report(folders: tuple[Path, ...], out: Path | None, reference: str | None, scenario: Path | None) -> None:
     """Write one self-contained HTML page about finished runs: what came of them, in words, tables and pictures.

@@ -18,7 +18,8 @@ from nmfd.errors import InputError
 @click.command()
 @click.argument("scenario", type=FOLDER)
 @click.option("--controller", required=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
-@click.option("--against", metavar="NAME", help="Run this controller too, on the same trips, in a second process.")
+@click.option("--against", metavar="NAME",
+              help="Run this controller too, on the same trips, in a second process, and compare with it.")
 @click.option("--seed", type=SEED, default=0, show_default=True,
               help="Of the trips, the drivers and the guidance.")
 @click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
@@ -53,6 +54,8 @@ def run(
 
     kinds = outputs.parse(sumo_output) if sumo_output is not None else ()
     names = [controller] + ([against] if against and against != controller else [])
+    if "no-control" not in names:
+        names.reverse()  # what comes first is what the other is compared with
     for name in names:
         strategy.parse(name)
 

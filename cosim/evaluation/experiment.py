@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cosim.evaluation import estimation_errors
+from cosim.evaluation import estimation_errors, run_metrics
 from cosim.evaluation.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.plant import incidents
 from cosim.plant.launch import own_files, own_vehicles
@@ -33,16 +33,19 @@ from nmfd.runs import run_folder
 from nmfd.runs.files import check_file, file_hash, write_text
 from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
-from nmfd.studies.benchmark import REFERENCE, draw_accumulations, interval
+from nmfd.studies.benchmark import REFERENCE, compared_with, draw_accumulations, interval
+from nmfd.studies.traffic_states import OutflowOf, RegionalOutflow
+from nmfd.types import Trajectory
 
 Progress = Callable[[int, int, str], None]  # takes what is done, what there is to do, and what is running
 Outcomes = Iterator[tuple[Task, Result | Failure]]
 # Of loading runs: whether they guide routes, and so depend on the drivers' own split ratios.
 LOADING = {"probing-pc": False, "probing-pcrg": True, "route-guidance": True}
 CAPTION = (
-    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; removed: taken out "
-    "before the last edge of their route, in TTS as if they were there to the end; backlog: not inserted at the end; "
-    "step: median / longest decision; outside SUMO: share of the wall time not in its own step")
+    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; change: of the mean "
+    "TTS against {against}; removed: taken out before the last edge of their route, in TTS as if they were there to "
+    "the end; backlog: not inserted at the end; step: median / longest decision; outside SUMO: share of the wall time "
+    "not in its own step")
 
 
 def experiment(
@@ -57,8 +60,9 @@ def experiment(
     failures = perform([(out, task) for task in tasks], workers=workers, fresh=zipped, progress=progress, tell=tell)
     if (out / "summary.csv").is_file() and (kept := run_folder.trajectories(out)):
         scenario = scenario_of(tasks[0])
-        draw_accumulations(out, scenario, kept)
-        estimation_errors.write_errors(out, scenario.network, kept)
+        measured = measured_outflow(out)
+        draw_accumulations(out, scenario, kept, outflow=measured)
+        estimation_errors.write_errors(out, scenario.network, kept, measured)
     if failures:
         raise ended([(label(task), failure) for task, failure in failures])
     return overview(out)
@@ -228,6 +232,19 @@ def read_run(folder: Path, controller: str, seed: int) -> Result:
                 name: file[name][...] for name in quantities(Record) if name in file.variables})
 
 
+def measured_outflow(folder: Path) -> OutflowOf:
+    """What left every region in a run of the folder, as SUMO counted it (T, R) [veh/s]; None of a run that an older
+    version recorded without it."""
+    def outflow(trajectory: Trajectory) -> RegionalOutflow | None:
+        with run_folder.opened(run_folder.run_path(folder, trajectory.controller, trajectory.seed)) as file:
+            if not {"arrivals", "crossings"} <= set(file.variables):
+                return None
+            return run_metrics.regional_outflow(
+                {name: file[name][...] for name in ("arrivals", "crossings")}, trajectory.step)
+
+    return outflow
+
+
 def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
     path = folder.path / "sumo.csv"
     rows = read_facts(path) if path.is_file() else pd.DataFrame(columns=FACTS)
@@ -257,15 +274,14 @@ def read_facts(path: Path) -> pd.DataFrame:
 
 def overview_table(rows: pd.DataFrame) -> str:
     """The overview as text: one line per controller, means over seeds, TTS with its 95 % interval."""
-    reference = rows.loc[rows["controller"] == REFERENCE, "total_time_spent_veh_s"]
+    against = compared_with(rows["controller"]) if len(rows) else REFERENCE
+    reference = rows.loc[rows["controller"] == against, "total_time_spent_veh_s"]
     lines = []
     for name, group in rows.groupby("controller", sort=False):
         tts = group["total_time_spent_veh_s"]
         spread = f" ± {interval(list(tts)):.1e}" if len(tts) > 1 else ""
-        change = ""
-        if len(reference) and name != REFERENCE:
-            percent = percent_change(tts.mean(), reference.mean())
-            change = "-" if math.isnan(percent) else f"{percent:+.1f} %"
+        percent = percent_change(tts.mean(), reference.mean())
+        change = "" if name == against else "-" if math.isnan(percent) else f"{percent:+.1f} %"
         lines.append({
             "controller": name, "seeds": len(group), "TTS [veh s]": f"{tts.mean():.4g}{spread}", "change": change,
             "completed": f"{group['completed_veh'].mean():,.0f} of {group['trips'].mean():,.0f}",
@@ -276,7 +292,7 @@ def overview_table(rows: pd.DataFrame) -> str:
             **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
             "wall [s]": f"{group['wall_time_s'].mean():.0f}",
             "outside SUMO": f"{100 * group['overhead_share'].mean():.1f} %"})
-    return "\n".join([text_table(lines, CAPTION), *remarks(rows)])
+    return "\n".join([text_table(lines, CAPTION.format(against=against)), *remarks(rows)])
 
 
 def remarks(rows: pd.DataFrame) -> list[str]:

@@ -92,16 +92,20 @@ def benchmark(
               help="Adam steps. [default: what scenario.toml says, else 400]")
 @click.option("--out", type=FILE, metavar="FILE", help="The policy file. [default: SCENARIO/NAME.pt]")
 @click.option("--resume", is_flag=True, help="Go on with an interrupted training.")
+@click.option("--anyway", is_flag=True, help="Even on placeholder MFDs, or where no gateway can be controlled.")
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True,
               help="auto: a GPU where there is one. The CPU gives the same weights every time.")
 @click.option("--compile/--no-compile", "compiled", default=None,
               help="Compile the rollout: a minute or two first, then about twice as fast. [default: from 200 Adam "
                    "steps up, where there is a C++ compiler]")
 def train(
-    scenario: Path, controller: str, seed: int, steps: int | None, out: Path | None, resume: bool, device: str,
-    compiled: bool | None,
+    scenario: Path, controller: str, seed: int, steps: int | None, out: Path | None, resume: bool, anyway: bool,
+    device: str, compiled: bool | None,
 ) -> None:
     """Train a DPC policy on a scenario. The -robust ones are trained with noise on the demand.
+
+    Of an imported city, identify it first: on placeholder MFDs, and for a city of which no gateway can be controlled,
+    nothing is trained.
 
     The policy that does best in validation is in the policy file at any time; Ctrl-C keeps it, and --resume goes on.
 
@@ -116,6 +120,11 @@ def train(
     loaded = load_scenario(scenario)
     device = training.available(device)
     chosen = training.settings(loaded, controller, steps)  # complains of the name before a file is named after it
+    if not anyway:
+        model = training.check(loaded, controller)
+        for name, doubts in zip(model.region_names, model.doubts, strict=False):
+            if doubts:
+                click.echo(f"nmfd: the model of region {name} is doubtful: {'; '.join(doubts)}", err=True)
     file = scenario / f"{controller}.pt" if out is None else out
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the policy; make it or choose another --out")
@@ -140,7 +149,7 @@ def train(
 
             training.train(
                 loaded, controller, seed=seed, out=file, steps=steps, resume=resume, device=device, compiled=compiled,
-                progress=progress)
+                anyway=anyway, progress=progress)
     except KeyboardInterrupt:
         if not resume and _stamp(state) == before:
             raise Interrupted("interrupted before the first validation; nothing is kept") from None
@@ -148,6 +157,7 @@ def train(
         again += f" --seed {seed}" if seed else ""
         again += f" --steps {steps}" if steps else ""
         again += f" --out {quoted(out)}" if out else ""
+        again += " --anyway" if anyway else ""
         again += f" --device {device}" if device != "cpu" else ""
         again += "" if default else f" --{'' if compiled else 'no-'}compile"
         raise Interrupted(f"interrupted; the best policy so far is {file}; go on with: {again} --resume") from None

@@ -215,3 +215,14 @@ def prediction_shares(
     """(len(intervals), R) [-]: RMSE of `prediction_errors`, as a share of the critical accumulation."""
     errors = [prediction_errors(network, runs, n, **scheme) for n in intervals]
     return np.sqrt([(error**2).mean(axis=0) for error in errors]) / [curve.critical for curve in network.mfds]
+
+
+def persistence_shares(
+    network: RegionalModel, runs: Sequence[Observed], intervals: Sequence[int],
+) -> Float[np.ndarray, "L R"]:
+    """(len(intervals), R) [-]: as `prediction_shares`, of the prediction that nothing changes."""
+    errors = []
+    for n in intervals:
+        states = [run.accumulation.sum(axis=2) for run in runs if len(run.demand) >= n]
+        errors.append(np.concatenate([state[:-n] - state[n:] for state in states]))
+    return np.sqrt([(error**2).mean(axis=0) for error in errors]) / [curve.critical for curve in network.mfds]

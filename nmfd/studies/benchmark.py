@@ -2,7 +2,7 @@
 
 import math
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,16 +17,23 @@ from nmfd.runs import run_folder
 from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, Worker, attempt, ended, outcomes
 from nmfd.studies import plots
+from nmfd.studies.traffic_states import OutflowOf, model_outflow, remembered
 from nmfd.types import Plant, Trajectory
 
 PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
 CAPTION = (
-    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against no-control; control: time of all "
+    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against {against}; control: time of all "
     "decisions of a run; step: median / longest decision; decisions of all seeds: " + "; ".join(
         f"{heading}: {what}" for heading, what in COUNTED.values()))
 BOUND_CAPTION = (
     "; above bound: TTS against the bound with the same controls, perimeter alone (PC) or with routes (PCRG)")
+
+
+def compared_with(controllers: Iterable[str]) -> str:
+    """What controllers are compared with: no control, or the first of them where that is not among them."""
+    names = list(controllers)
+    return REFERENCE if REFERENCE in names else names[0]
 
 
 def run_one(
@@ -150,11 +157,12 @@ def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -
 
 def draw_accumulations(
     folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory], *, seed: int | None = None,
-    title: str | None = None,
+    title: str | None = None, outflow: OutflowOf | None = None,
 ) -> None:
     """Total and regional accumulation over time, as png files in `folder`.
 
-    seed: shown instead of the mean over seeds; title: above both pictures.
+    seed: shown instead of the mean over seeds; title: above both pictures; outflow: what left every region of a run,
+    where it was measured; else that of the regional model, of runs on it.
     """
     drawing = plots.figure(8.0, 4.6)
     ax = plots.total_accumulation(drawing.subplots(), trajectories, seed)
@@ -162,9 +170,10 @@ def draw_accumulations(
     plots.legend_below(drawing, [ax], columns=6)
     plots.save(drawing, folder / "total_accumulation.png")
     network = scenario.network
+    outflow = remembered(outflow or model_outflow(network))
     drawing, axes = plots.panels(network.regions)
     for region, ax in enumerate(axes):
-        plots.region_accumulation(ax, network, region, trajectories, seed)
+        plots.region_accumulation(ax, network, region, trajectories, seed, outflow)
     drawing.suptitle(title, fontsize="medium")
     plots.legend_below(drawing, axes, columns=3)
     plots.save(drawing, folder / "region_accumulation.png")
@@ -207,6 +216,7 @@ def summary_table(rows: Sequence[Mapping]) -> str:
     for row in rows:
         groups.setdefault(row["controller"], []).append(row)
     tts = {name: [row["total_time_spent_veh_s"] for row in group] for name, group in groups.items()}
+    against = compared_with(tts) if tts else REFERENCE
     with_bound = any(name in tts for name in ("bound-pc", "bound-pcrg"))
     lines = []
     for name, group in groups.items():
@@ -214,9 +224,7 @@ def summary_table(rows: Sequence[Mapping]) -> str:
             return statistics.fmean(row[column] for row in group)
 
         spread = interval(tts[name])
-        change = ""
-        if REFERENCE in tts and name != REFERENCE:
-            change = _percent(tts[name], tts[REFERENCE])
+        change = _percent(tts[name], tts[against]) if name != against else ""
         bound = "bound-pcrg" if "-pcrg" in name else "bound-pc"
         above = _percent(tts[name], tts[bound]) if bound in tts and name != bound else ""
         lines.append({
@@ -230,7 +238,7 @@ def summary_table(rows: Sequence[Mapping]) -> str:
             "step [ms]": f"{mean('control_step_ms_median'):.3g} / "
                          f"{max(row['control_step_ms_max'] for row in group):.3g}",
             **{heading: sum(row[column] for row in group) for column, (heading, _) in COUNTED.items()}})
-    return text_table(lines, CAPTION + BOUND_CAPTION * with_bound)
+    return text_table(lines, CAPTION.format(against=against) + BOUND_CAPTION * with_bound)
 
 
 def _percent(values: Sequence[float], reference: Sequence[float]) -> str:

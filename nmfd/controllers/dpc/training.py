@@ -6,6 +6,7 @@ validation on the scenario itself is kept. The same seed gives the same weights.
 
 import io
 import math
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from nmfd.controllers.dpc.rollout import Rollout, compiled_step
 from nmfd.controllers.options import options
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError, RunFailed
+from nmfd.model.authority import NO_GATEWAY
 from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
@@ -53,6 +55,26 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
     return chosen if steps is None else chosen.changed(steps=steps)
 
 
+def check(scenario: Scenario, controller: str) -> RegionalModel:
+    """The regional model on which `controller` is trained. InputError where training would be for nothing: no gateway
+    of the city can be controlled, or the MFDs are placeholders that no run has measured."""
+    city, believed = scenario.network, planning_model(scenario, controller).network
+    if city.controllable is not None and not city.controllable.any():
+        raise InputError(
+            f"{_file(city)}: controllable: is 0 at every boundary: {NO_GATEWAY}; --anyway trains {controller} all the "
+            "same")
+    if believed.placeholder:
+        raise InputError(
+            f"{_file(believed)}: placeholder: is true: its MFDs are guesses from lanes and speed limits, and a policy "
+            f"would learn these; run 'cosim identify {os.path.dirname(_file(city)) or 'NETWORK'}' first, or set it to "
+            f"false once you have put in MFDs of your own; --anyway trains {controller} all the same")
+    return believed
+
+
+def _file(network: RegionalModel) -> str:
+    return network.name if network.folder is None else os.path.normpath(network.folder / "network.toml")
+
+
 def available(device: str) -> str:
     """"cpu" or "cuda", with "auto" the GPU where there is one. InputError for a GPU that is not there."""
     if device == "cuda" and not torch.cuda.is_available():
@@ -63,17 +85,19 @@ def available(device: str) -> str:
 @one_thread()
 def train(
     scenario: Scenario, controller: str, *, seed: int, out: Path, steps: int | None = None, resume: bool = False,
-    device: str = "cpu", compiled: bool = False, progress: Callable[[int, int, str], None] | None = None,
-    log: Callable[[int, float], None] | None = None,
+    device: str = "cpu", compiled: bool = False, anyway: bool = False,
+    progress: Callable[[int, int, str], None] | None = None, log: Callable[[int, float], None] | None = None,
 ) -> Path:
     """Train `controller`, one that `settings` knows, on the regional model and write the policy to `out`.
 
     `out` holds the best policy so far after every validation; `out`.resume beside it holds what `resume` needs and
     goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done, TTS)` after
     every validation. `compiled` makes a step about twice as fast, after up to a minute or two of compilation; the
-    weights differ by rounding.
+    weights differ by rounding. `anyway`: even where `check` refuses.
     """
     chosen = settings(scenario, controller, steps)
+    if not anyway:
+        check(scenario, controller)
     planning = planning_model(scenario, controller)
     configuration = {
         "controller": controller, "scenario": planning.name, "seed": seed, "compiled": compiled, **vars(chosen)}
