@@ -15,7 +15,7 @@ from cosim.plant.programmes import city_signals
 from cosim.plant.record import Record, Recorder
 from cosim.plant.sensing import Estimation, Sensing
 from cosim.plant.settings import ESTIMATE, Settings, scenario_file, settings
-from cosim.plant.strategy import MAX_PRESSURE
+from cosim.plant.strategy import PRESSURES
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, Gateway, check_adjacency, load_city
 from cosim.sumo.session import Session, Window
@@ -151,7 +151,7 @@ class SumoPlant:
             random=np.random.default_rng([seed, GUIDANCE]))
 
     def _new_actuation(self) -> Actuation:
-        flows = self._launch.turning_flows() if self._settings.signals == MAX_PRESSURE else None
+        flows = self._launch.turning_flows() if self._settings.signals in PRESSURES else None
         return Actuation(
             self.session, self.city, self._scenario, self._settings, self._signals, self._incidents, flows)
 
@@ -163,9 +163,9 @@ class SumoPlant:
 
 def _check_mesoscopic(scenario: Scenario, chosen: Settings) -> None:
     """InputError for what needs lanes where there are none."""
-    for key, value, what in (("signals", MAX_PRESSURE, "counts vehicles lane by lane"),
-                             ("measurement", ESTIMATE, "needs loop detectors on lanes")):
-        if chosen.mesoscopic and getattr(chosen, key) == value:
+    for key, values, what in (("signals", PRESSURES, "counts vehicles lane by lane"),
+                              ("measurement", (ESTIMATE,), "needs loop detectors on lanes")):
+        if chosen.mesoscopic and (value := getattr(chosen, key)) in values:
             raise InputError(
                 f"{scenario_file(scenario)}: sumo.{key}: {value} {what}, but SUMO's mesoscopic model has no lanes; "
                 "omit it, or set mesoscopic = false (import the city without --mesoscopic)")
