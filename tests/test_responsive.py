@@ -115,3 +115,44 @@ def test_rationed_under_max_pressure(town, signals):
         seen[gate] = record.gateway_flow.sum()
         assert all(gateway.signal is None for gateway in leaks)
     assert seen[0.1] < 0.7 * seen[0.9]
+
+
+REFUSED = {
+    "max-pressure": "max-pressure counts vehicles lane by lane",
+    "pi-gating+max-pressure-cyclic": "max-pressure-cyclic counts vehicles lane by lane",
+    "route-guidance+estimate": "needs loop detectors on lanes"}
+
+
+@pytest.fixture(scope="module")
+def queues(town, tmp_path_factory):
+    """The city of `town` in SUMO's queue model, and a city without any signal."""
+    made = {}
+    for name, options, given in (("queues", ("--mesoscopic",), town[1]), ("bare", (), None)):
+        folder = given or tmp_path_factory.mktemp(name)
+        if given is None:
+            tiny_city.network(folder, "--default-junction-type", "priority")
+            (folder / "cars.rou.xml").write_text(CARS)
+            (folder / "city.sumocfg").write_text(CONFIG)
+        done = cosim("import", folder / "city.sumocfg", "--regions", 2, "--method", "geometric", "--no-run", "--out",
+                     folder / "networks" / name, *options)
+        assert done.exit_code == 0, done.output + str(done.exception)
+        made[name] = folder / "scenarios" / name
+    return made
+
+
+@pytest.mark.parametrize("command", ["run", "evaluate", "sweep"])
+@pytest.mark.parametrize("name, city", [*((name, "queues") for name in REFUSED), ("pi-gating", "bare"), ("mine", "queues")])
+def test_what_cannot_run_here_is_refused_before_the_first_run(queues, tmp_path, command, name, city):
+    """One line that names it, though another strategy comes first; nothing is written."""
+    if name == "mine":
+        (tmp_path / "mine.py").write_text(
+            "class Mine:\n    def __init__(self, scenario):\n        pass\n    def reset(self, *a, **k):\n        pass\n"
+            "    def act(self, observation, *a):\n        return None\n")
+        name = f"{tmp_path / 'mine.py'}:Mine+max-pressure"
+    names = (("--controllers", f"no-control,{name}") if command != "run" else
+             ("--controller", "no-control", "--against", name))
+    done = cosim(command, queues[city], *names, "--steps", 1, "--out", tmp_path / "out")
+    assert done.exit_code != 0 and len(done.stderr.strip().splitlines()) == 1
+    assert f"controller {name} cannot" in done.stderr
+    assert REFUSED.get(name, "lane by lane" if city == "queues" else "none of the") in done.stderr
+    assert not (tmp_path / "out").exists()

@@ -70,8 +70,8 @@ class Actuation:
                           start=session.time) for plan in own if plan.static], incidents.show))
         self._controls.append(ResponsiveSignals(session, [
             ResponsiveSignal(session, incidents, plan, movements[plan.signal], min_green=chosen.min_green)
-            for plan in own if plan.phased and not plan.static]))
-        phases |= {plan.signal: plan.phases for plan in own if plan.phased}
+            for plan in own if plan.actuated]))
+        phases |= {plan.signal: plan.phases for plan in own if plan.static or plan.actuated}
         self._commanded = phases.keys()
         self.original_green = _programmed_green(city, phases, scenario.step)
 

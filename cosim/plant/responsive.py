@@ -1,4 +1,4 @@
-"""Perimeter control at signals that SUMO itself times: actuated and delay-based ones, and phases in no fixed order.
+"""Perimeter control at signals that SUMO times by its detectors: actuated and delay-based ones.
 
 They have no windows whose length is known before. A gateway movement i -> h may be green for
 

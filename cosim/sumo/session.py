@@ -49,13 +49,13 @@ class Phase:
 @dataclass(frozen=True, kw_only=True)
 class Programme:
     """A signal programme. id: of those of the signal; position [s]: where in its cycle it was when it was read; static:
-    fixed-time, one phase after the other; phased: what it shows is always one of its phases."""
+    fixed-time, one phase after the other; actuated: timed by detectors, and what it shows is one of its phases."""
 
     signal: str
     phases: tuple[Phase, ...]
     position: float
     static: bool
-    phased: bool = True
+    actuated: bool = False
     id: str = ""
 
     @property
@@ -213,9 +213,7 @@ class Session:
                     position=elapsed - left,
                     static=logic.type == types.TRAFFICLIGHT_TYPE_STATIC
                     and not any(phase.next for phase in logic.phases),
-                    phased=logic.type in (
-                        types.TRAFFICLIGHT_TYPE_STATIC, types.TRAFFICLIGHT_TYPE_ACTUATED,
-                        types.TRAFFICLIGHT_TYPE_DELAYBASED))
+                    actuated=logic.type in (types.TRAFFICLIGHT_TYPE_ACTUATED, types.TRAFFICLIGHT_TYPE_DELAYBASED))
         raise RuntimeError(f"signal {signal} has no programme {active}")
 
     def signals(self) -> tuple[str, ...]:
