@@ -1,6 +1,8 @@
 """Signals that SUMO actuates: held back and rationed, with yellow and minimum green; untouched where nothing is held."""
 
 from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -11,11 +13,10 @@ from signal_rules import MIN_GREEN, check
 
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
-from cosim.sumo.net import gateway_movements
 from nmfd.api import load_scenario
+from nmfd.model.scenario import with_faults
 from nmfd.types import Controls
 
-KINDS = ("actuated", "delay_based")
 CONFIG = """<configuration>
   <input><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></input><time><end value="450"/></time>
 </configuration>"""
@@ -27,27 +28,41 @@ CARS = """<routes>
 </routes>"""
 
 
-@pytest.fixture(scope="module", params=KINDS)
-def town(request, tmp_path_factory):
-    """The kind and the folder of a city whose signals are all of it; two regions, left and right."""
-    folder = tmp_path_factory.mktemp(request.param)
-    tiny_city.network(folder, "--tls.set", "B1,B2,C1,C2", "--tls.default-type", request.param)
+def imported(folder, name, *options, signals):
+    """The scenario of a city of two regions, left and right."""
+    folder.mkdir()
+    tiny_city.network(folder, *signals)
     (folder / "cars.rou.xml").write_text(CARS)
     (folder / "city.sumocfg").write_text(CONFIG)
     done = cosim("import", folder / "city.sumocfg", "--regions", 2, "--method", "geometric", "--no-run", "--out",
-                 folder / "networks" / "town")
+                 folder / "networks" / name, *options)
     assert done.exit_code == 0, done.output + str(done.exception)
-    return request.param, folder
+    return folder / "scenarios" / name
 
 
-def drive(folder, gates, **overrides):
-    """States of every signal second by second, the programmes, the record, leaks; gates: u of every interval."""
-    scenario = replace(load_scenario(folder / "scenarios" / "town"), steps=len(gates))
+@pytest.fixture(scope="module", params=("actuated", "delay_based"))
+def town(request, tmp_path_factory):
+    """The kind of all signals, and the scenario."""
+    return request.param, imported(
+        tmp_path_factory.mktemp("town") / request.param, "town",
+        signals=("--tls.set", "B1,B2,C1,C2", "--tls.default-type", request.param))
+
+
+@pytest.fixture(scope="module")
+def opened(town):
+    """A run with open gates, in which SUMO does all by itself."""
+    return drive(town[1], [0.9] * 4)
+
+
+def drive(folder, gates, faults=(), **overrides):
+    """A run under u = gates[k] in interval k: what every signal shows second by second, and more."""
+    scenario = with_faults(replace(load_scenario(folder), steps=len(gates)), faults)
     plant = SumoPlant(scenario, overrides=settings(scenario).changed(**overrides))
     try:
         plant.reset(1)
         session, shown, step = plant.session, {}, plant.session.step
         plans = {name: session.programme(name) for name in session.signals()}
+        plans |= {signal.id: signal for signal in plant.simple_signals}
 
         def watch():
             step()
@@ -57,102 +72,104 @@ def drive(folder, gates, **overrides):
         session.step = watch
         for gate in gates:
             plant.step(Controls(perimeter=np.where(scenario.network.adjacency, gate, 0.0), splits=None))
-        plans |= {signal.id: signal for signal in plant.simple_signals}
-        own = {name: session.programme_id(name) for name in plans}
-        return shown, plans, plant.record(), plant.leaks(), own, gateway_movements(plant.city)
+        return SimpleNamespace(
+            shown=shown, plans=plans, record=plant.record(), leaks=plant.leaks(), gateways=plant.city.gateways,
+            programmes={name: session.programme_id(name) for name in plans})
     finally:
         plant.close()
 
 
+def rules(run):
+    """Yellow, minimum green and conflicts, of all signals."""
+    for name, states in run.shown.items():
+        check(states, [(phase.state, phase.duration) for phase in run.plans[name].phases])
+
+
 def test_gateways_of_actuated_signals_are_controlled(town):
     """The table tells them from fixed ones and from missing ones."""
-    kind, folder = town
-    gateways = pd.read_csv(folder / "networks" / "town" / "gateways.csv", keep_default_na=False)
-    assert set(zip(gateways.control, gateways.kind, strict=True)) >= {("controlled", kind)}
-    assert set(gateways.kind[gateways.control == "no signal"]) <= {""}
+    kind, scenario = town
+    gateways = pd.read_csv(scenario.parents[1] / "networks" / "town" / "gateways.csv", keep_default_na=False)
+    assert set(zip(gateways.control, gateways.kind, strict=True)) == {("controlled", kind), ("no signal", "")}
 
 
-def test_held_back_safely(town):
-    """Less flow at u_min, the green rationed; never red without yellow; given back to SUMO afterwards."""
-    _, folder = town
-    opened = drive(folder, [0.9] * 5)
-    held = drive(folder, [0.1] * 5)
-    assert not held[3] or all(gateway.signal is None for gateway in held[3])
-    flows = [record.gateway_flow.sum() for _, _, record, *_ in (opened, held)]
-    assert flows[1] < 0.7 * flows[0]
-    for shown, plans, _, _, _, gates in (opened, held):
-        for name, states in shown.items():
-            check(states, [(phase.state, phase.duration) for phase in plans[name].phases])
-            assert name not in gates or len(states[0]) > max(gates[name])
-    green = held[2].gateway_green
-    reached = ~np.isnan(green[0])
-    assert np.nanmax(green[1:, reached]) <= 2 * MIN_GREEN + 1.0
-    back = drive(folder, [0.9, 0.1, 0.5, 0.7, 0.9, 0.9])
-    assert all(programme == "0" for programme in back[4].values())
-    assert (back[2].gateway_green[-1, reached] > 2 * MIN_GREEN).all()
-    for name, states in back[0].items():
-        check(states, [(phase.state, phase.duration) for phase in back[1][name].phases])
+def test_held_back_safely(town, opened):
+    """Less flow at u_min, and the minimum green; never red without yellow; given back to SUMO afterwards."""
+    run = drive(town[1], [0.1, 0.1, 0.5, 0.9, 0.9, 0.9])
+    rules(run)
+    assert run.leaks and all(gateway.signal is None for gateway in run.leaks)
+    reached = ~np.isnan(run.record.gateway_green[0])
+    green, free = run.record.gateway_green[:, reached], opened.record.gateway_green[:, reached]
+    assert (green[1] <= MIN_GREEN + 1.0).all() and (free[1] > 2 * MIN_GREEN).all()
+    assert (green[2] > MIN_GREEN + 1.0).any() and (green[-1] > 2 * MIN_GREEN).all()
+    assert run.record.gateway_flow[1].sum() < 0.5 * opened.record.gateway_flow[1].sum()
+    assert set(run.programmes.values()) == {"0"}  # not "online", as signals that are told their states
 
 
-def test_open_gates_leave_sumo_s_own_signals_to_the_byte(town, monkeypatch):
-    """As if there were no gateway signal at all."""
-    _, folder = town
-    opened = drive(folder, [0.9] * 5)
-    names = tuple(gateway for gateway in opened[1])
-    alone = drive(folder, [0.9] * 5, leave_signals=names)
-    assert opened[0] == alone[0] and (opened[2].edge_vehicles == alone[2].edge_vehicles).all()
-    assert np.isnan(alone[2].gateway_green).all() and not np.isnan(opened[2].gateway_green).all()
+def test_open_gates_leave_sumo_s_own_signals_to_the_byte(town, opened):
+    """As if no gateway signal could be held."""
+    rules(opened)
+    alone = drive(town[1], [0.9] * 4, leave_signals=tuple(opened.plans))
+    assert opened.shown == alone.shown and (opened.record.edge_vehicles == alone.record.edge_vehicles).all()
+    assert np.isnan(alone.record.gateway_green).all() and not np.isnan(opened.record.gateway_green).all()
 
 
 @pytest.mark.parametrize("signals", ["max-pressure", "max-pressure-cyclic"])
-def test_rationed_under_max_pressure(town, signals):
-    _, folder = town
-    seen = {}
-    for gate in (0.9, 0.1):
-        shown, plans, record, leaks, _, _ = drive(folder, [gate] * 5, signals=signals)
-        for name, states in shown.items():
-            check(states, [(phase.state, phase.duration) for phase in plans[name].phases])
-        seen[gate] = record.gateway_flow.sum()
-        assert all(gateway.signal is None for gateway in leaks)
-    assert seen[0.1] < 0.7 * seen[0.9]
+def test_rationed_under_max_pressure(town, signals, opened):
+    """Max-pressure runs their stages, and closed gateways let less through."""
+    run = drive(town[1], [0.1] * 3, signals=signals)
+    rules(run)
+    assert run.record.gateway_flow[1:3].sum() < 0.6 * opened.record.gateway_flow[1:3].sum()
+    assert all(gateway.signal is None for gateway in run.leaks)
 
 
-REFUSED = {
-    "max-pressure": "max-pressure counts vehicles lane by lane",
-    "pi-gating+max-pressure-cyclic": "max-pressure-cyclic counts vehicles lane by lane",
-    "route-guidance+estimate": "needs loop detectors on lanes"}
+def test_a_deaf_signal_runs_its_own_programme_and_can_be_held_again(town):
+    """Green to red by way of yellow all the time."""
+    run = drive(town[1], [0.1, 0.1, 0.1], faults=("signal:B2@1-2",))
+    assert not any(a in "Gg" and b == "r" for before, after in pairwise(run.shown["B2"])
+                   for a, b in zip(before, after, strict=True))
+    green = run.record.gateway_green[:, [n for n, g in enumerate(run.gateways) if g.signal == "B2"]]
+    held = ~np.isnan(green[0])
+    assert (green[[0, 2]][:, held] <= MIN_GREEN + 1.0).all() and (green[1, held] > 2 * MIN_GREEN).all()
+
+
+OWN = """
+import numpy as np
+from nmfd import Controls
+class Mine:
+    def __init__(self, scenario):
+        self.shape = scenario.network.adjacency.shape
+    def reset(self, seed=0):
+        pass
+    def act(self, measurement):
+        return Controls(perimeter=np.full(self.shape, 0.5), splits=None)
+"""
 
 
 @pytest.fixture(scope="module")
-def queues(town, tmp_path_factory):
-    """The city of `town` in SUMO's queue model, and a city without any signal."""
-    made = {}
-    for name, options, given in (("queues", ("--mesoscopic",), town[1]), ("bare", (), None)):
-        folder = given or tmp_path_factory.mktemp(name)
-        if given is None:
-            tiny_city.network(folder, "--default-junction-type", "priority")
-            (folder / "cars.rou.xml").write_text(CARS)
-            (folder / "city.sumocfg").write_text(CONFIG)
-        done = cosim("import", folder / "city.sumocfg", "--regions", 2, "--method", "geometric", "--no-run", "--out",
-                     folder / "networks" / name, *options)
-        assert done.exit_code == 0, done.output + str(done.exception)
-        made[name] = folder / "scenarios" / name
+def places(tmp_path_factory):
+    """Scenarios: a city in SUMO's queue model, and one without any signal."""
+    folder, made = tmp_path_factory.mktemp("places"), {}
+    for name, signals, options in (
+            ("queues", ("--tls.set", "B1,B2"), ("--mesoscopic",)), ("bare", ("--default-junction-type", "priority"), ())):
+        made[name] = imported(folder / name, name, *options, signals=signals)
     return made
 
 
-@pytest.mark.parametrize("command", ["run", "evaluate", "sweep"])
-@pytest.mark.parametrize("name, city", [*((name, "queues") for name in REFUSED), ("pi-gating", "bare"), ("mine", "queues")])
-def test_what_cannot_run_here_is_refused_before_the_first_run(queues, tmp_path, command, name, city):
+@pytest.mark.parametrize("command, name, city, said", [
+    ("run", "max-pressure", "queues", "max-pressure counts vehicles lane by lane"),
+    ("sweep", "pi-gating+max-pressure-cyclic", "queues", "max-pressure-cyclic counts vehicles lane by lane"),
+    ("evaluate", "route-guidance+estimate", "queues", "needs loop detectors on lanes"),
+    ("evaluate", "mine.py:Mine+max-pressure", "queues", "counts vehicles lane by lane"),
+    ("run", "webster", "bare", "webster needs fixed-time signals"),
+    ("evaluate", "pi-gating+max-pressure", "bare", "max-pressure needs signals")])
+def test_what_cannot_run_here_is_refused_before_the_first_run(
+        places, tmp_path, monkeypatch, command, name, city, said):
     """One line that names it, though another strategy comes first; nothing is written."""
-    if name == "mine":
-        (tmp_path / "mine.py").write_text(
-            "class Mine:\n    def __init__(self, scenario):\n        pass\n    def reset(self, *a, **k):\n        pass\n"
-            "    def act(self, observation, *a):\n        return None\n")
-        name = f"{tmp_path / 'mine.py'}:Mine+max-pressure"
-    names = (("--controllers", f"no-control,{name}") if command != "run" else
-             ("--controller", "no-control", "--against", name))
-    done = cosim(command, queues[city], *names, "--steps", 1, "--out", tmp_path / "out")
-    assert done.exit_code != 0 and len(done.stderr.strip().splitlines()) == 1
-    assert f"controller {name} cannot" in done.stderr
-    assert REFUSED.get(name, "lane by lane" if city == "queues" else "none of the") in done.stderr
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(OWN)
+    names = ("--controller", "no-control", "--against", name) if command == "run" else (
+        "--controllers", f"no-control,{name}")
+    done = cosim(command, places[city], *names, "--steps", 1, "--out", "out")
+    assert done.exit_code != 0 and len(done.stderr.strip().splitlines()) == 1, done.stderr
+    assert f"controller {name} cannot run here: " in done.stderr and said in done.stderr
     assert not (tmp_path / "out").exists()

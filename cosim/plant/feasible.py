@@ -3,34 +3,20 @@
 from cosim.plant.launch import own_files
 from cosim.plant.programmes import CitySignals, city_signals
 from cosim.plant.settings import ESTIMATE, Settings, scenario_file, settings
-from cosim.plant.strategy import ALONE, FIXED, PRESSURES, parse
+from cosim.plant.strategy import FIXED, PRESSURES, parse
 from cosim.sumo.net import City
-from cosim.sumo.signals import held_signals
-from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 
-UNHELD = (ALONE, "probing-pc")  # they need no gateway, though they guide nobody: the second only loads the city
-
-
 def check_strategy(name: str, scenario: Scenario, city: City) -> None:
-    """InputError, in a line that begins with the strategy, unless it can run in this city and would do something."""
-    strategy = parse(name)
+    """InputError, in a line that begins with the strategy, unless it can run in this city."""
     try:
-        chosen = settings(scenario).changed(**strategy.overrides)
+        chosen = settings(scenario).changed(**parse(name).overrides)
         check_lanes(scenario, chosen)
         if chosen.signals != FIXED:
             signals_of(city, scenario, chosen)
     except InputError as error:
         raise InputError(f"controller {name} cannot run here: {error}") from None
-    if strategy.controller in UNHELD or registry.guides(strategy.controller):
-        return
-    held = held_signals(city, own_files(scenario, chosen.additional)) - {*chosen.leave_signals}
-    if not any(gateway.signal in held for gateway in city.gateways):
-        raise InputError(
-            f"controller {name} cannot do anything here: it only holds vehicles back at gateways, and none of the "
-            f"{len(city.gateways)} gateways of {city.net_file} has a signal that can be held (fixed-time, actuated or "
-            "delay-based); choose one that guides routes, or import the city with other regions")
 
 
 def signals_of(city: City, scenario: Scenario, chosen: Settings) -> CitySignals:

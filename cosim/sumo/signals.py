@@ -73,21 +73,6 @@ def read_signals(
         raise InputError(f"{city.net_file}: its signals cannot be read ({error}); build it with netconvert") from None
 
 
-def held_signals(city: City, additional: Iterable[Path] = ()) -> set[str]:
-    """The names of those whose green can be taken away: that run a programme of HELD kinds, phases in their order.
-    Of several programmes the one that is read last counts. InputError."""
-    try:
-        logics = {
-            attribute(logic, "id"): logic
-            for file in map(read_xml, (city.net_file, *additional)) for logic in file.iter("tlLogic")}
-    except BROKEN as error:
-        raise InputError(f"{city.net_file}: its signals cannot be read ({error}); build it with netconvert") from None
-    return {
-        name for name, logic in logics.items()
-        if logic.get("type", FIXED) in HELD and logic.get("programID") != "off" and not (
-            logic.get("type", FIXED) == FIXED and any(phase.get("next") for phase in logic.iter("phase")))}
-
-
 def _signals(
     city: City, additional: Iterable[Path], kinds: Collection[str],
 ) -> tuple[list[Signal], list[str]]:
