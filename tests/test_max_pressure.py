@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from signal_rules import CROSS, MIN_GREEN, PHASES, SINGLE, check, signal
 
-from cosim.plant.max_pressure import EVERY, MAX_RED, PERMISSIVE, Junction, MaxPressure, Roads, transition
+from cosim.plant.max_pressure import EVERY, MAX_RED, PERMISSIVE, Junction, MaxPressure, Roads, stages_of, transition
 from cosim.sumo.net import Gateway
 from cosim.sumo.session import Phase
 from cosim.sumo.signals import Link
@@ -36,6 +36,18 @@ def test_the_programme_s_own_way_is_kept():
     assert [(p.state, p.duration) for p in transition(phases, 0, 3)] == [("yyr", 4), ("rrr", 2)]
     assert [(p.state, p.duration) for p in transition(phases, 0, 5)] == [("Gyr", 4), ("Grr", 2)]
     assert transition(phases, 5, 0) == [Phase(duration=3, state="yrr")]
+
+
+@pytest.mark.parametrize("states, kept", [
+    ("Gr yr rG rG ry", [0, 2]), ("GGr Gyr Grr yrr rrG rry", [0, 4]), ("GGg yyg rrG rry", [0, 2]),
+    ("Ggr yyr GrG Grr", [0, 2])], ids=["twice", "a part goes on", "protected later", "the last of two"])
+def test_stages_that_serve_nothing_more_are_left_out(states, kept):
+    assert list(stages_of(signal([(state, 5) for state in states.split()]))) == kept
+
+
+def test_the_way_from_a_phase_that_comes_twice():
+    phases = signal([("Gr", 9), ("Gr", 6), ("yr", 3), ("rr", 2), ("rG", 9), ("ry", 3)]).phases
+    assert [(p.state, p.duration) for p in transition(phases, 0, 4)] == [("yr", 3), ("rr", 2)]
 
 
 @pytest.mark.parametrize("phases", [PHASES, SINGLE, CROSS])

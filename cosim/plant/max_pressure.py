@@ -31,6 +31,7 @@ from cosim.sumo.session import Phase, Session
 from cosim.sumo.signals import GREEN, Link, Signal, is_stage, lane_id
 from nmfd.arrays import PerPair
 
+LEVELS = "rgG"    # from nothing to the right of way
 EVERY = 5.0       # s between two decisions: about two vehicles per lane
 MAX_RED = 120.0   # s; about the longest cycle that is usual (Signal Timing Manual, 2nd edition, 2015)
 WHOLE = 1 - 1e-9  # of the vehicles of a lane: all of them
@@ -122,9 +123,9 @@ class Junction:
         self, signal: Signal, now: float, gateways: Mapping[int, tuple[int, int]] | None = None, *, min_green: float,
     ):
         """gateways: link index -> (i, h), of the links whose green is rationed; min_green: [s]"""
-        self.signal, self._phases, self._numbers = signal.id, signal.phases, signal.stages
-        self.stages, self.stage = len(signal.stages), 0
-        self._base = signal.phases[signal.stages[0]].state
+        self.signal, self._phases, self._numbers = signal.id, signal.phases, stages_of(signal)
+        self.stages, self.stage = len(self._numbers), 0
+        self._base = signal.phases[self._numbers[0]].state
         self._green_since, self._min_green, self.stage_since = now, min_green, now
         cycle = sum(phase.duration for phase in signal.phases)
         self._rations = {
@@ -190,6 +191,21 @@ class Junction:
         return self.state
 
 
+def stages_of(signal: Signal) -> tuple[int, ...]:
+    """The phases to choose from: stages of the programme that serve something no other one serves as well.
+
+    Programmes have the same phase twice, and phases in which a part of the green goes on until the last have passed.
+    """
+    level = {n: [LEVELS.index(light) for light in signal.phases[n].state] for n in signal.stages}
+
+    def needless(n: int) -> bool:
+        return any(
+            all(a <= b for a, b in zip(level[n], level[m], strict=True)) and (level[n] != level[m] or m < n)
+            for m in level if m != n)
+
+    return tuple(n for n in level if not needless(n))
+
+
 def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phase]:
     """What is shown between two stages.
 
@@ -198,6 +214,8 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
     others stay as they are, and nothing that conflicts with them is green before the target stage.
     """
     between, n = [], (source + 1) % len(phases)
+    while phases[n].state == phases[source].state:
+        n = (n + 1) % len(phases)
     while not is_stage(phases[n].state):
         between.append(phases[n])
         n = (n + 1) % len(phases)
@@ -221,7 +239,7 @@ class Approaches:
 
     def __init__(self, signal: Signal, lane_number: Mapping[str, int], now: float):
         """lane_number: of the lanes whose vehicles are counted"""
-        self.serves = np.array([_green(signal.phases[n].state) for n in signal.stages], dtype=float)
+        self.serves = np.array([_green(signal.phases[n].state) for n in stages_of(signal)], dtype=float)
         pairs = sorted({(link.index, lane_number[lane_id(link)]) for link in signal.links})
         self._link, self._lane = np.array(pairs).T
         self._last_green = np.full(self.serves.shape[1], now)
@@ -294,7 +312,7 @@ class Roads:
         begins: list[int] = []
         for signal in signals:
             begins.append(len(rows))
-            states = [signal.phases[number].state for number in signal.stages]
+            states = [signal.phases[number].state for number in stages_of(signal)]
             served = [self._served(signal, state) for state in states]
             whole = {lane for parts in served for lane, part in parts.items() if part >= WHOLE}
             for state, parts in zip(states, served, strict=True):
