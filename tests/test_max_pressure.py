@@ -274,3 +274,17 @@ def test_a_spent_ration_exerts_no_pressure():
         session.time = float(second)
         control.play(session.time)
     assert shown[-1] == "Gr" and control.green_time()["s"][0] > 50.0
+
+
+def test_what_is_known_of_a_run():
+    """Of five lanes one is served in part by a stage of t; CROSS is 6 s of 66 s between its stages, and so is t."""
+    vehicles = {"a": 9.0, "c": 9.0}
+    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane[0], 0.0))
+    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, min_green=5.0, max_green=20.0, show=lambda *_: None)
+    for _ in range(100):
+        control.play(session.time)
+        session.time += 1.0
+    facts = control.facts(session.time)
+    assert (facts["signal_lanes"], facts["split_lanes"], facts["never_whole_lanes"]) == (4, 1, 0)
+    assert facts["programmed_intergreen_share"] == pytest.approx(6.0 / 66.0)
+    assert facts["intergreen_share"] == pytest.approx(0.5 * 4 * 3.0 / 100.0)  # s changes four times, t never

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cosim.evaluation import estimation_errors
+from cosim.evaluation import estimation_errors, signal_reasons
 from cosim.evaluation.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.plant import incidents
 from cosim.plant.feasible import check_strategy
@@ -265,4 +265,4 @@ def overview_table(rows: pd.DataFrame) -> str:
             **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
             "wall [s]": f"{group['wall_time_s'].mean():.0f}",
             "outside SUMO": f"{100 * group['overhead_share'].mean():.1f} %"})
-    return text_table(lines, CAPTION)
+    return "\n".join([text_table(lines, CAPTION), *signal_reasons.losses(rows)])

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cosim.evaluation import estimation_errors, run_metrics
+from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.plant.strategy import Strategy, configured, parse, planning_of
@@ -29,7 +30,7 @@ FACTS = (
     "mean_trip_time_s", "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh",
     "gateway_queue_max_veh", "gateway_full_share", "notes", "leaking_share",
     "estimate_rmse_share", "estimate_cell_rmse_veh", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s",
-    "signals_left_alone")
+    "signals_left_alone", *PRESSURE_FACTS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +119,7 @@ def drive(
             **_estimation(scenario, trajectory), "wall_time_s": trajectory.wall_time, "sumo_time_s": sumo_time,
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
-            "signals_left_alone": len(plant.other_signals)}
+            "signals_left_alone": len(plant.other_signals), **plant.pressure_facts()}
         sumo_output.check_whole(files)
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
 

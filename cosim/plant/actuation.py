@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from cosim.plant.incidents import Incidents
-from cosim.plant.max_pressure import MaxPressure
+from cosim.plant.max_pressure import FACTS, MaxPressure
 from cosim.plant.perimeter import GREEN, GatewaySignal, GatewaySignals
 from cosim.plant.programmes import CitySignals
 from cosim.plant.responsive import ResponsiveSignal, ResponsiveSignals
@@ -58,10 +58,11 @@ class Actuation:
         self._controls: list[SignalControl] = []
         phases: dict[str, Sequence[Phase]] = {}  # of the original programmes of the signals that are commanded
         movements = gateway_movements(city)
-        if flows is not None:
-            self._controls.append(MaxPressure(
-                session, city, signals.steered, flows, min_green=chosen.min_green, max_green=chosen.max_green,
-                show=incidents.show, cyclic=chosen.signals == CYCLIC))
+        self._pressure = None if flows is None else MaxPressure(
+            session, city, signals.steered, flows, min_green=chosen.min_green, max_green=chosen.max_green,
+            show=incidents.show, cyclic=chosen.signals == CYCLIC)
+        if self._pressure is not None:
+            self._controls.append(self._pressure)
             phases |= {signal.id: signal.phases for signal in signals.steered if signal.id in movements}
         own = [session.programme(signal) for signal in sorted(movements)
                if signal not in phases and signal not in chosen.leave_signals]
@@ -107,6 +108,12 @@ class Actuation:
         out of order it was the original one."""
         out = [gateway.signal in self._incidents.refused for gateway in self._city.gateways]
         return np.where(out, self.original_green, green)
+
+    def pressure_facts(self) -> dict[str, float]:
+        """max_pressure.FACTS of this run; NaN where it does not run the signals."""
+        if self._pressure is None:
+            return dict.fromkeys(FACTS, float("nan"))
+        return self._pressure.facts(self._session.time)
 
     def leaks(self) -> list[Gateway]:
         """Gateways that no command reaches."""

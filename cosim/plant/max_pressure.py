@@ -32,6 +32,7 @@ from cosim.sumo.signals import GREEN, Link, Signal, is_stage, lane_id
 from nmfd.arrays import PerPair
 
 LEVELS = "rgG"    # from nothing to the right of way
+FACTS = ("signal_lanes", "split_lanes", "never_whole_lanes", "intergreen_share", "programmed_intergreen_share")
 EVERY = 5.0       # s between two decisions: about two vehicles per lane
 MAX_RED = 120.0   # s; about the longest cycle that is usual (Signal Timing Manual, 2nd edition, 2015)
 WHOLE = 1 - 1e-9  # of the vehicles of a lane: all of them
@@ -51,7 +52,9 @@ class MaxPressure:
         roads = Roads(city, signals, flows)
         self._lanes, self._weights, self._movements = roads.lanes, roads.weights, roads.movements
         self._gain, self._begins = roads.stages(signals)
+        self._shared, self._start = roads.shared(signals), session.time
         pairs = gateway_movements(city)
+        self._programmed = float(np.mean([_intergreen(signal) for signal in signals])) if signals else 0.0
         self._junctions = [
             Junction(signal, session.time, pairs.get(signal.id), min_green=min_green) for signal in signals]
         self._approaches = [Approaches(signal, roads.lane_number, session.time) for signal in signals]
@@ -69,6 +72,13 @@ class MaxPressure:
         """Signal -> gateway link -> seconds of green shown so far."""
         now = self._session.time
         return {junction.signal: junction.green_time(now) for junction in self._rationed}
+
+    def facts(self, now: float) -> dict[str, float]:
+        """FACTS: lanes before the signals, those of them that a stage serves in part, and those that none serves whole;
+        share of the time until `now` [s] between two stages, mean of the signals, and in the original programmes."""
+        lost = [junction.lost for junction in self._junctions]
+        share = float(np.mean(lost)) / max(now - self._start, 1.0) if lost else 0.0
+        return dict(zip(FACTS, (*self._shared, share, self._programmed), strict=True))
 
     def play(self, now: float) -> None:
         """Show what holds from `now` [s] on."""
@@ -133,6 +143,7 @@ class Junction:
             for link, pair in (gateways or {}).items()}
         self._movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
         self._coming: list[tuple[float, str]] = []
+        self.lost = 0.0  # s between two stages so far
         self._between: dict[tuple[int, int], list[Phase]] = {}  # stage, next stage -> what is shown between them
         self.state = self._base
         self.next_change = now if self._rations else NEVER  # until then, commands hold from the first second on
@@ -173,6 +184,7 @@ class Junction:
             begin += phase.duration
         self._coming.append((begin, self._phases[self._numbers[stage]].state))
         self.stage, self._green_since, self.stage_since = stage, begin, begin
+        self.lost += begin - now
         return self.advance(now)
 
     def advance(self, now: float) -> str:
@@ -229,6 +241,12 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
     return [
         Phase(duration=seconds, state="".join(light if k in losing else a for k, a in enumerate(before)))
         for seconds, light in ((yellow, "y"), (red, "r")) if seconds]
+
+
+def _intergreen(signal: Signal) -> float:
+    """Share of its cycle in which the original programme is between two stages."""
+    durations = [(phase.duration, is_stage(phase.state)) for phase in signal.phases]
+    return sum(seconds for seconds, green in durations if not green) / max(sum(seconds for seconds, _ in durations), 1.0)
 
 
 class Approaches:
@@ -326,6 +344,17 @@ class Roads:
                         row[movement] = row.get(movement, 0.0) + gain
                 rows.append(row)
         return _sparse(rows, len(self.movements)), begins
+
+    def shared(self, signals: Iterable[Signal]) -> tuple[int, int, int]:
+        """Lanes for cars before the signals; those of them that some stage serves in part; those that none serves
+        whole."""
+        lanes, split, whole = set(), set(), set()
+        for signal in signals:
+            lanes |= {lane_id(link) for link in signal.links} & self._cars
+            for number in stages_of(signal):
+                for lane, part in self._served(signal, signal.phases[number].state).items():
+                    (whole if part >= WHOLE else split).add(lane)
+        return len(lanes), len(split), len(split - whole)
 
     def _served(self, signal: Signal, state: str) -> dict[str, float]:
         """Lane -> share of its vehicles that have green in `state`."""

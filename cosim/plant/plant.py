@@ -121,6 +121,10 @@ class SumoPlant:
             raise RuntimeError("no simulation is running; call reset(seed) first")
         return self._session
 
+    def pressure_facts(self) -> dict[str, float]:
+        """What can be said of a run under max-pressure (max_pressure.FACTS); NaN of others."""
+        return self._actuation.pressure_facts()
+
     def leaks(self) -> list[Gateway]:
         """Gateways that no signal under perimeter control has: it does not reach them."""
         return self._actuation.leaks()
