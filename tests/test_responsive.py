@@ -1,4 +1,4 @@
-"""Signals that SUMO actuates: held back and rationed, with yellow and minimum green; untouched where nothing is held."""
+"""Signals that SUMO actuates: held back and rationed, with yellow and minimum green; untouched elsewhere."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -150,7 +150,8 @@ def places(tmp_path_factory):
     """Scenarios: a city in SUMO's queue model, and one without any signal."""
     folder, made = tmp_path_factory.mktemp("places"), {}
     for name, signals, options in (
-            ("queues", ("--tls.set", "B1,B2"), ("--mesoscopic",)), ("bare", ("--default-junction-type", "priority"), ())):
+            ("queues", ("--tls.set", "B1,B2"), ("--mesoscopic",)),
+            ("bare", ("--default-junction-type", "priority"), ())):
         made[name] = imported(folder / name, name, *options, signals=signals)
     return made
 

@@ -6,8 +6,8 @@ from nmfd.errors import InputError
 
 CONTROLLER_HELP = (
     "no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc or dpc-pcrg; what else the city does is joined by +: webster, "
-    "actuated, max-pressure or max-pressure-cyclic signals, rerouting-N (percent of the drivers), hold-back or redistribute, compliance-N, "
-    "guidance-period-N (guided drivers are asked again every N seconds), queue-override-N, estimate. A controller of "
+    "actuated, max-pressure or max-pressure-cyclic signals, rerouting-N (percent of the drivers), hold-back or "
+    "redistribute, compliance-N, guidance-period-N (guided drivers are asked again every N seconds), queue-override-N, estimate. A controller of "
     "your own: file.py:Class (see nmfd new-controller).")
 
 

@@ -17,8 +17,8 @@ from cosim.importing.partition import Clustered, Drawn, partition
 from cosim.importing.regions import positions
 from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.net import City, load_city
-from cosim.sumo.signals import HELD
 from cosim.sumo.recorded_trips import MESOSCOPIC, read_recorded_trips, write_recorded_trips
+from cosim.sumo.signals import HELD
 from nmfd.errors import InputError
 from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel

@@ -51,7 +51,8 @@ def tables(
         "links": " ".join(map(str, g.links)),
         "signal_serves": " ".join(f"{i}-{h}" for i, h in sorted(pairs.get(g.signal or "", ()))),
         "control": "no signal" if g.signal is None else left_alone.get(g.signal, "controlled"),
-        "kind": kind(streets, g.signal), "flow_veh": moves[streets.number[g.from_edge], streets.number[g.to_edge]]} for g in city.gateways]
+        "kind": kind(streets, g.signal),
+        "flow_veh": moves[streets.number[g.from_edge], streets.number[g.to_edge]]} for g in city.gateways]
     density = np.zeros(len(regions)) if baseline is None else 1000.0 * baseline.density(streets)
     everywhere = _variance(density, streets, streets.drivable)[1]
     signals = _signals(streets, regions, city)

@@ -1,9 +1,9 @@
 """From commands to lights: one object in front of all that controls signals.
 
 Perimeter control acts on the gateway movements of fixed-time signals (`perimeter`) and of those that SUMO actuates
-(`responsive`), or rations their green where max-pressure runs the signals (`max_pressure`, `green_quota`). Either way u between its bounds becomes a share, a
-gateway before which the street is full may be spared (queue override), and a signal that is out of order does not take
-what it is shown (`incidents`).
+(`responsive`), or rations their green where max-pressure runs the signals (`max_pressure`, `green_quota`). Either way u
+between its bounds becomes a share, a gateway before which the street is full may be spared (queue override), and a
+signal that is out of order does not take what it is shown (`incidents`).
 """
 
 from collections.abc import Collection, Mapping, Sequence

@@ -8,6 +8,7 @@ from cosim.sumo.net import City
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 
+
 def check_strategy(name: str, scenario: Scenario, city: City) -> None:
     """InputError, in a line that begins with the strategy, unless it can run in this city."""
     try:

@@ -5,7 +5,8 @@ Max-pressure has no cycle and no windows that could be shortened. Here a gateway
     m + (u_ih - u_min) / (u_max - u_min) (C - m)        of every C seconds,
 
 m the minimum green and C the cycle of the signal's original programme, whenever max-pressure likes; under u_max there
-is no limit. (Where the green has another measure than C it is `full`: cosim.plant.responsive.) Once that is spent its link turns yellow and red, and it exerts no pressure until the next C seconds begin.
+is no limit. Once that is spent its link turns yellow and red, and it exerts no pressure until the next C seconds begin.
+At signals that SUMO actuates (cosim.plant.responsive) the second C is less, the green in a cycle that is usual there.
 """
 
 from cosim.sumo.signals import GREEN

@@ -246,7 +246,8 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
 def _intergreen(signal: Signal) -> float:
     """Share of its cycle in which the original programme is between two stages."""
     durations = [(phase.duration, is_stage(phase.state)) for phase in signal.phases]
-    return sum(seconds for seconds, green in durations if not green) / max(sum(seconds for seconds, _ in durations), 1.0)
+    between = sum(seconds for seconds, green in durations if not green)
+    return between / max(sum(seconds for seconds, _ in durations), 1.0)
 
 
 class Approaches:
@@ -337,7 +338,8 @@ class Roads:
                 row: dict[int, float] = {}
                 for link in {(k.from_edge, k.lane, k.to_edge): k for k in signal.links}.values():
                     lane = lane_id(link)
-                    if state[link.index] in GREEN and lane in self._cars and (parts[lane] >= WHOLE or lane not in whole):
+                    counts = lane in self._cars and (lane not in whole or parts.get(lane, 0.0) >= WHOLE)
+                    if state[link.index] in GREEN and counts:
                         share = self._lane_shares(lane)[link.to_edge]
                         gain = share * min(parts[lane], 1.0) * (1.0 if state[link.index] == "G" else PERMISSIVE)
                         movement = self.movements[link.from_edge, link.to_edge]

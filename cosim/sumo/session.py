@@ -209,7 +209,8 @@ class Session:
                 elapsed = sum(p.duration for p in logic.phases[:self._sumo.trafficlight.getPhase(signal) + 1])
                 left = self._sumo.trafficlight.getNextSwitch(signal) - self._sumo.simulation.getTime()
                 return Programme(
-                    signal=signal, id=active, phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
+                    signal=signal, id=active,
+                    phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
                     position=elapsed - left,
                     static=logic.type == types.TRAFFICLIGHT_TYPE_STATIC
                     and not any(phase.next for phase in logic.phases),
