@@ -350,7 +350,9 @@ class Roads:
     def shared(self, signals: Iterable[Signal]) -> tuple[int, int, int]:
         """Lanes for cars before the signals; those of them that some stage serves in part; those that none serves
         whole."""
-        lanes, split, whole = set(), set(), set()
+        lanes: set[str] = set()
+        split: set[str] = set()
+        whole: set[str] = set()
         for signal in signals:
             lanes |= {lane_id(link) for link in signal.links} & self._cars
             for number in stages_of(signal):
