@@ -6,9 +6,9 @@ from nmfd.errors import InputError
 
 CONTROLLER_HELP = (
     "no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc or dpc-pcrg; what else the city does is joined by +: webster, "
-    "actuated or max-pressure signals, rerouting-N (percent of the drivers), hold-back or redistribute, compliance-N, "
-    "guidance-period-N (guided drivers are asked again every N seconds), queue-override-N, estimate. A controller of "
-    "your own: file.py:Class (see nmfd new-controller).")
+    "actuated, max-pressure or max-pressure-cyclic signals, rerouting-N (percent of the drivers), hold-back or "
+    "redistribute, compliance-N, guidance-period-N (guided drivers are asked again every N seconds), "
+    "queue-override-N, estimate. A controller of your own: file.py:Class (see nmfd new-controller).")
 
 
 def parsed_level(text: str, no_run: bool) -> float | None:

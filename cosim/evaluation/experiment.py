@@ -11,17 +11,18 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cosim.evaluation import estimation_errors, run_metrics
+from cosim.evaluation import estimation_errors, run_metrics, signal_reasons
 from cosim.evaluation.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.plant import incidents
+from cosim.plant.feasible import check_strategy
 from cosim.plant.launch import own_files, own_vehicles
 from cosim.plant.record import Record
 from cosim.plant.settings import FILES, Settings, settings
-from cosim.plant.strategy import MAX_PRESSURE, configured, parse
+from cosim.plant.strategy import PRESSURES, configured, parse
 from cosim.sumo import outputs
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import check_adjacency, load_city
-from cosim.sumo.signals import read_signals
+from cosim.sumo.signals import HELD, read_signals
 from cosim.sumo.xml_files import read_xml
 from nmfd.controllers import registry
 from nmfd.errors import InputError
@@ -167,12 +168,15 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
     files = ensure_built(scenario.network)
     city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
     check_adjacency(city, scenario.network)
-    simple, _ = read_signals(city)
     own_vehicles(scenario, chosen, city)
-    everywhere = MAX_PRESSURE in {parse(name).overrides.get("signals", chosen.signals) for name in controllers}
+    used = {parse(name).overrides.get("signals", chosen.signals) for name in controllers}
+    everywhere = not used.isdisjoint(PRESSURES)
+    simple, _ = read_signals(city, own_files(scenario, chosen.additional), HELD)
     incidents.check(scenario.ordered_faults, city, "faults", [signal.id for signal in simple] if everywhere else ())
     for path in own_files(scenario, (*chosen.background, *chosen.additional)):
         read_xml(path)
+    for name in controllers:
+        check_strategy(name, scenario, city)
     configuration = {
         "scenario": scenario.name, "network": scenario.network.name, "plant": "sumo", "step_s": scenario.step,
         "steps": scenario.steps, "demand_factor": first.demand_factor,
@@ -292,7 +296,7 @@ def overview_table(rows: pd.DataFrame) -> str:
             **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
             "wall [s]": f"{group['wall_time_s'].mean():.0f}",
             "outside SUMO": f"{100 * group['overhead_share'].mean():.1f} %"})
-    return "\n".join([text_table(lines, CAPTION.format(against=against)), *remarks(rows)])
+    return "\n".join([text_table(lines, CAPTION.format(against=against)), *signal_reasons.losses(rows), *remarks(rows)])
 
 
 def remarks(rows: pd.DataFrame) -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Int
 
-from cosim.evaluation import experiment, statistics
+from cosim.evaluation import experiment, signal_reasons, statistics
 from cosim.plant.strategy import model_free
 from nmfd.arrays import PerRegion
 from nmfd.model.regional_model import RegionalModel
@@ -143,6 +143,7 @@ def verdict(
     if pair.percent == 0.0:
         kind = "changes nothing"
     reasons = [] if unmodelled else _reasons(rows, name, against, found, leaking, done, network)
+    reasons += signal_reasons.reasons(rows[rows["controller"] == name])
     return f"{kind} ({size})" + (f": {'; '.join(reasons)}" if reasons else "")
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cosim.evaluation import estimation_errors, run_metrics
+from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
 from cosim.plant.plant import SumoPlant
 from cosim.plant.record import settled
 from cosim.plant.settings import settings
@@ -30,7 +31,7 @@ FACTS = (
     "mean_trip_time_s", "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh",
     "gateway_queue_max_veh", "gateway_full_share", "notes", "outside_training", "leaking_share",
     "estimate_rmse_share", "estimate_cell_rmse_veh", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s",
-    "signals_left_alone", "booked_intervals", "removed_veh", "removed_waiting_veh", "jumps")
+    "signals_left_alone", "booked_intervals", "removed_veh", "removed_waiting_veh", "jumps", *PRESSURE_FACTS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +130,8 @@ def drive(
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
             "signals_left_alone": len(plant.other_signals), "booked_intervals": plant.booked,
             "removed_veh": int(record.removals.sum() + record.given_up.sum()),
-            "removed_waiting_veh": int(record.given_up.sum()), "jumps": int(record.jumps.sum())}
+            "removed_waiting_veh": int(record.given_up.sum()), "jumps": int(record.jumps.sum()),
+            **plant.pressure_facts()}
         sumo_output.check_whole(files)
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
 

@@ -11,6 +11,7 @@ from cosim.importing.baseline import Baseline
 from cosim.importing.streets import Streets, graph
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers
 from cosim.sumo.net import City
+from cosim.sumo.signals import FIXED
 from nmfd.runs.tables import text_table
 
 QUALITY = (
@@ -18,7 +19,7 @@ QUALITY = (
     "variance_within", "gateways", "controlled_gateways", "boundary_flow_veh", "uncontrolled_share")
 GATEWAYS = (
     "source", "target", "from_edge", "to_edge", "lanes", "shared_lanes", "signal", "links", "signal_serves", "control",
-    "flow_veh")
+    "kind", "flow_veh")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +51,7 @@ def tables(
         "links": " ".join(map(str, g.links)),
         "signal_serves": " ".join(f"{i}-{h}" for i, h in sorted(pairs.get(g.signal or "", ()))),
         "control": "no signal" if g.signal is None else left_alone.get(g.signal, "controlled"),
+        "kind": kind(streets, g.signal),
         "flow_veh": moves[streets.number[g.from_edge], streets.number[g.to_edge]]} for g in city.gateways]
     density = np.zeros(len(regions)) if baseline is None else 1000.0 * baseline.density(streets)
     everywhere = _variance(density, streets, streets.drivable)[1]
@@ -62,6 +64,12 @@ def tables(
     total["variance_within"] = round(float(np.average([row["variance_within"] for row in rows], weights=weight)), 2)
     total["pieces"] = sum(row["pieces"] for row in rows)
     return Tables(quality=[*rows, total], gateways=gateways)
+
+
+def kind(streets: Streets, signal: str | None) -> str:
+    """Of the programme that a signal runs: "fixed", or SUMO's word for others; "" where there is none."""
+    logics = streets.logics.get(signal or "")
+    return "" if not logics else "fixed" if logics[-1].kind == FIXED else logics[-1].kind
 
 
 def _row(streets: Streets, members: np.ndarray, region: str, name: str, signals: int, density: np.ndarray,

@@ -8,22 +8,21 @@ import numpy as np
 
 from cosim.plant.actuation import Actuation
 from cosim.plant.detectors import instruments, lay_out, probes
+from cosim.plant.feasible import check_lanes, signals_of
 from cosim.plant.guidance import Guide
 from cosim.plant.incidents import Incidents
-from cosim.plant.launch import Launch, own_files
+from cosim.plant.launch import Launch
 from cosim.plant.meter import Meter
-from cosim.plant.programmes import city_signals
 from cosim.plant.record import Record, Recorder
 from cosim.plant.sensing import Estimation, Sensing
-from cosim.plant.settings import ESTIMATE, Settings, scenario_file, settings
+from cosim.plant.settings import ESTIMATE, Settings, settings
 from cosim.plant.standstill import Standstill
-from cosim.plant.strategy import MAX_PRESSURE
+from cosim.plant.strategy import PRESSURES
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, Gateway, check_adjacency, load_city
 from cosim.sumo.session import Session, Window
 from cosim.sumo.tripinfo import TripFacts, TripReader
 from nmfd.arrays import PerTurn
-from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
@@ -51,13 +50,13 @@ class SumoPlant:
         """
         self._scenario, self._planning = scenario, planning or planning_model(scenario)
         self._settings = chosen = overrides or settings(scenario)
-        _check_mesoscopic(scenario, chosen)
+        check_lanes(scenario, chosen)
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
         check_adjacency(self.city, scenario.network)
         self._layout = lay_out(self.city, chosen.detector_share)
         self._instruments = instruments(self.city, self._layout, chosen.probe_share)
-        self._signals = city_signals(self.city, chosen, own_files(scenario, chosen.additional))
+        self._signals = signals_of(self.city, scenario, chosen)
         self.simple_signals, self.other_signals = self._signals.simple, self._signals.others
         self._launch = Launch(
             scenario, chosen, self.city, self._signals, self._layout, outputs=dict(outputs or {}), window=window)
@@ -138,6 +137,10 @@ class SumoPlant:
             raise RuntimeError("no simulation is running; call reset(seed) first")
         return self._session
 
+    def pressure_facts(self) -> dict[str, float]:
+        """What can be said of a run under max-pressure (max_pressure.FACTS); NaN of others."""
+        return self._actuation.pressure_facts()
+
     def leaks(self) -> list[Gateway]:
         """Gateways that no signal under perimeter control has: it does not reach them."""
         return self._actuation.leaks()
@@ -196,7 +199,7 @@ class SumoPlant:
             random=np.random.default_rng([seed, GUIDANCE]))
 
     def _new_actuation(self) -> Actuation:
-        flows = self._launch.turning_flows() if self._settings.signals == MAX_PRESSURE else None
+        flows = self._launch.turning_flows() if self._settings.signals in PRESSURES else None
         return Actuation(
             self.session, self.city, self._scenario, self._settings, self._signals, self._incidents, flows)
 
@@ -204,13 +207,3 @@ class SumoPlant:
         if self._session is not None:
             self._session.close()
             self._session = None
-
-
-def _check_mesoscopic(scenario: Scenario, chosen: Settings) -> None:
-    """InputError for what needs lanes where there are none."""
-    for key, value, what in (("signals", MAX_PRESSURE, "counts vehicles lane by lane"),
-                             ("measurement", ESTIMATE, "needs loop detectors on lanes")):
-        if chosen.mesoscopic and getattr(chosen, key) == value:
-            raise InputError(
-                f"{scenario_file(scenario)}: sumo.{key}: {value} {what}, but SUMO's mesoscopic model has no lanes; "
-                "omit it, or set mesoscopic = false (import the city without --mesoscopic)")

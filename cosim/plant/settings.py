@@ -26,6 +26,9 @@ class SumoTable(config.Settings):
         "whether green that the perimeter control takes away is red for all, or goes to the other movements", HOLD_BACK)
     min_green: float = setting(
         "least green of a gateway movement, and of every stage under max-pressure", 5.0, unit="s", ge=1.0)
+    max_green: float = setting(
+        "under max-pressure, no stage is green for longer while others wait; 50 s is netconvert's for actuated signals",
+        50.0, unit="s", ge=1.0)
     queue_override: Share = setting(
         "a gateway whose edge held this share of its room in the last control interval is left open; 0 for never", 0.0)
     compliance: Share = setting("share of the decisions in which a driver follows the route guidance", 1.0)
@@ -63,6 +66,9 @@ class SumoTable(config.Settings):
         if self.measurement == ESTIMATE and self.detector_share == self.probe_share == 0:
             raise Problem("measurement", "\"estimate\" needs detectors or probes, but sumo.detector_share and "
                           "sumo.probe_share are both 0; raise one of them")
+        if self.max_green < self.min_green:
+            raise Problem("max_green", f"expected {self.min_green:g} s, the sumo.min_green, or more, got "
+                          f"{self.max_green:g} instead")
         return self
 
 

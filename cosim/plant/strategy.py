@@ -17,10 +17,11 @@ from nmfd.model.planning import PlanningModel, guided_model, planning_model, wit
 from nmfd.model.scenario import Scenario
 
 ALONE = "no-control"  # the controller of a name that is only options
-Signals = Literal["fixed", "webster", "actuated", "max-pressure"]
+Signals = Literal["fixed", "webster", "actuated", "max-pressure", "max-pressure-cyclic"]
 Mode = Literal["hold-back", "redistribute"]
 SIGNALS, MODES = get_args(Signals), get_args(Mode)
-FIXED, WEBSTER, ACTUATED, MAX_PRESSURE = SIGNALS
+FIXED, WEBSTER, ACTUATED, MAX_PRESSURE, CYCLIC = SIGNALS
+PRESSURES = (MAX_PRESSURE, CYCLIC)
 HOLD_BACK, REDISTRIBUTE = MODES
 GUIDED = "guided"
 

@@ -49,13 +49,15 @@ class Phase:
 
 @dataclass(frozen=True, kw_only=True)
 class Programme:
-    """A signal programme. position [s]: where in its cycle it was when it was read; static: fixed-time,
-    one phase after the other."""
+    """A signal programme. id: of those of the signal; position [s]: where in its cycle it was when it was read; static:
+    fixed-time, one phase after the other; actuated: timed by detectors, and what it shows is one of its phases."""
 
     signal: str
     phases: tuple[Phase, ...]
     position: float
     static: bool
+    actuated: bool = False
+    id: str = ""
 
     @property
     def cycle(self) -> float:
@@ -220,16 +222,18 @@ class Session:
 
     def programme(self, signal: str) -> Programme:
         """The programme that runs on `signal` now."""
-        active = self._sumo.trafficlight.getProgram(signal)
+        active, types = self._sumo.trafficlight.getProgram(signal), self._sumo.constants
         for logic in self._sumo.trafficlight.getAllProgramLogics(signal):
             if logic.programID == active:
                 elapsed = sum(p.duration for p in logic.phases[:self._sumo.trafficlight.getPhase(signal) + 1])
                 left = self._sumo.trafficlight.getNextSwitch(signal) - self._sumo.simulation.getTime()
                 return Programme(
-                    signal=signal, phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
+                    signal=signal, id=active,
+                    phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
                     position=elapsed - left,
-                    static=logic.type == self._sumo.constants.TRAFFICLIGHT_TYPE_STATIC
-                    and not any(phase.next for phase in logic.phases))
+                    static=logic.type == types.TRAFFICLIGHT_TYPE_STATIC
+                    and not any(phase.next for phase in logic.phases),
+                    actuated=logic.type in (types.TRAFFICLIGHT_TYPE_ACTUATED, types.TRAFFICLIGHT_TYPE_DELAYBASED))
         raise RuntimeError(f"signal {signal} has no programme {active}")
 
     def signals(self) -> tuple[str, ...]:
@@ -239,6 +243,13 @@ class Session:
     def signal_state(self, signal: str) -> str:
         """What it shows now, a character per link."""
         return self._sumo.trafficlight.getRedYellowGreenState(signal)
+
+    def state_underneath(self, signal: str, programme: str) -> str:
+        """What a programme of `signal` would show, were it not for the states that were set: it runs on."""
+        for logic in self._sumo.trafficlight.getAllProgramLogics(signal):
+            if logic.programID == programme:
+                return logic.phases[logic.currentPhaseIndex].state
+        raise RuntimeError(f"signal {signal} has no programme {programme}")
 
     def set_signal_state(self, signal: str, state: str) -> bool:
         """False where SUMO does not take it."""
