@@ -58,7 +58,7 @@ def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1
     files = ensure_built(scenario.network)
     city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment, "outcomes", lambda function, todo, workers, *, fresh: (
+        patch.setattr(experiment, "outcomes", lambda function, todo, workers, **_: (
             (task, result(task, city)) for task in todo))
         evaluate.evaluate(evaluate.Evaluation(
             scenario=SCENARIO, controllers=controllers, seeds=seeds, levels=levels, steps=STEPS, out=out))

@@ -37,7 +37,7 @@ def ran(monkeypatch):
     """SUMO is not started: the tasks that would be run, and which of them fail."""
     tasks, failing = [], set()
 
-    def outcomes(function, todo, workers, *, fresh):
+    def outcomes(function, todo, workers, *, fresh, group=None):
         assert fresh
         for task in todo:
             tasks.append((task.controller, task.seed, task.demand_factor))

@@ -31,7 +31,7 @@ def city(tmp_path_factory):
 def read_once(monkeypatch):
     """The city, which is the same for every run folder."""
     monkeypatch.setattr(experiment, "load_city", cache(experiment.load_city))
-    monkeypatch.setattr(experiment, "read_signals", lambda city: ([], []))
+    monkeypatch.setattr(experiment, "read_signals", lambda city, *_: ([], []))
 
 
 def result(task, tts: float, completed: int = TRIPS) -> Result:
@@ -52,7 +52,7 @@ def runs(monkeypatch):
     """The tasks that are run; their total time spent is lowest at set point 300 and kp 2."""
     tasks, failing = [], set()
 
-    def outcomes(function, todo, workers, *, fresh):
+    def outcomes(function, todo, workers, *, fresh, group=None):
         for task in todo:
             tasks.append(task)
             options = dict(task.options)
@@ -128,7 +128,7 @@ def test_one_line_for_what_cannot_be_tuned(city, tmp_path, arguments, expected):
 def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_path, monkeypatch):
     seen = []
 
-    def outcomes(function, todo, workers, *, fresh):
+    def outcomes(function, todo, workers, *, fresh, group=None):
         for task in todo:
             seen.append(task.policy)
             yield task, result(task, 1e6 * dict(task.options)["mfd_scale"])
@@ -152,7 +152,7 @@ SERVED = {  # demand -> of four seeds, how many serve all trips
 def demanded(monkeypatch):
     tasks = []
 
-    def outcomes(function, todo, workers, *, fresh):
+    def outcomes(function, todo, workers, *, fresh, group=None):
         for task in todo:
             tasks.append((task.controller, task.demand_factor))
             served = task.seed - 1000 < SERVED[task.controller][task.demand_factor]

@@ -303,6 +303,6 @@ def remarks(rows: pd.DataFrame) -> list[str]:
     """A line for every controller whose policy was run outside of what it was trained on."""
     if "outside_training" not in rows:  # of an older version
         return []
-    said = rows[rows["outside_training"].fillna("") != ""]
+    said = rows[rows["outside_training"].astype(object).fillna("") != ""]
     return [f"{name}: {text}" for name, text in dict.fromkeys(
         zip(said["controller"], said["outside_training"], strict=True))]
