@@ -99,7 +99,7 @@ class TripReader:
         mesoscopic model teleports to the end of its route, too."""
         ends = []
         for _, element in self._parser.read_events():
-            if element.tag == "tripinfo":
+            if isinstance(element, Element) and element.tag == "tripinfo":
                 ended = float(attribute(element, "arrival")) >= 0 or (
                     float(attribute(element, "depart")) >= 0 and left(element.get("id", "")))
                 reason = element.get("vaporized", "")
