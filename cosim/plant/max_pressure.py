@@ -17,6 +17,8 @@ Which stage comes next is decided in one of two ways. Acyclic (Varaiya): the one
 was red for MAX_RED while somebody waited there comes first. Cyclic (as Levin, Hu and Odell, "Max-pressure signal
 control with cyclical phase structure", 2020): the stages keep the order of the programme, stay while none has a higher
 pressure, and those that nobody waits for are left out. In both no green outlasts the maximum while others wait.
+A change costs the seconds of yellow and red on the way: the pressure of another stage counts for the share of green in
+these and the SOON seconds that follow. Without that it loses against fixed time in Bologna, whose ways are long.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -34,6 +36,7 @@ from nmfd.arrays import PerPair
 LEVELS = "rgG"    # from nothing to the right of way
 FACTS = ("signal_lanes", "split_lanes", "never_whole_lanes", "intergreen_share", "programmed_intergreen_share")
 EVERY = 5.0       # s between two decisions: about two vehicles per lane
+SOON = 10.0       # s; about two minimum greens
 MAX_RED = 120.0   # s; about the longest cycle that is usual (Signal Timing Manual, 2nd edition, 2015)
 WHOLE = 1 - 1e-9  # of the vehicles of a lane: all of them
 PERMISSIVE = 0.3  # saturation flow of a movement that must give way (g), as a share of a protected one
@@ -112,8 +115,9 @@ class MaxPressure:
             overdue = approaches.serves @ (waiting * approaches.overdue(now))
             if overdue.any():
                 return int(np.argmax(overdue))
-        best = max(in_turn, key=lambda n: pressure[n])
-        if pressure[best] > pressure[own] or (
+        worth = {n: pressure[n] * SOON / (SOON + junction.loss(n)) for n in in_turn}
+        best = max(in_turn, key=worth.__getitem__)
+        if worth[best] > pressure[own] or (
                 now + EVERY > junction.stage_since + self._max_green + 1e-6):
             return in_turn[0] if self._cyclic else best
         return own
@@ -176,16 +180,24 @@ class Junction:
 
     def switch(self, stage: int, now: float) -> str:
         """Leave the stage that is shown for another; the state from `now` on."""
-        begin, self._coming, change = now, [], (self.stage, stage)
-        if change not in self._between:
-            self._between[change] = transition(self._phases, *(self._numbers[n] for n in change))
-        for phase in self._between[change]:
+        begin, self._coming = now, []
+        for phase in self._way(stage):
             self._coming.append((begin, phase.state))
             begin += phase.duration
         self._coming.append((begin, self._phases[self._numbers[stage]].state))
         self.stage, self._green_since, self.stage_since = stage, begin, begin
         self.lost += begin - now
         return self.advance(now)
+
+    def loss(self, stage: int) -> float:
+        """[s] between the stage that is shown and another one."""
+        return sum(phase.duration for phase in self._way(stage))
+
+    def _way(self, stage: int) -> list[Phase]:
+        change = self.stage, stage
+        if change not in self._between:
+            self._between[change] = transition(self._phases, *(self._numbers[n] for n in change))
+        return self._between[change]
 
     def advance(self, now: float) -> str:
         """The state from `now` [s] on; call at every `next_change`."""
