@@ -6,7 +6,17 @@ import click
 
 from nmfd.cli.errors import Commands, Interrupted
 from nmfd.cli.exchange import export, new_controller
-from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, controller_names, fault_option, policy_files, quoted, time_limit_option
+from nmfd.cli.options import (
+    COUNT,
+    FILE,
+    FOLDER,
+    SEED,
+    controller_names,
+    fault_option,
+    policy_files,
+    quoted,
+    time_limit_option,
+)
 from nmfd.cli.progress import progress_line, resumable
 from nmfd.cli.studies import ablation, adaptation, bound, robustness, scaling
 from nmfd.errors import InputError

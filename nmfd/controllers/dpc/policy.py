@@ -18,8 +18,8 @@ from nmfd.arrays import Adjacency
 from nmfd.controllers.dpc.options import DEEPEST, WIDEST, Activation
 from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
-from nmfd.runs.files import check_file
 from nmfd.model.regional_model import RegionalModel
+from nmfd.runs.files import check_file
 from nmfd.tensors import PerPair, PerTurn
 from nmfd.types import Controls, Observation, Status
 
