@@ -21,6 +21,7 @@ from cosim.sumo.recorded_trips import MESOSCOPIC, read_recorded_trips, write_rec
 from nmfd.errors import InputError
 from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel
+from nmfd.runs.files import synced
 from nmfd.runs.scratch import LOCK, Scratch
 
 LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
@@ -195,7 +196,9 @@ def _folders(order: ImportOptions) -> Iterator[tuple[Path, Path]]:
                 (folder / GUIDED / "network.toml").unlink(missing_ok=True)
             for file in sorted(temporary.iterdir(), key=lambda file: (file.suffix == ".toml", file.name)):
                 if file.name != LOCK:
+                    synced(file)
                     os.replace(file, folder / file.name)
+                    synced(folder)
 
 
 class _Baselines:

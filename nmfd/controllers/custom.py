@@ -355,7 +355,7 @@ def _undone(where: str) -> Iterator[None]:
             now = os.getcwd()
         if now != folder:
             os.chdir(folder)
-        if torch and modes != (torch.get_default_dtype(), torch.is_grad_enabled(), torch.get_num_threads()):
+        if torch and modes and modes != (torch.get_default_dtype(), torch.is_grad_enabled(), torch.get_num_threads()):
             torch.set_default_dtype(modes[0])
             torch.set_grad_enabled(modes[1])
             torch.set_num_threads(modes[2])
