@@ -124,7 +124,8 @@ def test_what_all_share_stays_as_it_is(tmp_path, scenario):
 
 LETHAL = {
     "exits": ("ACT", "os._exit(0)", "act: its process died (status 0)"),
-    "swallows": ("ACT", "while True:\n    try:\n        while True: pass\n    except BaseException: pass", "act: took longer"),
+    "swallows": ("ACT", "while True:\n    try:\n        while True: pass\n    except BaseException: pass",
+                 "act: took longer"),
     "counts": ("ACT", "sum(itertools.count())", "act: took longer than its time limit, and its process was ended"),
     "closes": ("ACT", "os.closerange(0, 100)", "its process died (status 1)"),
     "leaves": ("ACT", "threading.Thread(target=time.sleep, args=[1e6]).start(); raise ValueError", "act: ValueError"),

@@ -67,7 +67,7 @@ def test_xarray_opens_a_run_with_names_and_units(tmp_path):
         assert tuple(data["note"].values) == original.note == ("", "", "", "no")
         assert list(data["status"].values) == [0, 0, 0, 3]  # a solver failure and a fallback
         assert data["status"].attrs["flag_meanings"] == "solver_failure fallback sensor_fault plant_fault late"
-        assert list(data["status"].attrs["flag_masks"]) == [1, 2, 4, 8]
+        assert list(data["status"].attrs["flag_masks"]) == [1, 2, 4, 8, 16]
         assert list(data["time"].values) == [0.0, 30.0, 60.0, 90.0, 120.0] and data["time"].attrs["units"] == "s"
         assert float(data["accumulation"].sel(time=60.0, region=1, destination=0)) == original.accumulation[2, 1, 0]
         for name, values in record.items():

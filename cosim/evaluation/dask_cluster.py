@@ -103,9 +103,10 @@ def connect(scheduler: Scheduler | str) -> "Client":
     try:
         return Client(scheduler.address, timeout=PATIENCE, set_as_default=False, security=security)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
         certificates = " with certificates that it trusts" if scheduler.encrypted else ""
         raise InputError(
-            f"--scheduler: no Dask scheduler answers at {scheduler.address!r} ({' '.join(str(error).split())}); start "
+            f"--scheduler: no Dask scheduler answers at {scheduler.address!r} ({reason}); start "
             f"one with 'dask scheduler' and give its address, such as tcp://host:8786{certificates}") from None
 
 
@@ -116,8 +117,9 @@ def _security(scheduler: Scheduler) -> "Security | None":
     options = {"--scheduler-ca": scheduler.ca, "--scheduler-cert": scheduler.cert, "--scheduler-key": scheduler.key}
     given = {option: path for option, path in options.items() if path is not None}
     if given and not scheduler.encrypted:
-        raise InputError(f"{next(iter(given))}: is for an encrypted scheduler, at tls://..., not {scheduler.address!r}: "
-                         "omit it, or start the scheduler with --protocol tls")
+        raise InputError(
+            f"{next(iter(given))}: is for an encrypted scheduler, at tls://..., not {scheduler.address!r}: omit it, or "
+            "start the scheduler with --protocol tls")
     for option, path in given.items():
         check_file(path, "give a PEM file")
         if not path.is_file():

@@ -27,7 +27,8 @@ FIRST_SEED = 2000  # these seeds are kept for evaluations: nothing was chosen, t
 class Evaluation:
     """scenario: its folder; controllers: strategies; levels: multiples of the scenario's demand; steps: control
     intervals, all if None; policies: controller -> file instead of the scenario's own; reference: a controller to
-    pair with, besides no control; time_limit: of controllers of the user's own, instead of the scenario's; out: the folder of the evaluation."""
+    pair with, besides no control; time_limit: of controllers of the user's own, instead of the scenario's; out: the
+    folder of the evaluation."""
 
     scenario: Path
     controllers: tuple[str, ...]

@@ -355,8 +355,11 @@ def _undone(where: str) -> Iterator[None]:
             now = os.getcwd()
         if now != folder:
             os.chdir(folder)
-        if torch and modes != (torch.get_default_dtype(), torch.is_grad_enabled(), torch.get_num_threads()):
-            torch.set_default_dtype(modes[0]), torch.set_grad_enabled(modes[1]), torch.set_num_threads(modes[2])
+        if torch and modes and modes != (torch.get_default_dtype(), torch.is_grad_enabled(), torch.get_num_threads()):
+            torch.set_default_dtype(modes[0])
+            torch.set_grad_enabled(modes[1])
+            torch.set_num_threads(modes[2])
     if now != folder:
-        raise InputError(f"{where}: left the folder {folder} for {now or 'one that is gone'}; name files by their whole "
-                         "path instead")
+        raise InputError(
+            f"{where}: left the folder {folder} for {now or 'one that is gone'}; name files by their whole path "
+            "instead")

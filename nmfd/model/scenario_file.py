@@ -66,8 +66,8 @@ class ScenarioTable(Settings):
     demand_file: Text | None = setting("csv with the columns interval, from, to, veh_s, added to [[demand]]", None)
     faults: Texts = setting("injected into every run: KIND[:VALUE][@FROM-TO], as of --fault", ())
     own_time_limit: float = setting(
-        "of every call of a controller of your own: its import, making, reset and every act; 0: none; --time-limit goes "
-        "before it", OWN_TIME_LIMIT, unit="s", ge=0.0)
+        "of every call of a controller of your own: its import, making, reset and every act; 0: none; --time-limit "
+        "goes before it", OWN_TIME_LIMIT, unit="s", ge=0.0)
     noise: NoiseTable = setting("of the measurements", NoiseTable())
     forecast: ForecastTable = setting("of the demand", ForecastTable())
     demand: Rows[DemandTable] | None = setting("one table per flow; may be left out beside demand_file", None)

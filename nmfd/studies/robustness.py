@@ -146,5 +146,6 @@ def improvement_table(rows: Sequence[Mapping]) -> str:
     lines = [["trips", *(f"{total:,.0f}" for total in count.values())]]
     for name in compared(rows):
         gains = improvements(rows, name)
-        lines.append([name, *("{:.1f} ± {:.1f}".format(*gains[s]) if s in gains and not math.isnan(gains[s][0]) else "-" for s in count)])
+        defined = {s for s in gains if not math.isnan(gains[s][0])}
+        lines.append([name, *("{:.1f} ± {:.1f}".format(*gains[s]) if s in defined else "-" for s in count)])
     return text_columns(["sigma", *(f"{sigma:g}" for sigma in count)], lines, CAPTION)

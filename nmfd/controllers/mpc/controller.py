@@ -33,7 +33,7 @@ ROUNDING = 0.005    # of the smallest jam accumulation: over which the solver se
 TOLERANCE = 1e-6
 ACCEPTABLE = 1e-5
 FAILED = Status.SOLVER_FAILURE | Status.FALLBACK
-IN_TIME = 0.9       # of the deadline is the solver's; what is left is for the controls that its plan, or want of one, means
+IN_TIME = 0.9       # share of the deadline that the solver has; the rest is for what becomes of its plan
 FEW = 5.0           # veh: added to the vehicles that a control decides on, where these scale the solver's steps
 
 
