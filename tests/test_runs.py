@@ -21,6 +21,7 @@ from nmfd import quantities
 from nmfd.cli.progress import progress_line
 from nmfd.errors import InputError
 from nmfd.runs import files, run_folder, workers
+from nmfd.runs.tables import markdown_table
 from nmfd.types import Trajectory
 
 ROOT = Path(__file__).parents[1]
@@ -77,7 +78,10 @@ def test_xarray_opens_a_run_with_names_and_units(tmp_path):
 
 @pytest.mark.parametrize("page, kind", [("nmfd/runs/README.md", Trajectory), ("cosim/plant/record.md", Record)])
 def test_the_pages_list_what_is_in_a_file(page, kind):
-    assert quantities.reference(kind) in (ROOT / page).read_text()
+    table = markdown_table(("variable", "dimensions", "unit", "what"), (
+        (name, ", ".join(about["dimensions"]), about["attributes"].get("units", ""), about["text"])
+        for name, about in quantities.quantities(kind).items()))
+    assert table in (ROOT / page).read_text()
 
 
 def test_the_tables_of_a_run_row_by_row():

@@ -15,8 +15,8 @@ from cosim.evaluation.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.plant import incidents
 from cosim.plant.launch import own_files, own_vehicles
 from cosim.plant.record import Record
-from cosim.plant.settings import FILES, Settings, settings
-from cosim.plant.strategy import MAX_PRESSURE, configured, parse
+from cosim.plant.settings import FILES, MAX_PRESSURE, Settings, settings
+from cosim.plant.strategy import configured, parse
 from cosim.sumo import outputs
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import check_adjacency, load_city

@@ -13,7 +13,7 @@ from cosim.evaluation import estimation_errors, run_metrics
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.plant.strategy import Strategy, configured, parse, planning_of
-from cosim.sumo import outputs as sumo_output
+from cosim.sumo.outputs import check_whole
 from nmfd import closed_loop, metrics
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
@@ -119,7 +119,7 @@ def drive(
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
             "signals_left_alone": len(plant.other_signals)}
-        sumo_output.check_whole(files)
+        check_whole(files)
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
 
 

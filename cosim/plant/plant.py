@@ -14,8 +14,7 @@ from cosim.plant.meter import Meter
 from cosim.plant.programmes import city_signals
 from cosim.plant.record import Record, Recorder
 from cosim.plant.sensing import Estimation, Sensing
-from cosim.plant.settings import ESTIMATE, Settings, scenario_file, settings
-from cosim.plant.strategy import MAX_PRESSURE
+from cosim.plant.settings import ESTIMATE, MAX_PRESSURE, Settings, scenario_file, settings
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, Gateway, check_adjacency, load_city
 from cosim.sumo.session import Session, Window
