@@ -110,8 +110,8 @@ def checked(declaration: type[S], values: Mapping[str, Any], where: Path | str, 
 def parsed(declaration: type[S], key: str, text: str | list[str]) -> Any:
     """The value of a setting, or those of a list, from what the command line says. ValueError."""
     field = declaration.model_fields[key]
-    kind = TypeAdapter(Annotated[field.annotation, field], config=declaration.model_config)
-    return kind.validate_python(text, strict=False)
+    kind: Any = Annotated[field.annotation, field]
+    return TypeAdapter(kind, config=declaration.model_config).validate_python(text, strict=False)
 
 
 def error(where: Path | str, key: str, problem: str) -> InputError:

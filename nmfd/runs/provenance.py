@@ -28,7 +28,7 @@ def provenance() -> dict:
 
 def _git(folder: Path, *arguments: str) -> str | None:
     try:
-        command = ["git", "--no-optional-locks", "-C", folder, *arguments]  # killed, a lock would stay for ever
+        command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]  # killed, a lock would stay for ever
         done = subprocess.run(command, capture_output=True, text=True, timeout=10)
     except (OSError, subprocess.TimeoutExpired):
         return None
