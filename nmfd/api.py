@@ -10,8 +10,7 @@ from nmfd.controllers.dpc import training
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario, read_scenario
 from nmfd.runs import run_folder
-from nmfd.studies import benchmark as benchmarks
-from nmfd.studies.benchmark import PLANTS
+from nmfd.studies.benchmark import PLANTS, run_all
 from nmfd.types import Controller, Plant, Trajectory
 
 
@@ -82,7 +81,7 @@ def benchmark(
     Raises InputError and nmfd.runs.workers.RunFailed.
     """
     scenario = _loaded(scenario)
-    return benchmarks.benchmark(
+    return run_all(
         scenario, list(controllers), range(seeds) if isinstance(seeds, int) else list(seeds), plant,
         out=run_folder.default_folder(scenario.name) if out is None else Path(out),
         policies={name: Path(file) for name, file in (policies or {}).items()}, workers=workers, progress=progress)

@@ -31,10 +31,3 @@ def variables(kind: type, values: Mapping) -> dict[str, tuple]:
     return {
         name: (about["dimensions"], np.asarray(values[name]), {"long_name": about["text"], **about["attributes"]})
         for name, about in quantities(kind).items() if name in values}
-
-
-def reference(kind: type) -> str:
-    """The quantities of `kind` as a Markdown table."""
-    lines = [f"| {name} | {', '.join(about['dimensions'])} | {about['attributes'].get('units', '')} | {about['text']} |"
-             for name, about in quantities(kind).items()]
-    return "\n".join(["| variable | dimensions | unit | what |", "|---|---|---|---|", *lines])

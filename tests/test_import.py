@@ -348,6 +348,7 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
     network, scenario = tmp_path / "networks" / "tiny", tmp_path / "scenarios" / "tiny"
     file = scenario / "scenario.toml"
     file.write_text(re.sub(r"\nsteps = \d+", "\nsteps = 10", file.read_text()))
+    (network.parent / "network.schema.json").touch()
     text = good(cosim("identify", network, "--levels", "1,2", "--seeds", 1, "--iterations", 3, "--workers", 1, "--out",
                       tmp_path / "loading"))
     assert "Drivers who go their own ways:" in text and "Drivers who are guided:" in text
@@ -356,7 +357,9 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
     loaded = load_scenario(scenario)
     guided = planning_model(loaded, "dpc-pcrg").network
     assert guided.hash != loaded.network.hash and guided.observed_split_ratios == loaded.network.observed_split_ratios
-    assert "PLACEHOLDERS" not in (network / "network.toml").read_text() and not loaded.network.placeholder
+    written = (network / "network.toml").read_text()
+    assert "PLACEHOLDERS" not in written and not loaded.network.placeholder
+    assert written.startswith("#:schema ../network.schema.json\n# Regional model")
     assert all("one seed" in doubts for doubts in loaded.network.doubts) and "WARNING, one seed" in text
     assert text.count("Can perimeter control help?") == 2 and (tmp_path / "loading" / "fit.csv").is_file()
     assert "loading runs under no-control" in (network / "verdict.txt").read_text()

@@ -147,8 +147,8 @@ def test_one_run_for_real(peak, tmp_path):
 
 @pytest.mark.parametrize("arguments, expected", [
     (("--controllers", "nobody"), "'nobody' is unknown"),
-    (("--controllers", "no-control", "--compliance", "0.5"), "--compliance: expected whole percentages"),
-    (("--controllers", "no-control", "--compliance", "5,05"), "names a percentage twice"),
+    (("--controllers", "no-control", "--compliance", "0.5"), "'--compliance': expected a list of distinct whole"),
+    (("--controllers", "no-control", "--compliance", "5,05"), "'--compliance': expected a list of distinct"),
     (("--controllers", "dpc-pcrg+compliance-50", "--compliance", "0"), "exclude each other"),
     (("--controllers", "no-control", "--workers", "2", "--scheduler", "tcp://x:1"), "omit one"),
 ])

@@ -7,8 +7,17 @@ from pathlib import Path
 
 import click
 
-from cosim.cli.options import CONTROLLER_HELP, parsed_levels, tell
-from nmfd.cli.options import COUNT, FOLDER, SEED, policy_files
+from cosim.cli.options import CONTROLLER, CONTROLLER_HELP, tell
+from nmfd.cli.declared import declared
+from nmfd.cli.options import (
+    POLICIES,
+    SCENARIO,
+    STEPS,
+    controller_names,
+    controllers_option,
+    out_option,
+    policy_files,
+)
 from nmfd.cli.progress import resumable
 from nmfd.errors import InputError, RunFailed
 from nmfd.runs.files import file_name
@@ -16,31 +25,22 @@ from nmfd.runs.workers import cores
 
 
 @click.command()
-@click.argument("scenario", type=FOLDER)
-@click.option("--controller", required=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
+@SCENARIO
+@CONTROLLER
 @click.option("--option", "knobs", required=True, multiple=True, metavar="KEY=LOW:HIGH",
               help="An option of the controller and the range that is searched; KEY[0], KEY[1], ... for the numbers of "
                    "a list. May be repeated, up to 20 numbers. One with which a policy is trained trains one for "
                    "every candidate.")
-@click.option("--candidates", type=COUNT, default=40, show_default=True, metavar="N",
-              help="How many are tried, the scenario's own options first; each takes one run per seed and level.")
-@click.option("--seeds", type=COUNT, default=2, show_default=True, metavar="N", help="Runs per candidate and level.")
-@click.option("--first-seed", type=SEED, default=1000, show_default=True, metavar="S",
-              help="The seeds are S to S + N - 1. Those from 2000 on are for evaluations.")
-@click.option("--demand", default="1.0", show_default=True, metavar="A,B,...",
-              help="Demand levels: multiples of the scenario's demand.")
-@click.option("--search-seed", type=SEED, default=0, show_default=True, help="Of CMA-ES, and of training.")
-@click.option("--population", type=click.IntRange(2, 1000), metavar="N",
-              help="Candidates per generation. [default: the rule of CMA-ES]")
-@click.option("--workers", type=COUNT, metavar="N",
-              help="Runs at a time, each in a process of its own. [default: one per core]")
+@declared("cosim.evaluation.settings:Search", "candidates", "seeds", "first_seed", "demand", "search_seed")
+@declared("cosim.evaluation.settings:Search", "population", instead="the rule of CMA-ES")
+@declared("cosim.evaluation.settings:Search", "workers", instead="one per core")
 @click.option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster that does the runs (as of cosim sweep).")
-@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
-@click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-tune]")
+@STEPS
+@out_option("tune", "The folder.")
 def tune(
-    scenario: Path, controller: str, knobs: tuple[str, ...], candidates: int, seeds: int, first_seed: int, demand: str,
-    search_seed: int, population: int | None, workers: int | None, scheduler: str | None, steps: int | None,
-    out: Path | None,
+    scenario: Path, controller: str, knobs: tuple[str, ...], candidates: int, seeds: int, first_seed: int,
+    demand: tuple[float, ...], search_seed: int, population: int | None, workers: int | None, scheduler: str | None,
+    steps: int | None, out: Path | None,
 ) -> None:
     """Search for the options of a controller that do best in the microsimulation, by CMA-ES.
 
@@ -63,7 +63,7 @@ def tune(
     order = tuning.Tuning(
         scenario=scenario, controller=controller, knobs=tuple(tuning.knob(text) for text in knobs),
         candidates=candidates, seeds=range(first_seed, first_seed + seeds),
-        levels=tuple(parsed_levels("--demand", demand)), search_seed=search_seed, population=population, steps=steps,
+        levels=demand, search_seed=search_seed, population=population, steps=steps,
         out=Path("runs") / f"{file_name(scenario.name)}-tune" if out is None else out)
     with resumable("tune", order.out, "tune.csv") as progress:
         table = tuning.tune(
@@ -73,24 +73,17 @@ def tune(
 
 
 @click.command()
-@click.argument("scenario", type=FOLDER)
-@click.option("--controllers", required=True, metavar="A,B,...", help="Separated by commas. " + CONTROLLER_HELP)
-@click.option("--demand", default="0.8,1.0,1.2,1.4,1.6,1.8,2.0", show_default=True, metavar="A,B,...",
-              help="Demand levels: multiples of the scenario's demand.")
-@click.option("--seeds", type=COUNT, default=10, show_default=True, metavar="N",
-              help="Runs per controller and demand level, on the same trips for all controllers.")
-@click.option("--first-seed", type=SEED, default=1000, show_default=True, metavar="S",
-              help="The seeds are S to S + N - 1. Those from 2000 on are for evaluations.")
+@SCENARIO
+@controllers_option("Separated by commas. " + CONTROLLER_HELP)
+@declared("cosim.evaluation.settings:Range", "demand", "seeds", "first_seed")
 @click.option("--everything", is_flag=True,
               help="Run every controller at every level, also beyond one at which it served all trips with no seed.")
-@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
-              help="Policy of a DPC controller, if not SCENARIO/NAME.pt. May be repeated.")
-@click.option("--workers", type=COUNT, metavar="N",
-              help="Runs at a time, each in a process of its own. [default: one per core]")
-@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
-@click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-frontier]")
+@POLICIES
+@declared("cosim.evaluation.settings:Range", "workers", instead="one per core")
+@STEPS
+@out_option("frontier", "The folder.")
 def frontier(
-    scenario: Path, controllers: str, demand: str, seeds: int, first_seed: int, everything: bool,
+    scenario: Path, controllers: str, demand: tuple[float, ...], seeds: int, first_seed: int, everything: bool,
     policies: tuple[str, ...], workers: int | None, steps: int | None, out: Path | None,
 ) -> None:
     """Find up to which demand every controller serves all trips: a picture, frontier.png, and a table.
@@ -104,11 +97,7 @@ def frontier(
     """
     from cosim.plant.strategy import parse  # heavy
 
-    names = [name.strip() for name in controllers.split(",")]
-    for name in names:
-        parse(name)
-    if repeated := [name for n, name in enumerate(names) if name in names[:n]]:
-        raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
+    names = controller_names(controllers, parse)
     files = policy_files(policies, names)
 
     from cosim.evaluation import evaluate  # heavy
@@ -118,7 +107,7 @@ def frontier(
 
     order = evaluate.Evaluation(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
-        levels=tuple(parsed_levels("--demand", demand)), steps=steps, policies=files,
+        levels=demand, steps=steps, policies=files,
         out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-frontier" if out is None else out)
     with resumable("frontier", order.out) as progress:
         table, failures = method.frontier(

@@ -20,8 +20,6 @@ from nmfd.errors import InputError
 from nmfd.runs import files
 from nmfd.runs.workers import ended
 
-FIRST_SEED = 2000  # these seeds are kept for evaluations: nothing was chosen, trained or identified on them
-
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:

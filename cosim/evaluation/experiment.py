@@ -17,8 +17,8 @@ from cosim.plant import incidents
 from cosim.plant.feasible import check_strategy
 from cosim.plant.launch import own_files, own_vehicles
 from cosim.plant.record import Record
-from cosim.plant.settings import FILES, Settings, settings
-from cosim.plant.strategy import PRESSURES, configured, parse
+from cosim.plant.settings import FILES, PRESSURES, Settings, settings
+from cosim.plant.strategy import configured, parse
 from cosim.sumo import outputs
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import check_adjacency, load_city

@@ -31,7 +31,7 @@ from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model import identification, mfd
 from nmfd.model.identification import Observed, observed_split_ratios
-from nmfd.model.model_file import network_toml
+from nmfd.model.model_file import network_toml, schema_line
 from nmfd.model.planning import GUIDED, GUIDING
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
@@ -139,7 +139,7 @@ def identify(
     mfd_bands.draw_production(out / "production.png", model, [result.record for result in found])
     levels, seeds = ", ".join(f"{level:g}" for level in loading.levels), f"{min(loading.seeds)} to {max(loading.seeds)}"
     target.mkdir(parents=True, exist_ok=True)
-    files.write_text(target / "network.toml", network_toml(
+    files.write_text(target / "network.toml", schema_line(target) + network_toml(
         model, _sumo_table(own, target),
         f"Regional model: written by cosim identify from {len(found)} loading runs of {loaded.name} under {first} and\n"
         f"# {second}, demand times {levels}, seeds {seeds}."))

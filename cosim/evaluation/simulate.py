@@ -15,7 +15,7 @@ from cosim.plant.plant import SumoPlant
 from cosim.plant.record import settled
 from cosim.plant.settings import settings
 from cosim.plant.strategy import Strategy, configured, parse, planning_of
-from cosim.sumo import outputs as sumo_output
+from cosim.sumo.outputs import check_whole
 from nmfd import closed_loop, metrics
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
@@ -132,7 +132,7 @@ def drive(
             "removed_veh": int(record.removals.sum() + record.given_up.sum()),
             "removed_waiting_veh": int(record.given_up.sum()), "jumps": int(record.jumps.sum()),
             **plant.pressure_facts()}
-        sumo_output.check_whole(files)
+        check_whole(files)
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
 
 

@@ -15,9 +15,8 @@ from cosim.plant.launch import Launch
 from cosim.plant.meter import Meter
 from cosim.plant.record import Record, Recorder
 from cosim.plant.sensing import Estimation, Sensing
-from cosim.plant.settings import ESTIMATE, Settings, settings
+from cosim.plant.settings import ESTIMATE, PRESSURES, Settings, settings
 from cosim.plant.standstill import Standstill
-from cosim.plant.strategy import PRESSURES
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, Gateway, check_adjacency, load_city
 from cosim.sumo.session import Session, Window

@@ -1,16 +1,23 @@
 """The table [sumo] of scenario.toml: how the city is simulated, actuated and measured."""
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Literal, Self, get_args
 
 from pydantic import model_validator
 
-from cosim.plant.strategy import FIXED, HOLD_BACK, Mode, Signals
-from nmfd.model.scenario import Scenario
 from nmfd.model.scenario_file import read_tables
 from nmfd.runs import config
 from nmfd.runs.config import Problem, Seconds, Share, Texts, setting
 
+if TYPE_CHECKING:  # at run time it would bring numpy, and the help of an option waits for this module
+    from nmfd.model.scenario import Scenario
+
+Signals = Literal["fixed", "webster", "actuated", "max-pressure", "max-pressure-cyclic"]
+Mode = Literal["hold-back", "redistribute"]
+SIGNALS, MODES = get_args(Signals), get_args(Mode)
+FIXED, WEBSTER, ACTUATED, MAX_PRESSURE, CYCLIC = SIGNALS
+PRESSURES = (MAX_PRESSURE, CYCLIC)
+HOLD_BACK, REDISTRIBUTE = MODES
 EXACT, ESTIMATE = "exact", "estimate"
 FILES = ("routes", "background", "additional")
 
@@ -84,12 +91,12 @@ class Settings(SumoTable):
     guided: bool = False
 
 
-def scenario_file(scenario: Scenario) -> Path:
+def scenario_file(scenario: "Scenario") -> Path:
     """The scenario.toml, to name it in errors; without a folder, of a scenario that was not loaded from one."""
     return (scenario.folder or Path()) / "scenario.toml"
 
 
-def settings(scenario: Scenario) -> Settings:
+def settings(scenario: "Scenario") -> Settings:
     """Read and check the table [sumo] of the scenario. Raises InputError."""
     if scenario.folder is None:
         return Settings()

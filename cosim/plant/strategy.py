@@ -9,20 +9,15 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
+from cosim.plant.settings import MODES, SIGNALS
 from nmfd.controllers import registry
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.planning import PlanningModel, guided_model, planning_model, with_model
 from nmfd.model.scenario import Scenario
 
 ALONE = "no-control"  # the controller of a name that is only options
-Signals = Literal["fixed", "webster", "actuated", "max-pressure", "max-pressure-cyclic"]
-Mode = Literal["hold-back", "redistribute"]
-SIGNALS, MODES = get_args(Signals), get_args(Mode)
-FIXED, WEBSTER, ACTUATED, MAX_PRESSURE, CYCLIC = SIGNALS
-PRESSURES = (MAX_PRESSURE, CYCLIC)
-HOLD_BACK, REDISTRIBUTE = MODES
 GUIDED = "guided"
 
 # Option -> (field of cosim.plant.settings.Settings, its value).

@@ -16,8 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from cosim.evaluation import explain, fit_quality, statistics
 from cosim.evaluation.results import Finished, Level
 from cosim.plant.strategy import planning_of
-from cosim.report import pictures as report
-from cosim.report import summary_text
+from cosim.report import pictures, summary_text
 from nmfd.errors import InputError
 from nmfd.model import authority
 from nmfd.runs import files
@@ -101,13 +100,13 @@ def _run(run: Finished) -> dict:
         run.scenario.name, configuration["steps"], configuration["step_s"], len(run.levels), rows)
     with Scratch("cosim-") as folder:
         if run.city is not None:
-            report.region_map(folder / "regions.png", run.scenario, run.city)
+            pictures.region_map(folder / "regions.png", run.scenario, run.city)
         if len(run.levels) > 1:
-            report.demand_levels(folder / "demand.png", rows)
-        pictures = _pictures(folder, (("demand", caption), ("regions", REGIONS)))
+            pictures.demand_levels(folder / "demand.png", rows)
+        shown = _pictures(folder, (("demand", caption), ("regions", REGIONS)))
     return {
         "name": run.name, "story": [first, *(_at(run, level) + summary_text.head(level.rows) for level in run.levels)],
-        "models": _models(run), "pictures": pictures, "configuration": _configuration(run),
+        "models": _models(run), "pictures": shown, "configuration": _configuration(run),
         "strategies": list({
             name: (name, _plain(depends) or "nothing of its own") for level in run.levels
             for name, depends in level.manifest.get("controllers", {}).items()}.values())}
@@ -152,20 +151,20 @@ def _level(run: Finished, level: Level, reference: str | None) -> dict:
     title = f"Demand times {level.demand:g}"
     signals, reasons = explain.at(level.demand, level.folder, run.scenario.network, rows)
     with Scratch("cosim-") as folder:
-        report.draw(level.folder, run.scenario, run.city, rows, folder)
-        report.draw_more(folder, run.scenario, level.folder, rows)
-        pictures = [(heading, _pictures(folder, chosen, f"{title}. ")) for heading, chosen in PICTURES]
-    missing = ", ".join(heading.lower() for heading, there in pictures if not there)
+        pictures.draw(level.folder, run.scenario, run.city, rows, folder)
+        pictures.draw_more(folder, run.scenario, level.folder, rows)
+        drawn = [(heading, _pictures(folder, chosen, f"{title}. ")) for heading, chosen in PICTURES]
+    missing = ", ".join(heading.lower() for heading, there in drawn if not there)
     why = run.changed or "there was nothing of the kind in these runs, or an older version did not record it"
     against = statistics.compared_with(rows)
-    pair = [name for name in report.ranked(rows) if name != against][:1]
+    pair = [name for name in pictures.ranked(rows) if name != against][:1]
     both = f" and, where two are compared, {against} and {pair[0]}" if pair else ""
     return {
         "title": title, "details": summary_text.details(rows), "signals": signals, "reasons": reasons,
-        "shown": f"Pictures of single runs show seed {report.shown_seed(rows)}{both}.",
+        "shown": f"Pictures of single runs show seed {pictures.shown_seed(rows)}{both}.",
         "outcome": outcome, "how": how, "pairs": statistics.pairs(rows).drop(columns="demand"),
         "runs": rows[["controller", *(name for name in rows.columns if name != "controller")]],
-        "pictures": [(heading, there) for heading, there in pictures if there],
+        "pictures": [(heading, there) for heading, there in drawn if there],
         "missing": f"Without pictures of {missing}: {why}." if missing else ""}
 
 

@@ -66,7 +66,7 @@ class TripReader:
     def __init__(self, path: Path, flush: Callable[[], bool] = lambda: False):
         """flush: has SUMO write what it keeps in memory (some 8 kB, about ten trips), False where it does not"""
         self._path, self._flush, self._offset = path, flush, 0
-        self._parser = ElementTree.XMLPullParser()
+        self._parser: ElementTree.XMLPullParser = ElementTree.XMLPullParser()
         self.facts, self.prompt = TripFacts(), False
 
     def ends(self) -> list[End]:

@@ -1,12 +1,21 @@
 """network.toml of a regional model, as text; `nmfd.model.regional_model.load_network` reads it."""
 
 import io
+import os
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.config import quoted
+
+
+def schema_line(folder: Path) -> str:
+    """The line by which editors find the JSON schema of a network.toml in `folder`; "" where there is none above it."""
+    above = (parent / "network.schema.json" for parent in folder.absolute().parents)
+    found = next((file for file in above if file.is_file()), None)
+    return f"#:schema {Path(os.path.relpath(found, folder)).as_posix()}\n" if found else ""
 
 
 def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from nmfd.errors import InputError, did_you_mean
 from nmfd.runs import schema
@@ -113,6 +113,13 @@ def checked(declaration: type[S], values: Mapping[str, Any], where: Path | str, 
         return declaration.model_validate(values)
     except ValidationError as error:
         raise InputError(f"{where}: {prefix}{_told(declaration, values, error)}") from None
+
+
+def parsed(declaration: type[S], key: str, text: str | list[str]) -> Any:
+    """The value of a setting, or those of a list, from what the command line says. ValueError."""
+    field = declaration.model_fields[key]
+    kind: Any = Annotated[field.annotation, field]
+    return TypeAdapter(kind, config=declaration.model_config).validate_python(text, strict=False)
 
 
 def error(where: Path | str, key: str, problem: str) -> InputError:

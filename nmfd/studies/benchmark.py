@@ -47,7 +47,7 @@ def run_one(
     return run_folder.labelled(trajectory, controller=name, plant=plant)
 
 
-def benchmark(
+def run_all(
     scenario: Scenario, controllers: Sequence[str], seeds: Sequence[int], plant: str, *, out: Path,
     policies: Mapping[str, Path] | None = None, workers: int = 1,
     progress: Callable[[int, int, str], None] | None = None,

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -192,18 +193,26 @@ def checkpoint(policy: Policy, network: RegionalModel, configuration: Mapping, s
         "weights": {key: value.detach().cpu().clone() for key, value in policy.state_dict().items()}}
 
 
-def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
-    """The policy in `path` and its whole checkpoint. InputError if it is none, or was trained for another network.
-
-    No code of the file is executed (weights_only).
-    """
+def read_file(path: Path, missing: str, damaged: str) -> Any:
+    """What torch wrote to `path`, on the CPU; InputError in these words. No code of the file is executed."""
     check_file(path, "train one with 'nmfd train'")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
-        raise InputError(f"{path}: no such policy; train one with 'nmfd train'") from None
+        raise InputError(f"{path}: {missing}") from None
     except Exception:
-        raise InputError(f"{path}: is not a policy file; train one with 'nmfd train'") from None
+        raise InputError(f"{path}: {damaged}") from None
+
+
+def read_policy_file(path: Path) -> Any:
+    """The checkpoint in `path`, unchecked. InputError if there is none."""
+    return read_file(
+        path, "no such policy; train one with 'nmfd train'", "is not a policy file; train one with 'nmfd train'")
+
+
+def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
+    """The policy in `path` and its whole checkpoint. InputError if it is none, or was trained for another network."""
+    content = read_policy_file(path)
     try:
         if content["format"] != FORMAT:
             raise InputError(f"{path}: format: expected {FORMAT}, got {content['format']!r} instead; train it again")
