@@ -35,8 +35,8 @@ class Record:
         "interval", "region", "next_region", "destination", unit="veh",
         text="vehicles that came into another region where no gateway leads there")
     redirected: TurnCounts = quantity(
-        "interval", "region", "destination", "next_destination", unit="veh",
-        text="vehicles whose route was changed to end in another region")
+        "interval", "region", "destination", "next_region", unit="veh",
+        text="vehicles there whose route was changed to end in another region, the next, instead of destination")
     production: RegionCounts = quantity("interval", "region", unit="veh m/s", text="travel production, mean of samples")
     mean_accumulation: RegionCounts = quantity(
         "interval", "region", unit="veh", text="vehicles inside, mean of the same samples")

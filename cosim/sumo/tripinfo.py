@@ -66,7 +66,7 @@ class TripReader:
     def __init__(self, path: Path, flush: Callable[[], bool] = lambda: False):
         """flush: has SUMO write what it keeps in memory (some 8 kB, about ten trips), False where it does not"""
         self._path, self._flush, self._offset = path, flush, 0
-        self._parser: ElementTree.XMLPullParser = ElementTree.XMLPullParser()
+        self._parser: ElementTree.XMLPullParser[Element] = ElementTree.XMLPullParser()
         self.facts, self.prompt = TripFacts(), False
 
     def ends(self) -> list[End]:
@@ -98,7 +98,8 @@ class TripReader:
         """left: whether a vehicle has left of which SUMO says that it has not arrived. So it says of one that the
         mesoscopic model teleports to the end of its route, too."""
         ends = []
-        for _, element in self._parser.read_events():
+        for event in self._parser.read_events():
+            element = event[-1]
             if isinstance(element, Element) and element.tag == "tripinfo":
                 ended = float(attribute(element, "arrival")) >= 0 or (
                     float(attribute(element, "depart")) >= 0 and left(element.get("id", "")))
