@@ -228,20 +228,20 @@ def test_the_clock_is_looked_at_wherever_a_decision_takes_time(states, monkeypat
         begin = time.perf_counter()
         ticks.clear()
         assert "time limit" in controller.act(states[k]).note
-        assert len(ticks) > 0 and all(tick <= begin + limit for tick in ticks)
+        assert len(ticks) > 0 and sum(tick > begin + limit for tick in ticks) <= 1
 
 
 def test_a_decision_that_came_late_is_late_in_the_books(tmp_path):
     class Slow(NoControl):
-        deadline = 0.01
+        deadline = 0.2
 
         def act(self, observation):
-            time.sleep(0.02 * (observation.step == 1))
+            time.sleep(0.25 * (observation.step == 1))
             return super().act(observation)
 
     scenario = replace(load_scenario(tiny.write(tmp_path)), steps=3)
     for controller, kinds, note in (
-            (Slow(planning_model(scenario)), [Status.OK, Status.LATE, Status.OK], "later than its deadline of 0.01 s"),
+            (Slow(planning_model(scenario)), [Status.OK, Status.LATE, Status.OK], "later than its deadline of 0.2 s"),
             (NoControl(planning_model(scenario)), [Status.OK] * 3, "")):
         trajectory = run(NmfdPlant(scenario), controller, scenario, seed=0)
         assert list(trajectory.status) == [kind.value for kind in kinds] and trajectory.note[1] == note
