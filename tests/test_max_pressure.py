@@ -95,7 +95,9 @@ def link(index, start, end, lane=0):
 LANES = dict.fromkeys("acdefx", 1) | {"b": 2}
 AFTER = {"x": ("a",), "a": ("b",), "c": ("d",), "b": ("e", "f"), "d": (), "e": (), "f": ()}
 LANE_IDS = {edge: tuple(f"{edge}_{n}" for n in range(lanes)) for edge, lanes in LANES.items()}
-TOWN = SimpleNamespace(edges=tuple("abcdefx"), lanes=LANES, lane_ids=LANE_IDS, successors=AFTER, gateways=())
+TOWN = SimpleNamespace(
+    edges=tuple("abcdefx"), lanes=LANES, lane_ids=LANE_IDS, length=dict.fromkeys(LANES, 200.0), successors=AFTER,
+    gateways=())
 CROSSING = signal(CROSS, (link(0, "a", "b"), link(1, "c", "d")), "s")
 END = signal([("GGg", 30), ("yyy", 3), ("rrG", 30), ("rry", 3)], (
     link(0, "b", "e", lane=1), link(1, "b", "e"), link(2, "b", "f")), "t")
@@ -121,6 +123,16 @@ def test_weights_by_hand():
 def test_what_is_upstream_on_the_same_road_counts_too():
     assert weights(x=5.0)[0]["a", "b"] == pytest.approx(5.0)
     assert weights(d=9.0)[0]["c", "d"] == 0.0  # nobody on d wants to go on anywhere
+
+
+@pytest.mark.parametrize("length, weight", [(10.0, 5.0 + 0.25 * 8.0), (100.0, 5.0)])
+def test_a_short_piece_before_the_signal_is_not_all_of_the_queue(length, weight):
+    """x leads into a, and for three quarters of its vehicles elsewhere; within 100 m they count by that share."""
+    after = {**AFTER, "x": ("a", "f")}
+    town = SimpleNamespace(**{**vars(TOWN), "successors": after, "length": {**TOWN.length, "a": length}})
+    roads = Roads(town, [CROSSING], {("x", "a"): 1.0, ("x", "f"): 3.0})
+    present = np.array([{"a": 5.0, "x": 8.0}.get(lane[0], 0.0) for lane in roads.lanes])
+    assert (roads.weights @ present)[roads.movements["a", "b"]] == pytest.approx(weight)
 
 
 def test_without_expected_flows_all_turns_are_alike():
@@ -247,7 +259,7 @@ def test_the_green_goes_where_the_pressure_is_after_the_minimum(junctions):
 @pytest.mark.parametrize("a, b, c, state", [
     (5.0, 0.0, 4.9, "Gr"), (5.0, 0.0, 6.4, "Gr"), (5.0, 0.0, 6.6, "rG"), (9.0, 3.0, 6.4, "rG"), (9.0, 0.0, 8.9, "Gr"),
     (0.0, 4.0, 0.1, "rG"), (0.0, 4.0, 0.0, "Gr")],
-    ids=["less", "not worth the change", "more", "less but nothing ahead", "more and nothing ahead", "negative",
+    ids=["less", "not worth it", "more", "less but nothing ahead", "more and nothing ahead", "negative",
          "nobody"])
 def test_the_higher_pressure_wins_and_the_green_stays_in_doubt(junctions, a, b, c, state):
     """The pressure of a is what waits there less what stands on b: 9 - 0.75 * 5.25 - 0.25 * 0.75 = 4.9 - at b = 3. That

@@ -37,6 +37,7 @@ LEVELS = "rgG"    # from nothing to the right of way
 FACTS = ("signal_lanes", "split_lanes", "never_whole_lanes", "intergreen_share", "programmed_intergreen_share")
 EVERY = 5.0       # s between two decisions: about two vehicles per lane
 SOON = 10.0       # s; about two minimum greens
+REACH = 100.0     # m before a signal within which vehicles count, wherever roads join and part there
 MAX_RED = 120.0   # s; about the longest cycle that is usual (Signal Timing Manual, 2nd edition, 2015)
 WHOLE = 1 - 1e-9  # of the vehicles of a lane: all of them
 PERMISSIVE = 0.3  # saturation flow of a movement that must give way (g), as a share of a protected one
@@ -325,7 +326,7 @@ class Roads:
         self.movements = {movement: n for n, movement in enumerate(movements)}
         rows: list[dict[int, float]] = []
         for edge, target in self.movements:
-            row = self._queue(edge, target)
+            row = self._queue(edge, target, arriving=True)
             end = self._chain(target)[-1]
             for onward, share in self._shares(end, self._targets(end)).items():
                 for lane, part in self._queue(end, onward).items():
@@ -380,18 +381,34 @@ class Roads:
                 to.setdefault(lane_id(link), set()).add(link.to_edge)
         return {lane: sum(self._lane_shares(lane)[edge] for edge in sorted(edges)) for lane, edges in to.items()}
 
-    def _queue(self, edge: str, to: str) -> dict[int, float]:
-        """Lane -> share of its vehicles that want to go from `edge` to `to`."""
+    def _queue(self, edge: str, to: str, *, arriving: bool = False) -> dict[int, float]:
+        """Lane -> share of its vehicles that want to go from `edge` to `to`. arriving: also from beyond the road."""
         queue = {}
         share = self._shares(edge, self._targets(edge))[to]
         for lane in self._city.lane_ids[edge]:
             if own := self._lane_shares(lane).get(to) if edge in self._links else share:
                 queue[self.lane_number[lane]] = own
-        before = self._upstream(edge)
+        before, last, length = self._upstream(edge), edge, self._city.length[edge]
         while before is not None:
             queue |= {self.lane_number[lane]: share for lane in self._city.lane_ids[before]}
+            length, last = length + self._city.length[before], before
             before = self._upstream(before)
+        if arriving:
+            for before, part in self._arriving(last, length).items():
+                queue |= {self.lane_number[lane]: share * part for lane in self._city.lane_ids[before]}
         return queue
+
+    def _arriving(self, edge: str, length: float) -> dict[str, float]:
+        """Edges without a signal that lead to `edge`, as far as REACH -> share of their vehicles that take it; length:
+        [m] from the beginning of `edge` to the signal. Roads are cut into pieces shorter than their queues."""
+        found, todo = {edge: 1.0}, [(edge, length)]
+        for onward, there in todo:
+            for before in self._before[onward] if there < REACH else ():
+                if before not in self._links and before not in found:
+                    found[before] = found[onward] * self._shares(before, self._targets(before))[onward]
+                    todo.append((before, there + self._city.length[before]))
+        del found[edge]
+        return found
 
     def _lane_shares(self, lane: str) -> dict[str, float]:
         edge = lane.rpartition("_")[0]
