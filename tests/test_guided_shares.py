@@ -1,15 +1,20 @@
 """Who is guided where, worked out by hand: two ways from region 0 to region 3, a through region 1 and b through 2."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from cosim.evaluation.simulate import drive
 from cosim.plant import guidance
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Event
+from cosim.plant.strategy import parse
 from cosim.sumo.net import City, Gateway
+from nmfd.api import load_scenario
+from nmfd.types import Controls
 
 # s and z are in region 0, a and b in 1 and 2; all lead to t in 3, where t2 follows, and z by a shorter u.
 REGION_OF = {"a": 1, "b": 2, "s": 0, "t": 3, "t2": 3, "u": 3, "v": 3}
@@ -166,3 +171,34 @@ def test_in_the_region_of_the_destination_it_is_the_fastest_way(present, expecte
     town.guide.apply([event])
     assert town.routes["x"] == expected
     assert town.guide.realised.sum() == 0
+
+
+class _Gate:
+    """Gates that are half open; `splits`: what drivers are told."""
+
+    name = "gate"
+
+    def __init__(self, splits=None):
+        self._splits = splits
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return Controls(perimeter=np.full_like(observation.accumulation, 0.4), splits=self._splits)
+
+
+def test_guided_is_guidance_by_travel_times_wherever_the_controller_says_nothing():
+    """The same bytes as of a controller that commands the drivers' own split ratios; and without it nobody is guided.
+    """
+    scenario = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
+    scenario = replace(scenario, steps=1, demand=scenario.demand[15:16])
+    own = scenario.network.nominal_splits
+    by_hand, option, off = (
+        drive(scenario, parse(name), _Gate(splits), seed=1)
+        for name, splits in (("pi-gating", own), ("pi-gating+guided", None), ("pi-gating", None)))
+    assert option.record["guided"].sum() > 0 and off.record["guided"].sum() == 0
+    for key, values in by_hand.record.items():
+        np.testing.assert_array_equal(option.record[key], values, err_msg=key)
+    np.testing.assert_array_equal(option.trajectory.accumulation, by_hand.trajectory.accumulation)
+    np.testing.assert_array_equal(option.trajectory.splits, by_hand.trajectory.splits)
