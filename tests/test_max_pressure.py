@@ -272,7 +272,8 @@ def test_the_green_goes_where_the_pressure_is_after_the_minimum(junctions):
 @pytest.mark.parametrize("a, b, c, state", [
     (5.0, 0.0, 4.9, "Gr"), (5.0, 0.0, 6.4, "Gr"), (5.0, 0.0, 6.6, "rG"), (9.0, 3.0, 6.4, "rG"), (9.0, 0.0, 8.9, "Gr"),
     (0.0, 4.0, 0.1, "rG"), (0.0, 4.0, 0.0, "Gr")],
-    ids=["less", "not worth it", "more", "less but nothing ahead", "more and nothing ahead", "negative", "nobody"])
+    ids=["less", "not worth it", "more", "less but nothing ahead", "more and nothing ahead", "negative",
+         "nobody"])
 def test_the_higher_pressure_wins_and_the_green_stays_in_doubt(junctions, a, b, c, state):
     """The pressure of a is what waits there less what stands on b: 9 - 0.75 * 5.25 - 0.25 * 0.75 = 4.9 - at b = 3. That
     of c has to be higher by 3 s of yellow in 10 s."""

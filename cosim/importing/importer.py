@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.importing import level, model, quality, written
+from cosim.importing import level, model, quality, verdict, written
 from cosim.importing.baseline import Baseline, run_baseline
 from cosim.importing.case import SumoInput, read_sumo_input, seconds
 from cosim.importing.demand import Traffic, read_traffic
@@ -22,6 +22,7 @@ from cosim.sumo.signals import HELD
 from nmfd.errors import InputError
 from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel
+from nmfd.runs.files import synced
 from nmfd.runs.scratch import LOCK, Scratch
 
 LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
@@ -93,6 +94,9 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
         written.write_table(net_folder / "regions.csv", ("edge", "region"), zip(streets.edges, regions, strict=True))
         city = load_city(net_folder / written.NET, net_folder / "regions.csv", network.regions)
         found = quality.tables(streets, regions, network.region_names, city, baseline, left)
+        judged = verdict.of_import(network, found.gateways, regions, baseline)
+        network = replace(network, controllable=judged.boundaries.shares)
+        verdict.write_verdict(net_folder, judged)
         tell("writing")
         written.write_network(net_folder, streets, regions, network, found, baseline, order.source.name)
         demand = model.region_demand(traffic, regions, clock)
@@ -102,6 +106,7 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
             network_path=os.path.relpath(order.out, order.scenario).replace(os.sep, "/"),
             protected=_protected(streets, regions, baseline, network), factor=factor, mesoscopic=order.mesoscopic))
         report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
+        report += "".join(f"\n{sentence}" for sentence in judged.sentences)
         report += _level_line(order, factor, congests)
         if moved and isinstance(order.cut, Drawn):
             report += (f"\n{moved:,} streets are in other regions than {order.cut.file.name} says: theirs was in "
@@ -196,7 +201,9 @@ def _folders(order: ImportOptions) -> Iterator[tuple[Path, Path]]:
                 (folder / GUIDED / "network.toml").unlink(missing_ok=True)
             for file in sorted(temporary.iterdir(), key=lambda file: (file.suffix == ".toml", file.name)):
                 if file.name != LOCK:
+                    synced(file)
                     os.replace(file, folder / file.name)
+                    synced(folder)
 
 
 class _Baselines:
@@ -279,8 +286,6 @@ def _report(
     if found.uncontrolled > LITTLE:
         lines.append(f"perimeter control reaches only {100 * (1 - found.uncontrolled):.0f} % of the flow over the "
                      "boundaries: other regions (--regions, --method, your own) may have more signals between them")
-    if not any(g["control"] == "controlled" for g in found.gateways):
-        lines.append("no gateway has a signal that perimeter control can use: only route guidance can do anything here")
     if baseline is not None:
         lines.append(
             f"without control: driving takes {baseline.pace(streets):.1f} times as long as at the speed limits; "

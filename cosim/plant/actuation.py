@@ -16,8 +16,7 @@ from cosim.plant.max_pressure import FACTS, MaxPressure
 from cosim.plant.perimeter import GREEN, GatewaySignal, GatewaySignals
 from cosim.plant.programmes import CitySignals
 from cosim.plant.responsive import ResponsiveSignal, ResponsiveSignals
-from cosim.plant.settings import Settings
-from cosim.plant.strategy import CYCLIC
+from cosim.plant.settings import CYCLIC, Settings
 from cosim.sumo.arrays import PerEdge, PerGateway
 from cosim.sumo.net import City, Gateway, gateway_movements, gateway_room_taken
 from cosim.sumo.session import Phase, Session

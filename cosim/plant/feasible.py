@@ -2,8 +2,8 @@
 
 from cosim.plant.launch import own_files
 from cosim.plant.programmes import CitySignals, city_signals
-from cosim.plant.settings import ESTIMATE, Settings, scenario_file, settings
-from cosim.plant.strategy import FIXED, PRESSURES, parse
+from cosim.plant.settings import ESTIMATE, FIXED, PRESSURES, Settings, scenario_file, settings
+from cosim.plant.strategy import parse
 from cosim.sumo.net import City
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from cosim.plant import webster
 from cosim.plant.actuated import actuated_row
-from cosim.plant.settings import Settings
-from cosim.plant.strategy import ACTUATED, FIXED, PRESSURES, WEBSTER
+from cosim.plant.settings import ACTUATED, FIXED, PRESSURES, WEBSTER, Settings
 from cosim.sumo.build import network_folder
 from cosim.sumo.net import City
 from cosim.sumo.signals import FIXED as FIXED_TIME
