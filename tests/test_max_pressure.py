@@ -135,6 +135,19 @@ def test_a_short_piece_before_the_signal_is_not_all_of_the_queue(length, weight)
     assert (roads.weights @ present)[roads.movements["a", "b"]] == pytest.approx(weight)
 
 
+def test_who_waits_behind_a_piece_too_short_to_be_seen_on_is_seen():
+    """A vehicle stands on x, before the 5 m of a, where a detector would find nobody: it gets its green."""
+    town = SimpleNamespace(**{**vars(TOWN), "length": {**TOWN.length, "a": 5.0}})
+    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"x": 1.0, "c": 9.0}.get(lane[0], 0.0))
+    shown = []
+    control = MaxPressure(session, town, [CROSSING], FLOWS, min_green=5.0, max_green=40.0,
+                          show=lambda name, state: shown.append(state))
+    for _ in range(100):
+        control.play(session.time)
+        session.time += 1.0
+    assert shown.count("rG") == 2 and shown.count("Gr") >= 2
+
+
 def test_without_expected_flows_all_turns_are_alike():
     roads = Roads(TOWN, [CROSSING, END], {})
     present = np.array([4.0 * (lane[0] == "b") for lane in roads.lanes])

@@ -37,6 +37,7 @@ LEVELS = "rgG"    # from nothing to the right of way
 FACTS = ("signal_lanes", "split_lanes", "never_whole_lanes", "intergreen_share", "programmed_intergreen_share")
 EVERY = 5.0       # s between two decisions: about two vehicles per lane
 SOON = 10.0       # s; about two minimum greens
+SHORT = 15.0      # m, two vehicles
 REACH = 100.0     # m before a signal within which vehicles count, wherever roads join and part there
 MAX_RED = 120.0   # s; about the longest cycle that is usual (Signal Timing Manual, 2nd edition, 2015)
 WHOLE = 1 - 1e-9  # of the vehicles of a lane: all of them
@@ -61,7 +62,7 @@ class MaxPressure:
         self._programmed = float(np.mean([_intergreen(signal) for signal in signals])) if signals else 0.0
         self._junctions = [
             Junction(signal, session.time, pairs.get(signal.id), min_green=min_green) for signal in signals]
-        self._approaches = [Approaches(signal, roads.lane_number, session.time) for signal in signals]
+        self._approaches = [Approaches(signal, roads.watched, session.time) for signal in signals]
         self._rationed = [junction for junction in self._junctions if junction.rationed]
         self._next = session.time
         for junction in self._junctions:
@@ -269,10 +270,10 @@ class Approaches:
     serves: (n, K) [0 or 1], whether a link is green in a stage; K links, by their index in the signal's states
     """
 
-    def __init__(self, signal: Signal, lane_number: Mapping[str, int], now: float):
-        """lane_number: of the lanes whose vehicles are counted"""
+    def __init__(self, signal: Signal, watched: Callable[[Link], set[int]], now: float):
+        """watched: the lanes, by their number, whose vehicles may wait for a link"""
         self.serves = np.array([_green(signal.phases[n].state) for n in stages_of(signal)], dtype=float)
-        pairs = sorted({(link.index, lane_number[lane_id(link)]) for link in signal.links})
+        pairs = sorted({(link.index, lane) for link in signal.links for lane in watched(link)})
         self._link, self._lane = np.array(pairs).T
         self._last_green = np.full(self.serves.shape[1], now)
 
@@ -397,6 +398,14 @@ class Roads:
             for before, part in self._arriving(last, length).items():
                 queue |= {self.lane_number[lane]: share * part for lane in self._city.lane_ids[before]}
         return queue
+
+    def watched(self, link: Link) -> set[int]:
+        """The numbers of the lanes on which somebody may wait for a link: its own, and those behind a piece of road
+        that is too short for a vehicle to be seen there."""
+        own = {self.lane_number[lane_id(link)]}
+        if lane_id(link) in self._cars and self._city.length[link.from_edge] < SHORT:
+            own |= self._queue(link.from_edge, link.to_edge, arriving=True).keys()
+        return own
 
     def _arriving(self, edge: str, length: float) -> dict[str, float]:
         """Edges without a signal that lead to `edge`, as far as REACH -> share of their vehicles that take it; length:
