@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from cosim.importing import atlas, layers, model, quality
+from cosim.importing.assignment import Assigned
 from cosim.importing.baseline import Baseline
 from cosim.importing.demand import Traffic, wrapped
 from cosim.importing.streets import Streets
@@ -59,6 +60,13 @@ def write_demand(path: Path, demand: PairsOverTime) -> None:
     """demand: (T, R, R) [veh/s]"""
     write_table(path, ("interval", "from", "to", "veh_s"), (
         (k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)))
+
+
+def write_assignment(path: Path, assigned: Assigned) -> None:
+    """A row per iteration; the routes of the chosen one are those of the vehicles."""
+    write_table(path, ("iteration", "relative_gap", "mean_trip_s", "arrived_veh", "chosen"), (
+        (n + 1, f"{one.gap:.5f}", f"{one.trip_time:.1f}", one.arrived, int(n == assigned.best))
+        for n, one in enumerate(assigned.iterations)))
 
 
 def write_network(folder: Path, streets: Streets, regions: EdgeNumbers, network: RegionalModel, found: quality.Tables,
