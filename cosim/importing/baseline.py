@@ -3,7 +3,7 @@
 import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -107,8 +107,10 @@ def holding_half(held: Float[np.ndarray, " E"]) -> int:
 def run_baseline(
     streets: Streets, *, routes: Sequence[Path], additional: Sequence[Path], begin: float, end: float,
     vehicles: Collection[str] = (), options: Sequence[str] = (), seed: int = 0,
+    look: Callable[[Path], None] = lambda edges: None,
 ) -> Baseline:
-    """Simulate without control; vehicles: ids of the demand. Raises InputError with SUMO's own words if it refuses."""
+    """Simulate without control; vehicles: ids of the demand; look: is called with SUMO's edgeData, which goes then.
+    Raises InputError with SUMO's own words if it refuses."""
     # A vehicle that a rerouter gives another route makes SUMO fail when it writes the times of the edges it has left.
     rerouted = any(next(read_xml(path).iter("routeProbReroute"), None) is not None for path in additional)
     with Scratch("cosim-") as folder:
@@ -128,6 +130,7 @@ def run_baseline(
         counts, trips = child(statistic, "vehicles"), child(statistic, "vehicleTripStatistics")
         waiting = int(attribute(counts, "waiting"))
         ways, driven = _ways(folder / "ways.xml", streets)
+        look(edges)
         presence, production = _measured(edges, streets, begin, end)
         return Baseline(
             presence=presence, production=production, ways=ways,

@@ -1,7 +1,7 @@
 """`cosim import`: from a sumocfg to networks/NAME and scenarios/NAME."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from cosim.importing import level, model, quality, written
-from cosim.importing.assignment import Assigned, Effort
+from cosim.importing.assignment import Assigned, Effort, relative_gap
 from cosim.importing.baseline import Baseline
 from cosim.importing.case import SumoInput, read_sumo_input, seconds
 from cosim.importing.demand import Traffic, read_traffic
-from cosim.importing.partition import Clustered, Drawn, partition
+from cosim.importing.partition import Clustered, Drawn, alternatives, partition
 from cosim.importing.regions import positions
 from cosim.importing.streets import Streets, read_streets
-from cosim.importing.trials import Peaks, Trials
+from cosim.importing.trials import Peaks, Trials, routed
 from cosim.sumo.net import City, load_city
 from nmfd.errors import InputError
 from nmfd.model.planning import GUIDED
@@ -76,7 +76,7 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
         case = model.without_idle(case, traffic)
     mesoscopic = order.mesoscopic or streets.drivable.sum() > LARGE
     effort = order.effort if order.run else replace(order.effort, iterations=0)
-    peaks = Peaks(streets, case, traffic, seed=order.seed, effort=effort, tell=tell)
+    peaks = Peaks(streets, case, traffic, seed=order.seed, effort=effort, mesoscopic=mesoscopic, tell=tell)
     times, congests = order.level or 1.0, True
     if order.level is None:
         times, congests = level.congesting(
@@ -89,9 +89,14 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
         files = written.write_traffic(folder, traffic)
         if assigned is not None:
             written.write_assignment(folder / "assignment.csv", assigned)
-        baseline = None
+        baseline, gaps = None, []
         if order.run:
-            baseline = Trials(streets, case, clock, folder, files).averaged(factor, mesoscopic, order.seeds, tell)
+            def judge(edges: Path) -> None:
+                if assigned is not None:
+                    gaps.append(relative_gap(streets.path, routed(traffic), edges, begin=clock.begin, seed=order.seed))
+
+            baseline = Trials(streets, case, clock, folder, files).averaged(
+                factor, mesoscopic, order.seeds, tell, judge)
         left = left_alone(streets, traffic)
         tell("partition")
         regions, asked, moved = partition(streets, baseline, order.cut, seed=order.seed, left_alone=left)
@@ -100,7 +105,10 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
         written.write_net(case.net, net_folder / written.NET)
         written.write_table(net_folder / "regions.csv", ("edge", "region"), zip(streets.edges, regions, strict=True))
         city = load_city(net_folder / written.NET, net_folder / "regions.csv", network.regions)
-        found = quality.tables(streets, regions, network.region_names, city, baseline, left)
+        tell("other numbers of regions")
+        others = {} if baseline is None else alternatives(
+            streets, baseline, order.cut, regions, seed=order.seed, left_alone=left)
+        found = quality.tables(streets, regions, network.region_names, city, baseline, left, others)
         tell("writing")
         written.write_network(net_folder, streets, regions, network, found, baseline, order.source.name)
         demand = model.region_demand(traffic, regions, clock)
@@ -110,7 +118,7 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
             network_path=os.path.relpath(order.out, order.scenario).replace(os.sep, "/"),
             protected=_protected(streets, regions, baseline, network), factor=factor, mesoscopic=order.mesoscopic))
         report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
-        report += _demand_lines(order, streets, assigned, baseline)
+        report += _demand_lines(order, streets, assigned, baseline, gaps)
         report += _level_line(order, times if order.peak else factor, congests)
         if moved and isinstance(order.cut, Drawn):
             report += (f"\n{moved:,} streets are in other regions than {order.cut.file.name} says: theirs was in "
@@ -224,13 +232,17 @@ def _probe(
 
 def _demand_lines(
     order: ImportOptions, streets: Streets, assigned: Assigned | None, baseline: Baseline | None,
+    gaps: Sequence[float],
 ) -> str:
-    """How far a generated demand is from an equilibrium, and whether a few streets hold it, for the report."""
+    """How far a generated demand is from an equilibrium, and whether a few streets hold it, for the report. gaps: of
+    the run without control, in which SUMO's model may be another one than in the assignment."""
     text = ""
     if assigned is not None:
-        text = (f"\nroutes by duaIterate.py, mesoscopic: relative gap {100 * assigned.iterations[0].gap:.1f} % at free "
-                f"flow, {100 * assigned.gap:.1f} % in iteration {assigned.best + 1} of {len(assigned.iterations)} "
-                "(assignment.csv)")
+        last = assigned.iterations[assigned.best]
+        text = (f"\nroutes by duaIterate.py: relative gap {100 * assigned.iterations[0].gap:.1f} % at free flow, "
+                f"{100 * assigned.gap:.1f} % in iteration {assigned.best + 1} of {len(assigned.iterations)}, "
+                f"{'mesoscopic' if last.mesoscopic else 'car-following'} (assignment.csv)"
+                + "".join(f", {100 * gap:.1f} % in the run without control" for gap in gaps))
         if not assigned.reached:
             text += (f"\nWARNING: the relative gap of {100 * assigned.effort.gap:g} % was not reached: some of what "
                      "rerouting gains here it would gain from drivers who know the city, too; more --iterations, or a "

@@ -104,4 +104,6 @@ def congesting(probe: Probe, *, mesoscopic: bool, tell: Callable[[str], None]) -
         if n == MOST:
             return level(n), False
         n += 1
+    while n - 1 in seen[mesoscopic] and congests(n - 1, mesoscopic):
+        n -= 1
     return level(n), True

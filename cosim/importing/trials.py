@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, ElementTree
 
 from cosim.importing import model
 from cosim.importing.assignment import Assigned, Effort, assign
@@ -19,6 +19,11 @@ JITTER = 10.0  # s: what seeds differ in, as in the scenario that is written
 TYPES = ("vType", "vTypeDistribution")
 
 
+def routed(traffic: Traffic) -> list[Element]:
+    """The vehicles of a generated demand with the types that they need, as cosim.importing.assignment wants them."""
+    return [*(element for element in traffic.shared if element.tag in TYPES), *traffic.vehicles]
+
+
 class Trials:
     """Runs of `traffic`, the city's own vehicles, left out or doubled; each level is run once for each seed."""
 
@@ -31,23 +36,27 @@ class Trials:
                          "--time-to-teleport", f"{case.time_to_teleport:g}"]
         self._known: dict[tuple[float, bool, int], Baseline] = {}
 
-    def run(self, factor: float, mesoscopic: bool, seed: int = 0) -> Baseline:
-        """With the demand times `factor`. Of seed 0 everybody departs when they wish to."""
+    def run(
+        self, factor: float, mesoscopic: bool, seed: int = 0, look: Callable[[Path], None] = lambda edges: None,
+    ) -> Baseline:
+        """With the demand times `factor`. Of seed 0 everybody departs when they wish to. look: as of run_baseline."""
         if (key := (factor, mesoscopic, seed)) not in self._known:
             with Scratch("cosim-") as folder:
                 routes, vehicles = self._vehicles(folder, factor, seed)
                 self._known[key] = run_baseline(
                     self._streets, routes=[*routes, *self._background], additional=self._additional,
-                    begin=self._clock.begin, end=self._clock.end, vehicles=vehicles, seed=seed,
+                    begin=self._clock.begin, end=self._clock.end, vehicles=vehicles, seed=seed, look=look,
                     options=[*self._options, *(MESOSCOPIC if mesoscopic else ())])
         return self._known[key]
 
-    def averaged(self, factor: float, mesoscopic: bool, seeds: int, tell: Callable[[str], None]) -> Baseline:
-        """Of seeds 0 to seeds - 1."""
+    def averaged(
+        self, factor: float, mesoscopic: bool, seeds: int, tell: Callable[[str], None], look: Callable[[Path], None],
+    ) -> Baseline:
+        """Of seeds 0 to seeds - 1. look: as of run_baseline, for the first."""
         runs = []
         for seed in range(seeds):
             tell(f"simulating without control, {seed + 1} of {seeds}")
-            runs.append(self.run(factor, mesoscopic, seed))
+            runs.append(self.run(factor, mesoscopic, seed, look if seed == 0 else lambda edges: None))
         return averaged(runs)
 
     def _vehicles(self, folder: Path, factor: float, seed: int) -> tuple[list[Path], list[str]]:
@@ -64,10 +73,10 @@ class Peaks:
     """Generated peaks at any level, their routes assigned; each level is made once."""
 
     def __init__(self, streets: Streets, case: SumoInput, beside: Traffic, *, seed: int, effort: Effort,
-                 tell: Callable[[str], None]):
-        """beside: what else the city's files hold; effort: of the assignment."""
-        self._streets, self._case, self._beside, self._seed, self._effort, self._tell = (
-            streets, case, beside, seed, effort, tell)
+                 mesoscopic: bool, tell: Callable[[str], None]):
+        """beside: what else the city's files hold; effort, mesoscopic: of the assignment."""
+        self._streets, self._case, self._beside, self._seed, self._effort, self._mesoscopic, self._tell = (
+            streets, case, beside, seed, effort, mesoscopic, tell)
         self._known: dict[float, tuple[Traffic, Assigned | None]] = {}
 
     def at(self, level: float) -> tuple[Traffic, Assigned | None]:
@@ -90,17 +99,16 @@ class Peaks:
     def _assigned(self, traffic: Traffic) -> tuple[Traffic, Assigned]:
         """Only cars drive in the assignment: what runs in the background is left out of it."""
         clock = model.clock(self._case, self._streets, traffic)
-        types = [element for element in traffic.shared if element.tag in TYPES]
         others = [element for element in traffic.shared if element.tag not in TYPES]
         with Scratch("cosim-") as folder:
             additional: list[Path] = []
             if others:
                 additional = [folder / "city.add.xml"]
-                ElementTree.ElementTree(wrapped(others, "additional")).write(additional[0])
+                ElementTree(wrapped(others, "additional")).write(additional[0])
             found = assign(
-                self._streets.path.absolute(), [*types, *traffic.vehicles], begin=clock.begin, end=clock.end,
-                seed=self._seed, effort=self._effort, additional=additional,
-                time_to_teleport=self._case.time_to_teleport, tell=self._tell)
+                self._streets.path.absolute(), routed(traffic), begin=clock.begin, end=clock.end,
+                seed=self._seed, effort=self._effort, additional=additional, mesoscopic=self._mesoscopic,
+                options=[f"--time-to-teleport={self._case.time_to_teleport:g}"], tell=self._tell)
         for vehicle in traffic.vehicles:
             if (route := vehicle.find("route")) is not None and (name := vehicle.get("id", "")) in found.routes:
                 route.set("edges", " ".join(found.routes[name]))

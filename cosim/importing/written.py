@@ -64,8 +64,8 @@ def write_demand(path: Path, demand: PairsOverTime) -> None:
 
 def write_assignment(path: Path, assigned: Assigned) -> None:
     """A row per iteration; the routes of the chosen one are those of the vehicles."""
-    write_table(path, ("iteration", "relative_gap", "mean_trip_s", "arrived_veh", "chosen"), (
-        (n + 1, f"{one.gap:.5f}", f"{one.trip_time:.1f}", one.arrived, int(n == assigned.best))
+    write_table(path, ("iteration", "mesoscopic", "relative_gap", "mean_trip_s", "arrived_veh", "chosen"), (
+        (n + 1, int(one.mesoscopic), f"{one.gap:.5f}", f"{one.trip_time:.1f}", one.arrived, int(n == assigned.best))
         for n, one in enumerate(assigned.iterations)))
 
 
@@ -77,6 +77,9 @@ def write_network(folder: Path, streets: Streets, regions: EdgeNumbers, network:
     for name, columns, rows in (("quality.csv", quality.QUALITY, found.quality),
                                 ("gateways.csv", quality.GATEWAYS, found.gateways)):
         write_table(folder / name, columns, ([row[column] for column in columns] for row in rows))
+    if found.partitions:
+        write_table(folder / "partitions.csv", quality.PARTITIONS, (
+            [row[column] for column in quality.PARTITIONS] for row in found.partitions))
     names = network.region_names
     (folder / "regions.taz.xml").write_text(layers.taz_xml(streets, regions, names))
     (folder / "regions.poly.xml").write_text(layers.polygons_xml(streets, regions, names))
