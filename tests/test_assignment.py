@@ -55,7 +55,7 @@ def test_routes_spread_until_nobody_gains(fork):
     assert found.gap == min(followed) and found.reached == (min(followed) <= 0.05)
     assert len(told) == len(found.iterations) and told[0] == "assignment 1" and "car-following" in told[-1]
     again = assign(net, vehicles, begin=0.0, end=1800.0, seed=3, effort=effort)
-    assert again.iterations == found.iterations[:len(queue)] and again.routes != found.routes
+    assert again.iterations == found.iterations[:len(queue)]
 
 
 def test_an_assignment_that_sumo_refuses(fork):
@@ -147,7 +147,7 @@ def test_the_level_is_one_at_which_a_region_comes_to_its_critical_accumulation(m
 
 
 @pytest.mark.parametrize("probe", [
-    lambda times, meso: made(bottleneck, times=times), lambda times, meso: made(parabola, times=times, spread=0.02),
+    lambda times, meso: made(bottleneck, times=times), lambda times, meso: made(parabola, times=times, spread=0.01),
     lambda times, meso: made(lambda held: 8.0 * held, times=times)],
     ids=["a bottleneck", "a few streets", "free flow"])
 def test_what_is_no_congested_network(probe):

@@ -22,7 +22,7 @@ from cosim.sumo.arrays import EdgeNumbers
 
 NEAR = 0.9       # of the critical accumulation
 FALLEN = 0.9     # of the highest production: below, what is beyond counts as beyond critical
-FEW = 0.05       # of the streets of a region
+FEW = 0.03       # of the streets of a region
 BINS = 12        # of the accumulation, in which the production is averaged
 RATIO = 1.2      # between two levels that are tried: ..., 0.83, 1, 1.2, 1.44, ...
 MOST = 6         # levels above and below 1
