@@ -255,8 +255,8 @@ def _demand_lines(
         text += (f"\nhalf of all vehicles are on {half:,} of {of:,} edges ({100 * half / max(of, 1):.1f} %) in the "
                  "busiest quarter of an hour")
         if half < level.FEW * of:
-            text += "\nWARNING: these are queues on a few streets rather than a congested network: what relieves these streets "
-                     "gains much, for drivers who know the city as well"
+            text += ("\nWARNING: these are queues on a few streets rather than a congested network: what relieves them "
+                     "gains much, for drivers who know the city as well")
     return text
 
 
