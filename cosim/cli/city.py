@@ -99,7 +99,7 @@ def identify(
 @click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak, for a city without demand.")
 @click.option("--iterations", type=click.IntRange(min=0), default=20, show_default=True, metavar="N",
               help="Of the assignment of that peak, at most; 0: everybody goes as if alone, no basis for comparisons.")
-@click.option("--gap", type=click.FloatRange(0.0, 1.0), default=0.05, show_default=True, metavar="X",
+@click.option("--gap", type=float, default=0.05, show_default=True, metavar="X",
               help="The relative gap at which the assignment ends.")
 @click.option("--level", default="1", show_default=True, metavar="X|auto",
               help="Times the city's vehicles, or the usual peak; auto: the lowest at which without control a region "
@@ -142,6 +142,8 @@ def import_(
         raise InputError("--regions: give a number of regions, or else one of --edges, --taz and --polygons")
     if no_run and cuts[0].method == "density":
         raise InputError("--no-run: the densities come from that run; add --method geometric")
+    if not 0.0 <= gap <= 1.0:
+        raise InputError(f"--gap: expected a share from 0 to 1, got {gap:g} instead")
     order = ImportOptions(
         source=source, out=out, cut=cuts[0], seed=seed, run=not no_run, force=force,
         peak=demand is not None, level=parsed_level(level, no_run), mesoscopic=mesoscopic,

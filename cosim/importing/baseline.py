@@ -56,11 +56,22 @@ class Baseline:
 
     def peak(self) -> Float[np.ndarray, "K E"]:
         """(up to PEAK, E): `presence` in the quarter of an hour with the most vehicles."""
-        return busiest(self.presence)
+        return self.presence[busiest(self.presence)]
 
     def concentration(self, edges: EdgeMask) -> tuple[int, int]:
         """(the fewest of some edges that hold half of all vehicles on these, how many edges) when there are most."""
-        return holding_half(busiest(self.presence[:, edges]).sum(axis=0)), int(edges.sum())
+        return len(self._crowded(edges)), int(edges.sum())
+
+    def pace_of_crowded(self, streets: Streets, edges: EdgeMask) -> float:
+        """Time that vehicles spend on these fewest edges over what it takes at the speed limits [-], when there are
+        most: whether they stand there, or only many pass."""
+        crowded, when = self._crowded(edges), busiest(self.presence[:, edges])
+        driven = self.production[when][:, crowded].sum(axis=0)
+        return float(self.presence[when][:, crowded].sum() / max((driven / streets.speed[crowded]).sum(), 1.0))
+
+    def _crowded(self, edges: EdgeMask) -> np.ndarray:
+        held = np.where(edges, self.presence[busiest(self.presence[:, edges])].sum(axis=0), 0.0)
+        return np.argsort(-held, kind="stable")[:holding_half(held)]
 
     def moves(self) -> Counter[tuple[int, int]]:
         """(edge, next edge) -> vehicles that went from one to the other."""
@@ -92,11 +103,11 @@ class Baseline:
         return np.where(visits > 0, metres / np.maximum(visits, 1.0), np.nan)
 
 
-def busiest(presence: Float[np.ndarray, "K E"]) -> Float[np.ndarray, "_ E"]:
+def busiest(presence: Float[np.ndarray, "K E"]) -> slice:
     """Those PEAK intervals, one after the other, in which the edges hold most."""
     total = presence.sum(axis=1)
     first = int(np.argmax(np.convolve(total, np.ones(min(PEAK, len(total))), mode="valid")))
-    return presence[first : first + PEAK]
+    return slice(first, first + PEAK)
 
 
 def holding_half(held: Float[np.ndarray, " E"]) -> int:

@@ -24,6 +24,7 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.scratch import LOCK, Scratch
 
 LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
+STANDING = 2.0  # times as long as at the speed limits: the vehicles on a few streets queue there
 LITTLE = 0.3  # of the flow over the boundaries passes no signal under control: worth a word
 
 
@@ -254,7 +255,7 @@ def _demand_lines(
         half, of = baseline.concentration(streets.drivable)
         text += (f"\nhalf of all vehicles are on {half:,} of {of:,} edges ({100 * half / max(of, 1):.1f} %) in the "
                  "busiest quarter of an hour")
-        if half < level.FEW * of:
+        if half < level.FEW * of and baseline.pace_of_crowded(streets, streets.drivable) > STANDING:
             text += ("\nWARNING: these are queues on a few streets rather than a congested network: what relieves them "
                      "gains much, for drivers who know the city as well")
     return text
