@@ -177,3 +177,18 @@ def test_whether_crowded_streets_stand(tmp_path):
                             waiting=0, running=0)
         assert baseline.concentration(streets.drivable)[0] == 1
         assert baseline.pace_of_crowded(streets, streets.drivable) == pytest.approx(slower)
+
+
+@pytest.mark.slow
+def test_a_peak_at_the_level_at_which_a_region_congests(tmp_path):
+    """--level auto with --demand peak: every level tried is assigned, and the one found is driven as it was."""
+    net = tiny_city.network(tmp_path, "--tls.set", "B1,C2", name="tiny.net.xml")
+    text = good(cosim("import", net, "--regions", 2, "--demand", "peak", "--mesoscopic", "--method", "geometric",
+                      "--iterations", 1, "--level", "auto", "--seeds", 1, "--out", tmp_path / "networks" / "tiny"))
+    scenario = load_scenario(tmp_path / "scenarios" / "tiny")
+    times = float(re.search(r"demand times ([\d.]+) ", text)[1])
+    trips = len(read_recorded_trips([scenario.folder / "vehicles.rou.xml.gz"]).depart)
+    usual = good(cosim("import", net, "--regions", 2, "--demand", "peak", "--method", "geometric", "--no-run", "--out",
+                       tmp_path / "networks" / "usual"))
+    assert scenario.demand_factor == 1.0
+    assert trips == pytest.approx(times * int(re.search(r"peak: ([\d,]+)", usual)[1].replace(",", "")), rel=0.02)
