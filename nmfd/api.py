@@ -10,8 +10,7 @@ from nmfd.controllers.dpc import training
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario, read_scenario
 from nmfd.runs import run_folder
-from nmfd.studies import benchmark as benchmarks
-from nmfd.studies.benchmark import PLANTS
+from nmfd.studies.benchmark import PLANTS, run_all
 from nmfd.types import Controller, Plant, Trajectory
 
 
@@ -82,7 +81,7 @@ def benchmark(
     Raises InputError and nmfd.runs.workers.RunFailed.
     """
     scenario = _loaded(scenario)
-    return benchmarks.benchmark(
+    return run_all(
         scenario, list(controllers), range(seeds) if isinstance(seeds, int) else list(seeds), plant,
         out=run_folder.default_folder(scenario.name) if out is None else Path(out),
         policies={name: Path(file) for name, file in (policies or {}).items()}, workers=workers, progress=progress)
@@ -90,14 +89,16 @@ def benchmark(
 
 def train(
     scenario: Scenario | Path | str, controller: str, *, out: Path | str, seed: int = 0, steps: int | None = None,
-    resume: bool = False, progress: Callable[[int, int, str], None] | None = None,
+    resume: bool = False, anyway: bool = False, progress: Callable[[int, int, str], None] | None = None,
 ) -> Path:
     """`nmfd train` on the CPU: train the DPC policy `controller` and write it to the file `out`, which is returned.
 
-    steps: Adam steps; what scenario.toml says, else 400, if None. Raises InputError.
+    steps: Adam steps; what scenario.toml says, else 400, if None; anyway: even on placeholder MFDs, or where no gateway
+    can be controlled. Raises InputError.
     """
     return training.train(
-        _loaded(scenario), controller, seed=seed, out=Path(out), steps=steps, resume=resume, progress=progress)
+        _loaded(scenario), controller, seed=seed, out=Path(out), steps=steps, resume=resume, anyway=anyway,
+        progress=progress)
 
 
 def named(controller: str | Controller, scenario: Scenario, policy: Path | str | None) -> tuple[str, Controller]:

@@ -25,7 +25,7 @@ def run(
     goes to and fro is copied: a controller that writes into what it is given, or into what it returned, changes
     nothing. `progress(done, steps)` is called after every interval. The faults that the scenario orders are injected
     (nmfd.faults). What was wrong with an observation, or what the plant could not do in an interval, is in the status
-    of that decision.
+    of that decision; so is that it came after the control interval, or the controller's `deadline` [s] if it has one.
     """
     network = scenario.network
     opened = np.where(network.adjacency, network.u_max, 0.0)
@@ -35,15 +35,18 @@ def run(
     states, controls, decision_time = [plant.reset(seed)], [], []
     observed, problem = sensors.observe(states[-1], plant.observe())
     observations = [observed]
-    begin = time.perf_counter()
+    begin, deadline = time.perf_counter(), _deadline(controller, scenario.step)
     for k in range(scenario.steps):
         given = observed.copy()
         before = time.perf_counter()
         decided = supervised.act(given, problem)
         decision_time.append(time.perf_counter() - before)
         decided = _copied(decided)
+        if decision_time[-1] > deadline:
+            decided = _booked(decided, Status.LATE, f"later than its deadline of {deadline:g} s")
         states.append(plant.step(decided))
-        controls.append(_with_problem(decided, states[-1].problem))
+        fault = states[-1].problem
+        controls.append(_booked(decided, Status.PLANT_FAULT, fault) if fault else decided)
         observed, problem = sensors.observe(states[-1], plant.observe())
         observations.append(observed)
         if progress:
@@ -56,7 +59,9 @@ def run(
         perimeter=np.stack([c.perimeter for c in controls]),
         splits=np.stack([network.nominal_splits if c.splits is None else c.splits for c in controls]),
         decision_time=np.array(decision_time), status=np.array([c.status.value for c in controls]),
-        note=tuple(c.note for c in controls), wall_time=time.perf_counter() - begin)
+        note=tuple(c.note for c in controls),
+        removed=np.stack([np.zeros_like(s.backlog) if s.removed is None else s.removed for s in states]),
+        wall_time=time.perf_counter() - begin)
 
 
 class _Sensors:
@@ -85,16 +90,18 @@ def noisy(state: State, noise: PerPair) -> Observation:
         step=state.step, time=state.time, accumulation=state.accumulation + noise, backlog=state.backlog)
 
 
+def _deadline(controller: Controller, step: float) -> float:
+    """Of its decisions [s]: what it says itself, at most the control interval."""
+    own = getattr(controller, "deadline", None)
+    return min(own, step) if isinstance(own, int | float) and own > 0 else step
+
+
 def _copied(controls: Controls) -> Controls:
     """With arrays of its own: a controller may go on writing into those that it returned."""
     splits = None if controls.splits is None else np.array(controls.splits)
     return replace(controls, perimeter=np.array(controls.perimeter), splits=splits)
 
 
-def _with_problem(controls: Controls, problem: str) -> Controls:
-    """With what the plant could not do in its status."""
-    if not problem:
-        return controls
-    return replace(
-        controls, status=controls.status | Status.PLANT_FAULT,
-        note="; ".join(note for note in (controls.note, problem) if note))
+def _booked(controls: Controls, status: Status, note: str) -> Controls:
+    """With what else was not as it should be: what the plant could not do, or a decision that came late."""
+    return replace(controls, status=controls.status | status, note="; ".join(filter(None, (controls.note, note))))

@@ -1,5 +1,6 @@
 """Figures of merit of a trajectory."""
 
+import math
 from collections import Counter
 
 import numpy as np
@@ -10,19 +11,27 @@ from nmfd.types import Status, Trajectory
 COUNTED = {
     "solver_failures": ("failures", "of the solver or policy"),
     "fallbacks": ("fallbacks", "controls of something behind the controller"),
-    "late_decisions": ("late", "decisions longer than the control interval"),
+    "late_decisions": ("late", "decisions after their deadline, at most the control interval"),
     "sensor_faults": ("sensor", "decisions on a wrong or missing measurement"),
     "plant_faults": ("plant", "intervals in which the city could not do what was commanded"),
 }
 
 
 def total_time_spent(trajectory: Trajectory) -> float:
-    """dt * sum over k = 0 .. T-1 of all vehicles, running and waiting to enter [veh s].
+    """dt * sum over k = 0 .. T-1 of all vehicles, running, waiting to enter, and removed before that [veh s].
 
-    The objective of Tumu et al., with those who wait outside; the state at the end of the horizon is not counted.
+    The objective of Tumu et al., with those who wait outside; the state at the end of the horizon is not counted. A
+    vehicle that was removed on its way counts as if it were still there until the end of the horizon, the most that it
+    could have spent: a trip that is not made never counts as less than one that is.
     """
-    vehicles = trajectory.accumulation[:-1].sum() + trajectory.backlog[:-1].sum()
+    vehicles = (
+        trajectory.accumulation[:-1].sum() + trajectory.backlog[:-1].sum() + trajectory.removed[:-1].sum())
     return float(trajectory.step * vehicles)
+
+
+def percent_change(value: float, reference: float) -> float:
+    """How far `value` is above `reference` [%]; NaN, not defined, where that is 0."""
+    return 100.0 * (value / reference - 1.0) if reference else math.nan
 
 
 def decisions(trajectory: Trajectory, kind: Status) -> int:
@@ -31,8 +40,8 @@ def decisions(trajectory: Trajectory, kind: Status) -> int:
 
 
 def late_decisions(trajectory: Trajectory) -> int:
-    """Decisions that took longer than the control interval, by the wall clock."""
-    return int((trajectory.decision_time > trajectory.step).sum())
+    """Decisions that took longer than the control interval or their own deadline, by the wall clock."""
+    return int(((trajectory.decision_time > trajectory.step) | (trajectory.status & Status.LATE.value != 0)).sum())
 
 
 def notes(trajectory: Trajectory, most: int = 3) -> str:

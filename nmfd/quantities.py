@@ -26,14 +26,8 @@ def quantities(kind: type) -> dict[str, Mapping]:
 
 
 def variables(kind: type, values: Mapping) -> dict[str, tuple]:
-    """The `values` of quantities of `kind` as xarray.Dataset takes them: name -> (dimensions, array, attributes)."""
+    """The `values` of quantities of `kind`, as far as given, as xarray.Dataset takes them: name -> (dimensions, array,
+    attributes)."""
     return {
         name: (about["dimensions"], np.asarray(values[name]), {"long_name": about["text"], **about["attributes"]})
-        for name, about in quantities(kind).items()}
-
-
-def reference(kind: type) -> str:
-    """The quantities of `kind` as a Markdown table."""
-    lines = [f"| {name} | {', '.join(about['dimensions'])} | {about['attributes'].get('units', '')} | {about['text']} |"
-             for name, about in quantities(kind).items()]
-    return "\n".join(["| variable | dimensions | unit | what |", "|---|---|---|---|", *lines])
+        for name, about in quantities(kind).items() if name in values}

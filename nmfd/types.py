@@ -22,9 +22,8 @@ class Status(Flag):
     FALLBACK: the controls are not those of the controller that was asked for, but of something behind it
     SENSOR_FAULT: the controller was given a wrong, late or incomplete observation
     PLANT_FAULT: the city could not do what was commanded, or was not whole, during the interval
-
-    Decisions that took longer than the control interval are no status, for wall times are not part of a result: they
-    are counted in the tables (nmfd.metrics.late_decisions).
+    LATE: the decision took longer than the control interval, or than the controller's own `deadline` [s], by the clock
+        of the closed loop. The only part of a run's file that depends on wall time
     """
 
     OK = 0
@@ -32,6 +31,7 @@ class Status(Flag):
     FALLBACK = 2
     SENSOR_FAULT = 4
     PLANT_FAULT = 8
+    LATE = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,9 @@ class State:
     time: seconds since the start [s]
     accumulation: (R, R) [veh], [i, j] = in region i bound for j
     backlog: (R, R) [veh], [i, j] = waiting outside the network to enter region i, bound for j; zero in the NMFD
-    completed: trips ended since the start [veh]
+    completed: trips that reached their end since the start [veh]
+    removed: (R, R) [veh], [i, j] = taken out in i, or before they entered it, on their way to j, since the start: by
+        whatever removes vehicles from a simulation; zero if None, as in the NMFD
     problem: what the plant could not do in the interval that has just ended, "" if nothing
     """
 
@@ -51,7 +53,14 @@ class State:
     accumulation: PerPair
     backlog: PerPair
     completed: float
+    removed: PerPair | None = None
     problem: str = ""
+
+    @property
+    def unfinished(self) -> PerPair:
+        """(R, R) [veh]: those that spend time: running, waiting to enter, and removed (nmfd.metrics)."""
+        spending = self.accumulation + self.backlog
+        return spending if self.removed is None else spending + self.removed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +148,7 @@ class Trajectory:
     wall_time: float
     accumulation: StatesOverTime = quantity("time", "region", "destination", unit="veh", text="vehicles inside")
     backlog: StatesOverTime = quantity("time", "region", "destination", unit="veh", text="vehicles waiting to enter")
-    completed: Cumulative = quantity("time", unit="veh", text="trips ended, cumulative")
+    completed: Cumulative = quantity("time", unit="veh", text="trips that reached their end, cumulative")
     observed: StatesOverTime = quantity(
         "time", "region", "destination", unit="veh",
         text="vehicles inside as the controller was given them; the last as it would have been")
@@ -157,6 +166,13 @@ class Trajectory:
         attributes={"flag_masks": [kind.value for kind in Status],
                     "flag_meanings": " ".join(str(kind.name).lower() for kind in Status)})
     note: tuple[str, ...] = quantity("interval", unit="", text="the status in words", repr=False)
+    removed: StatesOverTime = quantity(
+        "time", "region", "destination", unit="veh", text="vehicles taken out on their way, cumulative", default=None)
+
+    def __post_init__(self) -> None:
+        """Nobody is removed where nothing is said of it."""
+        if self.removed is None:
+            object.__setattr__(self, "removed", np.zeros_like(self.backlog))
 
     @property
     def variables(self) -> dict[str, tuple]:

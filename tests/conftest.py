@@ -1,5 +1,6 @@
 """What every test shares: one thread per process, and no skipped test where `--no-skips` forbids it."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -43,6 +44,17 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         from nmfd.model.regional_model import load_network
 
         ensure_built(load_network(Path(__file__).parents[1] / "networks" / "grid7"))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Nothing of what collection makes is garbage until the end: looking for it takes a fifth of that time."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_keyboard_interrupt() -> None:

@@ -47,7 +47,7 @@ def result(task, city) -> Result:
         "production": random.uniform(0.0, 9.0, (steps, regions)), "mean_accumulation": np.ones((steps, regions)),
         "guided": crossings * guides}
     facts = {name: random.uniform(0.1, 100.0) for name in FACTS} | {
-        "controller": task.controller, "seed": task.seed, "trips": 600,
+        "controller": task.controller, "seed": task.seed, "trips": 600, "outside_training": "",
         "teleports": 3 * (task.controller == "pi-gating"), "final_backlog_veh": 20}
     return Result(trajectory=trajectory, record=record, facts=facts)
 
@@ -58,7 +58,7 @@ def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1
     files = ensure_built(scenario.network)
     city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment, "outcomes", lambda function, todo, workers, *, fresh: (
+        patch.setattr(experiment, "outcomes", lambda function, todo, workers, **_: (
             (task, result(task, city)) for task in todo))
         evaluate.evaluate(evaluate.Evaluation(
             scenario=SCENARIO, controllers=controllers, seeds=seeds, levels=levels, steps=STEPS, out=out))

@@ -91,8 +91,8 @@ def test_horizon_runs_every_length_and_can_be_extended(folder, tmp_path):
 @pytest.mark.parametrize("arguments, fragment", [
     (["training", "--controller", "dpc-pc"], "dpc-pc has one decoder only"),
     (["horizon", "--controllers", "dpc-pc"], "dpc-pc has no horizon"),
-    (["horizon", "--horizons", "1,8"], "--horizons: expected different whole numbers from 2 up"),
-    (["horizon", "--horizons", "8,8"], "--horizons: expected different"),
+    (["horizon", "--horizons", "1,8"], "'--horizons': expected a list of distinct whole numbers from 2"),
+    (["horizon", "--horizons", "8,8"], "'--horizons': expected a list of distinct"),
     (["training", "--controller", "mpc-pc"], "'mpc-pc' cannot be trained")])
 def test_wrong_arguments_are_one_line(folder, tmp_path, arguments, fragment):
     result = nmfd("ablation", arguments[0], folder, *arguments[1:], "--out", tmp_path / "out")

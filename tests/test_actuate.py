@@ -5,7 +5,7 @@ import pytest
 from signal_rules import MIN_GREEN, PHASES, SINGLE, check, runs
 
 from cosim.plant.perimeter import YELLOW, GatewaySignal, GatewaySignals, _apportion, yellow_time
-from cosim.plant.strategy import MODES
+from cosim.plant.settings import MODES
 from cosim.sumo.session import Phase, Programme
 
 

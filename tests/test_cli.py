@@ -6,20 +6,23 @@ import os
 import subprocess
 import sys
 
+import click
 import numpy as np
 import pytest
 import tiny
 import torch
 from commands import nmfd
 
+from cosim.cli.main import main
 from nmfd import closed_loop
+from nmfd.cli.declared import Declared, shown
 from nmfd.controllers import registry
 from nmfd.controllers.dpc import rollout, training
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.runs import run_folder
 from nmfd.studies import benchmark
 
-HEAVY = ("torch", "casadi", "libsumo", "numpy", "pandas", "matplotlib")
+HEAVY = ("pydantic", "torch", "casadi", "libsumo", "numpy", "pandas", "matplotlib")
 TIMES = ("evaluation_time_s", "control_step_ms_median", "control_step_ms_max")
 COLUMNS = (
     "controller,seed,plant,total_time_spent_veh_s,final_accumulation_veh,max_accumulation_veh,completed_veh,"
@@ -257,3 +260,30 @@ def test_show_draws_the_scenario(scenario, tmp_path):
 def test_interval_is_students():
     assert benchmark.interval([1.0, 2.0, 3.0]) == pytest.approx(4.3027 / 3**0.5, rel=1e-4)
     assert np.isnan(benchmark.interval([1.0]))
+
+
+def declared_options():
+    return [
+        pytest.param(package, command, option, id=f"{package}-{command}-{option.name}")
+        for package in ("nmfd", "cosim")
+        for command, found in importlib.import_module(f"{package}.cli.main").main.commands.items()
+        for option in found.params if isinstance(option, Declared)]
+
+
+@pytest.mark.parametrize("package, command, option", declared_options())
+def test_an_option_says_what_its_declaration_says(package, command, option):
+    module, _, name = option._declaration.partition(":")
+    field = getattr(importlib.import_module(module), name).model_fields[option.name]
+    context = click.Context(importlib.import_module(f"{package}.cli.main").main.commands[command])
+    names, text = option.get_help_record(context)
+    assert text.lower().startswith(field.description.lower())
+    if not option.is_flag and option._instead is None:
+        assert option.get_default(context) == field.get_default()
+        assert option.type_cast_value(context, shown(field.get_default())) == field.get_default()
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "1.5", "nan", "x", "200000001"])
+def test_an_option_allows_what_its_declaration_allows(value):
+    with pytest.raises(click.BadParameter, match=f"expected a whole number from 1 to 200000000, got '{value}' instead"):
+        option = next(option for option in main.commands["run"].params if option.name == "steps")
+        option.type_cast_value(click.Context(main.commands["run"]), value)

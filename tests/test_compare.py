@@ -9,14 +9,8 @@ import tiny
 import torch
 import trajectories
 
-from cosim.evaluation.identify import (
-    as_it_was,
-    fit_table,
-    nearly_empty,
-    samples_of,
-    static_model,
-    unreached,
-)
+from cosim.evaluation.fit_quality import fit_table, nearly_empty, region_fits
+from cosim.evaluation.identify import as_it_was, samples_of, static_model
 from cosim.evaluation.model_validation import errors, held_up, outflow_samples, predict, predict_next
 from cosim.evaluation.simulate import Result
 from cosim.plant.strategy import planning_of
@@ -159,9 +153,12 @@ def test_regions_that_no_loading_run_filled_are_named(scenario):
     critical = np.array([curve.critical for curve in network.mfds])
     state = np.zeros((5, 7, 7))
     state[2] = np.diag(critical * [1.1, 0.4, 1.2, 1.3, 1.5, 1.01, 2.0])
-    line = unreached(network, [state, 0.5 * state])
-    assert "1 " + network.region_names[1] + " (40 % of it)" in line and line.count("% of it") == 1
-    assert unreached(network, [3.0 * state]) == ""
+    empty = [{"loading": np.empty((0, 2))}] * 7
+    short = [any(doubt.startswith("not reached") for doubt in fit.doubts)
+             for fit in region_fits(network, empty, [state, 0.5 * state])]
+    assert short == [False, True, *[False] * 5]
+    assert "not reached (40 % of critical)" in region_fits(network, empty, [state])[1].doubts
+    assert not any("not reached" in doubt for fit in region_fits(network, empty, [3.0 * state]) for doubt in fit.doubts)
 
 
 def test_an_empty_region_keeps_its_model_in_identification(scenario, result):

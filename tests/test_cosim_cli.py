@@ -156,7 +156,7 @@ def test_policy_for_another_network(small, tmp_path):
     (("run", "{tmp}/none", "--controller", "no-control"), "scenario.toml: no such file"),
     (("run", "{small}", "--controller", "no-control", "--steps", "0"), "--steps"),
     (("run", "{small}", "--controller", "no-control", "--policy", "x.pt"), "reads no policy"),
-    (("identify", "{small}", "--levels", "a,b"), "--levels: expected numbers above 0 up to 10"),
+    (("identify", "{small}", "--levels", "a,b"), "'--levels': expected a list of distinct numbers above 0 up to 10"),
     (("compare", "{tmp}"), "scenario.toml: no such file"),
     (("drive",), "drive"),
 ])

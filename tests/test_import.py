@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tiny_city
-from commands import cosim, error_line, good
+from commands import cosim, error_line, good, nmfd
 
 from cosim.importing.case import read_sumo_input
 from cosim.importing.demand import read_traffic
@@ -24,6 +24,7 @@ from cosim.sumo.turning_flows import own_flows
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
+from nmfd.model.regional_model import load_network
 from nmfd.types import Controls
 
 
@@ -95,6 +96,13 @@ def test_gateways_and_quality_add_up(imported):
     assert whole.boundary_flow_veh == gateways.flow_veh.sum() > 0
     free = gateways.flow_veh[gateways.control != "controlled"].sum() / gateways.flow_veh.sum()
     assert whole.uncontrolled_share == pytest.approx(free, abs=1e-3)
+    boundaries = pd.read_csv(network / "boundaries.csv").iloc[-1]
+    assert (boundaries.flow_veh, boundaries.gateways) == (whole.boundary_flow_veh, whole.gateways)
+    assert boundaries.controlled_share == pytest.approx(1.0 - whole.uncontrolled_share, abs=1e-3)
+    answer = (network / "verdict.txt").read_text().splitlines()[0]
+    assert answer.startswith("Can perimeter control help? ") and answer in imported[1]
+    shares = load_network(network).controllable
+    assert (shares > 0).any() and ((shares >= 0) & (shares <= 1)).all() and load_network(network).placeholder
     assert quality.lane_km[:-1].sum() == pytest.approx(whole.lane_km, abs=0.02)
     assert (quality.pieces[:-1] == 1).all() and whole.variance_within <= whole.variance_before
 
@@ -325,6 +333,7 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
     network, scenario = tmp_path / "networks" / "tiny", tmp_path / "scenarios" / "tiny"
     file = scenario / "scenario.toml"
     file.write_text(re.sub(r"\nsteps = \d+", "\nsteps = 10", file.read_text()))
+    (network.parent / "network.schema.json").touch()
     text = good(cosim("identify", network, "--levels", "1,2", "--seeds", 1, "--iterations", 3, "--workers", 1, "--out",
                       tmp_path / "loading"))
     assert "Drivers who go their own ways:" in text and "Drivers who are guided:" in text
@@ -333,7 +342,13 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
     loaded = load_scenario(scenario)
     guided = planning_model(loaded, "dpc-pcrg").network
     assert guided.hash != loaded.network.hash and guided.observed_split_ratios == loaded.network.observed_split_ratios
-    assert "PLACEHOLDERS" not in (network / "network.toml").read_text()
+    written = (network / "network.toml").read_text()
+    assert "PLACEHOLDERS" not in written and not loaded.network.placeholder
+    assert written.startswith("#:schema ../network.schema.json\n# Regional model")
+    assert all("one seed" in doubts for doubts in loaded.network.doubts) and "WARNING, one seed" in text
+    assert text.count("Can perimeter control help?") == 2 and (tmp_path / "loading" / "fit.csv").is_file()
+    assert "loading runs under no-control" in (network / "verdict.txt").read_text()
+    assert loaded.network.controllable is not None and loaded.network.controllable.any()
     good(cosim("import", config, "--regions", 2, "--method", "geometric", "--no-run", "--out", network, "--force"))
     assert planning_model(load_scenario(scenario), "dpc-pcrg").network.regions == 2
 
@@ -345,6 +360,9 @@ def test_the_chain_in_a_city_without_signals(tmp_path):
                "--out", tmp_path / "networks" / "none"))
     good(cosim("evaluate", tmp_path / "scenarios" / "none", "--controllers", "no-control,pi-gating,route-guidance",
                "--seeds", 1, "--steps", 4, "--workers", 1, "--out", tmp_path / "out"))
+    for controller in ("dpc-pc", "dpc-pcrg"):  # the reason that identification would not mend comes first
+        said = error_line(nmfd("train", tmp_path / "scenarios" / "none", "--controller", controller), "nmfd")
+        assert "no gateway has a signal" in said and "route guidance" in said
     report = (tmp_path / "out" / "evaluate.md").read_text()
     assert "Signals under control see 0 % of the flow" in report and "route-guidance" in report
     line = next(line for line in report.splitlines() if line.startswith("- pi-gating"))

@@ -47,9 +47,9 @@ def arrays(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.glob("*.nc")}
 
 
-def interrupted(file: Path, *command, after: float) -> tuple[int, str]:
-    """Exit status and stderr (through `file`) of a command in a forked process that gets Ctrl-C after so many
-    seconds."""
+def interrupted(file: Path, *command, after: float, by: int = signal.SIGINT) -> tuple[int, str]:
+    """Exit status and stderr (through `file`) of a command in a forked process that gets Ctrl-C, or another signal,
+    after so many seconds."""
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
@@ -68,7 +68,7 @@ def interrupted(file: Path, *command, after: float) -> tuple[int, str]:
         os._exit(99)
     os.read(reader, 1)
     time.sleep(after)
-    os.kill(child, signal.SIGINT)
+    os.kill(child, by)
     _, status = os.waitpid(child, 0)
     return os.waitstatus_to_exitcode(status), file.read_text()
 
@@ -91,6 +91,21 @@ def test_ctrl_c_at_random_moments(tmp_path):
     assert 130 in seen
     good(call(*command, out))
     assert arrays(out) == arrays(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("command", [
+    ("benchmark", "--controllers", "no-control,mpc-pc", "--seeds", 200),
+    ("bound", "--controller", "bound-pc", "--iterations", 100_000)], ids=["benchmark", "bound"])
+def test_sigterm_ends_like_ctrl_c(tmp_path, command):
+    scenario, out = tiny.write(tmp_path), tmp_path / "out"
+    name, *options = command
+    out = tmp_path / "out" if name == "benchmark" else tmp_path / "plan.npz"
+    status, said = interrupted(
+        tmp_path / "said", "nmfd", name, scenario, *options, "--out", out, after=1.0, by=signal.SIGTERM)
+    assert status == 143 and "Traceback" not in said and said.splitlines()[-1].startswith("nmfd: interrupted"), said
+    assert not [path for path in tmp_path.rglob(".*") if path.name == LOCK or TEMPORARY.fullmatch(path.name)]
+    if name == "benchmark":
+        everything_readable(out)
 
 
 BOUNDARIES = [(1, False), (1, True), (2, False), (2, True), (3, False), (3, True), (5, True), (6, False), (8, True)]
@@ -351,3 +366,18 @@ def test_what_is_made_while_others_look_for_old_folders_stays(tmp_path, monkeypa
         sweep(tmp_path, "x-")
         assert list(tmp_path.iterdir()) == [folder]
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_written_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    """After a power loss: the content before the name, and the name before anybody says that it is there."""
+    done, sync, replace = [], os.fsync, os.replace
+
+    def noted(handle):
+        done.append(Path(os.readlink(f"/proc/self/fd/{handle}")))
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    monkeypatch.setattr(os, "replace", lambda source, target: (done.append("replace"), replace(source, target)))
+    files.write_text(tmp_path / "a.csv", "x")
+    assert done == [tmp_path / f".a-{os.getpid()}.tmp.csv", "replace", tmp_path]
+    assert (tmp_path / "a.csv").read_text() == "x"

@@ -63,7 +63,7 @@ def test_a_controller_that_writes_into_everything_changes_nobodys_result(tmp_pat
     scenario = nmfd.load_scenario(tiny.write(tmp_path))
     alone = {name: nmfd.run(scenario, name, plant=plant) for name in ("no-control", "pi-gating")}
     names = [written(tmp_path, False), written(tmp_path, True), *alone]
-    rows = benchmark.benchmark(scenario, names, [0], plant, out=tmp_path / "out")
+    rows = benchmark.run_all(scenario, names, [0], plant, out=tmp_path / "out")
     spent = {row["controller"]: row["total_time_spent_veh_s"] for row in rows}
     assert spent[names[0]] == spent[names[1]] > 0.0
     for name, trajectory in alone.items():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from signal_rules import CROSS, MIN_GREEN, PHASES, SINGLE, check, signal
 
-from cosim.plant.max_pressure import EVERY, PERMISSIVE, Junction, MaxPressure, Roads, transition
+from cosim.plant.max_pressure import EVERY, MAX_RED, PERMISSIVE, Junction, MaxPressure, Roads, stages_of, transition
 from cosim.sumo.net import Gateway
 from cosim.sumo.session import Phase
 from cosim.sumo.signals import Link
@@ -36,6 +36,18 @@ def test_the_programme_s_own_way_is_kept():
     assert [(p.state, p.duration) for p in transition(phases, 0, 3)] == [("yyr", 4), ("rrr", 2)]
     assert [(p.state, p.duration) for p in transition(phases, 0, 5)] == [("Gyr", 4), ("Grr", 2)]
     assert transition(phases, 5, 0) == [Phase(duration=3, state="yrr")]
+
+
+@pytest.mark.parametrize("states, kept", [
+    ("Gr yr rG rG ry", [0, 2]), ("GGr Gyr Grr yrr rrG rry", [0, 4]), ("GGg yyg rrG rry", [0, 2]),
+    ("Ggr yyr GrG Grr", [0, 2])], ids=["twice", "a part goes on", "protected later", "the last of two"])
+def test_stages_that_serve_nothing_more_are_left_out(states, kept):
+    assert list(stages_of(signal([(state, 5) for state in states.split()]))) == kept
+
+
+def test_the_way_from_a_phase_that_comes_twice():
+    phases = signal([("Gr", 9), ("Gr", 6), ("yr", 3), ("rr", 2), ("rG", 9), ("ry", 3)]).phases
+    assert [(p.state, p.duration) for p in transition(phases, 0, 4)] == [("yr", 3), ("rr", 2)]
 
 
 @pytest.mark.parametrize("phases", [PHASES, SINGLE, CROSS])
@@ -82,7 +94,10 @@ def link(index, start, end, lane=0):
 # signal t, where the left one leads to e alone, the right one to e and f. x leads into a and nowhere else: one road.
 LANES = dict.fromkeys("acdefx", 1) | {"b": 2}
 AFTER = {"x": ("a",), "a": ("b",), "c": ("d",), "b": ("e", "f"), "d": (), "e": (), "f": ()}
-TOWN = SimpleNamespace(edges=tuple("abcdefx"), lanes=LANES, successors=AFTER, gateways=())
+LANE_IDS = {edge: tuple(f"{edge}_{n}" for n in range(lanes)) for edge, lanes in LANES.items()}
+TOWN = SimpleNamespace(
+    edges=tuple("abcdefx"), lanes=LANES, lane_ids=LANE_IDS, length=dict.fromkeys(LANES, 200.0), successors=AFTER,
+    gateways=())
 CROSSING = signal(CROSS, (link(0, "a", "b"), link(1, "c", "d")), "s")
 END = signal([("GGg", 30), ("yyy", 3), ("rrG", 30), ("rry", 3)], (
     link(0, "b", "e", lane=1), link(1, "b", "e"), link(2, "b", "f")), "t")
@@ -110,6 +125,16 @@ def test_what_is_upstream_on_the_same_road_counts_too():
     assert weights(d=9.0)[0]["c", "d"] == 0.0  # nobody on d wants to go on anywhere
 
 
+@pytest.mark.parametrize("length, weight", [(10.0, 5.0 + 0.25 * 8.0), (100.0, 5.0)])
+def test_a_short_piece_before_the_signal_is_not_all_of_the_queue(length, weight):
+    """x leads into a, and for three quarters of its vehicles elsewhere; within 100 m they count by that share."""
+    after = {**AFTER, "x": ("a", "f")}
+    town = SimpleNamespace(**{**vars(TOWN), "successors": after, "length": {**TOWN.length, "a": length}})
+    roads = Roads(town, [CROSSING], {("x", "a"): 1.0, ("x", "f"): 3.0})
+    present = np.array([{"a": 5.0, "x": 8.0}.get(lane[0], 0.0) for lane in roads.lanes])
+    assert (roads.weights @ present)[roads.movements["a", "b"]] == pytest.approx(weight)
+
+
 def test_without_expected_flows_all_turns_are_alike():
     roads = Roads(TOWN, [CROSSING, END], {})
     present = np.array([4.0 * (lane[0] == "b") for lane in roads.lanes])
@@ -117,7 +142,8 @@ def test_without_expected_flows_all_turns_are_alike():
 
 
 def test_saturation_flows_by_hand():
-    """A lane each; of a lane that two movements share, a share; of a permissive green, less."""
+    """A lane each; of a lane that two movements share, a share; of a permissive green, less; nothing of a lane that
+    this stage serves in part and another one wholly: its queue stands behind whoever is first."""
     _, roads = weights()
     gain, begins = roads.stages([CROSSING, END])
     assert begins == [0, 2]
@@ -126,8 +152,28 @@ def test_saturation_flows_by_hand():
     assert dense[0, movement["a", "b"]] == 1.0 and dense[1, movement["c", "d"]] == 1.0
     assert dense[2, movement["b", "e"]] == pytest.approx(1.75)
     assert dense[2, movement["b", "f"]] == pytest.approx(0.25 * PERMISSIVE)
-    assert dense[3, movement["b", "f"]] == pytest.approx(0.25)
-    assert np.count_nonzero(dense) == 5
+    assert dense[3, movement["b", "f"]] == 0.0
+    assert np.count_nonzero(dense) == 4
+
+
+def test_a_lane_that_no_stage_serves_wholly_counts_as_its_first_vehicle_is_likely_to_be_served():
+    """Three quarters of the right lane of b go to e: a share of 0.75 with a chance of 0.75; 0.25 of 0.25 go to f."""
+    divided = signal([("GGr", 30), ("yyr", 3), ("rrG", 30), ("rry", 3)], END.links, "t")
+    roads = Roads(TOWN, [CROSSING, divided], FLOWS)
+    dense, movement = roads.stages([CROSSING, divided])[0].toarray(), roads.movements
+    assert dense[2, movement["b", "e"]] == pytest.approx(1.0 + 0.75 * 0.75)
+    assert dense[3, movement["b", "f"]] == pytest.approx(0.25 * 0.25)
+
+
+def test_lanes_are_those_of_cars():
+    """A bus lane on the right: the cars' lane of a is its second one, and who is on the first has no weight."""
+    town = SimpleNamespace(**{**vars(TOWN), "lane_ids": {**LANE_IDS, "a": ("a_1",)}})
+    crossing = signal(CROSS, (link(0, "a", "b", lane=0), link(0, "a", "b", lane=1), link(1, "c", "d")), "s")
+    roads = Roads(town, [crossing], {})
+    column = {lane: n for n, lane in enumerate(roads.lanes)}
+    weights = roads.weights.toarray()[roads.movements["a", "b"]]
+    assert weights[column["a_1"]] == 1.0 and weights[column["a_0"]] == 0.0
+    assert roads.stages([crossing])[0].toarray()[0, roads.movements["a", "b"]] == 1.0
 
 
 @pytest.fixture
@@ -140,7 +186,7 @@ def junctions():
         if name == "s":
             shown.append((session.time, name, state))
 
-    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, min_green=12.0, show=show)
+    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, min_green=12.0, max_green=50.0, show=show)
 
     def play(until):
         while session.time <= until:
@@ -149,6 +195,55 @@ def junctions():
         return shown
 
     return control, vehicles, play
+
+
+@pytest.mark.parametrize("cyclic", [False, True])
+def test_no_green_outlasts_the_maximum_while_others_wait(cyclic):
+    """A single vehicle waits on c, a hundred on a; nobody anywhere else: then a keeps its green."""
+    def greens(**vehicles):
+        session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane.partition("_")[0], 0.0))
+        shown = []
+        control = MaxPressure(
+            session, TOWN, [CROSSING], FLOWS, min_green=5.0, max_green=40.0, cyclic=cyclic,
+            show=lambda name, state: shown.append((session.time, state)))
+        for _ in range(200):
+            control.play(session.time)
+            session.time += 1.0
+        return [time for time, state in shown if state == "rG"]
+
+    assert greens(a=100.0) == []
+    assert greens(a=100.0, c=1.0) == [43.0, 93.0, 143.0, 193.0]  # decided every 5 s: 40 s of green, 3 s; 37 s, 3 s
+
+
+@pytest.mark.parametrize("cyclic, order", [(False, [2, 0, 2]), (True, [1, 2, 0])])
+def test_stages_keep_their_order_if_cyclic(cyclic, order):
+    """The third of three stages has the highest pressure; the second one somebody who waits."""
+    phases = [("Grr", 30), ("yrr", 3), ("rGr", 30), ("ryr", 3), ("rrG", 30), ("rry", 3)]
+    three = signal(phases, (link(0, "a", "b"), link(1, "c", "d"), link(2, "x", "e")), "s")
+    after = {**AFTER, "x": ("e",)}
+    town = SimpleNamespace(**{**vars(TOWN), "successors": after})
+    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 1.0, "c": 0.5, "x": 9.0}.get(lane[0], 0.0))
+    shown = []
+    control = MaxPressure(session, town, [three], {}, min_green=5.0, max_green=40.0, cyclic=cyclic,
+                          show=lambda name, state: shown.append(state))
+    for _ in range(110):
+        control.play(session.time)
+        session.time += 1.0
+    assert [state.index("G") for state in shown if "G" in state][1:4] == order
+
+
+def test_who_waits_too_long_comes_first():
+    """c has no pressure at all, as its road ahead is full; after 120 s of red its link gets the minimum green."""
+    town = SimpleNamespace(**{**vars(TOWN), "successors": {**AFTER, "d": ("e",)}})
+    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 5.0, "c": 2.0, "d": 30.0}.get(lane[0], 0.0))
+    shown = []
+    control = MaxPressure(session, town, [CROSSING], FLOWS, min_green=5.0, max_green=500.0,
+                          show=lambda name, state: shown.append((session.time, state)))
+    for _ in range(150):
+        control.play(session.time)
+        session.time += 1.0
+    assert [entry for entry in shown if entry[1] == "rG"] == [(MAX_RED + 3.0, "rG")]
+    assert shown[-1] == (MAX_RED + 13.0, "Gr")
 
 
 def test_the_green_goes_where_the_pressure_is_after_the_minimum(junctions):
@@ -162,11 +257,13 @@ def test_the_green_goes_where_the_pressure_is_after_the_minimum(junctions):
 
 
 @pytest.mark.parametrize("a, b, c, state", [
-    (5.0, 0.0, 4.9, "Gr"), (5.0, 0.0, 5.0, "Gr"), (5.0, 0.0, 5.1, "rG"), (9.0, 3.0, 4.9, "rG"), (9.0, 0.0, 8.9, "Gr"),
+    (5.0, 0.0, 4.9, "Gr"), (5.0, 0.0, 6.4, "Gr"), (5.0, 0.0, 6.6, "rG"), (9.0, 3.0, 6.4, "rG"), (9.0, 0.0, 8.9, "Gr"),
     (0.0, 4.0, 0.1, "rG"), (0.0, 4.0, 0.0, "Gr")],
-    ids=["less", "as much", "more", "less but nothing ahead", "more and nothing ahead", "negative", "nobody"])
+    ids=["less", "not worth it", "more", "less but nothing ahead", "more and nothing ahead", "negative",
+         "nobody"])
 def test_the_higher_pressure_wins_and_the_green_stays_in_doubt(junctions, a, b, c, state):
-    """The pressure of a is what waits there less what stands on b: 9 - 0.75 * 5.25 - 0.25 * 0.75 = 4.9 - at b = 3."""
+    """The pressure of a is what waits there less what stands on b: 9 - 0.75 * 5.25 - 0.25 * 0.75 = 4.9 - at b = 3. That
+    of c has to be higher by 3 s of yellow in 10 s."""
     _, vehicles, play = junctions
     vehicles.update(a=a, b=b, c=c)
     assert play(40.0)[-1][2] == state
@@ -178,7 +275,7 @@ def test_a_spent_ration_exerts_no_pressure():
         Gateway(source=0, target=1, from_edge="a", to_edge="b", signal="s", links=(0,)),)})
     shown, session = [], SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 50.0, "c": 1.0}.get(lane[0], 0.0))
     control = MaxPressure(
-        session, town, [CROSSING], FLOWS, min_green=5.0, show=lambda name, state: shown.append(state))
+        session, town, [CROSSING], FLOWS, min_green=5.0, max_green=99.0, show=lambda name, state: shown.append(state))
     control.command(np.full((2, 2), 5.0 / 61.0), {})  # 5 s, and so much of the other 61 s
     assert control.green_time() == {"s": {0: 0.0}}
     for second in range(66):
@@ -191,3 +288,17 @@ def test_a_spent_ration_exerts_no_pressure():
         session.time = float(second)
         control.play(session.time)
     assert shown[-1] == "Gr" and control.green_time()["s"][0] > 50.0
+
+
+def test_what_is_known_of_a_run():
+    """Of five lanes one is served in part by a stage of t; CROSS is 6 s of 66 s between its stages, and so is t."""
+    vehicles = {"a": 9.0, "c": 9.0}
+    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane[0], 0.0))
+    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, min_green=5.0, max_green=20.0, show=lambda *_: None)
+    for _ in range(100):
+        control.play(session.time)
+        session.time += 1.0
+    facts = control.facts(session.time)
+    assert (facts["signal_lanes"], facts["split_lanes"], facts["never_whole_lanes"]) == (4, 1, 0)
+    assert facts["programmed_intergreen_share"] == pytest.approx(6.0 / 66.0)
+    assert facts["intergreen_share"] == pytest.approx(0.5 * 4 * 3.0 / 100.0)  # s changes four times, t never

@@ -1,5 +1,6 @@
 """Economic MPC: optimal and admissible plans, forecasts, declared fallbacks, and the benchmark rows."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from tiny import random_controls
 
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
+from nmfd.controllers.mpc import edge_model
 from nmfd.controllers.mpc.controller import TOLERANCE, EconomicMpc
 from nmfd.controllers.no_control import NoControl
 from nmfd.errors import InputError
@@ -207,3 +209,40 @@ def test_ipopt_is_the_reference_solver(states, guidance):
         start, demand = controller.forecast(states[20])
         costs.append(controller.cost(start, demand, controller._plan))
     assert costs[1] == pytest.approx(costs[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("limit", [0.002, 0.02])
+def test_the_clock_is_looked_at_wherever_a_decision_takes_time(states, monkeypatch, limit):
+    """A model that takes a millisecond for every interval: the search, its line search and what comes before stop."""
+    slow, ticks = edge_model.advance, []
+
+    def advance(*arguments, **more):
+        ticks.append(time.perf_counter())
+        while time.perf_counter() < ticks[-1] + 1e-3:
+            pass
+        return slow(*arguments, **more)
+
+    monkeypatch.setattr(edge_model, "advance", advance)
+    controller = EconomicMpc(planning_model(with_options(time_limit=limit)), guidance=True)
+    for k in (29, 30):
+        begin = time.perf_counter()
+        ticks.clear()
+        assert "time limit" in controller.act(states[k]).note
+        assert len(ticks) > 0 and sum(tick > begin + limit for tick in ticks) <= 1
+
+
+def test_a_decision_that_came_late_is_late_in_the_books(tmp_path):
+    class Slow(NoControl):
+        deadline = 0.2
+
+        def act(self, observation):
+            time.sleep(0.25 * (observation.step == 1))
+            return super().act(observation)
+
+    scenario = replace(load_scenario(tiny.write(tmp_path)), steps=3)
+    for controller, kinds, note in (
+            (Slow(planning_model(scenario)), [Status.OK, Status.LATE, Status.OK], "later than its deadline of 0.2 s"),
+            (NoControl(planning_model(scenario)), [Status.OK] * 3, "")):
+        trajectory = run(NmfdPlant(scenario), controller, scenario, seed=0)
+        assert list(trajectory.status) == [kind.value for kind in kinds] and trajectory.note[1] == note
+        assert summary(trajectory)["late_decisions"] == kinds.count(Status.LATE)

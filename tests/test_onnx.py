@@ -13,12 +13,18 @@ from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint, load_p
 from nmfd.model.regional_model import load_network
 
 ROOT = Path(__file__).parents[1]
-onnxruntime = pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
-pytest.importorskip("onnxscript")
-pytestmark = pytest.mark.usefixtures("unchecked")  # a check of shapes makes the batch of the graph a constant
+# A check of shapes makes the batch of the graph a constant.
+pytestmark = pytest.mark.usefixtures("onnxruntime", "unchecked")
 
 
-def test_a_committed_policy(tmp_path):
+@pytest.fixture(scope="module")
+def onnxruntime():
+    """Imported for these tests only, by the process that runs them: it brings sympy, and takes a second."""
+    pytest.importorskip("onnxscript", reason="the extra onnx is not installed")
+    return pytest.importorskip("onnxruntime", reason="the extra onnx is not installed")
+
+
+def test_a_committed_policy(tmp_path, onnxruntime):
     file, out = ROOT / "scenarios" / "economic_mpc" / "dpc-pcrg.pt", tmp_path / "policy.onnx"
     done = nmfd("export", file, "--out", out)
     assert done.exit_code == 0, done.output

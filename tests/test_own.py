@@ -18,6 +18,7 @@ from nmfd.controllers import custom, registry
 from nmfd.controllers.template import MyController
 from nmfd.errors import InputError
 from nmfd.runs import run_folder
+from nmfd.runs.workers import Watch
 
 ROOT = Path(__file__).parents[1]
 GOOD = """
@@ -157,6 +158,8 @@ def test_names_that_mean_nothing(place, name, expected):
 def test_entry_points(place, monkeypatch):
     point = metadata.EntryPoint("the-template", "nmfd.controllers.template:MyController", custom.GROUP)
     monkeypatch.setattr(custom, "entry_points", lambda: {"the-template": point})
+    monkeypatch.setattr("nmfd.runs.workers._here", Watch())  # it is not installed: other processes do not know it
+    monkeypatch.setattr(registry, "runs_apart", lambda name: False)
     done = nmfd("benchmark", "scenario", "--controllers", "no-control,the-template", "--out", "out")
     assert done.exit_code == 0 and "the-template" in done.output
     assert parse("the-template+actuated").controller == "the-template"

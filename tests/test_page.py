@@ -66,10 +66,10 @@ def evaluation(tmp_path_factory):
 @pytest.fixture(scope="module")
 def content(evaluation):
     """The page, with pictures at demand 1 only: they take most of the time."""
-    draw, more = html.report.draw, html.report.draw_more
+    draw, more = html.pictures.draw, html.pictures.draw_more
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(html.report, "draw", lambda *a: draw(*a) if a[3]["demand"].iloc[0] == 1 else None)
-        patch.setattr(html.report, "draw_more", lambda *a: more(*a) if a[3]["demand"].iloc[0] == 1 else None)
+        patch.setattr(html.pictures, "draw", lambda *a: draw(*a) if a[3]["demand"].iloc[0] == 1 else None)
+        patch.setattr(html.pictures, "draw_more", lambda *a: more(*a) if a[3]["demand"].iloc[0] == 1 else None)
         result = cosim("report", evaluation, "--reference", "pi-gating")
     assert result.exit_code == 0, result.output + str(result.exception)
     return (evaluation / "report.html").read_text()
@@ -78,7 +78,7 @@ def content(evaluation):
 @pytest.fixture
 def blind(monkeypatch):
     for name in ("draw", "draw_more", "region_map"):
-        monkeypatch.setattr(html.report, name, lambda *_: None)
+        monkeypatch.setattr(html.pictures, name, lambda *_: None)
 
 
 def test_the_page_is_valid_and_needs_nothing_else(content):
@@ -172,7 +172,7 @@ def test_a_failure_leaves_the_old_page(evaluation, tmp_path, monkeypatch):
     def fail(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(html.report, "draw", fail)
+    monkeypatch.setattr(html.pictures, "draw", fail)
     (tmp_path / "report.html").write_text("old")
     assert cosim("report", evaluation, "--out", tmp_path / "report.html").exit_code == 130
     assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
@@ -232,9 +232,9 @@ def test_a_run_whose_row_is_gone_is_not_shown(evaluation, tmp_path, monkeypatch)
     shutil.copytree(evaluation / "demand-1", tmp_path / "one")
     file, shown = tmp_path / "one" / "sumo.csv", []
     file.write_text("".join([line for line in file.open() if "pi-gating" not in line]))
-    monkeypatch.setattr(html.report, "draw_accumulations", lambda out, scenario, runs, **_: shown.extend(runs))
+    monkeypatch.setattr(html.pictures, "draw_accumulations", lambda out, scenario, runs, **_: shown.extend(runs))
     run = results.read(tmp_path / "one")
-    html.report.draw(tmp_path / "one", run.scenario, None, run.rows)
+    html.pictures.draw(tmp_path / "one", run.scenario, None, run.rows)
     assert {trajectory.controller for trajectory in shown} == {"no-control", "dpc-pcrg"}
 
 

@@ -8,7 +8,7 @@ import pytest
 import tiny
 import trajectories
 
-from cosim.evaluation import explain
+from cosim.evaluation import explain, signal_reasons
 from nmfd.model.regional_model import load_network
 
 
@@ -87,3 +87,22 @@ def test_nothing_to_compare_with(network):
     found = explain.load(network, [run(network, 2.0, 0.9)], [])
     line = explain.verdict(rows, 1.0, "pi-gating", found, 0.0, explain.ControlActivity(held=0.1, guided=0.0), network)
     assert "no common seed with no-control" in line and np.isnan(found.inside).all()
+
+
+def test_why_max_pressure_costs_time(network):
+    """A sentence with the numbers, in the evaluation and beside the table of a run; none where it gains."""
+    facts = {"signal_lanes": 33, "split_lanes": 19, "never_whole_lanes": 2, "intergreen_share": 0.3,
+             "programmed_intergreen_share": 0.1, "signals_left_alone": 4}
+    rows = table(WORSE).replace("pi-gating", "max-pressure")
+    for key, value in facts.items():
+        rows[key] = np.where(rows["controller"] == "max-pressure", value, np.nan)
+    found, done = explain.load(network, [run(network, 0.5, 0.9)], []), explain.ControlActivity(held=0.0, guided=0.0)
+    line = explain.verdict(rows, 1.0, "max-pressure", found, 0.0, done, network)
+    [sentence] = signal_reasons.losses(rows)
+    for text in (line, sentence):
+        assert "19 of 33 lanes before its signals are shared by movements that a stage serves one without" in text
+        assert "2 of them are shared by movements that no stage serves together" in text
+        assert "between two stages 30 % of the time" in text and "are 10 %" in text and "4 signals keep" in text
+    assert sentence.startswith("max-pressure costs 20.0 % against no-control here: ")
+    assert not signal_reasons.losses(table(BETTER).replace("pi-gating", "max-pressure"))
+    assert not signal_reasons.losses(rows[[c for c in rows if c != "split_lanes"]])  # runs of an older version

@@ -9,6 +9,7 @@ import pytest
 
 from cosim.plant.settings import SumoTable
 from cosim.report.reference import files
+from nmfd.model.model_file import schema_line
 from nmfd.runs import reference, schema
 
 ROOT = Path(__file__).parents[1]
@@ -46,3 +47,11 @@ def test_a_table_of_the_page():
 def test_what_is_written_by_hand_stays():
     page = reference.placed("# Head\n", "first\n")
     assert reference.placed(page + "tail\n", "second\n") == page.replace("first", "second") + "tail\n"
+
+
+def test_editors_find_the_schema_of_a_network_that_is_written(tmp_path):
+    assert schema_line(tmp_path / "networks" / "mine") == ""
+    (tmp_path / "networks").mkdir()
+    (tmp_path / "networks" / "network.schema.json").touch()
+    assert schema_line(tmp_path / "networks" / "mine") == "#:schema ../network.schema.json\n"
+    assert schema_line(tmp_path / "networks" / "mine" / "guided") == "#:schema ../../network.schema.json\n"

@@ -5,6 +5,7 @@ import hashlib
 import io
 import json
 import os
+import subprocess
 import termios
 import time
 from dataclasses import replace
@@ -20,7 +21,8 @@ from cosim.plant.record import Record
 from nmfd import quantities
 from nmfd.cli.progress import progress_line
 from nmfd.errors import InputError
-from nmfd.runs import files, run_folder, workers
+from nmfd.runs import files, provenance, run_folder, workers
+from nmfd.runs.tables import markdown_table
 from nmfd.types import Trajectory
 
 ROOT = Path(__file__).parents[1]
@@ -66,8 +68,8 @@ def test_xarray_opens_a_run_with_names_and_units(tmp_path):
             assert values.attrs["long_name"] and ("units" in values.attrs or name == "note"), name
         assert tuple(data["note"].values) == original.note == ("", "", "", "no")
         assert list(data["status"].values) == [0, 0, 0, 3]  # a solver failure and a fallback
-        assert data["status"].attrs["flag_meanings"] == "solver_failure fallback sensor_fault plant_fault"
-        assert list(data["status"].attrs["flag_masks"]) == [1, 2, 4, 8]
+        assert data["status"].attrs["flag_meanings"] == "solver_failure fallback sensor_fault plant_fault late"
+        assert list(data["status"].attrs["flag_masks"]) == [1, 2, 4, 8, 16]
         assert list(data["time"].values) == [0.0, 30.0, 60.0, 90.0, 120.0] and data["time"].attrs["units"] == "s"
         assert float(data["accumulation"].sel(time=60.0, region=1, destination=0)) == original.accumulation[2, 1, 0]
         for name, values in record.items():
@@ -77,7 +79,10 @@ def test_xarray_opens_a_run_with_names_and_units(tmp_path):
 
 @pytest.mark.parametrize("page, kind", [("nmfd/runs/README.md", Trajectory), ("cosim/plant/record.md", Record)])
 def test_the_pages_list_what_is_in_a_file(page, kind):
-    assert quantities.reference(kind) in (ROOT / page).read_text()
+    table = markdown_table(("variable", "dimensions", "unit", "what"), (
+        (name, ", ".join(about["dimensions"]), about["attributes"].get("units", ""), about["text"])
+        for name, about in quantities.quantities(kind).items()))
+    assert table in (ROOT / page).read_text()
 
 
 def test_the_tables_of_a_run_row_by_row():
@@ -250,3 +255,13 @@ def test_progress_begins_again_with_another_total():
         show(3, 4)
         show(0, 100, "fitting")
     assert "0/100  ? left, fitting" in stream.getvalue().split("\r")[-3]
+
+
+def test_a_look_at_the_checkout_does_not_write_to_it(tmp_path):
+    (tmp_path / "a").write_text("content")
+    for command in (["init", "-q"], ["add", "a"], ["-c", "user.name=x", "-c", "user.email=x", "commit", "-qm", "x"]):
+        subprocess.run(["git", "-C", tmp_path, *command], check=True)
+    os.utime(tmp_path / "a", (1e9, 1e9))  # git would write that down
+    before = (tmp_path / ".git" / "index").read_bytes()
+    assert provenance._git(tmp_path, "status", "--porcelain") == ""
+    assert (tmp_path / ".git" / "index").read_bytes() == before

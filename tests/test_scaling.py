@@ -82,11 +82,14 @@ def test_fresh_processes_and_their_time_limit():
 
 
 @pytest.mark.parametrize("arguments, fragment", [
-    (["--regions", "1,2"], "--regions: expected different whole numbers from 2 up, such as 2,4,8, got '1,2' instead"),
-    (["--regions", "2,2"], "--regions: expected different whole numbers"), (["--regions", "a"], "--regions: expected"),
+    (["--regions", "1,2"],
+     "'--regions': expected a list of distinct whole numbers from 2 to 1000000, separated by commas, got '1,2'"),
+    (["--regions", "2,2"], "'--regions': expected a list of distinct"), (["--regions", "a"], "'--regions': expected"),
     (["--controllers", "pi-gating"], "'pi-gating' is not measured; choose from dpc-pc, dpc-pcrg, mpc-pc, mpc-pcrg"),
-    (["--controllers", "x"], "controller 'x' is unknown"), (["--family", "cube"], "'cube' is not one of"),
-    (["--load", "none"], "'none' is not one of"), (["--memory", "0"], "'--memory': 0"),
+    (["--controllers", "x"], "controller 'x' is unknown"),
+    (["--family", "cube"], "expected one of complete, hexagonal, got 'cube'"),
+    (["--load", "none"], "expected one of published, congested, got 'none'"),
+    (["--memory", "0"], "'--memory': expected a number above 0"),
     (["--workers", "0"], "'--workers'"), (["--out", "/dev/null/x"], "/dev/null/x: Not a directory")])
 def test_errors_are_one_line(tmp_path, arguments, fragment):
     out = [] if "--out" in arguments else ["--out", tmp_path / "out"]

@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -56,6 +57,20 @@ def plant_of(scenario):
     yield make
     for plant in plants:
         plant.close()
+
+
+@pytest.fixture(scope="module")
+def driven(scenario):
+    """The first four intervals at u with these overrides, for all tests that ask for the same: `drive`, and leaks."""
+    @cache
+    def run(u, **overrides):
+        plant = SumoPlant(scenario, overrides=Settings(**overrides))
+        try:
+            return *drive(plant, scenario, 4, u=u), plant.leaks()
+        finally:
+            plant.close()
+
+    return run
 
 
 def drive(plant, scenario, intervals, seed=1, u=0.9):
@@ -125,16 +140,14 @@ def test_pressure_is_upstream_minus_downstream(city, scenario):
     assert len(before) > 300 and held[held > 0] == pytest.approx(1.0)
 
 
-def test_perimeter_control_over_max_pressure(scenario, plant_of):
+def test_perimeter_control_over_max_pressure(driven):
     """Open gateways leave max-pressure as it is; closed ones let less through, safely, and keep to their ration."""
     seen = {}
-    for name, u, gateways_fixed in (("alone", 0.9, False), ("open", 0.9, True), ("closed", 0.1, True)):
-        plant = plant_of(signals="max-pressure", gateways_fixed=gateways_fixed)
-        shown, original, record = drive(plant, scenario, 4, u=u)
+    for name, u, overrides in (("alone", 0.9, {"gateways_fixed": False}), ("open", 0.9, {}), ("closed", 0.1, {})):
+        shown, original, record, _ = driven(u, signals="max-pressure", **overrides)
         for signal_id, states in shown.items():
             check(states, [(phase.state, phase.duration) for phase in original[signal_id].phases], MIN_GREEN)
         seen[name] = shown, record
-        plant.close()
     assert seen["alone"][0] == seen["open"][0] != seen["closed"][0]
     green = seen["closed"][1].gateway_green
     assert np.nanmax(green[1:]) <= MIN_GREEN + 1.0
@@ -144,26 +157,22 @@ def test_perimeter_control_over_max_pressure(scenario, plant_of):
 
 
 @pytest.mark.parametrize("signals", ["fixed", "max-pressure"])
-def test_queue_override(scenario, plant_of, signals):
+def test_queue_override(city, driven, signals):
     """Closed gateways open where the edge before them is full, in the next interval, and nowhere else."""
-    plant = plant_of(signals=signals, queue_override=0.3)
-    _, _, record = drive(plant, scenario, 4, u=0.1)
-    full = gateway_room_taken(record.edge_vehicles.astype(float), plant.city) >= 0.3
+    _, _, record, _ = driven(0.1, signals=signals, queue_override=0.3)
+    full = gateway_room_taken(record.edge_vehicles.astype(float), city) >= 0.3
     green = record.gateway_green
     assert full[:-1].any() and not full.all()
     assert (green[1:][~full[:-1]] <= 2 * MIN_GREEN + 1.0).all()  # two windows in a cycle, at most
     opened = green[1:][full[:-1]]
     assert opened.mean() > 3.0 * green[1:][~full[:-1]].mean()
-    plant.close()
-    strict = plant_of(signals=signals)
-    _, _, held = drive(strict, scenario, 4, u=0.1)
+    _, _, held, _ = driven(0.1, signals=signals)
     assert held.gateway_flow.sum() < record.gateway_flow.sum()
 
 
-def test_max_pressure_is_safe(scenario, plant_of):
-    plant = plant_of(signals="max-pressure")
-    shown, original, record = drive(plant, scenario, 2)
-    gateways, changed = {g.signal for g in plant.city.gateways}, set()
+def test_max_pressure_is_safe(city, driven):
+    shown, original, record, leaks = driven(0.9, signals="max-pressure")
+    gateways, changed = {g.signal for g in city.gateways}, set()
     for name, states in shown.items():
         phases = [(phase.state, phase.duration) for phase in original[name].phases]
         check(states, phases, MIN_GREEN)
@@ -171,7 +180,7 @@ def test_max_pressure_is_safe(scenario, plant_of):
         if states != [cycle[n % 90] for n in range(len(states))]:
             changed.add(name)
     assert len(changed) > 30 and len(changed & gateways) > 10
-    assert not np.isnan(record.gateway_green).any() and not plant.leaks()
+    assert not np.isnan(record.gateway_green).any() and not leaks
 
 
 @pytest.mark.parametrize("gateways_fixed", [True, False])

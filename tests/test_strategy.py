@@ -18,12 +18,21 @@ from nmfd.errors import InputError
     ("pi-gating+estimate", "pi-gating", {"gateways_fixed": True, "measurement": "estimate"}),
     ("dpc-pcrg+redistribute+compliance-0", "dpc-pcrg",
      {"gateways_fixed": True, "actuation": "redistribute", "compliance": 0.0}),
+    ("pi-gating+guided+max-pressure", "pi-gating",
+     {"gateways_fixed": True, "guided": True, "signals": "max-pressure"}),
+    ("guided", "no-control", {"gateways_fixed": False, "guided": True}),
     ("dpc-pcrg+guidance-period-90", "dpc-pcrg", {"gateways_fixed": True, "guidance_period": 90.0}),
 ])
 def test_what_a_name_means(name, controller, overrides):
     strategy = parse(name)
     assert (strategy.name, strategy.controller, strategy.overrides) == (name, controller, overrides)
     assert model_free(name) == (controller == ALONE)
+
+
+@pytest.mark.parametrize("name, guides", [
+    ("pi-gating", False), ("pi-gating+guided", True), ("guided", True), ("route-guidance", True), ("dpc-pc", False)])
+def test_who_guides(name, guides):
+    assert parse(name).guides == guides
 
 
 def test_every_controller_and_option_is_a_strategy():
@@ -60,6 +69,7 @@ def test_a_strategy_uses_the_table_that_fits_it_best():
     ("rerouting", "unknown"),
     ("rerouting-2.5", "unknown"),
     ("actuated+webster", "actuated and webster exclude each other"),
+    ("dpc-pcrg+guided", "dpc-pcrg guides routes itself; omit guided"),
     ("rerouting-30+rerouting-40", "exclude each other"),
     ("pi-gating+hold-back+redistribute", "exclude each other"),
 ])

@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import threading
 import time
 from pathlib import Path
@@ -17,7 +18,7 @@ from click.testing import CliRunner
 from commands import killed
 
 from cosim.cli.main import main
-from cosim.evaluation import dask_worker, sweeps
+from cosim.evaluation import dask_cluster, dask_worker, sweeps
 from cosim.evaluation.simulate import FACTS, Result, Task
 from nmfd.errors import InputError
 from nmfd.runs.run_folder import read_summary
@@ -57,7 +58,7 @@ def made_up(task) -> Result:
         controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=np.ones((3, 7, 7)),
         backlog=np.zeros((3, 7, 7)), completed=np.arange(3.0), perimeter=np.zeros((2, 7, 7)),
         splits=np.zeros((2, 7, 7, 7)), decision_time=np.ones(2), wall_time=1.0)
-    facts = {**dict.fromkeys(FACTS, 1.0), "controller": task.controller, "seed": task.seed}
+    facts = {**dict.fromkeys(FACTS, 1.0), "outside_training": "", "controller": task.controller, "seed": task.seed}
     return Result(trajectory=trajectory, record=trajectories.record(2, regions=7), facts=facts)
 
 
@@ -146,8 +147,8 @@ def test_one_run_for_real(peak, tmp_path):
 
 @pytest.mark.parametrize("arguments, expected", [
     (("--controllers", "nobody"), "'nobody' is unknown"),
-    (("--controllers", "no-control", "--compliance", "0.5"), "--compliance: expected whole percentages"),
-    (("--controllers", "no-control", "--compliance", "5,05"), "names a percentage twice"),
+    (("--controllers", "no-control", "--compliance", "0.5"), "'--compliance': expected a list of distinct whole"),
+    (("--controllers", "no-control", "--compliance", "5,05"), "'--compliance': expected a list of distinct"),
     (("--controllers", "dpc-pcrg+compliance-50", "--compliance", "0"), "exclude each other"),
     (("--controllers", "no-control", "--workers", "2", "--scheduler", "tcp://x:1"), "omit one"),
 ])
@@ -220,6 +221,83 @@ def test_two_dask_workers_one_killed_in_mid_run(peak, tmp_path):
     assert here.exit_code == 0
     name = Path("demand-1") / "no-control-0.nc"
     assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory) -> Path:
+    """A folder with two authorities, here and other, and a certificate of each: NAME-ca.pem, NAME.pem, NAME.key."""
+    folder = tmp_path_factory.mktemp("certificates")
+
+    def openssl(*arguments):
+        subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
+
+    new = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
+    for name in ("here", "other"):
+        openssl("req", "-x509", *new, "-keyout", f"{name}-ca.key", "-out", f"{name}-ca.pem", "-days", "2",
+                "-subj", f"/CN={name} authority")
+        openssl("req", *new, "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", "/CN=localhost")
+        openssl("x509", "-req", "-in", f"{name}.csr", "-CA", f"{name}-ca.pem", "-CAkey", f"{name}-ca.key",
+                "-CAcreateserial", "-out", f"{name}.pem", "-days", "2")
+    return folder
+
+
+def shown(folder: Path, name: str, authority: str) -> dict:
+    return {"ca": folder / f"{authority}-ca.pem", "cert": folder / f"{name}.pem", "key": folder / f"{name}.key"}
+
+
+def encrypted(folder: Path, **more):
+    """A cluster that trusts who has a certificate of the authority here."""
+    distributed = pytest.importorskip("distributed", reason="the extra dask is not installed")
+    security = distributed.security.Security(require_encryption=True, tls_ca_file=str(folder / "here-ca.pem"), **{
+        f"tls_{side}_{what}": str(folder / f"here.{end}")
+        for side in ("client", "scheduler", "worker") for what, end in (("cert", "pem"), ("key", "key"))})
+    return distributed.LocalCluster(
+        security=security, protocol="tls://", threads_per_worker=1, dashboard_address=None, silence_logs=50,
+        memory_limit=0, **more)
+
+
+def test_an_encrypted_scheduler_is_reached_with_its_authority_only(certificates, monkeypatch):
+    monkeypatch.setattr(dask_cluster, "PATIENCE", 1.0)
+    with encrypted(certificates, n_workers=0, processes=False) as cluster:
+        address = cluster.scheduler_address
+        assert address.startswith("tls://")
+        dask_cluster.connect(dask_cluster.Scheduler(address=address, **shown(certificates, "here", "here"))).close()
+        for cert, authority in (("other", "here"), ("here", "other")):
+            with pytest.raises(InputError, match="no Dask scheduler answers at .* with certificates that it trusts"):
+                dask_cluster.connect(dask_cluster.Scheduler(address=address, **shown(certificates, cert, authority)))
+        with pytest.raises(InputError, match="--scheduler-ca: missing"):
+            dask_cluster.connect(address)
+
+
+@pytest.mark.parametrize("address, warned", [
+    ("tcp://127.0.0.1:1", False), ("localhost:1", False), ("tcp://[::1]:1", False), ("tls://far:1", False),
+    ("inproc://1/2", False), ("tcp://far:1", True), ("10.0.0.1:8786", True), ("ucx://10.0.0.1:1", True), ("", True)])
+def test_who_is_trusted_is_said(address, warned):
+    assert ("whoever reaches it can run code" in dask_cluster.Scheduler(address=address).warning) == warned
+
+
+@pytest.mark.parametrize("arguments, expected", [
+    (("--scheduler", "tcp://x:1", "--scheduler-ca", "here-ca.pem"), "--scheduler-ca: is for an encrypted scheduler"),
+    (("--scheduler", "tls://x:1", "--scheduler-ca", "nowhere.pem"), "nowhere.pem: no such file"),
+    (("--scheduler", "tls://x:1", "--scheduler-ca", "here-ca.pem"), "--scheduler-cert: missing"),
+    (("--scheduler", "tls://x:1", *(word for what in ("ca", "cert", "key") for word in (
+        f"--scheduler-{what}", "here.csr"))), "no Dask scheduler answers"),
+    (("--scheduler-key", "here.key"), "--scheduler: missing")])
+def test_mistakes_with_certificates(peak, tmp_path, certificates, monkeypatch, arguments, expected):
+    monkeypatch.chdir(certificates)
+    done = sweep(peak, "--controllers", "no-control", *arguments, "--out", tmp_path / "out")
+    assert done.exit_code == 2 and expected in done.stderr and done.stderr.count("\n") == 1, done.output
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_sweep_on_an_encrypted_cluster(peak, tmp_path, certificates):
+    with encrypted(certificates, n_workers=1) as cluster:
+        options = [str(word) for what, file in shown(certificates, "here", "here").items() for word in (
+            f"--scheduler-{what}", file)]
+        done = sweep(peak, "--controllers", "no-control", "--steps", 1, "--scheduler", cluster.scheduler_address,
+                     *options, "--out", tmp_path / "out")
+    assert done.exit_code == 0 and pd.read_parquet(tmp_path / "out" / "sweep.parquet")["status"].tolist() == ["ok"]
 
 
 def test_compliance_needs_whole_percentages_from_python_too(peak, tmp_path):

@@ -1,5 +1,6 @@
 """The regional model by its turns against nmfd.model.dynamics, its gradient against autograd; projected gradients."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -168,5 +169,10 @@ def test_minimise_says_why_it_stopped():
     assert search(hard, iterations=1).reason == "iteration limit"
     assert search(hard, seconds=0.0).reason == "time limit"
     assert search(lambda x: (np.nan, x)).reason == "not a number"
+    def rising(x):  # from everywhere: the line search would go on for long
+        time.sleep(0.01)
+        return float((x != 0.0).any()), -np.ones(2)
+
+    assert search(rising, seconds=0.025).evaluations <= 3
     wrong = search(lambda x: (1.0 + x.sum(), -np.ones(2)))
     assert wrong.reason == "no further descent" and (wrong.point == 0.0).all()

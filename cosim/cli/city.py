@@ -10,31 +10,26 @@ from typing import Literal
 
 import click
 
-from cosim.cli.options import parsed_level, parsed_levels
-from nmfd.cli.options import COUNT, FILE, FOLDER, SEED
+from cosim.cli.options import parsed_level
+from nmfd.cli.declared import declared
+from nmfd.cli.options import COUNT, FILE, FOLDER, SCENARIO, SEED, out_option
 from nmfd.cli.progress import progress_line, resumable
 from nmfd.errors import InputError
 from nmfd.runs import files
 
 
 @click.command()
-@click.argument("scenario", type=FOLDER)
-@click.option("--levels", default="0.6,0.8,1.0", show_default=True, metavar="A,B,...",
-              help="The loading runs: multiples of the scenario's demand.")
-@click.option("--seeds", type=COUNT, default=2, show_default=True, metavar="N",
-              help="Loading runs per level, with seeds 1000 to 1000 + N - 1.")
-@click.option("--workers", type=COUNT, default=2, show_default=True, metavar="N")
+@SCENARIO
+@declared("cosim.evaluation.settings:Identification", "levels", "seeds", "workers", "iterations")
 @click.option("--guided/--own", default=None,
               help="Only the model of guided drivers, or only that of drivers who go their own ways. [default: both]")
 @click.option("--with", "options", metavar="OPTION[+...]",
               help="Of a city with such signals or drivers: max-pressure, rerouting-30, ... as in a strategy's name.")
 @click.option("--network", "target", type=FOLDER, metavar="DIR",
               help="The folder whose network.toml is written, for one model. [default: the scenario's network]")
-@click.option("--iterations", type=COUNT, default=600, show_default=True, metavar="N",
-              help="Of the fit.")
-@click.option("--out", type=FOLDER, metavar="DIR", help="Samples and pictures. [default: runs/<scenario>-identify]")
+@out_option("identify", "Samples and pictures.")
 def identify(
-    scenario: Path, levels: str, seeds: int, workers: int, guided: bool | None, options: str | None,
+    scenario: Path, levels: tuple[float, ...], seeds: int, workers: int, guided: bool | None, options: str | None,
     target: Path | None, iterations: int, out: Path | None,
 ) -> None:
     """Fit the regional model and the drivers' own split ratios of a SUMO city; writes a network.toml.
@@ -60,7 +55,6 @@ def identify(
     from cosim.importing import find
     from nmfd.api import load_scenario
 
-    factors = parsed_levels("--levels", levels)
     scenario = find.scenario_of(scenario)
     loaded = load_scenario(scenario)
     both = guided is None and not options and target is None and identify.without_model(loaded)
@@ -70,7 +64,7 @@ def identify(
         if out and both and guide:
             folder = out / "guided"
         loading = identify.Loading(
-            levels=factors, seeds=range(1000, 1000 + seeds), guided=guide,
+            levels=levels, seeds=range(1000, 1000 + seeds), guided=guide,
             options=options.split("+") if options else (), network=target, iterations=iterations)
         with resumable("identify", folder) as progress:
             text = identify.identify(scenario, loading, out=folder, workers=workers, progress=progress)
@@ -106,8 +100,7 @@ def identify(
               "comes to its critical accumulation.")
 @click.option("--seeds", type=COUNT, default=3, show_default=True, metavar="N",
               help="Runs without control whose densities are averaged.")
-@click.option("--mesoscopic", is_flag=True,
-              help="With SUMO's queue model, now and later: ten times as fast, no lanes; for quick studies.")
+@declared("cosim.plant.settings:SumoTable", "mesoscopic", is_flag=True)
 @click.option("--begin", metavar="TIME", help="Instead of the sumocfg's, in seconds or as hours:minutes:seconds.")
 @click.option("--end", metavar="TIME", help="Later departures are left out.")
 @click.option("--seed", type=SEED, default=0, show_default=True)

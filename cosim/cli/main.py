@@ -9,12 +9,24 @@ from pathlib import Path
 import click
 
 from cosim.cli.city import identify, import_
-from cosim.cli.options import CONTROLLER_HELP, parsed_compliance, parsed_levels, tell
+from cosim.cli.options import CONTROLLER_HELP, REFERENCE, tell
 from cosim.cli.reference import reference
 from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
+from cosim.cli.search import frontier, tune
+from nmfd.cli.declared import declared
 from nmfd.cli.errors import Commands
-from nmfd.cli.options import COUNT, FOLDER, SEED, policy_files
+from nmfd.cli.options import (
+    FILE,
+    POLICIES,
+    SCENARIO,
+    STEPS,
+    TIME_LIMIT,
+    controller_names,
+    controllers_option,
+    out_option,
+    policy_files,
+)
 from nmfd.cli.progress import resumable
 from nmfd.errors import InputError, RunFailed
 from nmfd.runs.files import file_name
@@ -33,24 +45,18 @@ def main() -> None:
 
 
 @main.command()
-@click.argument("scenario", type=FOLDER)
-@click.option("--controllers", required=True, metavar="A,B,...", help="Separated by commas. " + CONTROLLER_HELP)
-@click.option("--seeds", type=COUNT, default=10, show_default=True, metavar="N",
-              help="Runs per controller and demand level, on the same trips for all controllers.")
-@click.option("--first-seed", type=SEED, default=2000, show_default=True, metavar="S",
-              help="The seeds are S to S + N - 1. From 2000 on they were never used in development.")
-@click.option("--demand", default="1.0", show_default=True, metavar="A,B,...",
-              help="Demand levels: multiples of the scenario's demand.")
-@click.option("--reference", metavar="NAME", help="Pair all controllers with this one too, besides no-control.")
-@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
-              help="Policy of a DPC controller, if not SCENARIO/NAME.pt. May be repeated.")
-@click.option("--workers", type=COUNT, metavar="N",
-              help="Runs at a time, each in a process of its own. [default: one per core]")
-@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
-@click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-evaluate]")
+@SCENARIO
+@controllers_option("Separated by commas. " + CONTROLLER_HELP)
+@declared("cosim.evaluation.settings:Evaluation", "seeds", "first_seed", "demand")
+@REFERENCE
+@POLICIES
+@declared("cosim.evaluation.settings:Evaluation", "workers", instead="one per core")
+@STEPS
+@TIME_LIMIT
+@out_option("evaluate", "The folder.")
 def evaluate(
-    scenario: Path, controllers: str, seeds: int, first_seed: int, demand: str, reference: str | None,
-    policies: tuple[str, ...], workers: int | None, steps: int | None, out: Path | None,
+    scenario: Path, controllers: str, seeds: int, first_seed: int, demand: tuple[float, ...], reference: str | None,
+    policies: tuple[str, ...], workers: int | None, steps: int | None, own_time_limit: float | None, out: Path | None,
 ) -> None:
     """Compare controllers in the microsimulation over seeds and demand levels; print and write tables, draw figures.
 
@@ -65,11 +71,7 @@ def evaluate(
     """
     from cosim.plant.strategy import parse  # heavy
 
-    names = [name.strip() for name in controllers.split(",")]
-    for name in names:
-        parse(name)
-    if repeated := [name for n, name in enumerate(names) if name in names[:n]]:
-        raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
+    names = controller_names(controllers, parse)
     files = policy_files(policies, names)
 
     from cosim.evaluation import evaluate, statistics  # heavy
@@ -79,7 +81,7 @@ def evaluate(
     loaded = load_scenario(scenario)
     chosen = evaluate.Evaluation(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
-        levels=tuple(parsed_levels("--demand", demand)), steps=steps, policies=files, reference=reference,
+        levels=demand, steps=steps, policies=files, reference=reference, time_limit=own_time_limit,
         out=Path("runs") / f"{file_name(loaded.name)}-evaluate" if out is None else out)
     workers = cores() if workers is None else workers
     with resumable("evaluate", chosen.out) as progress:
@@ -95,29 +97,28 @@ def evaluate(
 
 
 @main.command()
-@click.argument("scenario", type=FOLDER)
-@click.option("--controllers", required=True, metavar="A,B,...", help="Separated by commas. " + CONTROLLER_HELP)
-@click.option("--seeds", type=COUNT, default=1, show_default=True, metavar="N",
-              help="Runs per controller, demand level and compliance.")
-@click.option("--first-seed", type=SEED, default=0, show_default=True, metavar="S",
-              help="The seeds are S to S + N - 1.")
-@click.option("--demand", default="1.0", show_default=True, metavar="A,B,...",
-              help="Demand levels: multiples of the scenario's demand.")
-@click.option("--compliance", metavar="A,B,...",
-              help="Drivers who follow route guidance [%], such as 0,50,100; of controllers that guide nobody there is "
-                   "one run all the same. [default: the scenario's]")
-@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
-              help="Policy of a DPC controller, if not SCENARIO/NAME.pt. May be repeated.")
-@click.option("--workers", type=COUNT, metavar="N",
-              help="Runs at a time, each in a process of its own. [default: one per core]")
+@SCENARIO
+@controllers_option("Separated by commas. " + CONTROLLER_HELP)
+@declared("cosim.evaluation.settings:Sweep", "seeds", "first_seed", "demand")
+@declared("cosim.evaluation.settings:Sweep", "compliance", instead="the scenario's")
+@POLICIES
+@declared("cosim.evaluation.settings:Sweep", "workers", instead="one per core")
 @click.option("--scheduler", metavar="ADDRESS",
-              help="Of a Dask cluster that does the runs, such as tcp://host:8786 (extra dask). Its workers need this "
-                   "package, and the same files under the same paths.")
-@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
-@click.option("--out", type=FOLDER, metavar="DIR", help="The folder. [default: runs/<scenario>-sweep]")
+              help="Of a Dask cluster that does the runs, such as tls://host:8786 (extra dask). Its workers need this "
+                   "package, and the same files under the same paths. Whoever reaches a tcp:// scheduler runs code on "
+                   "the cluster and here.")
+@click.option("--scheduler-ca", type=FILE, metavar="PEM", help="Authority that a tls:// scheduler is trusted by.")
+@click.option("--scheduler-cert", type=FILE, metavar="PEM", help="Certificate that this side shows to it.")
+@click.option("--scheduler-key", type=FILE, metavar="PEM", help="The key of that certificate. [default, of all three: "
+                                                                "Dask's own configuration, distributed.comm.tls]")
+@STEPS
+@TIME_LIMIT
+@out_option("sweep", "The folder.")
 def sweep(
-    scenario: Path, controllers: str, seeds: int, first_seed: int, demand: str, compliance: str | None,
-    policies: tuple[str, ...], workers: int | None, scheduler: str | None, steps: int | None, out: Path | None,
+    scenario: Path, controllers: str, seeds: int, first_seed: int, demand: tuple[float, ...],
+    compliance: tuple[int, ...] | None, policies: tuple[str, ...], workers: int | None, scheduler: str | None,
+    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None,
+    own_time_limit: float | None, out: Path | None,
 ) -> None:
     """Run controllers x seeds x demand levels x compliance; write one table, sweep.parquet.
 
@@ -132,31 +133,32 @@ def sweep(
     """
     from cosim.plant.strategy import parse  # heavy
 
-    names = [name.strip() for name in controllers.split(",")]
-    for name in names:
-        parse(name)
-    if repeated := [name for n, name in enumerate(names) if name in names[:n]]:
-        raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
+    names = controller_names(controllers, parse)
     if scheduler is not None and workers is not None:
         raise InputError("--workers: is for processes here, and --scheduler has workers of its own; omit one")
     files = policy_files(policies, names)
 
-    from cosim.evaluation import sweeps  # heavy
+    from cosim.evaluation import dask_cluster, sweeps  # heavy
     from nmfd.api import load_scenario
+
+    cluster = None if scheduler is None else dask_cluster.Scheduler(
+        address=scheduler, ca=scheduler_ca, cert=scheduler_cert, key=scheduler_key)
+    if cluster is None and any((scheduler_ca, scheduler_cert, scheduler_key)):
+        raise InputError("--scheduler: missing; the certificates are those of its connection")
 
     order = sweeps.Sweep(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
-        levels=tuple(parsed_levels("--demand", demand)), compliance=parsed_compliance(compliance), steps=steps,
-        policies=files,
+        levels=demand, compliance=tuple(share / 100 for share in compliance or ()), steps=steps,
+        policies=files, time_limit=own_time_limit,
         out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
     workers = cores() if workers is None else workers
     with resumable("sweep", order.out) as progress:
-        rows = sweeps.sweep(order, workers=workers, scheduler=scheduler, progress=progress, tell=tell)
+        rows = sweeps.sweep(order, workers=workers, scheduler=cluster, progress=progress, tell=tell)
     click.echo(sweeps.text(rows))
     click.echo(f"Written to {order.out / 'sweep.parquet'}")
     if failed := int((rows["status"] == sweeps.FAILED).sum()):
         tell(f"{failed} of {len(rows)} runs failed, see the column reason; the same command tries them again")
 
 
-for command in (run, compare, report, video, watch, identify, import_, reference):
+for command in (run, compare, report, video, watch, identify, import_, reference, tune, frontier):
     main.add_command(command)

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import click
 
-from cosim.cli.options import CONTROLLER_HELP
-from nmfd.cli.options import COUNT, FILE, FOLDER, LEVEL, SEED, Positive
+from cosim.cli.options import CONTROLLER, POLICY, REFERENCE
+from nmfd.cli.declared import declared
+from nmfd.cli.options import FILE, FOLDER, SCENARIO, SEED, STEPS
 from nmfd.cli.progress import progress_line
 from nmfd.errors import InputError
 
@@ -17,7 +18,7 @@ from nmfd.errors import InputError
 @click.command()
 @click.argument("folders", type=FOLDER, metavar="RUN...", nargs=-1, required=True)
 @click.option("--out", type=FILE, metavar="FILE", help="The page. [default: report.html in the first RUN]")
-@click.option("--reference", metavar="NAME", help="Pair all controllers with this one too, besides no-control.")
+@REFERENCE
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="The runs' scenario, if it is no longer where it was.")
 def report(folders: tuple[Path, ...], out: Path | None, reference: str | None, scenario: Path | None) -> None:
     """Write one self-contained HTML page about finished runs: what came of them, in words, tables and pictures.
@@ -47,8 +48,7 @@ def report(folders: tuple[Path, ...], out: Path | None, reference: str | None, s
 @click.option("--against", metavar="NAME", help="A second run, shown beside it.")
 @click.option("--seed", type=SEED, help="[default: the first one there]")
 @click.option("--demand", type=float, metavar="X", help="Level of an evaluation. [default: the one nearest to 1]")
-@click.option("--rate", type=click.IntRange(1, 60), default=8, show_default=True, metavar="N",
-              help="Control intervals per second of the film.")
+@declared("cosim.evaluation.settings:Window", "rate")
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="The run's scenario, if it is no longer where it was.")
 @click.option("--out", type=FILE, metavar="FILE",
               help="A name that ends in .gif, or .mp4 where ffmpeg is installed. [default: a gif in RUN]")
@@ -78,15 +78,12 @@ def video(
 
 
 @click.command()
-@click.argument("scenario", type=FOLDER)
-@click.option("--controller", required=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
+@SCENARIO
+@CONTROLLER
 @click.option("--seed", type=SEED, default=0, show_default=True)
-@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
-@click.option("--demand", type=LEVEL, default=1.0, show_default=True, metavar="X",
-              help="Multiple of the scenario's demand.")
-@click.option("--policy", type=FILE, metavar="FILE", help="Policy of a DPC controller, if not SCENARIO/NAME.pt.")
-@click.option("--delay", type=Positive(1e6, zero=True), default=20.0, show_default=True, metavar="MS",
-              help="Wall time per simulated second at least; the window has a slider for it, too.")
+@STEPS
+@declared("cosim.evaluation.settings:Window", "demand", "delay")
+@POLICY
 def watch(
     scenario: Path, controller: str, seed: int, steps: int | None, demand: float, policy: Path | None, delay: float,
 ) -> None:
@@ -108,9 +105,11 @@ def watch(
         scenario=scenario, controller=controller, seed=seed, policy=policy, steps=steps, demand_factor=demand)
     try:
         with progress_line("watch") as progress:
-            row = summary(watch.watch(task, delay=delay, progress=progress))
+            trajectory = watch.watch(task, delay=delay, progress=progress)
+            row = summary(trajectory)
     except watch.WindowClosed:
         click.echo("The window was closed before the end.")
         return
     click.echo(f"{controller}, seed {seed}: total time spent {row['total_time_spent_veh_s']:.4g} veh s, "
-               f"{row['completed_veh']:,.0f} trips completed")
+               f"{row['completed_veh']:,.0f} trips completed"
+               + (f", {removed:,.0f} vehicles removed" if (removed := trajectory.removed[-1].sum()) else ""))

@@ -9,29 +9,31 @@ from pathlib import Path
 
 import click
 
-from cosim.cli.options import CONTROLLER_HELP, tell
-from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, fault_option
+from cosim.cli.options import CONTROLLER, CONTROLLER_HELP, POLICY, tell
+from nmfd.cli.options import FOLDER, PARQUET, SCENARIO, SEED, STEPS, TIME_LIMIT, fault_option, out_option
 from nmfd.cli.progress import resumable
 from nmfd.errors import InputError
 
 
 @click.command()
-@click.argument("scenario", type=FOLDER)
-@click.option("--controller", required=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
-@click.option("--against", metavar="NAME", help="Run this controller too, on the same trips, in a second process.")
+@SCENARIO
+@CONTROLLER
+@click.option("--against", metavar="NAME",
+              help="Run this controller too, on the same trips, in a second process, and compare with it.")
 @click.option("--seed", type=SEED, default=0, show_default=True,
               help="Of the trips, the drivers and the guidance.")
-@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
-@click.option("--policy", type=FILE, metavar="FILE", help="Policy of a DPC controller, if not SCENARIO/NAME.pt.")
+@STEPS
+@POLICY
 @click.option("--sumo-output", metavar="A,B,...",
               help="SUMO's own outputs in the run folder too: tripinfo, summary, edgedata (per control interval), "
                    "emission (of every vehicle in every step, large).")
-@click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.runs.frames).")
+@PARQUET
 @fault_option("closed:EDGE, signal:NAME, sumo-exits")
-@click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
+@TIME_LIMIT
+@out_option()
 def run(
     scenario: Path, controller: str, against: str | None, seed: int, steps: int | None, policy: Path | None,
-    sumo_output: str | None, parquet: bool, faults: tuple[str, ...], out: Path | None,
+    sumo_output: str | None, parquet: bool, faults: tuple[str, ...], own_time_limit: float | None, out: Path | None,
 ) -> None:
     """Run a controller in the microsimulation; print a table and write a run folder.
 
@@ -48,10 +50,12 @@ def run(
       cosim run scenarios/grid7_peak --controller dpc-pc --fault missing:3@20-30 --fault closed:c33-c34@10-40
     """
     from cosim.plant import strategy  # heavy
-    from cosim.sumo import outputs as outputs
+    from cosim.sumo import outputs
 
     kinds = outputs.parse(sumo_output) if sumo_output is not None else ()
     names = [controller] + ([against] if against and against != controller else [])
+    if "no-control" not in names:
+        names.reverse()  # what comes first is what the other is compared with
     for name in names:
         strategy.parse(name)
 
@@ -60,7 +64,7 @@ def run(
 
     tasks = [
         Task(scenario=scenario, controller=name, seed=seed, policy=policy if name == controller else None, steps=steps,
-             faults=faults)
+             faults=faults, time_limit=own_time_limit)
         for name in names]
     out, rows = _experiment(tasks, out, kinds)
     click.echo(experiment.overview_table(rows))
@@ -83,8 +87,8 @@ def run(
 @click.option("--model", type=FOLDER, metavar="DIR",
               help="A network of the same city, whose regional model predicts. [default: that with which the "
                    "controller plans]")
-@click.option("--steps", type=COUNT, metavar="N", help="Control intervals. [default: the scenario's]")
-@click.option("--out", type=FOLDER, metavar="DIR", help="Run folder of a SCENARIO. [default: runs/<scenario>-<time>]")
+@STEPS
+@out_option(text="Run folder of a SCENARIO.")
 def compare(
     target: Path, controller: str | None, seed: int | None, model: Path | None, steps: int | None, out: Path | None,
 ) -> None:

@@ -13,7 +13,8 @@ import threading
 from contextlib import suppress
 
 from cosim.evaluation.simulate import Result, Task, simulate
-from nmfd.runs.workers import Failure, attempt
+from nmfd.controllers import registry
+from nmfd.runs.workers import Failure, attempt, outcomes
 
 HEADER = 8  # bytes, the length of the pickle that follows
 
@@ -46,7 +47,11 @@ def _serve() -> None:
     task = pickle.loads(sys.stdin.buffer.read(int.from_bytes(sys.stdin.buffer.read(HEADER))))
     answered = threading.Event()
     threading.Thread(target=_end_with_the_caller, args=[answered], daemon=True).start()
-    outcome = pickle.dumps(attempt(simulate, task))
+    if registry.runs_apart(task.controller):
+        ((_, found),) = outcomes(simulate, [task], 1)
+    else:
+        found = attempt(simulate, task)
+    outcome = pickle.dumps(found)
     answer.write(outcome)
     answer.flush()
     answered.set()

@@ -10,6 +10,7 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
+from nmfd.studies.traffic_states import OutflowOf, remembered
 from nmfd.types import Trajectory
 
 COLUMNS = (
@@ -41,8 +42,13 @@ def errors(network: RegionalModel, trajectory: Trajectory) -> list[dict]:
     return [*rows, {name: whole[name] for name in COLUMNS}]
 
 
-def write_errors(folder: Path, network: RegionalModel, trajectories: Sequence[Trajectory]) -> pd.DataFrame:
-    """estimation.csv, and one picture per run that was controlled on estimates; nothing without such a run."""
+def write_errors(
+    folder: Path, network: RegionalModel, trajectories: Sequence[Trajectory], outflow: OutflowOf | None = None,
+) -> pd.DataFrame:
+    """estimation.csv, and one picture per run that was controlled on estimates; nothing without such a run.
+
+    outflow: what left every region of a run, for the picture (nmfd.studies.plots)
+    """
     estimated = [trajectory for trajectory in trajectories if trajectory.estimated]
     rows = pd.DataFrame([row for trajectory in estimated for row in errors(network, trajectory)], columns=COLUMNS)
     if not estimated:
@@ -52,8 +58,9 @@ def write_errors(folder: Path, network: RegionalModel, trajectories: Sequence[Tr
         path = folder / f"estimate-{run_folder.run_name(trajectory.controller, trajectory.seed)}.png"
         if not path.exists():
             drawing, axes = plots.panels(network.regions)
+            known = None if outflow is None else remembered(outflow)
             for region, ax in enumerate(axes):
-                plots.region_estimate(ax, network, region, trajectory)
+                plots.region_estimate(ax, network, region, trajectory, known)
             plots.legend_below(drawing, axes)
             plots.save(drawing, path)
     return rows

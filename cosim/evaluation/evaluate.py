@@ -20,14 +20,13 @@ from nmfd.errors import InputError
 from nmfd.runs import files
 from nmfd.runs.workers import ended
 
-FIRST_SEED = 2000  # these seeds are kept for evaluations: nothing was chosen, trained or identified on them
-
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
     """scenario: its folder; controllers: strategies; levels: multiples of the scenario's demand; steps: control
     intervals, all if None; policies: controller -> file instead of the scenario's own; reference: a controller to
-    pair with, besides no control; out: the folder of the evaluation."""
+    pair with, besides no control; time_limit: of controllers of the user's own, instead of the scenario's; out: the
+    folder of the evaluation."""
 
     scenario: Path
     controllers: tuple[str, ...]
@@ -36,6 +35,7 @@ class Evaluation:
     levels: tuple[float, ...] = (1.0,)
     steps: int | None = None
     policies: Mapping[str, Path] = field(default_factory=dict)
+    time_limit: float | None = None
     reference: str | None = None
 
     def plan(self) -> list[tuple[Path, Task]]:
@@ -43,7 +43,7 @@ class Evaluation:
         return [
             (self.out / f"demand-{level:g}", Task(
                 scenario=self.scenario, controller=name, seed=seed, policy=self.policies.get(name), steps=self.steps,
-                demand_factor=level))
+                demand_factor=level, time_limit=self.time_limit))
             for seed in self.seeds for level in self.levels for name in self.controllers]
 
 
@@ -70,7 +70,10 @@ def evaluate(
         table = statistics.write_tables(out, rows, evaluation.reference)
         scenario = load_scenario(evaluation.scenario)
         why = explain.text(level_folders(out), scenario.network, rows)
-        files.write_text(out / "evaluate.md", statistics.markdown(table, evaluation.reference) + "\n" + why)
+        remarks = "".join(f"- {line}\n" for line in experiment.remarks(rows))
+        files.write_text(
+            out / "evaluate.md", "\n".join(filter(None, (
+                statistics.markdown(table, evaluation.reference), remarks, why))))
     if failures and table.empty and all(failure.mistake for _, failure in failures):
         raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])
     return table, [f"{experiment.label(task)}: {failure.reason}" for task, failure in failures]

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from importlib import metadata
@@ -10,37 +11,42 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cosim.evaluation import estimation_errors
+from cosim.evaluation import estimation_errors, run_metrics, signal_reasons
 from cosim.evaluation.simulate import FACTS, Result, Task, scenario_of, simulate
 from cosim.plant import incidents
+from cosim.plant.feasible import check_strategy
 from cosim.plant.launch import own_files, own_vehicles
 from cosim.plant.record import Record
-from cosim.plant.settings import FILES, Settings, settings
-from cosim.plant.strategy import MAX_PRESSURE, configured, parse
+from cosim.plant.settings import FILES, PRESSURES, Settings, settings
+from cosim.plant.strategy import configured, parse
 from cosim.sumo import outputs
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import check_adjacency, load_city
-from cosim.sumo.signals import read_signals
+from cosim.sumo.signals import HELD, read_signals
 from cosim.sumo.xml_files import read_xml
 from nmfd.controllers import registry
 from nmfd.errors import InputError
-from nmfd.metrics import COUNTED
+from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.quantities import quantities, variables
 from nmfd.runs import run_folder
-from nmfd.runs.files import file_hash, write_text
+from nmfd.runs.files import check_file, file_hash, write_text
 from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
-from nmfd.studies.benchmark import REFERENCE, draw_accumulations, interval
+from nmfd.studies.benchmark import REFERENCE, compared_with, draw_accumulations, interval
+from nmfd.studies.traffic_states import OutflowOf, RegionalOutflow
+from nmfd.types import Trajectory
 
 Progress = Callable[[int, int, str], None]  # takes what is done, what there is to do, and what is running
 Outcomes = Iterator[tuple[Task, Result | Failure]]
 # Of loading runs: whether they guide routes, and so depend on the drivers' own split ratios.
 LOADING = {"probing-pc": False, "probing-pcrg": True, "route-guidance": True}
 CAPTION = (
-    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; backlog: not "
-    "inserted at the end; step: median / longest decision; outside SUMO: share of the wall time not in its own step")
+    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; change: of the mean "
+    "TTS against {against}; removed: taken out before the last edge of their route, in TTS as if they were there to "
+    "the end; backlog: not inserted at the end; step: median / longest decision; outside SUMO: share of the wall time "
+    "not in its own step")
 
 
 def experiment(
@@ -55,8 +61,9 @@ def experiment(
     failures = perform([(out, task) for task in tasks], workers=workers, fresh=zipped, progress=progress, tell=tell)
     if (out / "summary.csv").is_file() and (kept := run_folder.trajectories(out)):
         scenario = scenario_of(tasks[0])
-        draw_accumulations(out, scenario, kept)
-        estimation_errors.write_errors(out, scenario.network, kept)
+        measured = measured_outflow(out)
+        draw_accumulations(out, scenario, kept, outflow=measured)
+        estimation_errors.write_errors(out, scenario.network, kept, measured)
     if failures:
         raise ended([(label(task), failure) for task, failure in failures])
     return overview(out)
@@ -130,7 +137,7 @@ def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> d
     InputError for a controller that cannot be made.
     """
     controller, variant = parse(name).controller, configured(name, scenario.controller_options)
-    registry.make(variant, scenario, policy=policy)
+    registry.verify(variant, scenario, policy=policy)
     if controller == REFERENCE:
         return {}
     tables = scenario.controller_options
@@ -161,12 +168,15 @@ def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
     files = ensure_built(scenario.network)
     city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
     check_adjacency(city, scenario.network)
-    simple, _ = read_signals(city)
     own_vehicles(scenario, chosen, city)
-    everywhere = MAX_PRESSURE in {parse(name).overrides.get("signals", chosen.signals) for name in controllers}
+    used = {parse(name).overrides.get("signals", chosen.signals) for name in controllers}
+    everywhere = not used.isdisjoint(PRESSURES)
+    simple, _ = read_signals(city, own_files(scenario, chosen.additional), HELD)
     incidents.check(scenario.ordered_faults, city, "faults", [signal.id for signal in simple] if everywhere else ())
     for path in own_files(scenario, (*chosen.background, *chosen.additional)):
         read_xml(path)
+    for name in controllers:
+        check_strategy(name, scenario, city)
     configuration = {
         "scenario": scenario.name, "network": scenario.network.name, "plant": "sumo", "step_s": scenario.step,
         "steps": scenario.steps, "demand_factor": first.demand_factor,
@@ -188,9 +198,11 @@ def _plain(chosen: Settings, scenario: Scenario) -> dict:
 
 
 def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress: Progress | None) -> Outcomes:
-    """(task, Result or Failure); in this process, which reports every control interval, if one run is all there is."""
-    if len(todo) != 1 or fresh:
-        yield from _reported(lambda tasks: outcomes(simulate, tasks, workers, fresh=fresh), todo, progress)
+    """(task, Result or Failure); in this process, which reports every control interval, if one run is all there is, and
+    not of a controller of the user's own."""
+    if len(todo) != 1 or fresh or _apart(todo[0]):
+        yield from _reported(
+            lambda tasks: outcomes(simulate, tasks, workers, fresh=fresh, group=_apart), todo, progress)
         return
 
     def tick(k: int, steps: int) -> None:
@@ -198,6 +210,11 @@ def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress: Progres
             progress(k, steps, f"{todo[0].controller}, seed {todo[0].seed}")
 
     yield todo[0], attempt(lambda task: simulate(task, tick), todo[0])
+
+
+def _apart(task: Task) -> str:
+    """The controller of the user's own, which has a process to itself, "" for others."""
+    return task.controller if registry.runs_apart(task.controller) else ""
 
 
 def _reported(
@@ -215,8 +232,21 @@ def read_run(folder: Path, controller: str, seed: int) -> Result:
     """A finished run of the run folder. Raises InputError."""
     with run_folder.opened(run_folder.run_path(folder, controller, seed)) as file:
         return Result(
-            trajectory=run_folder.trajectory_in(file), record={name: file[name][...] for name in quantities(Record)},
-            facts={})
+            trajectory=run_folder.trajectory_in(file), facts={}, record={  # older versions recorded less
+                name: file[name][...] for name in quantities(Record) if name in file.variables})
+
+
+def measured_outflow(folder: Path) -> OutflowOf:
+    """What left every region in a run of the folder, as SUMO counted it (T, R) [veh/s]; None of a run that an older
+    version recorded without it."""
+    def outflow(trajectory: Trajectory) -> RegionalOutflow | None:
+        with run_folder.opened(run_folder.run_path(folder, trajectory.controller, trajectory.seed)) as file:
+            if not {"arrivals", "crossings"} <= set(file.variables):
+                return None
+            return run_metrics.regional_outflow(
+                {name: file[name][...] for name in ("arrivals", "crossings")}, trajectory.step)
+
+    return outflow
 
 
 def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
@@ -234,9 +264,11 @@ def overview(folder: Path) -> pd.DataFrame:
 
 
 def read_facts(path: Path) -> pd.DataFrame:
-    """The rows of sumo.csv. Raises InputError."""
+    """The rows of sumo.csv, with NaN for what an older version did not record. Raises InputError."""
+    check_file(path, "delete the folder and run again")
     try:
         rows = pd.read_csv(path)
+        rows = rows.reindex(columns=[*rows.columns, *(name for name in FACTS if name not in rows.columns)])
         return rows.astype({"controller": str, "seed": int})
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; delete the folder and run again") from None
@@ -246,19 +278,31 @@ def read_facts(path: Path) -> pd.DataFrame:
 
 def overview_table(rows: pd.DataFrame) -> str:
     """The overview as text: one line per controller, means over seeds, TTS with its 95 % interval."""
-    reference = rows.loc[rows["controller"] == REFERENCE, "total_time_spent_veh_s"]
+    against = compared_with(rows["controller"]) if len(rows) else REFERENCE
+    reference = rows.loc[rows["controller"] == against, "total_time_spent_veh_s"]
     lines = []
     for name, group in rows.groupby("controller", sort=False):
         tts = group["total_time_spent_veh_s"]
         spread = f" ± {interval(list(tts)):.1e}" if len(tts) > 1 else ""
-        change = f"{100 * (tts.mean() / reference.mean() - 1):+.1f} %" if len(reference) and name != REFERENCE else ""
+        percent = percent_change(tts.mean(), reference.mean())
+        change = "" if name == against else "-" if math.isnan(percent) else f"{percent:+.1f} %"
         lines.append({
             "controller": name, "seeds": len(group), "TTS [veh s]": f"{tts.mean():.4g}{spread}", "change": change,
             "completed": f"{group['completed_veh'].mean():,.0f} of {group['trips'].mean():,.0f}",
+            "removed": f"{group['removed_veh'].mean():,.0f}",
             "left inside": f"{group['final_accumulation_veh'].mean():,.0f}",
             "backlog": f"{group['final_backlog_veh'].mean():,.0f}", "teleports": int(group["teleports"].sum()),
             "step [ms]": f"{group['control_step_ms_median'].mean():.3g} / {group['control_step_ms_max'].max():.3g}",
             **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
             "wall [s]": f"{group['wall_time_s'].mean():.0f}",
             "outside SUMO": f"{100 * group['overhead_share'].mean():.1f} %"})
-    return text_table(lines, CAPTION)
+    return "\n".join([text_table(lines, CAPTION.format(against=against)), *signal_reasons.losses(rows), *remarks(rows)])
+
+
+def remarks(rows: pd.DataFrame) -> list[str]:
+    """A line for every controller whose policy was run outside of what it was trained on."""
+    if "outside_training" not in rows:  # of an older version
+        return []
+    said = rows[rows["outside_training"].astype(object).fillna("") != ""]
+    return [f"{name}: {text}" for name, text in dict.fromkeys(
+        zip(said["controller"], said["outside_training"], strict=True))]

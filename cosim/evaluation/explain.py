@@ -1,4 +1,5 @@
-"""Why a controller gained something against no control, or nothing: what the runs of an evaluation say about it.
+"""Why a controller gained something, or nothing, against no control, or against the first one where that was not run:
+what the runs of an evaluation say about it.
 
 Perimeter control can only gain where it controls the boundaries, where a region would go beyond its critical
 accumulation without it, and if it holds vehicles back at all; even then it may cost more than it saves.
@@ -12,7 +13,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Int
 
-from cosim.evaluation import experiment, statistics
+from cosim.evaluation import experiment, signal_reasons, statistics
 from cosim.plant.strategy import model_free
 from nmfd.arrays import PerRegion
 from nmfd.model.regional_model import RegionalModel
@@ -97,9 +98,10 @@ def text(folders: Mapping[float, Path], network: RegionalModel, rows: pd.DataFra
 
 
 def at(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame) -> tuple[str, list[str]]:
-    """What the city was like without control at one demand level, and a line per controller; rows: of this level."""
+    """What the city was like without control at one demand level, or under the first controller, and a line per
+    controller; rows: of this level."""
     kept = {name: [int(seed) for seed in group["seed"]] for name, group in rows.groupby("controller", sort=False)}
-    shown = REFERENCE if REFERENCE in kept else next(iter(kept))
+    shown = statistics.compared_with(rows)
     found = load(network, *_runs(folder, shown, kept[shown]))
     leaking = float(rows.loc[rows["controller"] == shown, "leaking_share"].mean())
     lines = []
@@ -120,25 +122,34 @@ def verdict(
     rows: pd.DataFrame, level: float, name: str, found: Loading, leaking: float, done: ControlActivity,
     network: RegionalModel,
 ) -> str:
-    """What a controller came to against no control, and why, in one line that begins behind its name. rows: of this
-    demand level; leaking: share of the flow over the boundaries that passes no signal under control."""
-    pair = statistics.paired(statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, REFERENCE))
+    """What a controller came to against no control or the first one, and why, in one line that begins behind its name.
+    rows: of this demand level; leaking: share of the flow over the boundaries that passes no signal under control."""
+    against = statistics.compared_with(rows)
+    if name == against and rows["controller"].nunique() > 1:
+        return f"is what the others are compared with, for {REFERENCE} was not run; {done}"
+    against = REFERENCE if name == against else against
+    pair = statistics.paired(statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, against))
     if not pair.seeds:
-        return f"has no common seed with {REFERENCE}, so that nothing can be said: add it to --controllers"
+        return f"has no common seed with {against}, so that nothing can be said: add it to --controllers"
+    if np.isnan(pair.percent):
+        return "is not told in percent: nobody spent any time with what it is compared with"
     spread = f"± {pair.percent_half:.1f} over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed, no proof"
-    size = f"{pair.percent:+.1f} % in total time spent {spread}"
+    other = "" if against == REFERENCE else f" against {against}"
+    size = f"{pair.percent:+.1f} % in total time spent{other} {spread}"
     unmodelled = model_free(name)
     if pair.percent < 0 and (pair.excludes_zero or pair.seeds == 1):
         return f"gains ({size})" + ("" if unmodelled else f"; {done}")
     kind = "loses" if pair.excludes_zero or pair.seeds == 1 else "gains nothing that stands out from the seeds"
     if pair.percent == 0.0:
         kind = "changes nothing"
-    reasons = [] if unmodelled else _reasons(rows, name, found, leaking, done, network)
+    reasons = [] if unmodelled else _reasons(rows, name, against, found, leaking, done, network)
+    reasons += signal_reasons.reasons(rows[rows["controller"] == name])
     return f"{kind} ({size})" + (f": {'; '.join(reasons)}" if reasons else "")
 
 
 def _reasons(
-    rows: pd.DataFrame, name: str, found: Loading, leaking: float, done: ControlActivity, network: RegionalModel,
+    rows: pd.DataFrame, name: str, against: str, found: Loading, leaking: float, done: ControlActivity,
+    network: RegionalModel,
 ) -> list[str]:
     """Why perimeter control, or guidance, gains nothing."""
     reasons = []
@@ -151,9 +162,9 @@ def _reasons(
         reasons.append(f"most of what fills {_list(network, found.critical)} starts there, where no gateway holds it "
                        "back")
     full = rows.groupby("controller")["gateway_full_share"].mean()
-    if done.held >= HARDLY and full.get(name, 0.0) - full.get(REFERENCE, 0.0) > MORE_FULL:
+    if done.held >= HARDLY and full.get(name, 0.0) - full.get(against, 0.0) > MORE_FULL:
         reasons.append(f"its queues fill the streets before the gateways ({_share(full[name])} of the time, "
-                       f"{_share(full[REFERENCE])} without control) and block others")
+                       f"{_share(full[against])} {statistics.than(against)}) and block others")
     return [*reasons, str(done)]
 
 

@@ -13,26 +13,32 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.evaluation import experiment, mfd_bands
-from cosim.evaluation.model_validation import SPILLBACK, draw_mfds, outflow_samples
+from cosim.evaluation import experiment, mfd_bands, verdict
+from cosim.evaluation.fit_quality import (
+    fit_table,
+    nearly_empty,
+    own_points,
+    prediction_table,
+    predictions,
+    region_fits,
+    write_fits,
+)
+from cosim.evaluation.model_validation import draw_mfds, outflow_samples
 from cosim.evaluation.simulate import Result, Task
 from cosim.sumo.arrays import Points
 from cosim.sumo.build import network_folder
 from nmfd.api import load_scenario
-from nmfd.arrays import StatesOverTime
 from nmfd.errors import InputError
 from nmfd.model import identification, mfd
 from nmfd.model.identification import Observed, observed_split_ratios
-from nmfd.model.model_file import network_toml
+from nmfd.model.model_file import network_toml, schema_line
 from nmfd.model.planning import GUIDED, GUIDING
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files
+from nmfd.runs.tables import wrapped
 from nmfd.runs.workers import ended
 
-SAMPLES = 10    # of a region: with fewer it is as good as empty, and keeps the MFD that it has
-AHEAD = 900.0   # s, of the longer prediction that is judged
-BINS = 12       # of accumulation, for the hysteresis
 PATHS = ("recipe", "net", "regions")  # keys of [sumo] in network.toml
 
 
@@ -79,7 +85,8 @@ def identify(
 ) -> str:
     """Load the city of `scenario`, fit its regional model, and write the network.toml of `loading`.
 
-    Samples, pictures and the loading runs go to `out`, one run folder per level. Returns the fit as a table. Raises
+    Samples, pictures, fit.csv and the loading runs go to `out`, one run folder per level. Returns the fit as a table,
+    with what is doubtful about it, and whether perimeter control can help (verdict.txt beside network.toml). Raises
     InputError for a network that does not come from a folder, RunFailed if a loading run failed. Loading runs are kept:
     the same call goes on where it was interrupted, and gives the same model.
     """
@@ -111,21 +118,32 @@ def identify(
 
     samples = samples_of(network, found)
     model = fitted(found, samples, "fitting")
-    text = fit_table(model, samples) + unreached(model, [result.trajectory.accumulation for result in found])
+    fits = region_fits(
+        model, samples, [result.trajectory.accumulation for result in found], seeds=len(loading.seeds))
+    text, foreseen = fit_table(model, samples, fits), None
     if held_out:
         kept = [result for result in found if not any(result is other for other in held_out)]
         without = fitted(kept, samples_of(network, kept), "fitting without the last seed")
-        text += "\n" + prediction_table(without, [observed(result) for result in held_out], scheme)
+        unseen = [observed(result) for result in held_out]
+        text += "\n" + prediction_table(without, unseen, scheme)
+        foreseen = predictions(without, unseen, scheme)
+    files.write_text(out / "fit.txt", text + "\n")
+    write_fits(out / "fit.csv", fits, foreseen)
+    model = replace(model, placeholder=False, doubts=tuple(fit.doubts for fit in fits))
+    judged = verdict.of_runs(model, [result for result in found if result.trajectory.controller == first])
+    model = replace(model, controllable=judged.boundaries.shares)
+    text = "\n".join([text, *wrapped("\n".join(judged.sentences))])
     _write_samples(out / "samples.csv", samples)
     by_run = [[own_points(cloud) for cloud in samples_of(network, [result])] for result in found]
     draw_mfds(out / "mfd.png", model, samples, [mfd_bands.band(runs) for runs in zip(*by_run, strict=True)])
     mfd_bands.draw_production(out / "production.png", model, [result.record for result in found])
     levels, seeds = ", ".join(f"{level:g}" for level in loading.levels), f"{min(loading.seeds)} to {max(loading.seeds)}"
     target.mkdir(parents=True, exist_ok=True)
-    files.write_text(target / "network.toml", network_toml(
+    files.write_text(target / "network.toml", schema_line(target) + network_toml(
         model, _sumo_table(own, target),
         f"Regional model: written by cosim identify from {len(found)} loading runs of {loaded.name} under {first} and\n"
         f"# {second}, demand times {levels}, seeds {seeds}."))
+    verdict.write_verdict(target, judged)
     return text
 
 
@@ -180,11 +198,6 @@ def observed(result: Result) -> Observed:
         perimeter=trajectory.perimeter, splits=trajectory.splits, crossings=record["crossings"].sum(axis=3))
 
 
-def nearly_empty(samples: Sequence[dict[str, Points]]) -> list[int]:
-    """The regions with too few samples to fit anything to."""
-    return [region for region, cloud in enumerate(samples) if len(own_points(cloud)) < SAMPLES]
-
-
 def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[int]) -> RegionalModel:
     """`model` with these regions as they are in `network`, and room for as many vehicles as their MFDs are meant for:
     what was fitted to hardly any vehicles knows nothing of more."""
@@ -193,70 +206,6 @@ def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[in
     return replace(
         model, mfds=mfds, exit_rates=np.where(alone[:, None], 1.0, model.exit_rates),
         storage=np.where(alone, np.maximum(model.storage, [mfd.jam for mfd in mfds]), model.storage))
-
-
-def own_points(cloud: dict[str, Points]) -> Points:
-    """(n, 2): the samples that the region's own MFD explains."""
-    return np.concatenate([points for label, points in cloud.items() if label != SPILLBACK])
-
-
-def hysteresis(cloud: dict[str, Points]) -> float:
-    """How much larger the outflow is while loading than while unloading at the same accumulation, as a share of it [-].
-
-    The mean over bins of accumulation with both, weighted by the outflow; NaN where there is none.
-    """
-    loading, unloading = (cloud.get(label, np.empty((0, 2))) for label in ("loading", "unloading"))
-    most = max((part[:, 0].max() for part in (loading, unloading) if len(part)), default=0.0)
-    means = np.full((2, BINS), np.nan)
-    for row, part in zip(means, (loading, unloading), strict=True):
-        number = np.minimum((BINS * part[:, 0] / max(most, 1e-9)).astype(int), BINS - 1)
-        for n in range(BINS):
-            if (number == n).sum() >= 3:
-                row[n] = part[number == n, 1].mean()
-    both = means[:, ~np.isnan(means).any(axis=0)]
-    return float((both[0] - both[1]).sum() / both.mean(axis=0).sum()) if both.size else float("nan")
-
-
-def fit_table(network: RegionalModel, samples: Sequence[dict]) -> str:
-    """Per region: the curve of the MFD, how well it explains the samples, and their hysteresis."""
-    lines = [f"{'region':<16}{'critical':>10}{'jam':>8}{'storage':>9}{'max outflow':>13}{'samples':>9}{'R2':>7}"
-             f"{'hysteresis':>12}   [veh, veh/s]"]
-    for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
-        points = own_points(cloud)
-        explained = float("nan")
-        if len(points) >= SAMPLES and points[:, 1].var() > 0:
-            explained = 1.0 - ((points[:, 1] - curve.outflow(points[:, 0])) ** 2).mean() / points[:, 1].var()
-        storage = float("inf") if network.storage is None else network.storage[region]
-        lines.append(
-            f"{f'{region} {network.region_names[region]}':<16}{curve.critical:>10.0f}{curve.jam:>8.0f}{storage:>9.0f}"
-            f"{curve.capacity:>13.3f}{len(points):>9}{explained:>7.2f}{100 * hysteresis(cloud):>10.0f} %")
-    if empty := nearly_empty(samples):
-        left = ", ".join(f"{region} {network.region_names[region]}" for region in empty)
-        lines.append(f"nearly empty in all loading runs: {left}; the MFD stays as it was there")
-    return "\n".join(lines)
-
-
-def unreached(network: RegionalModel, accumulations: Sequence[StatesOverTime]) -> str:
-    """A line on the regions whose critical accumulation no loading run reached, each run (T+1, R, R) [veh]; or none."""
-    most = np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
-    short = [f"{region} {network.region_names[region]} ({100 * most[region] / curve.critical:.0f} % of it)"
-             for region, curve in enumerate(network.mfds) if most[region] < curve.critical]
-    if not short:
-        return ""
-    return (f"\nnever beyond the critical accumulation: {', '.join(short)}; what lies beyond is a guess there.\n"
-            "Give higher --levels, or take it that perimeter control has nothing to protect there")
-
-
-def prediction_table(network: RegionalModel, held_out: Sequence[Observed], scheme: dict) -> str:
-    """RMSE of the accumulation one control interval and AHEAD seconds ahead, in runs that the fit did not see."""
-    intervals = identification.intervals_within(AHEAD, scheme["step"], held_out)
-    share = identification.prediction_shares(network, held_out, (1, intervals), **scheme)
-    heads = [f"{n * scheme['step']:g} s ahead" for n in (1, intervals)]
-    lines = [f"{'region':<16}{heads[0]:>14}{heads[1]:>14}   RMSE of critical, runs of the last seed, fit without them"]
-    for region, (one, many) in enumerate(zip(*share, strict=True)):
-        lines.append(f"{f'{region} {network.region_names[region]}':<16}{100 * one:>12.1f} %{100 * many:>12.1f} %")
-    lines.append(f"{'mean':<16}{100 * share[0].mean():>12.1f} %{100 * share[1].mean():>12.1f} %")
-    return "\n".join(lines)
 
 
 def _sumo_table(folder: Path, target: Path) -> dict[str, str]:

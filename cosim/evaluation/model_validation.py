@@ -9,7 +9,7 @@ import pandas as pd
 import torch
 from jaxtyping import Bool, Float
 
-from cosim.evaluation import mfd_bands
+from cosim.evaluation import mfd_bands, run_metrics
 from cosim.evaluation.simulate import Result
 from cosim.sumo.arrays import Points, RegionCounts, Series
 from nmfd import closed_loop
@@ -21,16 +21,19 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
+from nmfd.studies.traffic_states import model_outflow, remembered
 from nmfd.types import Controls, Observation, Trajectory
 
 COLUMNS = (
-    "region", "name", "critical_veh", "mean_veh", "rmse_veh", "rmse_share", "bias_veh", "next_interval_rmse_veh",
-    "next_interval_rmse_share")
+    "region", "name", "critical_veh", "mean_veh", "rmse_veh", "rmse_share", "persistence_rmse_veh", "bias_veh",
+    "next_interval_rmse_veh", "next_interval_rmse_share", "next_interval_persistence_rmse_veh")
 COLLAPSED = 0.7  # of the largest outflow so far
 SPILLBACK = "held up by a neighbour"
 CAPTION = (
     "RMSE, bias: of the accumulation that the regional model predicts for the whole run from its start [veh]; next "
-    "interval: predicted one control interval ahead from every recorded state; bias > 0: the model holds too many")
+    "interval: predicted one control interval ahead from every recorded state; if nothing changed: RMSE of the "
+    "prediction that the region keeps what it holds, from the start or for one interval [veh]; bias > 0: the model "
+    "holds too many")
 
 
 class Replay:
@@ -96,10 +99,11 @@ def _row(
     region: int | str, name: str, critical: float, simulated: Float[np.ndarray, " S"],
     whole: Float[np.ndarray, " S"], ahead: Series,
 ) -> dict:
-    rmse, next_rmse = float(np.sqrt((whole**2).mean())), float(np.sqrt((ahead**2).mean()))
+    rmse, next_rmse, still, next_still = (
+        float(np.sqrt((part**2).mean())) for part in (whole, ahead, simulated[0] - simulated, np.diff(simulated)))
     return dict(zip(COLUMNS, (
-        region, name, float(critical), float(simulated.mean()), rmse, rmse / critical, float(whole.mean()), next_rmse,
-        next_rmse / critical), strict=True))
+        region, name, float(critical), float(simulated.mean()), rmse, rmse / critical, still, float(whole.mean()),
+        next_rmse, next_rmse / critical, next_still), strict=True))
 
 
 def outflow_samples(
@@ -118,7 +122,7 @@ def outflow_samples(
     for trajectory, record in zip(trajectories, records, strict=True):
         x = 0.5 * (trajectory.accumulation[1:] + trajectory.accumulation[:-1])
         total, own = x.sum(2), x[:, range(x.shape[1]), range(x.shape[1])]
-        outflow = (record["arrivals"] + record["crossings"].sum(axis=(2, 3))) / trajectory.step
+        outflow = run_metrics.regional_outflow(record, trajectory.step)
         share = np.minimum(trajectory.perimeter[:, region].max(axis=1), u_max)
         weight = own[:, region] + share * (total - own)[:, region]
         points = np.stack(
@@ -157,12 +161,13 @@ def held_up(
 def error_table(rows: pd.DataFrame) -> str:
     """The errors as text."""
     shown = rows.copy()
-    for column in ("critical_veh", "mean_veh", "rmse_veh", "bias_veh", "next_interval_rmse_veh"):
+    for column in (name for name in COLUMNS if name.endswith("_veh")):
         shown[column] = [f"{value:.1f}" for value in rows[column]]
     for column in ("rmse_share", "next_interval_rmse_share"):
         shown[column] = [f"{100 * value:.1f} %" for value in rows[column]]
     headings = [
-        "region", "name", "critical", "mean", "RMSE", "of critical", "bias", "next interval RMSE", "of critical"]
+        "region", "name", "critical", "mean", "RMSE", "of critical", "if nothing changed", "bias", "next interval RMSE",
+        "of critical", "if nothing changed"]
     return text_columns(headings, shown.to_numpy().tolist(), CAPTION)
 
 
@@ -173,8 +178,11 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
     name = run_folder.run_name(result.trajectory.controller, result.trajectory.seed)
     files.write_text(folder / f"compare-{name}.csv", rows.to_csv(index=False))
     drawing, axes = plots.panels(scenario.network.regions + 1)
+    measured = run_metrics.regional_outflow(result.record, result.trajectory.step)
+    predicted_outflow = model_outflow(scenario.network)
+    outflow = remembered(lambda t: measured if t.plant == "sumo" else predicted_outflow(t))
     for region, ax in enumerate(axes[:-1]):
-        plots.region_accumulation(ax, scenario.network, region, [result.trajectory, predicted])
+        plots.region_accumulation(ax, scenario.network, region, [result.trajectory, predicted], outflow=outflow)
     plots.total_accumulation(axes[-1], [replace(
         result.trajectory, backlog=np.zeros_like(result.trajectory.backlog)), predicted])
     axes[-1].set_title("all regions", fontsize="medium")

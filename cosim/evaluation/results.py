@@ -8,13 +8,12 @@ from pathlib import Path
 import pandas as pd
 
 from cosim.evaluation import evaluate, experiment
-from cosim.evaluation.simulate import FACTS
 from cosim.sumo.build import SumoFiles, ensure_built
 from cosim.sumo.net import City, load_city
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
-from nmfd.runs.files import file_hash
+from nmfd.runs.files import check_file, file_hash
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +106,6 @@ def _level(demand: float, folder: Path, order: Sequence[str]) -> Level:
     rows = experiment.overview(folder)
     if rows.empty:
         raise InputError(f"{folder}: holds no finished runs; run the command that began it again")
-    rows = rows.reindex(columns=[*rows.columns, *(name for name in FACTS if name not in rows.columns)])
     rows.insert(0, "demand", float(demand))
     names = list(dict.fromkeys([*order, *rows["controller"]]))
     rows = rows.sort_values(
@@ -118,6 +116,7 @@ def _level(demand: float, folder: Path, order: Sequence[str]) -> Level:
 
 def _manifest(folder: Path) -> dict:
     path = folder / "manifest.json"
+    check_file(path, "give a folder of `cosim run` or `cosim evaluate`")
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
         configuration, scenario = manifest["configuration"], manifest["sessions"][-1]["scenario_folder"]

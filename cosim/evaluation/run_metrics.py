@@ -1,12 +1,12 @@
 """One row of sumo.csv: what a run in SUMO came to, beside the figures that every plant has (nmfd.metrics)."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from jaxtyping import Bool
 
 from cosim.plant.record import Record
-from cosim.sumo.arrays import EdgesOverTime
+from cosim.sumo.arrays import EdgesOverTime, RegionCounts
 from cosim.sumo.net import City, Gateway, gateway_room_taken
 from cosim.sumo.tripinfo import TripFacts
 
@@ -53,3 +53,9 @@ def leaking_share(record: Record, city: City, leaks: Collection[Gateway]) -> flo
     flow = record.gateway_flow.sum(axis=0)
     leaking = sum(passed for gateway, passed in zip(city.gateways, flow, strict=True) if gateway in leaks)
     return float(leaking / max(flow.sum(), 1))
+
+
+def regional_outflow(record: Mapping[str, np.ndarray], step: float) -> RegionCounts:
+    """(T, R) [veh/s]: trips that ended in every region, and vehicles that went on to another one, by a record's arrays;
+    step: control interval [s]"""
+    return (record["arrivals"] + record["crossings"].sum(axis=(2, 3))) / step

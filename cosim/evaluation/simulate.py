@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from cosim.evaluation import estimation_errors, run_metrics
+from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
 from cosim.plant.plant import SumoPlant
+from cosim.plant.record import settled
 from cosim.plant.settings import settings
 from cosim.plant.strategy import Strategy, configured, parse, planning_of
-from cosim.sumo import outputs as sumo_output
+from cosim.sumo.outputs import check_whole
 from nmfd import closed_loop, metrics
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
@@ -27,9 +29,9 @@ from nmfd.types import Controller, Trajectory
 FACTS = (
     "controller", "seed", "trips", "departed_veh", "final_backlog_veh", "total_backlog_veh_s", "teleports",
     "mean_trip_time_s", "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh",
-    "gateway_queue_max_veh", "gateway_full_share", "notes", "leaking_share",
+    "gateway_queue_max_veh", "gateway_full_share", "notes", "outside_training", "leaking_share",
     "estimate_rmse_share", "estimate_cell_rmse_veh", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s",
-    "signals_left_alone")
+    "signals_left_alone", "booked_intervals", "removed_veh", "removed_waiting_veh", "jumps", *PRESSURE_FACTS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +39,8 @@ class Task:
     """scenario: its folder; controller: a strategy (cosim.plant.strategy); policy: of a DPC controller, instead of the
     scenario's own; steps: control intervals, all if None; demand_factor: multiplies all flows;
     options: of the controller, instead of those of the scenario; sumo_output: kind (cosim.sumo.outputs) and file of
-    SUMO's own outputs; faults: besides those of the scenario."""
+    SUMO's own outputs; faults: besides those of the scenario; time_limit: of a controller of the user's own
+    [s], instead of that of the scenario."""
 
     scenario: Path
     controller: str
@@ -48,6 +51,7 @@ class Task:
     options: tuple[tuple[str, object], ...] = ()
     sumo_output: tuple[tuple[str, Path], ...] = ()
     faults: tuple[str, ...] = ()
+    time_limit: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,22 +70,26 @@ def scenario_of(task: Task) -> Scenario:
     scenario = with_faults(scenario, task.faults)
     scenario = replace(
         scenario, steps=steps, demand=task.demand_factor * scenario.demand[:steps],
-        demand_factor=task.demand_factor * scenario.demand_factor)
+        demand_factor=task.demand_factor * scenario.demand_factor,
+        own_time_limit=scenario.own_time_limit if task.time_limit is None else task.time_limit)
     if not task.options:
         return scenario
-    controller = parse(task.controller).controller
-    options = {**scenario.controller_options.get(controller, {}), **dict(task.options)}
-    return replace(scenario, controller_options={**scenario.controller_options, controller: options})
+    tables = scenario.controller_options
+    table = configured(task.controller, tables)
+    return replace(scenario, controller_options={**tables, table: {**tables.get(table, {}), **dict(task.options)}})
 
 
 def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> Result:
     """Run `task` in this process, which must hold no other SUMO session. Raises InputError."""
     begin = time.perf_counter()
     scenario, strategy = scenario_of(task), parse(task.controller)
-    controller = registry.make(configured(task.controller, scenario.controller_options), scenario, policy=task.policy)
-    return drive(
+    variant = configured(task.controller, scenario.controller_options)
+    controller = registry.make(variant, scenario, policy=task.policy)
+    result = drive(
         scenario, strategy, controller, seed=task.seed, progress=progress, begin=begin, outputs=dict(task.sumo_output),
         planning=planning_of(scenario, task.controller))
+    outside = registry.outside_training(variant, scenario, task.demand_factor, file=task.policy)
+    return replace(result, facts={**result.facts, "outside_training": outside})
 
 
 def drive(
@@ -105,21 +113,26 @@ def drive(
         trajectory = run_folder.labelled(
             closed_loop.run(plant, controller, scenario, seed=seed, progress=progress),
             controller=strategy.name, plant="sumo")
+        trips, sumo_time, leaks, facts = plant.trips, plant.sumo_time, set(plant.leaks()), plant.trip_facts()
         record = plant.record()
-        departed = int(record.departures.sum())
+        trajectory = settled(trajectory, record)
         backlog = trajectory.backlog.sum(axis=(1, 2))
-        sumo_time, leaks = plant.sumo_time, set(plant.leaks())
         row = {
-            "controller": strategy.name, "seed": seed, "trips": plant.trips, "departed_veh": departed,
+            "controller": strategy.name, "seed": seed, "trips": trips,
+            "departed_veh": int(record.departures.sum()),
             "final_backlog_veh": int(backlog[-1]), "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
-            "teleports": int(record.teleports.sum()), **run_metrics.trip_facts(plant.trip_facts()),
+            "teleports": int(record.teleports.sum()), **run_metrics.trip_facts(facts),
             **run_metrics.queue_facts(record, plant.city), "notes": metrics.notes(trajectory),
+            "outside_training": "",
             "leaking_share": run_metrics.leaking_share(record, plant.city, leaks),
             **_estimation(scenario, trajectory), "wall_time_s": trajectory.wall_time, "sumo_time_s": sumo_time,
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
-            "signals_left_alone": len(plant.other_signals)}
-        sumo_output.check_whole(files)
+            "signals_left_alone": len(plant.other_signals), "booked_intervals": plant.booked,
+            "removed_veh": int(record.removals.sum() + record.given_up.sum()),
+            "removed_waiting_veh": int(record.given_up.sum()), "jumps": int(record.jumps.sum()),
+            **plant.pressure_facts()}
+        check_whole(files)
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
 
 

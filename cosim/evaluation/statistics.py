@@ -12,21 +12,24 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nmfd.metrics import COUNTED
+from nmfd.metrics import COUNTED, percent_change
 from nmfd.runs import files
 from nmfd.runs.tables import markdown_table, text_table, wrapped
+from nmfd.studies import benchmark
 from nmfd.studies.benchmark import REFERENCE, interval
 
 TTS = "total_time_spent_veh_s"
 MEANS = (  # columns of summary.csv and sumo.csv of which an evaluation shows the mean over seeds
-    "completed_veh", "trips", "final_backlog_veh", "total_backlog_veh_s", "mean_trip_time_s", "mean_departure_delay_s",
-    "co2_kg", "fuel_kg", "gateway_queue_mean_veh", "gateway_full_share", "control_step_ms_median", "overhead_share",
-    "wall_time_s")
+    "completed_veh", "removed_veh", "trips", "final_backlog_veh", "total_backlog_veh_s", "mean_trip_time_s",
+    "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh", "gateway_full_share",
+    "control_step_ms_median", "overhead_share", "wall_time_s")
 CAPTION = (
-    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; change: of TTS, "
-    "paired by seed, mean of the percentages ± 95 % interval, * if that excludes zero; backlog: not inserted at the "
-    "end, and its time integral; teleports: all seeds; trip, delay: mean time on the road, and between the wanted and "
-    "the real departure, of all trips, unfinished ones with what they had spent at the end; queue: halting on the "
+    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; change: of TTS "
+    "against no-control, or against the controller that the heading names, paired by seed, mean of the percentages "
+    "± 95 % interval, * if that excludes zero; completed: on the last edge of their route; removed: by whatever else "
+    "takes vehicles out of SUMO, in TTS as if they were there to the end; backlog: not inserted at the end, and its "
+    "time integral; teleports: all seeds; trip, delay: mean time on the road, and between the wanted and the real "
+    "departure, of all trips, unfinished ones with what they had spent at the end; queue: halting on the "
     "edges before gateways, mean / longest; full: share of these edges and intervals that were full; decision: median "
     "/ longest; " + "; ".join(f"{heading}: {what}" for heading, what in COUNTED.values()))
 
@@ -48,9 +51,9 @@ class Paired:
 
 
 def paired(a: Mapping[int, float], b: Mapping[int, float]) -> Paired:
-    """a, b: seed -> value; NaN everywhere without a common seed."""
+    """a, b: seed -> value; NaN everywhere without a common seed, and the percentages where a value of b is 0."""
     seeds = sorted(set(a) & set(b))
-    percent = [100.0 * (a[seed] / b[seed] - 1.0) for seed in seeds]
+    percent = [percent_change(a[seed], b[seed]) for seed in seeds]
     difference = [a[seed] - b[seed] for seed in seeds]
     return Paired(
         seeds=len(seeds), percent=_mean(percent), percent_half=interval(percent), difference=_mean(difference),
@@ -72,17 +75,31 @@ def groups(rows: pd.DataFrame) -> dict[float, list[str]]:
     return {level: list(dict.fromkeys(part["controller"])) for level, part in rows.groupby("demand", sort=True)}
 
 
+def compared_with(rows: pd.DataFrame) -> str:
+    """What the controllers of `rows` are compared with: no control, or the first of them, where it was not run at every
+    demand level."""
+    levels = groups(rows).values()
+    names = list(dict.fromkeys(rows["controller"]))
+    return benchmark.compared_with([name for name in names if all(name in level for level in levels)] or names)
+
+
+def than(reference: str) -> str:
+    """Behind "less time than": what controllers are compared with, in words."""
+    return "without control" if reference == REFERENCE else f"under {reference}"
+
+
 def statistics(rows: pd.DataFrame, reference: str | None = None) -> pd.DataFrame:
     """One row per demand level and controller of `rows`, which are those of experiment.overview with a column
-    demand. `reference`: a controller to pair with, besides no control."""
+    demand. `reference`: a controller to pair with, besides that which all are compared with (column against)."""
     out = []
     for level, names in groups(rows).items():
+        against = compared_with(rows[rows["demand"] == level])
         for name in names:
             part = rows[(rows["demand"] == level) & (rows["controller"] == name)]
             row = {
-                "demand": level, "controller": name, "seeds": len(part), f"mean_{TTS}": part[TTS].mean(),
-                f"half_interval_{TTS}": interval(list(part[TTS]))}
-            for label, other in (("change", REFERENCE), ("change_to_reference", reference)):
+                "demand": level, "controller": name, "against": against, "seeds": len(part),
+                f"mean_{TTS}": part[TTS].mean(), f"half_interval_{TTS}": interval(list(part[TTS]))}
+            for label, other in (("change", against), ("change_to_reference", reference)):
                 pair = paired(by_seed(rows, level, name), by_seed(rows, level, other) if other else {})
                 shown = pair.seeds > 0 and name != other
                 row |= {
@@ -122,14 +139,17 @@ def pairs(rows: pd.DataFrame) -> pd.DataFrame:
 def shown(table: pd.DataFrame, reference: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame]:
     """`statistics` of one demand level as two tables of text: what came of it, and how."""
     first, second = [], []
+    found = list(dict.fromkeys(table["against"]))
+    change = "change" if found == [REFERENCE] or len(table) == 1 else f"against {found[0]}"
+    reference = None if reference in found else reference
     for row in table.to_dict("records"):
         teleports = f"{row['teleports']:.0f}"
         against = {f"against {reference}": _change(row, "change_to_reference")} if reference else {}
         first.append({
             "controller": row["controller"], "seeds": row["seeds"], "TTS [veh s]": _spread(row),
-            "change": _change(row, "change"), **against,
+            change: _change(row, "change"), **against,
             "completed": f"{row['completed_veh']:,.0f} of {row['trips']:,.0f}",
-            "backlog [veh]": f"{row['final_backlog_veh']:,.0f}",
+            "removed [veh]": f"{row['removed_veh']:,.0f}", "backlog [veh]": f"{row['final_backlog_veh']:,.0f}",
             "backlog [veh s]": f"{row['total_backlog_veh_s']:.2e}", "teleports": teleports})
         second.append({
             "controller": row["controller"], "trip [s]": f"{row['mean_trip_time_s']:,.0f}",
@@ -150,7 +170,7 @@ def _spread(row: Mapping) -> str:
 def _change(row: Mapping, label: str) -> str:
     percent, half = row[f"{label}_percent"], row[f"{label}_half_interval_percent"]
     if math.isnan(percent):
-        return ""
+        return "-" * bool(row[f"{label}_seeds"])
     return f"{percent:+.1f}" + (" %" if math.isnan(half) else f" ± {half:.1f} %{'*' * row[f'{label}_excludes_zero']}")
 
 

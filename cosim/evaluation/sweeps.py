@@ -32,7 +32,8 @@ FIRST = ["strategy", "controller", "seed", "demand", "compliance", "status", "re
 class Sweep:
     """scenario: its folder; controllers: strategies; levels: multiples of the scenario's demand; compliance: shares of
     the drivers' decisions that follow route guidance, the scenario's own where there is none or nobody guides;
-    steps: control intervals, all if None; policies: controller -> file instead of the scenario's own; out: the folder.
+    steps: control intervals, all if None; policies: controller -> file instead of the scenario's own; time_limit: of
+    controllers of the user's own, instead of the scenario's; out: the folder.
     """
 
     scenario: Path
@@ -43,12 +44,13 @@ class Sweep:
     compliance: tuple[float, ...] = ()
     steps: int | None = None
     policies: Mapping[str, Path] = field(default_factory=dict)
+    time_limit: float | None = None
 
     def strategies(self) -> dict[str, str]:
         """Strategy with its compliance -> strategy as asked for; those that guide nobody once only. InputError."""
         ways = [f"+compliance-{100 * share:g}" for share in self.compliance] or [""]
         found = {name + way: name for name in self.controllers for way in ways}
-        guiding = {name: registry.guides(parse(name).controller) for name in found}
+        guiding = {name: parse(name).guides for name in found}
         return {strategy if guiding[strategy] else name: name for strategy, name in found.items()}
 
     def plan(self) -> list[tuple[Path, Task]]:
@@ -56,19 +58,19 @@ class Sweep:
         return [
             (self.out / f"demand-{level:g}", Task(
                 scenario=self.scenario, controller=strategy, seed=seed, policy=self.policies.get(name),
-                steps=self.steps, demand_factor=level))
+                steps=self.steps, demand_factor=level, time_limit=self.time_limit))
             for seed in self.seeds for level in self.levels for strategy, name in self.strategies().items()]
 
 
 def sweep(
-    order: Sweep, *, workers: int = 1, scheduler: str | None = None,
+    order: Sweep, *, workers: int = 1, scheduler: dask_cluster.Scheduler | str | None = None,
     progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Run what is not there yet; returns the table, which is in sweep.parquet, of all runs in the folder.
 
     Columns: strategy, controller (without its compliance), seed, demand, compliance, status ("ok" or "failed"),
     reason, and those of summary.csv and sumo.csv, which are empty where a run failed. Failed runs are tried again at
-    the next call. `scheduler`: the address of a Dask scheduler, whose workers run all of it instead of `workers`
+    the next call. `scheduler`: a Dask scheduler or its address, whose workers run all of it instead of `workers`
     processes here. progress, tell: as in `experiment.perform`. Raises InputError, and
     RunFailed if no run at all went well.
     """
@@ -94,7 +96,11 @@ def sweep(
         write()
 
     if scheduler is not None:
+        if isinstance(scheduler, str):
+            scheduler = dask_cluster.Scheduler(address=scheduler)
         dask_cluster.connect(scheduler).close()  # before anything is written
+        if tell and scheduler.warning:
+            tell(scheduler.warning)
     failed_now = experiment.perform(
         plan, workers=workers, progress=progress, tell=tell, kept=write, failed=failed,
         source=partial(_local, workers=workers) if scheduler is None else partial(dask_cluster.outcomes, scheduler))
@@ -152,6 +158,7 @@ def text(rows: pd.DataFrame) -> str:
     if len(good):
         table["TTS [veh s]"] = good["total_time_spent_veh_s"].mean().map("{:.4g}".format)
         table["completed [veh]"] = good["completed_veh"].mean().map("{:,.0f}".format)
+        table["removed [veh]"] = good["removed_veh"].mean().map("{:,.0f}".format)
         table["trip [s]"] = good["mean_trip_time_s"].mean().map("{:,.0f}".format)
         table["CO2 [kg]"] = good["co2_kg"].mean().map("{:,.0f}".format)
     return text_table(table.reset_index().astype(object).fillna("").to_dict("records"))

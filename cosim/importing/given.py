@@ -12,6 +12,7 @@ from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers
 from cosim.sumo.xml_files import read_xml
 from nmfd.errors import InputError
+from nmfd.runs.files import check_file
 
 
 def read_given(streets: Streets, path: Path, method: str) -> EdgeNumbers:
@@ -30,6 +31,7 @@ def read_given(streets: Streets, path: Path, method: str) -> EdgeNumbers:
 
 
 def _edges(streets: Streets, path: Path) -> np.ndarray:
+    check_file(path, "give a csv with the columns edge,region")
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:  # spreadsheets begin with a mark
             rows = [(number, row) for number, row in enumerate(csv.reader(stream), start=1) if row]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.importing import level, model, quality, written
+from cosim.importing import level, model, quality, verdict, written
 from cosim.importing.assignment import Assigned, Effort, relative_gap
 from cosim.importing.baseline import Baseline
 from cosim.importing.case import SumoInput, read_sumo_input, seconds
@@ -18,9 +18,11 @@ from cosim.importing.regions import positions
 from cosim.importing.streets import Streets, read_streets
 from cosim.importing.trials import Peaks, Trials, routed
 from cosim.sumo.net import City, load_city
+from cosim.sumo.signals import HELD
 from nmfd.errors import InputError
 from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel
+from nmfd.runs.files import synced
 from nmfd.runs.scratch import LOCK, Scratch
 
 LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
@@ -110,6 +112,9 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
         others = {} if baseline is None else alternatives(
             streets, baseline, order.cut, regions, seed=order.seed, left_alone=left)
         found = quality.tables(streets, regions, network.region_names, city, baseline, left, others)
+        judged = verdict.of_import(network, found.gateways, regions, baseline)
+        network = replace(network, controllable=judged.boundaries.shares)
+        verdict.write_verdict(net_folder, judged)
         tell("writing")
         written.write_network(net_folder, streets, regions, network, found, baseline, order.source.name)
         demand = model.region_demand(traffic, regions, clock)
@@ -120,6 +125,7 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
             protected=_protected(streets, regions, baseline, network), factor=factor, mesoscopic=order.mesoscopic))
         report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
         report += _demand_lines(order, streets, assigned, baseline, gaps)
+        report += "".join(f"\n{sentence}" for sentence in judged.sentences)
         report += _level_line(order, times if order.peak else factor, congests)
         if moved and isinstance(order.cut, Drawn):
             report += (f"\n{moved:,} streets are in other regions than {order.cut.file.name} says: theirs was in "
@@ -157,11 +163,11 @@ def _traffic(case: SumoInput, streets: Streets, order: ImportOptions) -> Traffic
 
 
 def left_alone(streets: Streets, traffic: Traffic) -> dict[str, str]:
-    """Signal -> why perimeter control leaves it alone: only fixed-time programmes that always run are changed."""
+    """Signal -> why perimeter control leaves it alone: it holds back at programmes of HELD kinds that always run."""
     found = {signal: "no programme" for signal in streets.link_signals if signal and signal not in streets.logics}
     found |= {
         signal: "switched off" if logics[-1].programme == "off" else f"{logics[-1].kind} signal"
-        for signal, logics in streets.logics.items() if logics[-1].kind != "static" or logics[-1].programme == "off"}
+        for signal, logics in streets.logics.items() if logics[-1].kind not in HELD or logics[-1].programme == "off"}
     found |= {signal: "programme follows a timetable" for signal in traffic.switched}
     return found
 
@@ -209,7 +215,9 @@ def _folders(order: ImportOptions) -> Iterator[tuple[Path, Path]]:
                 (folder / GUIDED / "network.toml").unlink(missing_ok=True)
             for file in sorted(temporary.iterdir(), key=lambda file: (file.suffix == ".toml", file.name)):
                 if file.name != LOCK:
+                    synced(file)
                     os.replace(file, folder / file.name)
+                    synced(folder)
 
 
 def _probe(
@@ -312,8 +320,6 @@ def _report(
     if found.uncontrolled > LITTLE:
         lines.append(f"perimeter control reaches only {100 * (1 - found.uncontrolled):.0f} % of the flow over the "
                      "boundaries: other regions (--regions, --method, your own) may have more signals between them")
-    if not any(g["control"] == "controlled" for g in found.gateways):
-        lines.append("no gateway has a signal that perimeter control can use: only route guidance can do anything here")
     if baseline is not None:
         lines.append(
             f"without control: driving takes {baseline.pace(streets):.1f} times as long as at the speed limits; "

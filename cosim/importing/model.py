@@ -95,7 +95,8 @@ def network_of(streets: Streets, regions: EdgeNumbers, name: str, baseline: Base
     """The regional model: adjacency from the streets, own splits from the baseline, MFDs from lanes and speeds."""
     network = RegionalModel(
         name=name, region_names=names(streets, regions), positions=positions(streets, regions).round(1),
-        adjacency=digraph(streets, regions) > 0, mfds=_placeholders(streets, regions, baseline), u_min=0.1, u_max=0.9)
+        adjacency=digraph(streets, regions) > 0, mfds=_placeholders(streets, regions, baseline), u_min=0.1, u_max=0.9,
+        placeholder=True)
     if baseline is None:
         return network
     return replace(network, observed_split_ratios=observed_split_ratios(network, baseline.crossings(regions)))

@@ -13,6 +13,7 @@ from cosim.importing.regions import digraph
 from cosim.importing.streets import Streets, graph
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge
 from cosim.sumo.net import City
+from cosim.sumo.signals import FIXED
 from nmfd.arrays import PerRegion
 from nmfd.runs.tables import text_table
 
@@ -22,7 +23,7 @@ QUALITY = (
     "boundary_flow_veh", "uncontrolled_share")
 GATEWAYS = (
     "source", "target", "from_edge", "to_edge", "lanes", "shared_lanes", "signal", "links", "signal_serves", "control",
-    "flow_veh")
+    "kind", "flow_veh")
 
 
 PARTITIONS = ("asked", "regions", "ncut_silhouette", "tv_n", "smallest_lane_share", "chosen")
@@ -64,6 +65,7 @@ def tables(
         "links": " ".join(map(str, g.links)),
         "signal_serves": " ".join(f"{i}-{h}" for i, h in sorted(pairs.get(g.signal or "", ()))),
         "control": "no signal" if g.signal is None else left_alone.get(g.signal, "controlled"),
+        "kind": kind(streets, g.signal),
         "flow_veh": moves[streets.number[g.from_edge], streets.number[g.to_edge]]} for g in city.gateways]
     density = np.zeros(len(regions)) if baseline is None else 1000.0 * baseline.density(streets)
     everywhere = _variance(density, streets, streets.drivable)[1]
@@ -116,6 +118,12 @@ def _halves(streets: Streets, regions: EdgeNumbers, baseline: Baseline | None) -
     """The fewest edges that hold half of all vehicles, of every region and of all, when these have the most."""
     members = [streets.drivable & (regions == region) for region in range(int(regions.max()) + 1)]
     return [0 if baseline is None else baseline.concentration(edges)[0] for edges in (*members, streets.drivable)]
+
+
+def kind(streets: Streets, signal: str | None) -> str:
+    """Of the programme that a signal runs: "fixed", or SUMO's word for others; "" where there is none."""
+    logics = streets.logics.get(signal or "")
+    return "" if not logics else "fixed" if logics[-1].kind == FIXED else logics[-1].kind
 
 
 def _row(streets: Streets, members: np.ndarray, region: str, name: str, signals: int, density: np.ndarray,

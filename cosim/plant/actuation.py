@@ -1,9 +1,9 @@
 """From commands to lights: one object in front of all that controls signals.
 
-Perimeter control acts on the gateway movements of fixed-time signals (`perimeter`), or rations their green where
-max-pressure runs the signals (`max_pressure`, `green_quota`). Either way u between its bounds becomes a share, a
-gateway before which the street is full may be spared (queue override), and a signal that is out of order does not take
-what it is shown (`incidents`).
+Perimeter control acts on the gateway movements of fixed-time signals (`perimeter`) and of those that SUMO actuates
+(`responsive`), or rations their green where max-pressure runs the signals (`max_pressure`, `green_quota`). Either way u
+between its bounds becomes a share, a gateway before which the street is full may be spared (queue override), and a
+signal that is out of order does not take what it is shown (`incidents`).
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -12,10 +12,11 @@ from typing import Protocol
 import numpy as np
 
 from cosim.plant.incidents import Incidents
-from cosim.plant.max_pressure import MaxPressure
+from cosim.plant.max_pressure import FACTS, MaxPressure
 from cosim.plant.perimeter import GREEN, GatewaySignal, GatewaySignals
 from cosim.plant.programmes import CitySignals
-from cosim.plant.settings import Settings
+from cosim.plant.responsive import ResponsiveSignal, ResponsiveSignals
+from cosim.plant.settings import CYCLIC, Settings
 from cosim.sumo.arrays import PerEdge, PerGateway
 from cosim.sumo.net import City, Gateway, gateway_movements, gateway_room_taken
 from cosim.sumo.session import Phase, Session
@@ -56,14 +57,21 @@ class Actuation:
         self._controls: list[SignalControl] = []
         phases: dict[str, Sequence[Phase]] = {}  # of the original programmes of the signals that are commanded
         movements = gateway_movements(city)
-        if flows is not None:
-            self._controls.append(MaxPressure(
-                session, city, signals.steered, flows, min_green=chosen.min_green, show=incidents.show))
+        self._pressure = None if flows is None else MaxPressure(
+            session, city, signals.steered, flows, min_green=chosen.min_green, max_green=chosen.max_green,
+            show=incidents.show, cyclic=chosen.signals == CYCLIC)
+        if self._pressure is not None:
+            self._controls.append(self._pressure)
             phases |= {signal.id: signal.phases for signal in signals.steered if signal.id in movements}
-        fixed = _gateway_signals(session, chosen, {
-            signal: links for signal, links in sorted(movements.items()) if signal not in phases})
-        self._controls.append(GatewaySignals(fixed, incidents.show))
-        phases |= {signal.signal: signal.phases for signal in fixed}
+        own = [session.programme(signal) for signal in sorted(movements)
+               if signal not in phases and signal not in chosen.leave_signals]
+        self._controls.append(GatewaySignals([
+            GatewaySignal(plan, movements[plan.signal], min_green=chosen.min_green, mode=chosen.actuation,
+                          start=session.time) for plan in own if plan.static], incidents.show))
+        self._controls.append(ResponsiveSignals(session, [
+            ResponsiveSignal(session, incidents, plan, movements[plan.signal], min_green=chosen.min_green)
+            for plan in own if plan.actuated]))
+        phases |= {plan.signal: plan.phases for plan in own if plan.static or plan.actuated}
         self._commanded = phases.keys()
         self.original_green = _programmed_green(city, phases, scenario.step)
 
@@ -100,6 +108,12 @@ class Actuation:
         out = [gateway.signal in self._incidents.refused for gateway in self._city.gateways]
         return np.where(out, self.original_green, green)
 
+    def pressure_facts(self) -> dict[str, float]:
+        """max_pressure.FACTS of this run; NaN where it does not run the signals."""
+        if self._pressure is None:
+            return dict.fromkeys(FACTS, float("nan"))
+        return self._pressure.facts(self._session.time)
+
     def leaks(self) -> list[Gateway]:
         """Gateways that no command reaches."""
         return [gateway for gateway in self._city.gateways if gateway.signal not in self._commanded]
@@ -113,18 +127,6 @@ class Actuation:
             if gateway.signal is not None:
                 links.setdefault(gateway.signal, set()).update(gateway.links)
         return links
-
-
-def _gateway_signals(
-    session: Session, chosen: Settings, movements: Mapping[str, Mapping[int, tuple[int, int]]],
-) -> list[GatewaySignal]:
-    """Those with a fixed-time programme, by name."""
-    found = []
-    for name, links in movements.items():
-        if name not in chosen.leave_signals and (programme := session.programme(name)).static:
-            found.append(GatewaySignal(
-                programme, links, min_green=chosen.min_green, mode=chosen.actuation, start=session.time))
-    return found
 
 
 def _programmed_green(city: City, phases: Mapping[str, Sequence[Phase]], step: float) -> PerGateway:

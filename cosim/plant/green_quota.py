@@ -6,6 +6,7 @@ Max-pressure has no cycle and no windows that could be shortened. Here a gateway
 
 m the minimum green and C the cycle of the signal's original programme, whenever max-pressure likes; under u_max there
 is no limit. Once that is spent its link turns yellow and red, and it exerts no pressure until the next C seconds begin.
+At signals that SUMO actuates (cosim.plant.responsive) the second C is less, the green in a cycle that is usual there.
 """
 
 from cosim.sumo.signals import GREEN
@@ -16,13 +17,18 @@ NEVER = float("inf")
 class Ration:
     """The green of one link.
 
-    cycle: [s]; min_green: [s]; yellow: [s], after its green; start: simulation time at which the first cycle begins
+    cycle: [s]; min_green: [s]; yellow: [s], after its green; start: simulation time at which the first cycle begins;
+    full: [s] of green in a cycle that the share 1 stands for, the cycle if None
     """
 
-    def __init__(self, pair: tuple[int, int], *, cycle: float, min_green: float, yellow: float, start: float):
+    def __init__(
+        self, pair: tuple[int, int], *, cycle: float, min_green: float, yellow: float, start: float,
+        full: float | None = None,
+    ):
         """pair: (i, h), whose command it follows"""
         self.pair, self._green_time = pair, 0.0
-        self._cycle, self._min_green, self._yellow = cycle, min(min_green, cycle), yellow
+        self._full = cycle if full is None else full
+        self._cycle, self._min_green, self._yellow = cycle, min(min_green, self._full), yellow
         self._share, self._budget, self._spent = 1.0, NEVER, 0.0
         self._cycle_end = start
         self._open, self._opened_at = False, -NEVER
@@ -31,6 +37,11 @@ class Ration:
     def command(self, share: float) -> None:
         """share: (u - u_min) / (u_max - u_min) [-], for the cycles that begin from now on."""
         self._share = share
+
+    @property
+    def limited(self) -> bool:
+        """Whether there is an end to its green in this cycle."""
+        return self._budget < NEVER
 
     @property
     def exhausted(self) -> bool:
@@ -50,7 +61,7 @@ class Ration:
         while now >= self._cycle_end - 1e-6:
             self._cycle_end += self._cycle
             self._spent = 0.0
-            limit = self._min_green + self._share * (self._cycle - self._min_green)
+            limit = self._min_green + self._share * (self._full - self._min_green)
             self._budget = NEVER if self._share >= 1.0 else limit
         self._light, again = self._filter(light, now, lasting)
         return self._light, min(again, self._cycle_end)

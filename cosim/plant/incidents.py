@@ -79,6 +79,12 @@ class Incidents:
                 self._session.set_signal_state(signal, state)):
             self._refused.add(signal)
 
+    def release(self, signal: str, programme: str) -> None:
+        """Let a signal show its own programme again, which has run on underneath."""
+        self._wanted.pop(signal, None)
+        if signal not in self._silent and signal not in self._yellow:
+            self._session.restart_programme(signal, programme)
+
     @property
     def refused(self) -> set[str]:
         """Signals that did not take their states in this interval."""
@@ -94,14 +100,15 @@ class Incidents:
     def _change(self, signal: str) -> None:
         """From what it shows to its own programme, or back to what it should show; through yellow if need be."""
         session, shown = self._session, self._session.signal_state(signal)
-        if signal in self._silent:
+        alone = signal in self._silent or signal not in self._wanted
+        if alone:
             session.restart_programme(signal, self._own[signal])
             target = session.signal_state(signal)
         else:
-            target = self._wanted.get(signal, shown)
+            target = self._wanted[signal]
         losing = [a in GREEN and b not in GREEN for a, b in zip(shown, target, strict=True)]
         if any(losing):
             session.set_signal_state(signal, "".join("y" if lost else a for lost, a in zip(losing, shown, strict=True)))
             self._yellow[signal] = session.time + YELLOW
-        elif signal not in self._silent:
+        elif not alone:
             session.set_signal_state(signal, target)

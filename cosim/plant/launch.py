@@ -6,7 +6,7 @@ from pathlib import Path
 from cosim.plant.detectors import Layout, write_loops
 from cosim.plant.programmes import CitySignals, write_signal_programmes
 from cosim.plant.settings import ESTIMATE, Settings, scenario_file
-from cosim.sumo import outputs as sumo_output
+from cosim.sumo import outputs
 from cosim.sumo.net import City
 from cosim.sumo.recorded_trips import (
     MESOSCOPIC,
@@ -84,7 +84,7 @@ class Launch:
         """SUMO's, besides those that every session has."""
         chosen = self._settings
         options = [
-            *trip_options(self.trip_file), *sumo_output.options(self._outputs), "--begin", str(chosen.begin),
+            *trip_options(self.trip_file), *outputs.options(self._outputs), "--begin", str(chosen.begin),
             "--ignore-route-errors", str(bool(chosen.routes)).lower()]
         if chosen.rerouting > 0:
             options += [*REROUTING, "--device.rerouting.probability", str(chosen.rerouting)]
@@ -104,7 +104,7 @@ class Launch:
             write_loops(self._city, self._layout, scenario.step, files[-1])
         files += self._window.additional if self._window else ()
         if "edgedata" in self._outputs:
-            files.append(sumo_output.write_edge_data(
+            files.append(outputs.write_edge_data(
                 folder / "edgedata.add.xml", self._outputs["edgedata"], scenario.step))
         return files
 

@@ -8,6 +8,17 @@ gateway movements (cosim.plant.green_quota); one whose ration is spent exerts no
 
 x counts vehicles per lane, as loops and cameras see them; on lanes that several movements share, and upstream of the
 turn lanes, they are shared out by r, from the demand's static routes.
+
+Who is first on a shared lane holds up all behind until the green is theirs: a stage that serves a part of a lane moves
+a few vehicles, whatever the queue. So a shared lane counts for the stages that serve all of it; where there is none,
+for the others in so far as the first vehicle is likely to be served.
+
+Which stage comes next is decided in one of two ways. Acyclic (Varaiya): the one with the highest pressure; a link that
+was red for MAX_RED while somebody waited there comes first. Cyclic (as Levin, Hu and Odell, "Max-pressure signal
+control with cyclical phase structure", 2020): the stages keep the order of the programme, stay while none has a higher
+pressure, and those that nobody waits for are left out. In both no green outlasts the maximum while others wait.
+A change costs the seconds of yellow and red on the way: the pressure of another stage counts for the share of green in
+these and the SOON seconds that follow. Without that it loses against fixed time in Bologna, whose ways are long.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -19,10 +30,16 @@ from cosim.plant.green_quota import NEVER, Ration
 from cosim.plant.perimeter import yellow_time
 from cosim.sumo.net import City, gateway_movements
 from cosim.sumo.session import Phase, Session
-from cosim.sumo.signals import GREEN, Link, Signal, is_stage
+from cosim.sumo.signals import GREEN, Link, Signal, is_stage, lane_id
 from nmfd.arrays import PerPair
 
+LEVELS = "rgG"    # from nothing to the right of way
+FACTS = ("signal_lanes", "split_lanes", "never_whole_lanes", "intergreen_share", "programmed_intergreen_share")
 EVERY = 5.0       # s between two decisions: about two vehicles per lane
+SOON = 10.0       # s; about two minimum greens
+REACH = 100.0     # m before a signal within which vehicles count, wherever roads join and part there
+MAX_RED = 120.0   # s; about the longest cycle that is usual (Signal Timing Manual, 2nd edition, 2015)
+WHOLE = 1 - 1e-9  # of the vehicles of a lane: all of them
 PERMISSIVE = 0.3  # saturation flow of a movement that must give way (g), as a share of a protected one
 
 
@@ -31,17 +48,20 @@ class MaxPressure:
 
     def __init__(
         self, session: Session, city: City, signals: list[Signal], flows: Mapping[tuple[str, str], float], *,
-        min_green: float, show: Callable[[str, str], None],
+        min_green: float, max_green: float, show: Callable[[str, str], None], cyclic: bool = False,
     ):
-        """flows: (edge, next edge) -> any measure of flow, for the turning shares; min_green: [s]; show(signal, state)
-        puts a state on a signal."""
-        self._session, self._show = session, show
+        """flows: (edge, next edge) -> any measure of flow, for the turning shares; min_green, max_green: [s];
+        show(signal, state) puts a state on a signal; cyclic: whether stages keep their order."""
+        self._session, self._show, self._max_green, self._cyclic = session, show, max_green, cyclic
         roads = Roads(city, signals, flows)
         self._lanes, self._weights, self._movements = roads.lanes, roads.weights, roads.movements
         self._gain, self._begins = roads.stages(signals)
+        self._shared, self._start = roads.shared(signals), session.time
         pairs = gateway_movements(city)
+        self._programmed = float(np.mean([_intergreen(signal) for signal in signals])) if signals else 0.0
         self._junctions = [
             Junction(signal, session.time, pairs.get(signal.id), min_green=min_green) for signal in signals]
+        self._approaches = [Approaches(signal, roads.lane_number, session.time) for signal in signals]
         self._rationed = [junction for junction in self._junctions if junction.rationed]
         self._next = session.time
         for junction in self._junctions:
@@ -57,6 +77,13 @@ class MaxPressure:
         now = self._session.time
         return {junction.signal: junction.green_time(now) for junction in self._rationed}
 
+    def facts(self, now: float) -> dict[str, float]:
+        """FACTS: lanes before the signals, those of them that a stage serves in part, and those that none serves whole;
+        share of the time until `now` [s] between two stages, mean of the signals, and in the original programmes."""
+        lost = [junction.lost for junction in self._junctions]
+        share = float(np.mean(lost)) / max(now - self._start, 1.0) if lost else 0.0
+        return dict(zip(FACTS, (*self._shared, share, self._programmed), strict=True))
+
     def play(self, now: float) -> None:
         """Show what holds from `now` [s] on."""
         for junction in self._junctions:
@@ -65,17 +92,38 @@ class MaxPressure:
         if now < self._next - 1e-6:
             return
         self._next = now + EVERY
-        pressure = self._pressure()
-        for junction, begin in zip(self._junctions, self._begins, strict=True):
-            if junction.may_switch(now):
-                best = pressure[begin : begin + junction.stages]
-                stage = int(np.argmax(best))
-                if best[stage] > best[junction.stage]:
-                    self._show(junction.signal, junction.switch(stage, now))
-
-    def _pressure(self) -> np.ndarray:
         count = self._session.lane_vehicles
         present = np.array([count(lane) for lane in self._lanes], dtype=float)
+        pressure = self._pressure(present)
+        for junction, approaches, begin in zip(self._junctions, self._approaches, self._begins, strict=True):
+            approaches.observe(junction.state, now)
+            if junction.may_switch(now):
+                waiting = approaches.waiting(present, junction.exhausted_links())
+                stage = self._next_stage(
+                    junction, pressure[begin : begin + junction.stages], waiting, approaches, now)
+                if stage != junction.stage:
+                    self._show(junction.signal, junction.switch(stage, now))
+
+    def _next_stage(
+        self, junction: "Junction", pressure: np.ndarray, waiting: np.ndarray, approaches: "Approaches", now: float,
+    ) -> int:
+        """pressure: (n,) of the stages; waiting: (K,) bool, of the links; the present stage, if it may stay"""
+        own, called = junction.stage, approaches.serves @ waiting > 0
+        in_turn = [n % len(pressure) for n in range(own + 1, own + len(pressure)) if called[n % len(pressure)]]
+        if not in_turn:
+            return own
+        if not self._cyclic:
+            overdue = approaches.serves @ (waiting * approaches.overdue(now))
+            if overdue.any():
+                return int(np.argmax(overdue))
+        worth = {n: pressure[n] * SOON / (SOON + junction.loss(n)) for n in in_turn}
+        best = max(in_turn, key=worth.__getitem__)
+        if worth[best] > pressure[own] or (
+                now + EVERY > junction.stage_since + self._max_green + 1e-6):
+            return in_turn[0] if self._cyclic else best
+        return own
+
+    def _pressure(self, present: np.ndarray) -> np.ndarray:
         weight = np.maximum(self._weights @ present, 0.0)
         for junction in self._rationed:
             for movement in junction.exhausted():
@@ -90,16 +138,17 @@ class Junction:
         self, signal: Signal, now: float, gateways: Mapping[int, tuple[int, int]] | None = None, *, min_green: float,
     ):
         """gateways: link index -> (i, h), of the links whose green is rationed; min_green: [s]"""
-        self.signal, self._phases, self._numbers = signal.id, signal.phases, signal.stages
-        self.stages, self.stage = len(signal.stages), 0
-        self._base = signal.phases[signal.stages[0]].state
-        self._green_since, self._min_green = now, min_green
+        self.signal, self._phases, self._numbers = signal.id, signal.phases, stages_of(signal)
+        self.stages, self.stage = len(self._numbers), 0
+        self._base = signal.phases[self._numbers[0]].state
+        self._green_since, self._min_green, self.stage_since = now, min_green, now
         cycle = sum(phase.duration for phase in signal.phases)
         self._rations = {
             link: Ration(pair, cycle=cycle, min_green=min_green, yellow=yellow_time(signal.phases, link), start=now)
             for link, pair in (gateways or {}).items()}
         self._movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
         self._coming: list[tuple[float, str]] = []
+        self.lost = 0.0  # s between two stages so far
         self._between: dict[tuple[int, int], list[Phase]] = {}  # stage, next stage -> what is shown between them
         self.state = self._base
         self.next_change = now if self._rations else NEVER  # until then, commands hold from the first second on
@@ -116,7 +165,11 @@ class Junction:
 
     def exhausted(self) -> set[tuple[str, str]]:
         """(edge, next edge) of the gateway movements that get no more green for now."""
-        return {self._movement[link] for link, ration in self._rations.items() if ration.exhausted}
+        return {self._movement[link] for link in self.exhausted_links()}
+
+    def exhausted_links(self) -> list[int]:
+        """Of the gateway links, those that get no more green for now."""
+        return [link for link, ration in self._rations.items() if ration.exhausted]
 
     def green_time(self, now: float) -> dict[int, float]:
         """Seconds of green that every gateway link has shown before `now` [s]."""
@@ -128,15 +181,24 @@ class Junction:
 
     def switch(self, stage: int, now: float) -> str:
         """Leave the stage that is shown for another; the state from `now` on."""
-        begin, self._coming, change = now, [], (self.stage, stage)
-        if change not in self._between:
-            self._between[change] = transition(self._phases, *(self._numbers[n] for n in change))
-        for phase in self._between[change]:
+        begin, self._coming = now, []
+        for phase in self._way(stage):
             self._coming.append((begin, phase.state))
             begin += phase.duration
         self._coming.append((begin, self._phases[self._numbers[stage]].state))
-        self.stage, self._green_since = stage, begin
+        self.stage, self._green_since, self.stage_since = stage, begin, begin
+        self.lost += begin - now
         return self.advance(now)
+
+    def loss(self, stage: int) -> float:
+        """[s] between the stage that is shown and another one."""
+        return sum(phase.duration for phase in self._way(stage))
+
+    def _way(self, stage: int) -> list[Phase]:
+        change = self.stage, stage
+        if change not in self._between:
+            self._between[change] = transition(self._phases, *(self._numbers[n] for n in change))
+        return self._between[change]
 
     def advance(self, now: float) -> str:
         """The state from `now` [s] on; call at every `next_change`."""
@@ -154,6 +216,21 @@ class Junction:
         return self.state
 
 
+def stages_of(signal: Signal) -> tuple[int, ...]:
+    """The phases to choose from: stages of the programme that serve something no other one serves as well.
+
+    Programmes have the same phase twice, and phases in which a part of the green goes on until the last have passed.
+    """
+    level = {n: [LEVELS.index(light) for light in signal.phases[n].state] for n in signal.stages}
+
+    def needless(n: int) -> bool:
+        return any(
+            all(a <= b for a, b in zip(level[n], level[m], strict=True)) and (level[n] != level[m] or m < n)
+            for m in level if m != n)
+
+    return tuple(n for n in level if not needless(n))
+
+
 def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phase]:
     """What is shown between two stages.
 
@@ -162,6 +239,8 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
     others stay as they are, and nothing that conflicts with them is green before the target stage.
     """
     between, n = [], (source + 1) % len(phases)
+    while phases[n].state == phases[source].state:
+        n = (n + 1) % len(phases)
     while not is_stage(phases[n].state):
         between.append(phases[n])
         n = (n + 1) % len(phases)
@@ -177,10 +256,53 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
         for seconds, light in ((yellow, "y"), (red, "r")) if seconds]
 
 
+def _intergreen(signal: Signal) -> float:
+    """Share of its cycle in which the original programme is between two stages."""
+    durations = [(phase.duration, is_stage(phase.state)) for phase in signal.phases]
+    between = sum(seconds for seconds, green in durations if not green)
+    return between / max(sum(seconds for seconds, _ in durations), 1.0)
+
+
+class Approaches:
+    """Who waits before one signal, and since when it has been red for them.
+
+    serves: (n, K) [0 or 1], whether a link is green in a stage; K links, by their index in the signal's states
+    """
+
+    def __init__(self, signal: Signal, lane_number: Mapping[str, int], now: float):
+        """lane_number: of the lanes whose vehicles are counted"""
+        self.serves = np.array([_green(signal.phases[n].state) for n in stages_of(signal)], dtype=float)
+        pairs = sorted({(link.index, lane_number[lane_id(link)]) for link in signal.links})
+        self._link, self._lane = np.array(pairs).T
+        self._last_green = np.full(self.serves.shape[1], now)
+
+    def observe(self, state: str, now: float) -> None:
+        """Take note of what the signal shows at `now` [s]."""
+        self._last_green[_green(state)] = now
+
+    def waiting(self, present: np.ndarray, closed: Collection[int]) -> np.ndarray:
+        """(K,) bool: somebody is on a lane of the link; present: (L,) [veh]; nobody may wait for `closed` links"""
+        found = np.zeros(len(self._last_green), dtype=bool)
+        found[self._link[present[self._lane] > 0]] = True
+        found[list(closed)] = False
+        return found
+
+    def overdue(self, now: float) -> np.ndarray:
+        """(K,) [s] of red, of those links where that is MAX_RED or more."""
+        red = now - self._last_green
+        return red * (red >= MAX_RED - 1e-6)
+
+
+def _green(state: str) -> np.ndarray:
+    """(K,) bool"""
+    return np.isin(list(state), list(GREEN))
+
+
 class Roads:
     """Vehicles by lane -> weights of the movements -> pressures of the stages, as two sparse matrices.
 
-    lanes: (L,) names; movements: (edge, next edge) at `signals` -> their number; weights: (M, L) [-], of these; roads
+    lanes: (L,) names, of those for cars and of all others before the signals, such as bus lanes, which have no weight;
+    movements: (edge, next edge) at `signals` -> their number; weights: (M, L) [-], of these; roads
     that end at none of the signals are full too
     """
 
@@ -191,17 +313,20 @@ class Roads:
         for edge, after in city.successors.items():
             for other in after:
                 self._before[other].append(edge)
-        self.lanes = [f"{edge}_{n}" for edge in city.edges for n in range(city.lanes[edge])]
-        self._index = {lane: n for n, lane in enumerate(self.lanes)}
+        cars = [lane for edge in city.edges for lane in city.lane_ids[edge]]
+        links = [link for signal in signals for link in signal.links]
+        self.lanes = list(dict.fromkeys([*cars, *(lane_id(link) for link in links)]))
+        self.lane_number = {lane: n for n, lane in enumerate(self.lanes)}
         self._links: dict[str, list[Link]] = {}
-        for signal in signals:
-            for link in signal.links:
+        self._cars = frozenset(cars)
+        for link in links:
+            if lane_id(link) in self._cars:
                 self._links.setdefault(link.from_edge, []).append(link)
         movements = sorted({(link.from_edge, link.to_edge) for links in self._links.values() for link in links})
         self.movements = {movement: n for n, movement in enumerate(movements)}
         rows: list[dict[int, float]] = []
         for edge, target in self.movements:
-            row = self._queue(edge, target)
+            row = self._queue(edge, target, arriving=True)
             end = self._chain(target)[-1]
             for onward, share in self._shares(end, self._targets(end)).items():
                 for lane, part in self._queue(end, onward).items():
@@ -210,38 +335,84 @@ class Roads:
         self.weights = _sparse(rows, len(self.lanes))
 
     def stages(self, signals: Iterable[Signal]) -> tuple[csr_array, list[int]]:
-        """(S, M) saturation flows [lanes] of the movements in the stages, and the number of each signal's first one."""
+        """(S, M) saturation flows [lanes] of the movements in the stages, and the number of each signal's first one.
+
+        A shared lane gives a stage that serves a part of it nothing where another stage serves all of it, and else its
+        share times the chance that the first vehicle there is served.
+        """
         rows: list[dict[int, float]] = []
         begins: list[int] = []
         for signal in signals:
             begins.append(len(rows))
-            for number in signal.stages:
-                state = signal.phases[number].state
+            states = [signal.phases[number].state for number in stages_of(signal)]
+            served = [self._served(signal, state) for state in states]
+            whole = {lane for parts in served for lane, part in parts.items() if part >= WHOLE}
+            for state, parts in zip(states, served, strict=True):
                 row: dict[int, float] = {}
                 for link in {(k.from_edge, k.lane, k.to_edge): k for k in signal.links}.values():
-                    if state[link.index] in GREEN:
-                        share = self._lane_shares(link.from_edge, link.lane)[link.to_edge]
-                        gain = share * (1.0 if state[link.index] == "G" else PERMISSIVE)
+                    lane = lane_id(link)
+                    counts = lane in self._cars and (lane not in whole or parts.get(lane, 0.0) >= WHOLE)
+                    if state[link.index] in GREEN and counts:
+                        share = self._lane_shares(lane)[link.to_edge]
+                        gain = share * min(parts[lane], 1.0) * (1.0 if state[link.index] == "G" else PERMISSIVE)
                         movement = self.movements[link.from_edge, link.to_edge]
                         row[movement] = row.get(movement, 0.0) + gain
                 rows.append(row)
         return _sparse(rows, len(self.movements)), begins
 
-    def _queue(self, edge: str, to: str) -> dict[int, float]:
-        """Lane -> share of its vehicles that want to go from `edge` to `to`."""
+    def shared(self, signals: Iterable[Signal]) -> tuple[int, int, int]:
+        """Lanes for cars before the signals; those of them that some stage serves in part; those that none serves
+        whole."""
+        lanes: set[str] = set()
+        split: set[str] = set()
+        whole: set[str] = set()
+        for signal in signals:
+            lanes |= {lane_id(link) for link in signal.links} & self._cars
+            for number in stages_of(signal):
+                for lane, part in self._served(signal, signal.phases[number].state).items():
+                    (whole if part >= WHOLE else split).add(lane)
+        return len(lanes), len(split), len(split - whole)
+
+    def _served(self, signal: Signal, state: str) -> dict[str, float]:
+        """Lane -> share of its vehicles that have green in `state`."""
+        to: dict[str, set[str]] = {}
+        for link in signal.links:
+            if state[link.index] in GREEN and lane_id(link) in self._cars:
+                to.setdefault(lane_id(link), set()).add(link.to_edge)
+        return {lane: sum(self._lane_shares(lane)[edge] for edge in sorted(edges)) for lane, edges in to.items()}
+
+    def _queue(self, edge: str, to: str, *, arriving: bool = False) -> dict[int, float]:
+        """Lane -> share of its vehicles that want to go from `edge` to `to`. arriving: also from beyond the road."""
         queue = {}
         share = self._shares(edge, self._targets(edge))[to]
-        for lane in range(self._city.lanes[edge]):
-            if own := self._lane_shares(edge, lane).get(to) if edge in self._links else share:
-                queue[self._index[f"{edge}_{lane}"]] = own
-        before = self._upstream(edge)
+        for lane in self._city.lane_ids[edge]:
+            if own := self._lane_shares(lane).get(to) if edge in self._links else share:
+                queue[self.lane_number[lane]] = own
+        before, last, length = self._upstream(edge), edge, self._city.length[edge]
         while before is not None:
-            queue |= {self._index[f"{before}_{lane}"]: share for lane in range(self._city.lanes[before])}
+            queue |= {self.lane_number[lane]: share for lane in self._city.lane_ids[before]}
+            length, last = length + self._city.length[before], before
             before = self._upstream(before)
+        if arriving:
+            for before, part in self._arriving(last, length).items():
+                queue |= {self.lane_number[lane]: share * part for lane in self._city.lane_ids[before]}
         return queue
 
-    def _lane_shares(self, edge: str, lane: int) -> dict[str, float]:
-        return self._shares(edge, sorted({link.to_edge for link in self._links[edge] if link.lane == lane}))
+    def _arriving(self, edge: str, length: float) -> dict[str, float]:
+        """Edges without a signal that lead to `edge`, as far as REACH -> share of their vehicles that take it; length:
+        [m] from the beginning of `edge` to the signal. Roads are cut into pieces shorter than their queues."""
+        found, todo = {edge: 1.0}, [(edge, length)]
+        for onward, there in todo:
+            for before in self._before[onward] if there < REACH else ():
+                if before not in self._links and before not in found:
+                    found[before] = found[onward] * self._shares(before, self._targets(before))[onward]
+                    todo.append((before, there + self._city.length[before]))
+        del found[edge]
+        return found
+
+    def _lane_shares(self, lane: str) -> dict[str, float]:
+        edge = lane.rpartition("_")[0]
+        return self._shares(edge, sorted({link.to_edge for link in self._links[edge] if lane_id(link) == lane}))
 
     def _targets(self, edge: str) -> list[str]:
         """Where vehicles may go at the end of `edge`, signal or not."""

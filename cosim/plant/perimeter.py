@@ -16,7 +16,7 @@ from itertools import accumulate
 
 import numpy as np
 
-from cosim.plant.strategy import HOLD_BACK
+from cosim.plant.settings import HOLD_BACK
 from cosim.sumo.session import Phase, Programme
 from nmfd.arrays import PerPair
 

@@ -1,26 +1,27 @@
 """The SUMO city as a plant: the same protocol as the regional plants, the same controllers."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from cosim.plant.actuation import Actuation
 from cosim.plant.detectors import instruments, lay_out, probes
+from cosim.plant.feasible import check_lanes, signals_of
 from cosim.plant.guidance import Guide
 from cosim.plant.incidents import Incidents
-from cosim.plant.launch import Launch, own_files
+from cosim.plant.launch import Launch
 from cosim.plant.meter import Meter
-from cosim.plant.programmes import city_signals
 from cosim.plant.record import Record, Recorder
 from cosim.plant.sensing import Estimation, Sensing
-from cosim.plant.settings import ESTIMATE, Settings, scenario_file, settings
-from cosim.plant.strategy import MAX_PRESSURE
+from cosim.plant.settings import ESTIMATE, PRESSURES, Settings, settings
+from cosim.plant.standstill import Standstill
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, Gateway, check_adjacency, load_city
 from cosim.sumo.session import Session, Window
-from cosim.sumo.tripinfo import TripFacts, read_trip_facts
-from nmfd.errors import InputError
+from cosim.sumo.tripinfo import TripFacts, TripReader
+from nmfd.arrays import PerTurn
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
@@ -33,7 +34,7 @@ class SumoPlant:
 
     `simple_signals` may get another programme, `other_signals` are left alone (cosim.sumo.signals).
     `record()` tells what happened; `trips` is their number; `sumo_time` [s] is the wall time inside SUMO's own step
-    since the reset.
+    since the reset; `booked` control intervals were not simulated any more (cosim.plant.standstill).
     """
 
     def __init__(
@@ -48,13 +49,13 @@ class SumoPlant:
         """
         self._scenario, self._planning = scenario, planning or planning_model(scenario)
         self._settings = chosen = overrides or settings(scenario)
-        _check_mesoscopic(scenario, chosen)
+        check_lanes(scenario, chosen)
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
         check_adjacency(self.city, scenario.network)
         self._layout = lay_out(self.city, chosen.detector_share)
         self._instruments = instruments(self.city, self._layout, chosen.probe_share)
-        self._signals = city_signals(self.city, chosen, own_files(scenario, chosen.additional))
+        self._signals = signals_of(self.city, scenario, chosen)
         self.simple_signals, self.other_signals = self._signals.simple, self._signals.others
         self._launch = Launch(
             scenario, chosen, self.city, self._signals, self._layout, outputs=dict(outputs or {}), window=window)
@@ -64,22 +65,28 @@ class SumoPlant:
         """Trips, drivers and reroutes all follow from `seed`."""
         self._end_session()
         self._k, self._session = 0, self._launch.start(seed)
+        self._trips = TripReader(self._launch.trip_file, self.session.flush)
         self._incidents = Incidents(self._scenario.ordered_faults, self.session, self.city)
         self._sensing = self._new_sensing(seed)
         self._guide = self._new_guide(seed)
         self._actuation = self._new_actuation()
-        state = self._sensing.state(0)
+        self._state = state = self._sensing.state(0)
+        self._standstill = Standstill(len(self._launch.vehicles), self._scenario.step, self._scenario.steps)
+        self.booked, self._facts = 0, TripFacts()
+        self._standing = self._stands(state)
         self._recorder = Recorder(self._sensing.meter, self._guide, self._actuation)
         return state
 
     def step(self, controls: Controls) -> State:
         """One control interval: in every simulation step actuate, simulate, measure and guide; then record."""
+        if self._standing:
+            return self._book()
         session, streets = self.session, self._sensing.streets
         end = session.time + self._scenario.step
         vehicles, speed = (None, None) if streets is None else (streets.vehicles, streets.speed)
         self._incidents.begin(self._k)
         self._actuation.command(controls.perimeter, vehicles)
-        self._guide.command(controls.splits, speed)
+        self._guide.command(self._splits(controls), speed)
         self._sensing.begin()
         for _ in range(round(self._scenario.step / session.step_length)):
             self._actuation.play()
@@ -88,9 +95,10 @@ class SumoPlant:
             self._guide.apply(entered)
         assert abs(session.time - end) < 1e-6
         self._k += 1
-        state, means = self._sensing.finish(self._k, controls)
+        self._state, means = self._sensing.finish(self._k, controls)
         self._recorder.add(means)
-        return state
+        self._standing = self._stands(self._state)
+        return self._state
 
     def observe(self) -> Observation | None:
         """The estimate, where states are estimated."""
@@ -106,9 +114,15 @@ class SumoPlant:
         return self._recorder.record()
 
     def trip_facts(self) -> TripFacts:
-        """Ends the simulation, for only then does SUMO tell of the trips under way."""
-        self._end_session()
-        return read_trip_facts(self._launch.trip_file)
+        """Ends the simulation, for only then does SUMO tell of the trips under way, and closes the books. LedgerError
+        if they are not SUMO's."""
+        if self._session is not None:
+            emitted = self.session.emitted() if self.booked else (0.0, 0.0)
+            self._end_session()
+            self._sensing.meter.close_books()
+            self._recorder.close()
+            self._facts = self._with_standstill(self._trips.facts, *emitted)
+        return self._facts
 
     @property
     def sumo_time(self) -> float:
@@ -122,6 +136,10 @@ class SumoPlant:
             raise RuntimeError("no simulation is running; call reset(seed) first")
         return self._session
 
+    def pressure_facts(self) -> dict[str, float]:
+        """What can be said of a run under max-pressure (max_pressure.FACTS); NaN of others."""
+        return self._actuation.pressure_facts()
+
     def leaks(self) -> list[Gateway]:
         """Gateways that no signal under perimeter control has: it does not reach them."""
         return self._actuation.leaks()
@@ -132,14 +150,43 @@ class SumoPlant:
         if not self._settings.routes:
             return len(self._launch.vehicles)
         meter = self._sensing.meter
-        return int(meter.departures.sum() + meter.backlog().sum())
+        return int(meter.departures.sum() + meter.backlog().sum() + meter.given_up.sum())
+
+    def _stands(self, state: State) -> bool:
+        """Whether what is left of the run may be booked."""
+        meter = self._sensing.meter
+        left = meter.arrivals.sum() + meter.removals.sum() + meter.given_up.sum()
+        standing = self._standstill.reached(state, float(left))
+        return standing and self._settings.book_standstill and self.session.expected() <= (
+            state.accumulation.sum() + state.backlog.sum())
+
+    def _with_standstill(self, facts: TripFacts, co2: float, fuel: float) -> TripFacts:
+        """And what was booked without being simulated. co2, fuel: of everybody on the road at the end [kg/s]"""
+        time, state = self.booked * self._scenario.step, self._state
+        return replace(
+            facts, travel_time=facts.travel_time + time * float(state.accumulation.sum()),
+            departure_delay=facts.departure_delay + time * float(state.backlog.sum()),
+            co2=facts.co2 + time * co2, fuel=facts.fuel + time * fuel)
+
+    def _book(self) -> State:
+        """One control interval in which nothing moves."""
+        self._k, self.booked = self._k + 1, self.booked + 1
+        self._recorder.repeat()
+        self._state = replace(self._state, step=self._k, time=self._k * self._scenario.step)
+        return self._state
+
+    def _splits(self, controls: Controls) -> PerTurn | None:
+        """What drivers are guided by: the drivers' own split ratios mean guidance by travel times alone."""
+        return self._scenario.network.nominal_splits if controls.splits is None and self._settings.guided else (
+            controls.splits)
 
     def _new_sensing(self, seed: int) -> Sensing:
         chosen = self._settings
         if chosen.measurement != ESTIMATE:
-            meter, estimation = Meter(self.session, self.city), None
+            meter, estimation = Meter(self.session, self.city, trips=self._trips), None
         else:
-            meter = Meter(self.session, self.city, probes(self._launch.vehicles, chosen.probe_share, seed))
+            known = probes(self._launch.vehicles, chosen.probe_share, seed)
+            meter = Meter(self.session, self.city, known, self._trips)
             estimation = Estimation(self.session, self.city, self._layout, meter, self._instruments, self._planning)
         return Sensing(self._scenario, self.session, self.city, self._incidents, meter, estimation)
 
@@ -151,7 +198,7 @@ class SumoPlant:
             random=np.random.default_rng([seed, GUIDANCE]))
 
     def _new_actuation(self) -> Actuation:
-        flows = self._launch.turning_flows() if self._settings.signals == MAX_PRESSURE else None
+        flows = self._launch.turning_flows() if self._settings.signals in PRESSURES else None
         return Actuation(
             self.session, self.city, self._scenario, self._settings, self._signals, self._incidents, flows)
 
@@ -159,13 +206,3 @@ class SumoPlant:
         if self._session is not None:
             self._session.close()
             self._session = None
-
-
-def _check_mesoscopic(scenario: Scenario, chosen: Settings) -> None:
-    """InputError for what needs lanes where there are none."""
-    for key, value, what in (("signals", MAX_PRESSURE, "counts vehicles lane by lane"),
-                             ("measurement", ESTIMATE, "needs loop detectors on lanes")):
-        if chosen.mesoscopic and getattr(chosen, key) == value:
-            raise InputError(
-                f"{scenario_file(scenario)}: sumo.{key}: {value} {what}, but SUMO's mesoscopic model has no lanes; "
-                "omit it, or set mesoscopic = false (import the city without --mesoscopic)")

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from cosim.plant import webster
 from cosim.plant.actuated import actuated_row
-from cosim.plant.settings import Settings
-from cosim.plant.strategy import ACTUATED, FIXED, WEBSTER
+from cosim.plant.settings import ACTUATED, FIXED, PRESSURES, WEBSTER, Settings
 from cosim.sumo.build import network_folder
 from cosim.sumo.net import City
-from cosim.sumo.signals import Signal, read_signals, write_programmes
+from cosim.sumo.signals import FIXED as FIXED_TIME
+from cosim.sumo.signals import HELD, Signal, read_signals, write_programmes
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 
@@ -27,13 +27,14 @@ class CitySignals:
 
 def city_signals(city: City, chosen: Settings, additional: Sequence[Path]) -> CitySignals:
     """additional: the city's own additional files. InputError where the chosen programme fits no signal."""
-    simple, others = read_signals(city, additional)
+    pressure = chosen.signals in PRESSURES
+    simple, others = read_signals(city, additional, HELD if pressure else (FIXED_TIME,))
     left = {signal.id for signal in simple} & set(chosen.leave_signals)
     simple, others = [signal for signal in simple if signal.id not in left], sorted({*others, *left})
     if chosen.signals != FIXED and not simple:
         raise InputError(
-            f"{city.net_file}: sumo.signals: {chosen.signals} needs fixed-time signals with several green "
-            f"phases, but none of the {len(others)} signals here is one; choose fixed")
+            f"{city.net_file}: sumo.signals: {chosen.signals} needs {'' if pressure else 'fixed-time '}signals "
+            f"with several green phases, but none of the {len(others)} signals here is one; choose fixed")
     kept = set()
     if chosen.gateways_fixed and chosen.signals == ACTUATED:
         kept = {gateway.signal for gateway in city.gateways}

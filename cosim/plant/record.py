@@ -1,6 +1,6 @@
 """What a run in SUMO leaves behind, beside its trajectory."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,9 @@ from cosim.plant.meter import Meter
 from cosim.plant.sampling import StreetMeans
 from cosim.sumo.arrays import EdgesOverTime, GatewaysOverTime, PairCounts, RegionCounts, Series, TurnCounts
 from nmfd.quantities import quantity
+from nmfd.types import Trajectory
+
+BOOKS = ("departures", "arrivals", "removals", "given_up", "crossings", "jumps", "redirected")  # of the meter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,9 +23,20 @@ class Record:
     """
 
     departures: PairCounts = quantity("interval", "region", "destination", unit="veh", text="trips begun")
-    arrivals: RegionCounts = quantity("interval", "destination", unit="veh", text="trips ended")
+    arrivals: RegionCounts = quantity(
+        "interval", "destination", unit="veh", text="trips completed: on the last edge of their route")
+    removals: PairCounts = quantity(
+        "interval", "region", "destination", unit="veh", text="vehicles taken out on their way, whoever did it")
+    given_up: PairCounts = quantity(
+        "interval", "region", "destination", unit="veh", text="trips that SUMO dropped before they began")
     crossings: TurnCounts = quantity(
         "interval", "region", "next_region", "destination", unit="veh", text="vehicles that crossed a boundary")
+    jumps: TurnCounts = quantity(
+        "interval", "region", "next_region", "destination", unit="veh",
+        text="vehicles that came into another region where no gateway leads there")
+    redirected: TurnCounts = quantity(
+        "interval", "region", "destination", "next_region", unit="veh",
+        text="vehicles there whose route was changed to end in another region, the next, instead of destination")
     production: RegionCounts = quantity("interval", "region", unit="veh m/s", text="travel production, mean of samples")
     mean_accumulation: RegionCounts = quantity(
         "interval", "region", unit="veh", text="vehicles inside, mean of the same samples")
@@ -41,6 +55,20 @@ class Record:
     teleports: Series = quantity("interval", unit="1", text="vehicles that SUMO took out of a jam")
     guided: TurnCounts = quantity(
         "interval", "region", "next_region", "destination", unit="veh", text="reroutes by route guidance")
+
+
+def settled(trajectory: Trajectory, record: Record) -> Trajectory:
+    """What became of vehicles as the closed books have it, for where SUMO told late (cosim.plant.meter). Who was taken
+    out in the last step, too, is no longer there at the end."""
+    def since_start(counts: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.zeros_like(counts[:1]), counts]).cumsum(axis=0).astype(float)
+
+    moved, redirected = (record.crossings + record.jumps).sum(axis=0), record.redirected.sum(axis=0)
+    inside = (record.departures - record.removals).sum(axis=0) - np.diag(record.arrivals.sum(axis=0))
+    inside = inside + moved.sum(axis=0) - moved.sum(axis=1) + redirected.sum(axis=1) - redirected.sum(axis=2)
+    return replace(
+        trajectory, accumulation=np.concatenate([trajectory.accumulation[:-1], inside[None].astype(float)]),
+        completed=since_start(record.arrivals.sum(axis=1)), removed=since_start(record.removals + record.given_up))
 
 
 class Recorder:
@@ -64,14 +92,25 @@ class Recorder:
             "gateway_queue": streets.queue, "gateway_queue_max": streets.queue_max})
         self._before = totals
 
+    def repeat(self) -> None:
+        """Another interval in which everything stands and is shown as in the last one, and nothing was counted."""
+        counted = [key for key in self._before if key != "gateway_green"]
+        self._rows.append({**self._rows[-1], **{key: np.zeros_like(self._before[key]) for key in counted}})
+
     def record(self) -> Record:
         """Of all control intervals so far."""
         return Record(**{key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]})
 
+    def close(self) -> None:
+        """The books were closed: what was booked at last belongs to the last interval."""
+        totals = {name: getattr(self._meter, name).copy() for name in BOOKS}
+        for name in BOOKS if self._rows else ():
+            self._rows[-1][name] = self._rows[-1][name] + totals[name] - self._before[name]
+        self._before |= totals
+
     def _totals(self) -> dict[str, np.ndarray]:
         meter = self._meter
         return {
-            "departures": meter.departures.copy(), "arrivals": meter.arrivals.copy(),
-            "crossings": meter.crossings.copy(), "teleports": np.array(meter.teleports),
+            **{name: getattr(meter, name).copy() for name in BOOKS}, "teleports": np.array(meter.teleports),
             "guided": self._guide.realised.copy(), "gateway_flow": meter.gateway_flow(),
             "gateway_green": self._actuation.green_time()}

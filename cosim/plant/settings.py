@@ -1,16 +1,23 @@
 """The table [sumo] of scenario.toml: how the city is simulated, actuated and measured."""
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Literal, Self, get_args
 
 from pydantic import model_validator
 
-from cosim.plant.strategy import FIXED, HOLD_BACK, Mode, Signals
-from nmfd.model.scenario import Scenario
 from nmfd.model.scenario_file import read_tables
 from nmfd.runs import config
 from nmfd.runs.config import Problem, Seconds, Share, Texts, setting
 
+if TYPE_CHECKING:  # at run time it would bring numpy, and the help of an option waits for this module
+    from nmfd.model.scenario import Scenario
+
+Signals = Literal["fixed", "webster", "actuated", "max-pressure", "max-pressure-cyclic"]
+Mode = Literal["hold-back", "redistribute"]
+SIGNALS, MODES = get_args(Signals), get_args(Mode)
+FIXED, WEBSTER, ACTUATED, MAX_PRESSURE, CYCLIC = SIGNALS
+PRESSURES = (MAX_PRESSURE, CYCLIC)
+HOLD_BACK, REDISTRIBUTE = MODES
 EXACT, ESTIMATE = "exact", "estimate"
 FILES = ("routes", "background", "additional")
 
@@ -26,6 +33,9 @@ class SumoTable(config.Settings):
         "whether green that the perimeter control takes away is red for all, or goes to the other movements", HOLD_BACK)
     min_green: float = setting(
         "least green of a gateway movement, and of every stage under max-pressure", 5.0, unit="s", ge=1.0)
+    max_green: float = setting(
+        "under max-pressure, no stage is green for longer while others wait; 50 s is netconvert's for actuated signals",
+        50.0, unit="s", ge=1.0)
     queue_override: Share = setting(
         "a gateway whose edge held this share of its room in the last control interval is left open; 0 for never", 0.0)
     compliance: Share = setting("share of the decisions in which a driver follows the route guidance", 1.0)
@@ -50,6 +60,9 @@ class SumoTable(config.Settings):
     departure_jitter: Seconds = setting(
         "departures of the city's own vehicles are moved by up to this, either way, by the seed", 10.0)
     leave_signals: Texts = setting("signals that perimeter control leaves alone", ())
+    book_standstill: bool = setting(
+        "once every trip is due and nothing moves any more, the rest of the run is booked without simulating it, "
+        "within 0.1 % of the total time spent", False)
     mesoscopic: bool = setting(
         "SUMO's queue model instead of its car-following, about ten times as fast, for quick studies: no lanes and no "
         "positions on them, queues hold the vehicles that fit on an edge, signals cap the flow by their green share",
@@ -60,6 +73,9 @@ class SumoTable(config.Settings):
         if self.measurement == ESTIMATE and self.detector_share == self.probe_share == 0:
             raise Problem("measurement", "\"estimate\" needs detectors or probes, but sumo.detector_share and "
                           "sumo.probe_share are both 0; raise one of them")
+        if self.max_green < self.min_green:
+            raise Problem("max_green", f"expected {self.min_green:g} s, the sumo.min_green, or more, got "
+                          f"{self.max_green:g} instead")
         return self
 
 
@@ -68,17 +84,19 @@ class Settings(SumoTable):
 
     gateways_fixed: whether signals with a gateway movement stay fixed-time, for perimeter control, where the others
         are actuated
+    guided: whether drivers are guided by travel times where the controller does not guide routes itself
     """
 
     gateways_fixed: bool = True
+    guided: bool = False
 
 
-def scenario_file(scenario: Scenario) -> Path:
+def scenario_file(scenario: "Scenario") -> Path:
     """The scenario.toml, to name it in errors; without a folder, of a scenario that was not loaded from one."""
     return (scenario.folder or Path()) / "scenario.toml"
 
 
-def settings(scenario: Scenario) -> Settings:
+def settings(scenario: "Scenario") -> Settings:
     """Read and check the table [sumo] of the scenario. Raises InputError."""
     if scenario.folder is None:
         return Settings()

@@ -2,30 +2,28 @@
 
     dpc-pc+max-pressure      max-pressure at all signals, DPC limits the green of the gateways
     no-control+rerouting-30  nobody controls, 30 % of the drivers reroute; `rerouting-30` for short
+    pi-gating+guided         PI gating, and drivers are guided by travel times
     mine.py:Gate+actuated    a controller of one's own (nmfd.controllers.custom), actuated signals elsewhere
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
+from cosim.plant.settings import MODES, SIGNALS
 from nmfd.controllers import registry
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.planning import PlanningModel, guided_model, planning_model, with_model
 from nmfd.model.scenario import Scenario
 
 ALONE = "no-control"  # the controller of a name that is only options
-Signals = Literal["fixed", "webster", "actuated", "max-pressure"]
-Mode = Literal["hold-back", "redistribute"]
-SIGNALS, MODES = get_args(Signals), get_args(Mode)
-FIXED, WEBSTER, ACTUATED, MAX_PRESSURE = SIGNALS
-HOLD_BACK, REDISTRIBUTE = MODES
+GUIDED = "guided"
 
 # Option -> (field of cosim.plant.settings.Settings, its value).
 _WORDS = {
     **{name: ("signals", name) for name in SIGNALS[1:]}, **{name: ("actuation", name) for name in MODES},
-    "estimate": ("measurement", "estimate")}
+    "estimate": ("measurement", "estimate"), GUIDED: ("guided", True)}
 PERCENT, SECONDS = "percent", "seconds"
 # Option with a whole number -> (field of cosim.plant.settings.Settings, least, most, its unit).
 _NUMBERS = {
@@ -44,6 +42,11 @@ class Strategy:
     controller: str
     overrides: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def guides(self) -> bool:
+        """Whether routes may be guided, by the controller or by travel times alone."""
+        return bool(self.overrides.get("guided")) or registry.guides(self.controller)
+
 
 def parse(name: str) -> Strategy:
     """The strategy `name`. InputError for a controller or option that there is not, and for contradictory ones."""
@@ -60,6 +63,8 @@ def parse(name: str) -> Strategy:
         if option is None:
             raise _unknown(name, word, controllers=False)
         key, value = option
+        if word == GUIDED and registry.guides(controller) and not registry.is_own(controller):
+            raise InputError(f"strategy {name!r}: {controller} guides routes itself; omit {GUIDED}")
         if key in chosen:
             raise InputError(f"strategy {name!r}: {chosen[key]} and {word} exclude each other; omit one of them")
         chosen[key], overrides[key] = word, value
@@ -84,18 +89,19 @@ def configured(name: str, tables: Iterable[str]) -> str:
 
 
 def planning_of(scenario: Scenario, strategy: str, model: Path | None = None) -> PlanningModel:
-    """What the runs of `strategy` are predicted with: the planning model of its controller, or, of one that guides
-    routes and plans with none, that of guided drivers, if the network has one beside it.
+    """What the runs of `strategy` are predicted with: the planning model of its controller, or, where routes are guided
+    and nothing is planned, that of guided drivers, if the network has one beside it.
 
     model: the folder of a network, instead. Raises InputError.
     """
-    controller, variant = parse(strategy).controller, configured(strategy, scenario.controller_options)
+    parsed = parse(strategy)
+    controller, variant = parsed.controller, configured(strategy, scenario.controller_options)
     if registry.is_own(controller):
         variant, scenario = registry.configured_own(controller, scenario)
     if model is not None:
         return with_model(planning_model(scenario), scenario, model)
     planned = planning_model(scenario, variant)
-    if planned.network.folder == scenario.network.folder and registry.guides(controller) and (
+    if planned.network.folder == scenario.network.folder and parsed.guides and (
             folder := guided_model(scenario.network)) is not None:
         return with_model(planned, scenario, folder)
     return planned

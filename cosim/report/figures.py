@@ -12,6 +12,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 
 from cosim.sumo.arrays import EdgeNumbers, PerEdge, Points, Series
 from nmfd.studies import plots
+from nmfd.studies.benchmark import REFERENCE
 
 JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
 DENSITIES = ScalarMappable(Normalize(0.0, JAM_DENSITY), LinearSegmentedColormap.from_list(
@@ -60,7 +61,8 @@ def perimeter(ax: Axes, step: float, commanded: Series, green: Series, flow: Ser
             (green, GREEN_SHOWN, "green shown / original green", 1.6),
             (commanded, COMMANDED, "commanded u", 1.6)):
         ax.stairs(values, time, color=tone, linewidth=width, label=label, baseline=None)
-    ax.set_ylim(0.0, 1.08)
+    ax.set_ylim(0.0, max(1.08, 1.05 * float(np.nanmax([green, flow], initial=1.0))))
+    ax.set_ylabel("share [-]")
     ax.spines[["top", "right"]].set_visible(False)
     return ax
 
@@ -70,10 +72,10 @@ def green_against_command(
 ) -> Axes:
     """Every boundary and interval: share of the original green that was shown against the commanded u, both (n,)."""
     ax.scatter(commanded, green, s=5, color=GREEN_SHOWN, alpha=0.35, linewidths=0)
-    ax.set_xlabel("commanded u")
-    ax.set_ylabel("green shown / original")
+    ax.set_xlabel("commanded u [-]")
+    ax.set_ylabel("green shown / original [-]")
     ax.set_xlim(0.0, 1.0)
-    ax.set_ylim(0.0, 1.08)
+    ax.set_ylim(0.0, max(1.08, 1.05 * float(np.nanmax(green, initial=1.0))))
     ax.spines[["top", "right"]].set_visible(False)
     return ax
 
@@ -102,8 +104,8 @@ def split_totals(
     ax.plot([0, 1], [0, 1], color="#bbbbbb", linewidth=1.0, zorder=1)
     ax.scatter(commanded, realised, s=90.0 * vehicles / max(vehicles.max(initial=0.0), 1.0) + 3.0, color=FLOWED,
                alpha=0.45, linewidths=0, zorder=2)
-    ax.set_xlabel("commanded θ, mean of the run")
-    ax.set_ylabel("share that went there")
+    ax.set_xlabel("commanded θ [-], mean of the run")
+    ax.set_ylabel("share that went there [-]")
     ax.set_xlim(-0.04, 1.04)
     ax.set_ylim(-0.04, 1.04)
     ax.spines[["top", "right"]].set_visible(False)
@@ -145,11 +147,13 @@ def time_full(ax: Axes, hours: Mapping[str, np.ndarray]) -> Axes:
     return ax
 
 
-def over_demand(ax: Axes, ratios: Mapping[str, Mapping[float, tuple[float, float]]]) -> Axes:
-    """Total time spent as a share of no control's against the demand level: controller -> level -> mean over seeds and
-    half of its 95 % interval (NaN of a single seed)."""
-    ax.axhline(1.0, color=plots.CONTROLLER_COLOURS["no-control"], linewidth=1.0)
-    tones = plots.colours(list(ratios))
+def over_demand(
+    ax: Axes, ratios: Mapping[str, Mapping[float, tuple[float, float]]], against: str = REFERENCE,
+) -> Axes:
+    """Total time spent as a share of that of `against`, over the demand level: controller -> level -> mean over seeds
+    and half of its 95 % interval (NaN of a single seed)."""
+    tones = plots.colours([against, *ratios])
+    ax.axhline(1.0, color=tones[against], linewidth=1.0)
     levels = sorted({level for points in ratios.values() for level in points})
     aside = 0.012 * max(levels[-1] - levels[0], 0.1)  # so that intervals do not hide each other
     for number, (controller, points) in enumerate(ratios.items()):
@@ -159,7 +163,7 @@ def over_demand(ax: Axes, ratios: Mapping[str, Mapping[float, tuple[float, float
                     label=controller)
     ax.set_xticks(levels, [f"{level:g}" for level in levels])
     ax.set_xlabel("demand, multiple of the scenario's")
-    ax.set_ylabel("total time spent / that of no control")
+    ax.set_ylabel(f"total time spent / that of {against} [-]")
     ax.set_ylim(bottom=0.0)
     ax.spines[["top", "right"]].set_visible(False)
     return ax

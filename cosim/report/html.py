@@ -3,21 +3,24 @@
 import base64
 import json
 import math
+import os
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from cosim.evaluation import explain, statistics
+from cosim.evaluation import explain, fit_quality, statistics
 from cosim.evaluation.results import Finished, Level
-from cosim.report import pictures as report
-from cosim.report import summary_text
+from cosim.plant.strategy import planning_of
+from cosim.report import pictures, summary_text
+from nmfd.errors import InputError
+from nmfd.model import authority
 from nmfd.runs import files
 from nmfd.runs.scratch import Scratch
-from nmfd.studies.benchmark import REFERENCE
 
 PIXELS = 150.0  # per inch, of the pictures (nmfd.studies.plots.save)
 WORDS = (
@@ -28,10 +31,13 @@ WORDS = (
 PICTURES = (  # heading, its pictures with captions
     ("Vehicles and regions", (
         ("total_accumulation", "Vehicles in the network with those waiting to enter [veh] over time."),
-        ("region_accumulation", "Vehicles in each region [veh] over time. Green: within 10 % of the largest outflow; "
-         "red: congested."),
+        ("region_accumulation", "Vehicles in each region [veh] over time. The strips above, one per strategy, tell the "
+         "state of the region by the vehicles that left it in that run: light where it flows below the critical "
+         "accumulation, green where the outflow is within 10 % of the largest, red where less leaves than so "
+         "many vehicles could, because the region is congested or holds them back, dark and hatched where hardly "
+         "any vehicle leaves."),
         ("mfd", "Macroscopic fundamental diagram of each region: vehicles inside [veh] against vehicles that leave or "
-         "arrive [veh/s]. Dots: one per control interval; line: the regional model."))),
+         "arrive [veh/s]. Dots: one per control interval; line: the regional model; hatched: beyond all dots."))),
     ("Streets", (
         ("link_densities", "Density of every street [vehicles per km and lane] at four times, mean of the control "
          "interval; 133 is a standing queue. The two directions of a street are drawn apart."),)),
@@ -48,7 +54,7 @@ PICTURES = (  # heading, its pictures with captions
          "interval in which it has to be taken."),)))
 REGIONS = (
     "Streets in the colour of their region. Dots: gateways; black ones have a signal that perimeter control can use.")
-DEMAND = "Total time spent as a share of that without control, over the demand, with 95 % intervals."
+DEMAND = "Total time spent as a share of that {than}, over the demand, with 95 % intervals."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +70,7 @@ def write_page(
     path: Path, found: Sequence[Finished], reference: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """The page of the runs, atomically. reference: a strategy to pair with, besides no control."""
+    """The page of the runs, atomically. reference: a strategy to pair with, besides what all are compared with."""
     total, done, runs = sum(len(run.levels) for run in found), 0, []
     for number, run in enumerate(found):
         levels = []
@@ -89,20 +95,47 @@ def write_page(
 def _run(run: Finished) -> dict:
     """What the page shows of a folder before its levels, and its configuration."""
     configuration, rows = run.levels[0].manifest["configuration"], run.rows
+    caption = DEMAND.format(than=statistics.than(statistics.compared_with(rows)))
     first = summary_text.opening(
         run.scenario.name, configuration["steps"], configuration["step_s"], len(run.levels), rows)
     with Scratch("cosim-") as folder:
         if run.city is not None:
-            report.region_map(folder / "regions.png", run.scenario, run.city)
+            pictures.region_map(folder / "regions.png", run.scenario, run.city)
         if len(run.levels) > 1:
-            report.demand_levels(folder / "demand.png", rows)
-        pictures = _pictures(folder, (("demand", DEMAND), ("regions", REGIONS)))
+            pictures.demand_levels(folder / "demand.png", rows)
+        shown = _pictures(folder, (("demand", caption), ("regions", REGIONS)))
     return {
         "name": run.name, "story": [first, *(_at(run, level) + summary_text.head(level.rows) for level in run.levels)],
-        "pictures": pictures, "configuration": _configuration(run),
+        "models": _models(run), "pictures": shown, "configuration": _configuration(run),
         "strategies": list({
             name: (name, _plain(depends) or "nothing of its own") for level in run.levels
             for name, depends in level.manifest.get("controllers", {}).items()}.values())}
+
+
+def _models(run: Finished) -> list[str]:
+    """What is doubtful about the regional models that controllers plan with, and what was said of perimeter control in
+    this city before anything was trained; a sentence each."""
+    networks = {run.scenario.network.folder: run.scenario.network}
+    for name in dict.fromkeys(run.rows["controller"]):
+        with suppress(InputError):  # a model that is gone by now
+            network = planning_of(run.scenario, name).network
+            networks.setdefault(network.folder, network)
+    lines: list[str] = []
+    kinds: list[str] = []
+    for folder, network in networks.items():
+        title = network.name if folder is None else os.path.normpath(folder)
+        if network.placeholder:
+            lines.append(f"The MFDs of {title} are placeholders from lanes and speed limits, measured in no run.")
+        for region, doubts in zip(network.region_names, network.doubts, strict=False):
+            if doubts:
+                lines.append(f"The model {title} is doubtful in region {region}: {'; '.join(doubts)}.")
+                kinds += doubts
+    lines += fit_quality.meanings(kinds)
+    own = run.scenario.network.folder
+    if own is not None and (own / authority.FILE).is_file():
+        text = (own / authority.FILE).read_text(encoding="utf-8", errors="replace")
+        lines += text.partition("\n\n")[0].splitlines()
+    return lines
 
 
 def _at(run: Finished, level: Level) -> str:
@@ -118,19 +151,20 @@ def _level(run: Finished, level: Level, reference: str | None) -> dict:
     title = f"Demand times {level.demand:g}"
     signals, reasons = explain.at(level.demand, level.folder, run.scenario.network, rows)
     with Scratch("cosim-") as folder:
-        report.draw(level.folder, run.scenario, run.city, rows, folder)
-        report.draw_more(folder, run.scenario, level.folder, rows)
-        pictures = [(heading, _pictures(folder, chosen, f"{title}. ")) for heading, chosen in PICTURES]
-    missing = ", ".join(heading.lower() for heading, there in pictures if not there)
+        pictures.draw(level.folder, run.scenario, run.city, rows, folder)
+        pictures.draw_more(folder, run.scenario, level.folder, rows)
+        drawn = [(heading, _pictures(folder, chosen, f"{title}. ")) for heading, chosen in PICTURES]
+    missing = ", ".join(heading.lower() for heading, there in drawn if not there)
     why = run.changed or "there was nothing of the kind in these runs, or an older version did not record it"
-    pair = [name for name in report.ranked(rows) if name != REFERENCE][:1]
-    both = f" and, where two are compared, {REFERENCE} and {pair[0]}" if pair and REFERENCE in names else ""
+    against = statistics.compared_with(rows)
+    pair = [name for name in pictures.ranked(rows) if name != against][:1]
+    both = f" and, where two are compared, {against} and {pair[0]}" if pair else ""
     return {
         "title": title, "details": summary_text.details(rows), "signals": signals, "reasons": reasons,
-        "shown": f"Pictures of single runs show seed {report.shown_seed(rows)}{both}.",
+        "shown": f"Pictures of single runs show seed {pictures.shown_seed(rows)}{both}.",
         "outcome": outcome, "how": how, "pairs": statistics.pairs(rows).drop(columns="demand"),
         "runs": rows[["controller", *(name for name in rows.columns if name != "controller")]],
-        "pictures": [(heading, there) for heading, there in pictures if there],
+        "pictures": [(heading, there) for heading, there in drawn if there],
         "missing": f"Without pictures of {missing}: {why}." if missing else ""}
 
 

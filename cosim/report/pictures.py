@@ -19,7 +19,7 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
 from nmfd.studies import plots
-from nmfd.studies.benchmark import REFERENCE, draw_accumulations
+from nmfd.studies.benchmark import draw_accumulations
 
 MAPS = 4       # times of the maps
 PANELS = 11    # boundaries, or pairs of region and destination, that are shown one by one
@@ -43,13 +43,16 @@ def draw(
     runs = sorted((t for t in run_folder.trajectories(folder) if t.controller in order),
                   key=lambda t: (order.index(t.controller), t.seed))
     note = teleports(rows)
-    draw_accumulations(out, scenario, runs, seed=seed, title=f"seed {seed}, shaded: all seeds; {note}")
+    shaded = ", shaded: all seeds" if rows["seed"].nunique() > 1 else ""
+    draw_accumulations(out, scenario, runs, seed=seed, title=f"seed {seed}{shaded}; {note}",
+                       outflow=experiment.measured_outflow(folder))
     if city is None:
         return
     results = {
         name: result for name, result in recorded(folder, rows, seed).items() if set(DRAWN) <= set(result.record)}
-    best = next((name for name in names if name != REFERENCE and name in results), None)
-    pair = {name: results[name] for name in (REFERENCE, best) if name in results}
+    against = statistics.compared_with(rows)
+    best = next((name for name in names if name != against and name in results), None)
+    pair = {name: results[name] for name in (against, best) if name in results}
     if pair:
         link_maps(out / "link_densities.png", city, pair, f"seed {seed}; {note}")
         gateway_queues(out / "gateway_queues.png", city, pair, f"seed {seed}; {note}")
@@ -73,14 +76,15 @@ def acts(result: Result, network: RegionalModel) -> bool:
 
 
 def ranked(rows: pd.DataFrame) -> list[str]:
-    """Controllers of one demand level, the best first: by mean change against no control, else by mean TTS."""
+    """Controllers of one demand level, the best first: by mean change against what all are compared with, else by mean
+    TTS."""
     level = rows["demand"].iloc[0]
-    reference = statistics.by_seed(rows, level, REFERENCE)
+    reference = statistics.by_seed(rows, level, statistics.compared_with(rows))
     score = {}
     for name in dict.fromkeys(rows["controller"]):
         values = statistics.by_seed(rows, level, name)
         pair = statistics.paired(values, reference)
-        score[name] = pair.percent if pair.seeds else float(np.mean(list(values.values())))
+        score[name] = float(np.mean(list(values.values()))) if np.isnan(pair.percent) else pair.percent
     return sorted(score, key=score.__getitem__)
 
 
@@ -217,17 +221,18 @@ def _moving_sum(values: np.ndarray) -> np.ndarray:
 
 
 def demand_levels(path: Path, rows: pd.DataFrame) -> None:
-    """TTS against that of no control over the demand levels."""
+    """TTS over the demand levels, against that of no control or of the first controller."""
+    against = statistics.compared_with(rows)
     ratios: dict[str, dict[float, tuple[float, float]]] = {}
     for level, names in statistics.groups(rows).items():
         for name in names:
-            pair = statistics.paired(statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, REFERENCE))
-            if name != REFERENCE and pair.seeds:
+            pair = statistics.paired(statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, against))
+            if name != against and not np.isnan(pair.percent):
                 ratios.setdefault(name, {})[level] = 1.0 + pair.percent / 100.0, pair.percent_half / 100.0
     if not ratios:
         return
     drawing = plots.figure(7.5, 4.8)
-    ax = figures.over_demand(drawing.subplots(), ratios)
+    ax = figures.over_demand(drawing.subplots(), ratios, against)
     drawing.suptitle(f"paired by seed, 95 % intervals; {teleports(rows)}", fontsize="medium")
     plots.legend_below(drawing, [ax])
     plots.save(drawing, path)
@@ -246,9 +251,10 @@ def draw_all(out: Path, folders: Mapping[float, Path], scenario: Scenario, rows:
 def draw_more(out: Path, scenario: Scenario, folder: Path, rows: pd.DataFrame) -> None:
     """Beside `draw`, for a page, of one demand level: MFDs and decision times; arguments as there."""
     results = recorded(folder, rows, shown_seed(rows))
-    best = next((name for name in results if name != REFERENCE), None)
+    against = statistics.compared_with(rows)
+    best = next((name for name in results if name != against), None)
     outflows(out / "mfd.png", scenario.network, {
-        name: results[name] for name in (REFERENCE, best) if name in results})
+        name: results[name] for name in (against, best) if name in results})
     decision_times(out / "decision_times.png", rows, scenario.step)
 
 

@@ -1,5 +1,6 @@
 """What the runs of a demand level say, in plain words and numbers."""
 
+import math
 from collections.abc import Sequence
 
 import pandas as pd
@@ -27,7 +28,7 @@ def opening(name: str, steps: int, step: float, levels: int, rows: pd.DataFrame)
 
 def head(rows: pd.DataFrame) -> str:
     """What matters most; `rows` of one demand level, as in cosim.evaluation.statistics."""
-    return f"{best(rows)} {_unfinished(rows)} {_teleports(rows)}"
+    return " ".join(part for part in (best(rows), _unfinished(rows), _removed(rows), _teleports(rows)) if part)
 
 
 def details(rows: pd.DataFrame) -> list[str]:
@@ -38,20 +39,25 @@ def details(rows: pd.DataFrame) -> list[str]:
 def best(rows: pd.DataFrame) -> str:
     """Which strategy spent the least time, by how much, whether that may be chance, and on what it was chosen."""
     level, names = rows["demand"].iloc[0], pictures.ranked(rows)
-    others = [name for name in names if name != REFERENCE]
+    against = statistics.compared_with(rows)
+    others = [name for name in names if name != against]
     if not others:
-        return f"Only {REFERENCE} was run: total time spent {_time(rows, REFERENCE)}."
+        return f"Only {against} was run: total time spent {_time(rows, against)}."
     first = others[0]
     pair = statistics.paired(
-        statistics.by_seed(rows, level, first), statistics.by_seed(rows, level, REFERENCE))
+        statistics.by_seed(rows, level, first), statistics.by_seed(rows, level, against))
     if not pair.seeds:
         return (f"The lowest total time spent was that of {first}, {_time(rows, first)}; there is no run of "
-                f"{REFERENCE} with the same seed to compare it with.")
+                f"{against} with the same seed to compare it with.")
+    if math.isnan(pair.percent):
+        return (f"The total time spent of {against} was {_time(rows, against)}, that of {first} "
+                f"{_time(rows, first)}: a change in percent is not defined.")
     if pair.percent < 0:
         text = (f"The best strategy was {first}: total time spent {_time(rows, first)}, {-pair.percent:.1f} % less "
-                "than without control.")
+                f"than {statistics.than(against)}.")
     else:
-        text = (f"No strategy was better than no control; the nearest was {first}, whose total time spent "
+        other = "no control" if against == REFERENCE else against
+        text = (f"No strategy was better than {other}; the nearest was {first}, whose total time spent "
                 f"{_time(rows, first)} is {pair.percent:.1f} % more.")
     text += " " + _certainty(pair)
     if len(others) > 1:
@@ -59,7 +65,7 @@ def best(rows: pd.DataFrame) -> str:
                  "flattered; only other seeds would tell its true size.")
         second = others[1]
         lead = statistics.paired(statistics.by_seed(rows, level, first), statistics.by_seed(rows, level, second))
-        if lead.seeds:
+        if lead.seeds and not math.isnan(lead.percent):
             text += (f" Against the second, {second}, total time spent changes by {lead.percent:+.1f} %. "
                      f"{_certainty(lead)}")
     return text
@@ -76,18 +82,19 @@ def _certainty(pair: statistics.Paired) -> str:
 
 
 def _beyond_chance(rows: pd.DataFrame) -> str:
-    """Which strategies differ from no control by more than chance."""
-    level = rows["demand"].iloc[0]
+    """Which strategies differ from what all are compared with by more than chance."""
+    level, against = rows["demand"].iloc[0], statistics.compared_with(rows)
     better: list[str] = []
     worse: list[str] = []
     open_: list[str] = []
     for name in pictures.ranked(rows):
-        pair = statistics.paired(statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, REFERENCE))
-        if name != REFERENCE and pair.seeds > 1:
+        pair = statistics.paired(statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, against))
+        if name != against and pair.seeds > 1 and not math.isnan(pair.percent):
             (open_ if not pair.excludes_zero else better if pair.percent < 0 else worse).append(name)
     parts = [
         f"{what}: {', '.join(names)}" for what, names in (
-            ("less time than without control", better), ("more", worse), ("not told apart from it", open_)) if names]
+            (f"less time than {statistics.than(against)}", better), ("more", worse),
+            ("not told apart from it", open_)) if names]
     return f"By intervals that exclude zero or do not, {'; '.join(parts)}." if better or worse or open_ else ""
 
 
@@ -112,6 +119,17 @@ def _unfinished(rows: pd.DataFrame) -> str:
         return "Every trip was completed in every run."
     others = " The others completed all." if len(left) < rows["controller"].nunique() else ""
     return f"Trips not completed at the end, mean per run: {'; '.join(left)}.{others}"
+
+
+def _removed(rows: pd.DataFrame) -> str:
+    """Vehicles that somebody took out; nothing where nobody did, or where an older version did not record it."""
+    if "removed_veh" not in rows or not rows["removed_veh"].any():
+        return ""
+    counts = rows.groupby("controller", sort=False)["removed_veh"].mean()
+    parts = ", ".join(f"{name} {count:,.1f}" for name, count in counts.items() if count > 0)
+    return (f"Vehicles removed before the last edge of their route (by calibrators, collisions, teleports off the net, "
+            f"waits too long or other programs), mean per run: {parts}. They are no completed trips, and total time "
+            "spent has them as if they were there to the end; those whom they no longer hinder gain all the same.")
 
 
 def _teleports(rows: pd.DataFrame) -> str:

@@ -11,6 +11,7 @@ from matplotlib.colors import to_rgb
 from cosim.evaluation.simulate import Task, scenario_of
 from cosim.importing.layers import colour as region_colour
 from cosim.plant.plant import SumoPlant
+from cosim.plant.record import settled
 from cosim.plant.settings import settings
 from cosim.plant.strategy import configured, parse, planning_of
 from cosim.sumo.arrays import Points
@@ -81,10 +82,12 @@ def watch(
         drawn.write_text(layers_xml(plant.city, shapes))
         view.write_text(view_xml(shapes, delay))
         try:
-            return run_folder.labelled(
+            trajectory = run_folder.labelled(
                 closed_loop.run(Painted(plant, scenario.network), controller, scenario, seed=task.seed,
                                 progress=progress),
                 controller=task.controller, plant="sumo")
+            plant.trip_facts()
+            return settled(trajectory, plant.record())
         except LOST:
             raise WindowClosed from None
         finally:

@@ -6,7 +6,6 @@ import io
 import os
 import re
 import subprocess
-import tempfile
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -18,6 +17,7 @@ from cosim.sumo.recipe import CityTable, RecipeTable
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import config
+from nmfd.runs.files import atomic
 from nmfd.runs.scratch import Scratch
 
 # (lanes, movements, every movement has lanes of its own) -> lanes of each movement, numbered from the right
@@ -110,10 +110,8 @@ def _built(recipe_file: Path, network: RegionalModel) -> SumoFiles:
     net, regions = build(recipe, str(recipe_file))
     # the stamp comes last: whoever sees it finds the files that belong to it
     for file, content in ((files.net_file, net), (files.regions_csv, regions), (stamp_file, stamp.encode())):
-        handle, temporary = tempfile.mkstemp(dir=folder, prefix=f".{file.name}.")
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-        os.replace(temporary, file)
+        with atomic(file) as temporary:
+            temporary.write_bytes(content)
     return files
 
 

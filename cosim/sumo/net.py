@@ -14,6 +14,7 @@ from cosim.sumo.arrays import PerEdge, Points
 from cosim.sumo.xml_files import BROKEN, attribute, opened
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
+from nmfd.runs.files import check_file
 
 JAM_SPACING = 7.5  # m of lane per standing vehicle
 
@@ -212,6 +213,7 @@ def for_cars(lane: ElementTree.Element) -> bool:
 
 
 def _read_regions(path: Path, regions: int) -> dict[str, int]:
+    check_file(path, "give a table with the columns edge,region")
     try:
         with path.open(newline="") as stream:
             rows = list(csv.reader(stream))

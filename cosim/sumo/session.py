@@ -4,13 +4,14 @@ libsumo has no window: where one is asked for, sumo-gui runs beside this process
 functions, talks to it.
 """
 
+import ctypes
 import io
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,13 +49,15 @@ class Phase:
 
 @dataclass(frozen=True, kw_only=True)
 class Programme:
-    """A signal programme. position [s]: where in its cycle it was when it was read; static: fixed-time,
-    one phase after the other."""
+    """A signal programme. id: of those of the signal; position [s]: where in its cycle it was when it was read; static:
+    fixed-time, one phase after the other; actuated: timed by detectors, and what it shows is one of its phases."""
 
     signal: str
     phases: tuple[Phase, ...]
     position: float
     static: bool
+    actuated: bool = False
+    id: str = ""
 
     @property
     def cycle(self) -> float:
@@ -99,6 +102,7 @@ class Session:
                     "and `cosim video`") from None
             raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {_one_line(error)}") from None
         Session._open = True
+        self._flush = _flush_all() if window is None else None
         self.time = sumo.simulation.getTime()
         # Asked so often that a Python call around them would cost as much as SUMO's answer:
         # road(vehicle), the edge it is on, normal or internal; route(vehicle), its edges.
@@ -131,6 +135,12 @@ class Session:
         self.sumo_time += time.perf_counter() - before
         self.time = self._sumo.simulation.getTime()
 
+    def flush(self) -> bool:
+        """Have SUMO write what it keeps in memory of its output files; False where nobody can ask it to."""
+        if self._flush is not None:
+            self._flush()
+        return self._flush is not None
+
     # Vehicles: what happened in the last step.
 
     def loaded(self) -> tuple[str, ...]:
@@ -142,7 +152,8 @@ class Session:
         return self._sumo.simulation.getDepartedIDList()
 
     def arrived(self) -> tuple[str, ...]:
-        """At the end of their trips, or given up by SUMO."""
+        """At the end of their trips or, as their tripinfo tells, not: calibrators, collisions and teleports beyond the
+        end remove vehicles, too. Those that a program removes (TraCI) are not among them."""
         return self._sumo.simulation.getArrivedIDList()
 
     def started_teleport(self) -> tuple[str, ...]:
@@ -162,6 +173,16 @@ class Session:
     def teleports(self) -> int:
         """How many there were so far, by SUMO's own count: the mesoscopic model has no events for them."""
         return int(self._sumo.simulation.getParameter("", "stats.teleports.total"))
+
+    def expected(self) -> int:
+        """Vehicles on the road, and those that SUMO has read and that wait for their departure."""
+        return self._sumo.simulation.getMinExpectedNumber()
+
+    def emitted(self) -> tuple[float, float]:
+        """CO2 and fuel of all vehicles on the road at this moment [kg/s]."""
+        running = self.running()
+        co2, fuel = self._sumo.vehicle.getCO2Emission, self._sumo.vehicle.getFuelConsumption
+        return 1e-6 * sum(map(co2, running)), 1e-6 * sum(map(fuel, running))
 
     def known(self) -> tuple[str, ...]:
         """All that were loaded and have not arrived, wherever they are."""
@@ -201,16 +222,18 @@ class Session:
 
     def programme(self, signal: str) -> Programme:
         """The programme that runs on `signal` now."""
-        active = self._sumo.trafficlight.getProgram(signal)
+        active, types = self._sumo.trafficlight.getProgram(signal), self._sumo.constants
         for logic in self._sumo.trafficlight.getAllProgramLogics(signal):
             if logic.programID == active:
                 elapsed = sum(p.duration for p in logic.phases[:self._sumo.trafficlight.getPhase(signal) + 1])
                 left = self._sumo.trafficlight.getNextSwitch(signal) - self._sumo.simulation.getTime()
                 return Programme(
-                    signal=signal, phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
+                    signal=signal, id=active,
+                    phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
                     position=elapsed - left,
-                    static=logic.type == self._sumo.constants.TRAFFICLIGHT_TYPE_STATIC
-                    and not any(phase.next for phase in logic.phases))
+                    static=logic.type == types.TRAFFICLIGHT_TYPE_STATIC
+                    and not any(phase.next for phase in logic.phases),
+                    actuated=logic.type in (types.TRAFFICLIGHT_TYPE_ACTUATED, types.TRAFFICLIGHT_TYPE_DELAYBASED))
         raise RuntimeError(f"signal {signal} has no programme {active}")
 
     def signals(self) -> tuple[str, ...]:
@@ -220,6 +243,13 @@ class Session:
     def signal_state(self, signal: str) -> str:
         """What it shows now, a character per link."""
         return self._sumo.trafficlight.getRedYellowGreenState(signal)
+
+    def state_underneath(self, signal: str, programme: str) -> str:
+        """What a programme of `signal` would show, were it not for the states that were set: it runs on."""
+        for logic in self._sumo.trafficlight.getAllProgramLogics(signal):
+            if logic.programID == programme:
+                return logic.phases[logic.currentPhaseIndex].state
+        raise RuntimeError(f"signal {signal} has no programme {programme}")
 
     def set_signal_state(self, signal: str, state: str) -> bool:
         """False where SUMO does not take it."""
@@ -257,6 +287,17 @@ class Session:
         """Give points of interest, by id, a colour (red, green, blue)."""
         for mark, colour in colours.items():
             self._sumo.poi.setColor(mark, (*colour, 255))
+
+
+def _flush_all() -> Callable[[], None] | None:
+    """OutputDevice::flushAll of SUMO, which neither libsumo nor TraCI hand on: by the name that it has in the library,
+    where the compiler gives it this name (Linux, macOS)."""
+    try:
+        flush = ctypes.CDLL(libsumo._libsumo.__file__)["_ZN12OutputDevice8flushAllEv"]
+    except (AttributeError, OSError):
+        return None
+    flush.argtypes, flush.restype = (), None
+    return flush
 
 
 def _start_quietly(command: list[str]) -> None:

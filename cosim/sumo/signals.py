@@ -1,7 +1,7 @@
 """Signals as the network file describes them, and other programmes for them as an additional file of SUMO."""
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -13,6 +13,8 @@ from nmfd.errors import InputError
 from nmfd.runs import files
 
 GREEN = frozenset("Gg")
+FIXED, ACTUATED = "static", ("actuated", "delay_based")  # SUMO's types of programmes; those with detectors of their own
+HELD = (FIXED, *ACTUATED)  # what they show is always one of their phases: a part of its green can be taken away
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,9 +28,14 @@ class Link:
     turn: str = "s"
 
 
+def lane_id(link: Link) -> str:
+    """SUMO's name of the lane that a link comes from."""
+    return f"{link.from_edge}_{link.lane}"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Signal:
-    """A simple signal: one fixed-time programme, in which green is always followed by yellow.
+    """A simple signal: one programme of phases in one order, fixed-time unless others were asked for.
 
     links: of cars; several may have one index
     stages: the phases that are green and have no yellow, by their number
@@ -50,20 +57,25 @@ def is_stage(state: str) -> bool:
     return bool(GREEN & set(state)) and "y" not in state
 
 
-def read_signals(city: City, additional: Iterable[Path] = ()) -> tuple[list[Signal], list[str]]:
-    """The simple signals of the city, and the names of all others, which no signal plan here touches: already actuated,
-    fewer than two stages, phases out of order, or lights other than red, yellow and green.
+def read_signals(
+    city: City, additional: Iterable[Path] = (), kinds: Collection[str] = (FIXED,),
+) -> tuple[list[Signal], list[str]]:
+    """The simple signals of the city, and the names of all others, which no signal plan here touches: of other `kinds`
+    (already actuated, unless these are asked for, with their nominal durations), fewer than two stages, phases out of
+    order, or lights other than red, yellow and green.
 
     Of several programmes the one that is read last counts, as in SUMO: those of the network file come first, then those
     of the `additional` files.
     """
     try:
-        return _signals(city, additional)
+        return _signals(city, additional, kinds)
     except BROKEN as error:
         raise InputError(f"{city.net_file}: its signals cannot be read ({error}); build it with netconvert") from None
 
 
-def _signals(city: City, additional: Iterable[Path]) -> tuple[list[Signal], list[str]]:
+def _signals(
+    city: City, additional: Iterable[Path], kinds: Collection[str],
+) -> tuple[list[Signal], list[str]]:
     root = read_xml(city.net_file)
     links: dict[str, list[Link]] = {}
     for connection in root.iter("connection"):
@@ -79,7 +91,7 @@ def _signals(city: City, additional: Iterable[Path]) -> tuple[list[Signal], list
         for file in (root, *map(read_xml, additional)) for logic in file.iter("tlLogic")}
     simple, others = [], []
     for name, logic in logics.items():
-        found = _simple(logic, tuple(links.get(name, ())))
+        found = _simple(logic, tuple(links.get(name, ())), kinds)
         if found is not None:
             simple.append(found)
         else:
@@ -87,9 +99,9 @@ def _signals(city: City, additional: Iterable[Path]) -> tuple[list[Signal], list
     return sorted(simple, key=lambda signal: signal.id), sorted(others)
 
 
-def _simple(logic: ElementTree.Element, links: tuple[Link, ...]) -> Signal | None:
+def _simple(logic: ElementTree.Element, links: tuple[Link, ...], kinds: Collection[str]) -> Signal | None:
     rows = list(logic.iter("phase"))
-    if logic.get("type", "static") != "static" or any(row.get("next") for row in rows) or not links:
+    if logic.get("type", FIXED) not in kinds or any(row.get("next") for row in rows) or not links:
         return None
     phases = tuple(Phase(duration=float(attribute(row, "duration")), state=attribute(row, "state")) for row in rows)
     signal = Signal(id=attribute(logic, "id"), offset=float(logic.get("offset", 0.0)), phases=phases, links=links)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nmfd.errors import InputError
+from nmfd.runs.files import check_file
 
 # Of a file that is cut off, no XML, of an encoding that there is not, or whose attributes are missing or no numbers.
 BROKEN = (OSError, EOFError, zlib.error, ElementTree.ParseError, LookupError, TypeError, ValueError)
@@ -16,6 +17,7 @@ DEEPEST = 20  # of files that include each other
 
 def opened(path: Path) -> io.BufferedIOBase:
     """A binary stream of a file, unzipped if its name ends in .gz. Raises one of BROKEN."""
+    check_file(path)
     return gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb")
 
 

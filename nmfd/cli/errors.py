@@ -1,7 +1,10 @@
 """What the command lines `nmfd` and `cosim` share: every user error ends in one clear line and exit status 2."""
 
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 import click
@@ -10,14 +13,15 @@ from nmfd.errors import InputError, RunFailed
 
 
 class Interrupted(Exception):
-    """Ctrl-C. The message says in one line what was kept and how to go on."""
+    """Ctrl-C or SIGTERM. The message says in one line what was kept and how to go on."""
 
 
 class Commands(click.Group):
     """A click group with the project's manners; use it as `@click.group(name="cosim", cls=Commands)`.
 
     InputError, mistakes on the command line, and files that cannot be written or read: status 2.
-    RunFailed: status 1. Ctrl-C: status 130; a command that has something to say about it raises Interrupted.
+    RunFailed: status 1. Ctrl-C: status 130, SIGTERM 143, which is the same to commands: a KeyboardInterrupt; one that
+    has something to say about it raises Interrupted.
     All these give one line on stderr, `<name>: error: ...`; anything else is a bug and keeps its traceback.
     Without arguments the help is shown.
     """
@@ -29,14 +33,18 @@ class Commands(click.Group):
         """Run the command that `args` name, and exit."""
         arguments = list(sys.argv[1:] if args is None else args) or ["--help"]
         extra["standalone_mode"] = False
-        try:
-            result = super().main(arguments, self.name, **extra)
-        except Exception as error:
-            text, status = _verdict(error)
-            if text is None:
-                raise
-            click.echo(f"{self.name}: {' '.join(text.split())}", err=True)
-            sys.exit(status)
+        with _told_to_end() as told:
+            try:
+                _check_texts(arguments)
+                result = super().main(arguments, self.name, **extra)
+                if told:  # a command that makes do with what it has found
+                    raise Interrupted("interrupted")
+            except Exception as error:
+                text, status = _verdict(error)
+                if text is None:
+                    raise
+                click.echo(f"{self.name}: {_printable(text)}", err=True)
+                sys.exit(128 + signal.SIGTERM if told and status == 130 else status)
         # Outside its standalone mode click returns what the command returned, or an exit status.
         sys.exit(result if isinstance(result, int) else 0)
 
@@ -46,6 +54,42 @@ class Commands(click.Group):
             return super().invoke(ctx)
         except KeyboardInterrupt:  # before click sees it, which would print an empty line first
             raise Interrupted("interrupted") from None
+
+
+@contextmanager
+def _told_to_end() -> Iterator[list[int]]:
+    """SIGTERM is a KeyboardInterrupt in here; the list then holds it. A second one makes no difference."""
+    told: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield told
+        return
+
+    def end(number: int, _: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        told.append(number)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield told
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+
+
+def _check_texts(arguments: Sequence[str]) -> None:
+    """InputError for what cannot be the name of anything here: run folders hold their names as UTF-8 text."""
+    for argument in arguments:
+        try:
+            argument.encode()
+        except UnicodeEncodeError:
+            raise InputError(f"{_printable(argument)}: is not UTF-8 text; choose another name") from None
+        if "\0" in argument:
+            raise InputError(f"{_printable(argument)}: holds a zero byte; choose another name")
+
+
+def _printable(text: str) -> str:
+    """On one line, and what a terminal cannot or should not show as ?."""
+    return "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
 
 
 def _verdict(error: Exception) -> tuple[str | None, int]:

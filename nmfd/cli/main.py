@@ -4,9 +4,24 @@ from pathlib import Path
 
 import click
 
+from nmfd.cli.declared import declared
 from nmfd.cli.errors import Commands, Interrupted
 from nmfd.cli.exchange import export, new_controller
-from nmfd.cli.options import COUNT, FILE, FOLDER, SEED, controller_names, fault_option, policy_files, quoted
+from nmfd.cli.options import (
+    ADAM_STEPS,
+    FILE,
+    PARQUET,
+    POLICIES,
+    SCENARIO,
+    SEED,
+    TIME_LIMIT,
+    controller_names,
+    controllers_option,
+    fault_option,
+    out_option,
+    policy_files,
+    quoted,
+)
 from nmfd.cli.progress import progress_line, resumable
 from nmfd.cli.studies import ablation, adaptation, bound, robustness, scaling
 from nmfd.errors import InputError
@@ -24,26 +39,20 @@ def main() -> None:
 
 
 @main.command()
-@click.argument("scenario", type=FOLDER)
-@click.option("--controllers", required=True, metavar="A,B,...",
-              help="Which to run: no-control, route-guidance, pi-gating, mpc-pc, mpc-pcrg, probing-pc, "
-                   "probing-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, dpc-pcrg-robust, dpc-pc-guarded, "
-                   "dpc-pcrg-guarded, dpc-pc-online, dpc-pcrg-online, bound-pc, bound-pcrg, or file.py:Class "
-                   "(see nmfd new-controller).")
-@click.option("--seeds", type=COUNT, default=1, show_default=True, metavar="N",
-              help="Run seeds 0 to N-1 of the measurement noise.")
-@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", show_default=True,
-              help="The model that the controllers act on.")
-@click.option("--workers", type=COUNT, default=1, show_default=True, metavar="N",
-              help="Runs at a time, each on one core. Timings are cleanest with 1.")
-@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
-              help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.")
-@click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.runs.frames).")
+@SCENARIO
+@controllers_option("Which to run: no-control, route-guidance, pi-gating, mpc-pc, mpc-pcrg, probing-pc, "
+                     "probing-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, dpc-pcrg-robust, dpc-pc-guarded, "
+                    "dpc-pcrg-guarded, dpc-pc-online, dpc-pcrg-online, bound-pc, bound-pcrg, or file.py:Class "
+                    "(see nmfd new-controller).")
+@declared("nmfd.studies.settings:Study", "seeds", "plant", "workers")
+@POLICIES
+@PARQUET
 @fault_option()
-@click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
+@TIME_LIMIT
+@out_option()
 def benchmark(
     scenario: Path, controllers: str, seeds: int, plant: str, workers: int, policies: tuple[str, ...],
-    parquet: bool, faults: tuple[str, ...], out: Path | None,
+    parquet: bool, faults: tuple[str, ...], own_time_limit: float | None, out: Path | None,
 ) -> None:
     """Run controllers on a regional model; print a table and write a run folder.
 
@@ -61,14 +70,14 @@ def benchmark(
     files = policy_files(policies, names)
 
     from nmfd.api import load_scenario  # heavy
-    from nmfd.model.scenario import with_faults
+    from nmfd.model.scenario import with_faults, with_time_limit
     from nmfd.runs import run_folder
-    from nmfd.studies import benchmark as benchmarks
+    from nmfd.studies.benchmark import run_all, summary_table
 
-    loaded = with_faults(load_scenario(scenario), faults)
+    loaded = with_time_limit(with_faults(load_scenario(scenario), faults), own_time_limit)
     out = run_folder.default_folder(loaded.name) if out is None else out
     with resumable("benchmark", out, "summary.csv") as progress:
-        rows = benchmarks.benchmark(
+        rows = run_all(
             loaded, names, range(seeds), plant, out=out, policies=files, workers=workers, progress=progress)
     if parquet:
         import pandas as pd  # heavy
@@ -77,30 +86,33 @@ def benchmark(
 
         frames.write(out, run_folder.trajectories(out), {"summary": pd.DataFrame(rows)})
     click.echo(f"{loaded.name}, {plant} plant, {loaded.steps} control intervals of {loaded.step:g} s")
-    click.echo(benchmarks.summary_table(rows))
+    click.echo(summary_table(rows))
     click.echo(f"Written to {out}")
 
 
 @main.command()
-@click.argument("scenario", type=FOLDER)
+@SCENARIO
 @click.option("--controller", required=True, metavar="NAME",
               help="dpc-pc, dpc-pcrg, dpc-pc-robust or dpc-pcrg-robust.")
 @click.option("--seed", type=SEED, default=0, show_default=True,
               help="Of the initial weights and the training scenarios.")
-@click.option("--steps", type=COUNT, metavar="N",
-              help="Adam steps. [default: what scenario.toml says, else 400]")
+@ADAM_STEPS
 @click.option("--out", type=FILE, metavar="FILE", help="The policy file. [default: SCENARIO/NAME.pt]")
 @click.option("--resume", is_flag=True, help="Go on with an interrupted training.")
+@click.option("--anyway", is_flag=True, help="Even on placeholder MFDs, or where no gateway can be controlled.")
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True,
               help="auto: a GPU where there is one. The CPU gives the same weights every time.")
 @click.option("--compile/--no-compile", "compiled", default=None,
               help="Compile the rollout: a minute or two first, then about twice as fast. [default: from 200 Adam "
                    "steps up, where there is a C++ compiler]")
 def train(
-    scenario: Path, controller: str, seed: int, steps: int | None, out: Path | None, resume: bool, device: str,
-    compiled: bool | None,
+    scenario: Path, controller: str, seed: int, steps: int | None, out: Path | None, resume: bool, anyway: bool,
+    device: str, compiled: bool | None,
 ) -> None:
     """Train a DPC policy on a scenario. The -robust ones are trained with noise on the demand.
+
+    Of an imported city, identify it first: on placeholder MFDs, and for a city of which no gateway can be controlled,
+    nothing is trained.
 
     The policy that does best in validation is in the policy file at any time; Ctrl-C keeps it, and --resume goes on.
 
@@ -115,6 +127,11 @@ def train(
     loaded = load_scenario(scenario)
     device = training.available(device)
     chosen = training.settings(loaded, controller, steps)  # complains of the name before a file is named after it
+    if not anyway:
+        model = training.check(loaded, controller)
+        for name, doubts in zip(model.region_names, model.doubts, strict=False):
+            if doubts:
+                click.echo(f"nmfd: the model of region {name} is doubtful: {'; '.join(doubts)}", err=True)
     file = scenario / f"{controller}.pt" if out is None else out
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the policy; make it or choose another --out")
@@ -139,7 +156,7 @@ def train(
 
             training.train(
                 loaded, controller, seed=seed, out=file, steps=steps, resume=resume, device=device, compiled=compiled,
-                progress=progress)
+                anyway=anyway, progress=progress)
     except KeyboardInterrupt:
         if not resume and _stamp(state) == before:
             raise Interrupted("interrupted before the first validation; nothing is kept") from None
@@ -147,6 +164,7 @@ def train(
         again += f" --seed {seed}" if seed else ""
         again += f" --steps {steps}" if steps else ""
         again += f" --out {quoted(out)}" if out else ""
+        again += " --anyway" if anyway else ""
         again += f" --device {device}" if device != "cpu" else ""
         again += "" if default else f" --{'' if compiled else 'no-'}compile"
         raise Interrupted(f"interrupted; the best policy so far is {file}; go on with: {again} --resume") from None
@@ -155,8 +173,8 @@ def train(
 
 
 @main.command()
-@click.argument("scenario", type=FOLDER)
-@click.option("--out", type=FOLDER, metavar="DIR", help="Where the figures go. [default: runs/<scenario>-show]")
+@SCENARIO
+@out_option("show", "Where the figures go.")
 def show(scenario: Path, out: Path | None) -> None:
     """Draw a scenario: its demand, region map and MFDs.
 
@@ -166,12 +184,12 @@ def show(scenario: Path, out: Path | None) -> None:
     """
     from nmfd.api import load_scenario  # heavy
     from nmfd.runs.files import file_name
-    from nmfd.studies import benchmark as benchmarks
+    from nmfd.studies.benchmark import draw_scenario
 
     loaded = load_scenario(scenario)
     out = Path("runs") / f"{file_name(loaded.name)}-show" if out is None else out
     out.mkdir(parents=True, exist_ok=True)
-    files = benchmarks.draw_scenario(out, loaded)
+    files = draw_scenario(out, loaded)
     total = loaded.step * loaded.demand.sum()
     click.echo(
         f"{loaded.name}: {loaded.network.regions} regions, {total:,.0f} trips between "

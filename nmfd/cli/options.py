@@ -1,37 +1,40 @@
 """Command-line values that several commands of `nmfd` share."""
 
-import math
 import shlex
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import click
 
+from nmfd.cli.declared import Declared, declared
 from nmfd.errors import InputError
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 FILE = click.Path(path_type=Path, dir_okay=False)
 SEED = click.IntRange(0, 2**31 - 1)  # SUMO's are 32 bits long
-COUNT = click.IntRange(1, 10**6)
+
+SCENARIO = click.argument("scenario", type=FOLDER)
+STEPS = declared("nmfd.model.scenario_file:ScenarioTable", "steps", instead="the scenario's")
+TIME_LIMIT = click.option(
+    "--time-limit", "own_time_limit", cls=Declared, declaration="nmfd.model.scenario_file:ScenarioTable",
+    instead="the scenario's, else {}", metavar="SECONDS")
+ADAM_STEPS = declared(
+    "nmfd.controllers.dpc.options:Training", "steps", instead="what scenario.toml says, else {}")
+POLICIES = click.option(
+    "--policy", "policies", multiple=True, metavar="NAME=FILE",
+    help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.")
+PARQUET = click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.runs.frames).")
 
 
-class Positive(click.FloatRange):
-    """Above 0, or from it, and up to `most`; not NaN, which click lets pass."""
-
-    def __init__(self, most: float, *, zero: bool = False):
-        super().__init__(0.0, most, min_open=not zero)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """The number. A usage error for one out of the range."""
-        number = super().convert(value, param, ctx)
-        if math.isnan(number):
-            self.fail(f"{value} is not in the range {self._describe_range()}.", param, ctx)
-        return number
+def controllers_option(text: str, default: str | None = None) -> Callable[[Callable], Callable]:
+    """--controllers, which is required without a default."""
+    more = {"required": True} if default is None else {"default": default, "show_default": True}
+    return click.option("--controllers", metavar="A,B,...", help=text, **more)
 
 
-POSITIVE = Positive(1e6)
-LEVEL = Positive(10.0)  # of demand
+def out_option(kind: str = "<time>", text: str = "The run folder.") -> Callable[[Callable], Callable]:
+    """--out, a folder."""
+    return click.option("--out", type=FOLDER, metavar="DIR", help=f"{text} [default: runs/<scenario>-{kind}]")
 
 
 def fault_option(more: str = "") -> Callable[[Callable], Callable]:
@@ -44,13 +47,16 @@ def fault_option(more: str = "") -> Callable[[Callable], Callable]:
              "May be repeated; what is done instead is in the status of every decision.")
 
 
-def controller_names(controllers: str) -> list[str]:
-    """The controllers in a list separated by commas. InputError for an unknown, repeated or empty name."""
+def controller_names(controllers: str, check: Callable[[str], object] | None = None) -> list[str]:
+    """The controllers in a list separated by commas. InputError for an unknown, repeated or empty name.
+
+    check: raises InputError for an unknown name; that of the regional controllers if None
+    """
     from nmfd.controllers import registry  # heavy
 
     names = [name.strip() for name in controllers.split(",")]
     for name in names:
-        registry.check(name)
+        (check or registry.check)(name)
     if repeated := [name for n, name in enumerate(names) if name in names[:n]]:
         raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
     return names
@@ -74,13 +80,3 @@ def policy_files(options: tuple[str, ...], names: list[str]) -> dict[str, Path]:
 def quoted(path: Path) -> str:
     """`path` as a shell reads it."""
     return shlex.quote(str(path))
-
-
-def whole_numbers(option: str, text: str, example: str) -> list[int]:
-    """Different whole numbers from 2 up in a list separated by commas. InputError for anything else."""
-    parts = [part.strip() for part in text.split(",")]
-    values = [int(part) if part.isdecimal() and len(part) < 7 else 0 for part in parts]
-    if min(values) < 2 or len(set(values)) < len(values):
-        raise InputError(
-            f"{option}: expected different whole numbers from 2 up, such as {example}, got {text!r} instead")
-    return values

@@ -50,7 +50,7 @@ def resumable(label: str, out: Path, results: str = "") -> Iterator[Show | None]
         with progress_line(label) as show:
             yield show
     except KeyboardInterrupt:
-        if results and not (out / results).exists():
+        if not (out / results).exists():
             raise Interrupted("interrupted before a run was finished; nothing is kept") from None
         raise Interrupted(
             f"interrupted; finished runs are in {out}: the same command with --out {shlex.quote(str(out))} goes on"

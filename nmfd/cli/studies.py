@@ -7,31 +7,30 @@ from pathlib import Path
 
 import click
 
-from nmfd.cli.options import COUNT, FILE, FOLDER, POSITIVE, controller_names, policy_files, whole_numbers
+from nmfd.cli.declared import declared
+from nmfd.cli.options import (
+    ADAM_STEPS,
+    FILE,
+    FOLDER,
+    POLICIES,
+    SCENARIO,
+    controller_names,
+    controllers_option,
+    out_option,
+    policy_files,
+)
 from nmfd.cli.progress import progress_line, resumable
 from nmfd.errors import InputError
 
 
 @click.command()
-@click.argument("scenario", type=FOLDER)
-@click.option("--controllers", required=True, metavar="A,B,...",
-              help="Which to run besides no-control; the names as in nmfd benchmark.")
-@click.option("--sigmas", default="0,0.25,0.5,0.75,1,1.5,2,3,5", show_default=True, metavar="S,...",
-              help="Standard deviations of the noise [veh/s].")
-@click.option("--scenarios", type=COUNT, default=20, show_default=True, metavar="N",
-              help="Draws of the noise for every sigma.")
-@click.option("--where", type=click.Choice(["planned", "pairs", "all"]), default="pairs", show_default=True,
-              help="What is perturbed: planned demand while it lasts, its pairs of regions all the time, or all pairs. "
-                   "Clipping at zero makes the last two add many trips.")
-@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="acyclic", show_default=True,
-              help="The model that the controllers act on.")
-@click.option("--workers", type=COUNT, default=1, show_default=True, metavar="N",
-              help="Runs at a time, each on one core.")
-@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
-              help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.")
-@click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
+@SCENARIO
+@controllers_option("Which to run besides no-control; the names as in nmfd benchmark.")
+@declared("nmfd.studies.settings:Robustness", "sigmas", "scenarios", "where", "plant", "workers")
+@POLICIES
+@out_option()
 def robustness(
-    scenario: Path, controllers: str, sigmas: str, scenarios: int, where: str, plant: str, workers: int,
+    scenario: Path, controllers: str, sigmas: tuple[float, ...], scenarios: int, where: str, plant: str, workers: int,
     policies: tuple[str, ...], out: Path | None,
 ) -> None:
     """Run controllers against perturbed demand; print a table and draw the improvement over no control.
@@ -47,7 +46,6 @@ def robustness(
     """
     names = controller_names(controllers)
     files = policy_files(policies, names)
-    levels = _sigmas(sigmas)
 
     from nmfd.api import load_scenario  # heavy
     from nmfd.runs import run_folder
@@ -57,29 +55,22 @@ def robustness(
     out = run_folder.default_folder(loaded.name) if out is None else out
     with resumable("robustness", out, "robustness.csv") as progress:
         rows = method.robustness(
-            loaded, names, levels, scenarios, where=where, plant=plant, out=out, policies=files, workers=workers,
+            loaded, names, sigmas, scenarios, where=where, plant=plant, out=out, policies=files, workers=workers,
             progress=progress)
     click.echo(method.improvement_table(rows))
     click.echo(f"Written to {out}")
 
 
 @click.command()
-@click.argument("scenario", type=FOLDER)
-@click.option("--controllers", default="no-control,dpc-pcrg,dpc-pcrg-online", show_default=True, metavar="A,B,...",
-              help="Made for the scenario as it is; those in -online are fine-tuned between control steps.")
-@click.option("--cases", default="nominal,more,one-origin,later,rain", show_default=True, metavar="A,B,...",
-              help="What comes differently: more demand, more from one origin, all of it later, capacity minus 20 %.")
-@click.option("--seeds", type=COUNT, default=1, show_default=True, metavar="N",
-              help="Of the measurement noise.")
-@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", show_default=True)
-@click.option("--workers", type=COUNT, default=1, show_default=True, metavar="N",
-              help="Runs at a time, each on one core. Timings are cleanest with 1.")
-@click.option("--policy", "policies", multiple=True, metavar="NAME=FILE",
-              help="The file of a policy, if not SCENARIO/NAME.pt. May be repeated.")
-@click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-adaptation]")
+@SCENARIO
+@controllers_option("Made for the scenario as it is; those in -online are fine-tuned between control steps.",
+                    "no-control,dpc-pcrg,dpc-pcrg-online")
+@declared("nmfd.studies.settings:Adaptation", "cases", "seeds", "plant", "workers")
+@POLICIES
+@out_option("adaptation")
 def adaptation(
-    scenario: Path, controllers: str, cases: str, seeds: int, plant: str, workers: int, policies: tuple[str, ...],
-    out: Path | None,
+    scenario: Path, controllers: str, cases: tuple[str, ...], seeds: int, plant: str, workers: int,
+    policies: tuple[str, ...], out: Path | None,
 ) -> None:
     """Compare controllers where demand or capacity is not what they were made for; print a table.
 
@@ -99,24 +90,23 @@ def adaptation(
 
     loaded = load_scenario(scenario)
     out = Path("runs") / f"{file_name(loaded.name)}-adaptation" if out is None else out
-    chosen = list(dict.fromkeys(case.strip() for case in cases.split(",")))
     with resumable("adaptation", out, "adaptation.csv") as progress:
         rows = method.adaptation(
-            loaded, names, chosen, range(seeds), out=out, plant=plant, policies=files, workers=workers,
-            progress=progress)
+            loaded, names, list(dict.fromkeys(cases)), range(seeds), out=out, plant=plant, policies=files,
+            workers=workers, progress=progress)
     click.echo(method.adaptation_table(rows))
     click.echo(f"Written to {out}")
 
 
 @click.command()
-@click.argument("scenario", type=FOLDER)
+@SCENARIO
 @click.option("--controller", required=True, metavar="NAME", help="bound-pc or bound-pcrg.")
 @click.option("--from", "starts", metavar="A,B,...",
               help="Controllers whose closed loops it starts from, besides open and half-closed perimeters. "
                    "[default: pi-gating and the DPC policies there are]")
-@click.option("--iterations", type=COUNT, metavar="N", help="Adam steps. [default: 1500]")
+@declared("nmfd.studies.settings:Bound", "iterations")
 @click.option("--out", type=FILE, metavar="FILE", help="The plan file. [default: SCENARIO/NAME.npz]")
-def bound(scenario: Path, controller: str, starts: str | None, iterations: int | None, out: Path | None) -> None:
+def bound(scenario: Path, controller: str, starts: str | None, iterations: int, out: Path | None) -> None:
     """Compute the bound: the best control of the regional model that knows all demand.
 
     The plan is written to a file that `nmfd benchmark --controllers bound-pc,bound-pcrg` replays. Ctrl-C ends the
@@ -137,45 +127,26 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int |
     file = scenario / f"{controller}.npz" if out is None else out
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the plan; make it or choose another --out")
-    steps = iterations or method.ITERATIONS
     with progress_line(controller) as progress:
-        plan = method.compute(loaded, controller, starts=names, iterations=steps, progress=progress)
+        plan = method.compute(loaded, controller, starts=names, iterations=iterations, progress=progress)
     open_loop.write(plan, loaded, file)
     for name, total in sorted(plan.totals.items(), key=lambda item: item[1]):
         click.echo(f"from {name}: {total:.5g} veh s" + (" (kept)" if name == plan.start else ""))
-    click.echo(f"{plan.iterations} Adam steps" + ("" if plan.iterations == steps else ", interrupted"))
+    click.echo(f"{plan.iterations} Adam steps" + ("" if plan.iterations == iterations else ", interrupted"))
     click.echo(f"Written to {file}")
-
-
-def _sigmas(text: str) -> list[float]:
-    """Standard deviations in a list separated by commas. InputError for anything but numbers from 0 up."""
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = [-1.0]
-    if not all(0.0 <= value < float("inf") for value in values) or len(set(values)) < len(values):
-        raise InputError(f"--sigmas: expected different numbers from 0 up, such as 0,0.5,1, got {text!r} instead")
-    return values
 
 
 @click.command()
 @click.argument("what", type=click.Choice(["training", "horizon"]))
-@click.argument("scenario", type=FOLDER)
-@click.option("--seeds", type=COUNT, default=3, show_default=True, metavar="N",
-              help="training: seeds 0 to N-1 with each method.")
-@click.option("--controller", default="dpc-pcrg", show_default=True, metavar="NAME", help="training: what is trained.")
-@click.option("--steps", type=COUNT, metavar="N", help="training: Adam steps. [default: scenario.toml]")
-@click.option("--horizons", default="2,3,4,6,8,10,12,16,20,25,30", show_default=True, metavar="H,...",
-              help="horizon: control intervals that MPC looks ahead.")
-@click.option("--controllers", default="mpc-pc,mpc-pcrg", show_default=True, metavar="A,B", help="horizon: which MPC.")
-@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="acyclic", show_default=True,
-              help="The model that MPC and the trained policies act on.")
-@click.option("--workers", type=COUNT, default=1, show_default=True, metavar="N",
-              help="Runs at a time, each on one core. Timings are cleanest with 1.")
-@click.option("--out", type=FOLDER, metavar="DIR", help="The run folder. [default: runs/<scenario>-<time>]")
+@SCENARIO
+@declared("nmfd.studies.settings:Ablation", "seeds", "horizons", "plant", "workers")
+@click.option("--controller", default="dpc-pcrg", show_default=True, metavar="NAME", help="Training: what is trained.")
+@ADAM_STEPS
+@controllers_option("Horizon: which MPC.", "mpc-pc,mpc-pcrg")
+@out_option()
 def ablation(
-    what: str, scenario: Path, seeds: int, controller: str, steps: int | None, horizons: str, controllers: str,
-    plant: str, workers: int, out: Path | None,
+    what: str, scenario: Path, seeds: int, controller: str, steps: int | None, horizons: tuple[int, ...],
+    controllers: str, plant: str, workers: int, out: Path | None,
 ) -> None:
     """Vary one thing and draw its effect: the training of DPC with route guidance, or the horizon of MPC.
 
@@ -191,7 +162,7 @@ def ablation(
       nmfd ablation training scenarios/economic_mpc --seeds 3 --out runs/alternating
       nmfd ablation horizon scenarios/economic_mpc --controllers mpc-pc --out runs/horizon
     """
-    names, lengths = controller_names(controllers), whole_numbers("--horizons", horizons, "2,8")
+    names = controller_names(controllers)
 
     from nmfd.api import load_scenario  # heavy
     from nmfd.runs import run_folder
@@ -206,30 +177,20 @@ def ablation(
                 progress=progress)
         else:
             rows = method.horizons(
-                loaded, names, lengths, plant=plant, out=out, workers=workers, progress=progress)
+                loaded, names, horizons, plant=plant, out=out, workers=workers, progress=progress)
     click.echo(method.ablation_table(rows))
     click.echo(f"Written to {out}")
 
 
 @click.command()
-@click.option("--regions", metavar="N,...", help="Numbers of regions. [default: 2,4,8,... to 64, hexagonal to 256]")
-@click.option("--controllers", default="dpc-pc,dpc-pcrg,mpc-pc,mpc-pcrg", show_default=True, metavar="A,B,...",
-              help="Which to measure, out of these four.")
-@click.option("--family", type=click.Choice(["complete", "hexagonal"]), default="complete", show_default=True,
-              help="Every region adjacent to every other, as published, or a plane city.")
-@click.option("--load", type=click.Choice(["published", "congested"]), default="published", show_default=True,
-              help="Initial states: 0 to 100 vehicles bound for every region, or regions up to beyond their jam.")
-@click.option("--workers", type=COUNT, default=1, show_default=True, metavar="N",
-              help="Cases at a time, each in a process on one core. Timings are cleanest with 1.")
-@click.option("--memory", type=POSITIVE, default=16.0, show_default=True,
-              metavar="GIB", help="That a case may take.")
-@click.option("--time-limit", type=POSITIVE, default=600.0, show_default=True,
-              metavar="S", help="That a case may take.")
+@declared("nmfd.studies.settings:Scaling", "regions", instead="2,4,8,... to 64, hexagonal to 256")
+@controllers_option("Which to measure, out of these four.", "dpc-pc,dpc-pcrg,mpc-pc,mpc-pcrg")
+@declared("nmfd.studies.settings:Scaling", "family", "load", "workers", "memory", "time_limit")
 @click.option("--out", type=FOLDER, default=Path("runs/scaling"), show_default=True, metavar="DIR",
               help="The run folder.")
 def scaling(
-    regions: str | None, controllers: str, family: str, load: str, workers: int, memory: float, time_limit: float,
-    out: Path,
+    regions: tuple[int, ...] | None, controllers: str, family: str, load: str, workers: int, memory: float,
+    time_limit: float, out: Path,
 ) -> None:
     """Measure the time of a decision and its memory against the number of regions; print a table and draw it.
 
@@ -243,13 +204,12 @@ def scaling(
       nmfd scaling --family hexagonal --load congested --controllers dpc-pcrg,mpc-pcrg --regions 7,19,37
     """
     names = controller_names(controllers)
-    counts = () if regions is None else whole_numbers("--regions", regions, "2,4,8")
 
     from nmfd.studies import scaling as method  # heavy
 
     with resumable("scaling", out, "scaling.csv") as progress:
         rows = method.scaling(
-            names, out=out, family=family, load=load, regions=counts, workers=workers, memory_gib=memory,
+            names, out=out, family=family, load=load, regions=regions or (), workers=workers, memory_gib=memory,
             time_limit=time_limit, progress=progress)
     click.echo(method.scaling_table(rows))
     click.echo(f"Written to {out}")

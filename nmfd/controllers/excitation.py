@@ -10,7 +10,7 @@ from nmfd.model.planning import PlanningModel
 from nmfd.types import Controls, Observation
 
 HOLD = (3, 9)            # control intervals between two draws, from and to
-SET_POINTS = (0.5, 1.3)  # of the middle one, of every protected region
+SET_POINTS = (0.5, 1.3)  # of the middle one, of every region that is held
 DISTURBED = 0.35         # share of the gateways whose u is drawn by lot
 MOST_DIVERTED = 0.6      # share of the vehicles of one kind in a region whose way is drawn by lot; more locks a city
 
@@ -30,10 +30,12 @@ class Probing:
         """InputError for a wrong option."""
         self.name = "probing-pcrg" if guidance else "probing-pc"
         self._network, self._guidance, self._gating = planning.network, guidance, None
-        critical = tuple(planning.network.mfds[region].critical for region in planning.protected)
-        middle = options(SetPoint, planning, self.name).set_point or critical
+        chosen = options(SetPoint, planning, self.name)
+        regions = chosen.held(planning)
+        middle = chosen.set_point or tuple(planning.network.mfds[region].critical for region in regions)
         if middle:
-            self._gating = PiGating(replace(planning, controller_options={PiGating.name: {"set_point": list(middle)}}))
+            held = {"regions": list(regions), "set_point": list(middle)}
+            self._gating = PiGating(replace(planning, controller_options={PiGating.name: held}))
             self._gating.critical = np.array(middle)
         self._open = np.where(planning.network.adjacency, planning.network.u_max, 0.0)
         self.reset()

@@ -9,7 +9,7 @@ import numpy as np
 from nmfd.arrays import PairsOverTime, TurnsOverTime
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
-from nmfd.runs.files import atomic
+from nmfd.runs.files import atomic, check_file
 from nmfd.types import Controls, Observation
 
 NAMES = {"bound-pc": False, "bound-pcrg": True}  # whether routes are guided too
@@ -66,6 +66,7 @@ def write(plan: Plan, scenario: Scenario, path: Path) -> None:
 
 def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
     """What `write` wrote; InputError if it is none, of another scenario, or of the other action set."""
+    check_file(path, "compute one with 'nmfd bound'")
     try:
         with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:  # NumPy leaves others open
             content = {name: file[name] for name in file.files}

@@ -107,6 +107,11 @@ def is_own(name: str) -> bool:
     return name not in _ENTRIES
 
 
+def runs_apart(name: str) -> bool:
+    """Whether NAME or NAME+... is a controller of the user's own, each run of which has a process of its own."""
+    return is_own(split(name)[0])
+
+
 def guides(name: str) -> bool:
     """Whether the controller `name`, which must be known, may guide routes, as one of the user's own might."""
     return is_own(name) or _ENTRIES[name].guides
@@ -173,6 +178,25 @@ def make(name: str, scenario: Scenario, *, policy: Path | None = None) -> Contro
         return _ENTRIES[first].make(path, scenario)
     planning = planning_model(scenario, _owner(name))
     return _ENTRIES[first].make(planning) if path is None else _ENTRIES[first].make(path, planning)
+
+
+def outside_training(name: str, scenario: Scenario, level: float, *, file: Path | None = None) -> str:
+    """What to say of a run of `name`, as of `make`, at `level` times the demand of the scenario that a policy was
+    trained on; "" for what it has seen, and for controllers without a policy. Raises InputError as `make`."""
+    path = policy_path(name, scenario, file)
+    if path is None or split(name)[0] not in policy_names():
+        return ""
+    _, content = policy.load_policy(path, planning_model(scenario, _owner(name)).network)
+    return policy.outside_training(content, level)
+
+
+def verify(name: str, scenario: Scenario, *, policy: Path | None = None) -> None:
+    """InputError where `make` raises one; a controller of the user's own is tried in a process of its own."""
+    if is_own(split(name)[0]):
+        policy_path(name, scenario, policy)
+        custom.verify(split(name)[0], scenario)
+    else:
+        make(name, scenario, policy=policy)
 
 
 def check_options(scenario: Scenario) -> None:

@@ -109,7 +109,6 @@ def observed_split_ratios(
     return found
 
 
-@one_thread()  # and sums are always in the same order
 def fit(
     network: RegionalModel, runs: Sequence[Observed], *, step: float, substeps: int = 1, integrator: str = "euler",
     iterations: int = ITERATIONS, seed: int = 0, progress: Callable[[int, int, str], None] | None = None,
@@ -120,26 +119,27 @@ def fit(
     region. The curve of every region falls in q and stays positive up to its jam accumulation, beyond which the outflow
     is constant, and step * q * exit rate <= 1 for the integration step: the result is always a valid network.
     """
-    torch.manual_seed(seed)
-    generator = torch.Generator().manual_seed(seed)
-    model = _Model(network, runs, step, substeps / step)
-    horizon = min(HORIZON, max(len(run.demand) for run in runs))
-    data, scheme = windows(runs, horizon), {"step": step, "substeps": substeps, "integrator": integrator}
-    scale = torch.tensor([mfd.critical for mfd in network.mfds], dtype=torch.float32)
-    off_diagonal = 1.0 - torch.eye(network.regions)
-    optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
-    for iteration in range(iterations):
-        for group in optimizer.param_groups:
-            group["lr"] = LEARNING_RATE * (0.05 + 0.95 * 0.5 * (1.0 + math.cos(math.pi * iteration / iterations)))
-        chosen = torch.randint(len(data[0]), (min(BATCH, len(data[0])),), generator=generator)
-        loss = _misfit(model.parameters_of(off_diagonal), [part[chosen] for part in data], scale, scheme)
-        optimizer.zero_grad()
-        (loss + model.penalty()).backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
-        optimizer.step()
-        if progress:
-            progress(iteration + 1, iterations, f"misfit {loss.item():.3f}")
-    return _network(network, model, runs, off_diagonal)
+    with one_thread():  # and sums are always in the same order
+        torch.manual_seed(seed)
+        generator = torch.Generator().manual_seed(seed)
+        model = _Model(network, runs, step, substeps / step)
+        horizon = min(HORIZON, max(len(run.demand) for run in runs))
+        data, scheme = windows(runs, horizon), {"step": step, "substeps": substeps, "integrator": integrator}
+        scale = torch.tensor([mfd.critical for mfd in network.mfds], dtype=torch.float32)
+        off_diagonal = 1.0 - torch.eye(network.regions)
+        optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
+        for iteration in range(iterations):
+            for group in optimizer.param_groups:
+                group["lr"] = LEARNING_RATE * (0.05 + 0.95 * 0.5 * (1.0 + math.cos(math.pi * iteration / iterations)))
+            chosen = torch.randint(len(data[0]), (min(BATCH, len(data[0])),), generator=generator)
+            loss = _misfit(model.parameters_of(off_diagonal), [part[chosen] for part in data], scale, scheme)
+            optimizer.zero_grad()
+            (loss + model.penalty()).backward()
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
+            optimizer.step()
+            if progress:
+                progress(iteration + 1, iterations, f"misfit {loss.item():.3f}")
+        return _network(network, model, runs, off_diagonal)
 
 
 def windows(runs: Sequence[Observed], horizon: int) -> list[torch.Tensor]:
@@ -214,4 +214,15 @@ def prediction_shares(
 ) -> Float[np.ndarray, "L R"]:
     """(len(intervals), R) [-]: RMSE of `prediction_errors`, as a share of the critical accumulation."""
     errors = [prediction_errors(network, runs, n, **scheme) for n in intervals]
+    return np.sqrt([(error**2).mean(axis=0) for error in errors]) / [curve.critical for curve in network.mfds]
+
+
+def persistence_shares(
+    network: RegionalModel, runs: Sequence[Observed], intervals: Sequence[int],
+) -> Float[np.ndarray, "L R"]:
+    """(len(intervals), R) [-]: as `prediction_shares`, of the prediction that nothing changes."""
+    errors = []
+    for n in intervals:
+        states = [run.accumulation.sum(axis=2) for run in runs if len(run.demand) >= n]
+        errors.append(np.concatenate([state[:-n] - state[n:] for state in states]))
     return np.sqrt([(error**2).mean(axis=0) for error in errors]) / [curve.critical for curve in network.mfds]

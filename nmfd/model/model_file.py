@@ -1,7 +1,9 @@
 """network.toml of a regional model, as text; `nmfd.model.regional_model.load_network` reads it."""
 
 import io
+import os
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -9,10 +11,18 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.config import quoted
 
 
+def schema_line(folder: Path) -> str:
+    """The line by which editors find the JSON schema of a network.toml in `folder`; "" where there is none above it."""
+    above = (parent / "network.schema.json" for parent in folder.absolute().parents)
+    found = next((file for file in above if file.is_file()), None)
+    return f"#:schema {Path(os.path.relpath(found, folder)).as_posix()}\n" if found else ""
+
+
 def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) -> str:
     """network.toml of `network` with this table [sumo]."""
     out = io.StringIO()
-    out.write(f"# {comment}\nname = {quoted(network.name)}\n\n")
+    out.write(f"# {comment}\nname = {quoted(network.name)}\n")
+    out.write("placeholder = true\n\n" if network.placeholder else "\n")
     out.write(f"[perimeter]\nmin = {network.u_min:g}\nmax = {network.u_max:g}\n")
     if sumo:
         out.write("\n[sumo]\n" + "".join(f"{key} = {quoted(value)}\n" for key, value in sumo.items()))
@@ -36,7 +46,7 @@ def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) 
 
 
 def _options(network: RegionalModel, region: int) -> str:
-    """exit_rates, capacity and storage of one region, as far as the network has them."""
+    """What the network has of one region beside its MFD."""
     lines = ""
     if network.exit_rates is not None:
         lines += f"exit_rates = [{', '.join(f'{value:.4g}' for value in network.exit_rates[region])}]\n"
@@ -45,4 +55,9 @@ def _options(network: RegionalModel, region: int) -> str:
         lines += (
             f"capacity = [{', '.join(f'{value:.4g}' for value in passing)}]\n"
             f"storage = {network.storage[region]:.6g}\n")
+    if network.controllable is not None:
+        shares = network.controllable[region, network.adjacency[region]]
+        lines += f"controllable = [{', '.join(f'{value:.4g}' for value in shares)}]\n"
+    if network.doubts and network.doubts[region]:
+        lines += f"doubts = [{', '.join(map(quoted, network.doubts[region]))}]\n"
     return lines

@@ -9,7 +9,7 @@ from nmfd.runs import config
 from nmfd.runs.config import Problem, Regions, Rows, Settings, Share, got, setting
 
 MOST = 1e9  # veh in a region: beyond, it is a mistake
-OF_ALL = ("exit_rates", "capacity", "storage")  # options that every region has or none
+OF_ALL = ("exit_rates", "capacity", "storage", "controllable")  # options that every region has or none
 
 
 class PerimeterTable(Settings):
@@ -62,6 +62,10 @@ class RegionTable(Settings):
     storage: float | None = setting(
         "accumulation that leaves no room for vehicles from other regions; together with capacity", None, unit="veh",
         gt=0.0, le=MOST)
+    controllable: Annotated[tuple[Share, ...], Field(strict=False)] | None = setting(
+        "share of the flow into each adjacent region that passes signals under control, in the order of adjacent, "
+        "without those of no_way_to; cosim import and identify count it; for every region or for none", None, unit="-")
+    doubts: config.Texts = setting("what cosim identify found doubtful about the fit of this region", ())
 
     @model_validator(mode="after")
     def _complete(self) -> "RegionTable":
@@ -92,6 +96,8 @@ class NetworkTable(Settings):
     """The regional model of a city."""
 
     name: config.Name = setting("of the model")
+    placeholder: bool = setting(
+        "whether the MFDs are a guess from lanes and speed limits: nothing is trained on them", False)
     perimeter: PerimeterTable = setting("bounds of the control")
     mfd: MfdTable | None = setting("of every region without one of its own", None)
     regions: Rows[RegionTable] = setting("one table per region", min_length=1)
@@ -132,7 +138,8 @@ class NetworkTable(Settings):
         for key in OF_ALL:
             if getattr(row, key) is None and any(getattr(other, key) is not None for other in self.regions):
                 raise Problem(f"{where}.{key}", "missing; give it for every region or for none")
-        for key, length in (("exit_rates", count), ("capacity", len(row.onward))):
+        for key, length in (("exit_rates", count), ("capacity", len(row.onward)),
+                            ("controllable", len(row.onward))):
             values = getattr(row, key)
             if values is not None and len(values) != length:
                 raise Problem(f"{where}.{key}", got(f"a list of {length} numbers", list(values)))

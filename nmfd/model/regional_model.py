@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,7 @@ from scipy.sparse import csgraph
 from nmfd.arrays import Adjacency, Hops, PerPair, PerRegion, PerTurn, Positions, TurnMask
 from nmfd.errors import InputError
 from nmfd.model.mfd import Mfd
-from nmfd.model.network_file import NetworkTable
+from nmfd.model.network_file import NetworkTable, RegionTable
 from nmfd.runs import config
 
 # Of boundaries with a capacity. What passes is a smooth minimum of wish and limit, (wish^-n + limit^-n)^(-1/n), 84 % of
@@ -41,6 +41,9 @@ class RegionalModel:
     capacity: (R, R) [veh/s], [i, h]: the most that passes from i to an empty region h under u_max; None: u_ih is a
         share of the flow that wishes to pass, however little that is
     storage: (R,) [veh], the accumulation that leaves no room for vehicles from other regions; with `capacity`
+    controllable: (R, R) [-], [i, h]: share of the flow from i to h that passes signals under control; None if unknown
+    placeholder: whether the MFDs are a guess that no run has measured
+    doubts: of every region, what is doubtful about its fit; () if unknown
     folder: where network.toml was, or None
     """
 
@@ -55,6 +58,9 @@ class RegionalModel:
     exit_rates: PerPair | None = None
     capacity: PerPair | None = None
     storage: PerRegion | None = None
+    controllable: PerPair | None = None
+    placeholder: bool = False
+    doubts: tuple[tuple[str, ...], ...] = ()
     folder: Path | None = None
 
     @property
@@ -127,11 +133,7 @@ def load_network(folder: Path | str) -> RegionalModel:
     adjacency = np.zeros((len(rows), len(rows)), dtype=bool)
     for i, row in enumerate(rows):
         adjacency[i, list(row.onward)] = True
-    capacity = None
-    if rows[0].capacity is not None:
-        capacity = np.zeros(adjacency.shape)
-        for i, row in enumerate(rows):
-            capacity[i, list(row.onward)] = row.capacity
+    capacity, controllable = (_by_pair(rows, name) for name in ("capacity", "controllable"))
     network = RegionalModel(
         name=table.name, region_names=tuple(row.name or str(number) for number, row in enumerate(rows)),
         positions=np.array([row.position for row in rows]), adjacency=adjacency,
@@ -140,9 +142,20 @@ def load_network(folder: Path | str) -> RegionalModel:
                     for row in table.observed_split_ratios},
         exit_rates=None if rows[0].exit_rates is None else np.array([row.exit_rates for row in rows]),
         capacity=capacity, storage=None if rows[0].storage is None else np.array([row.storage for row in rows]),
-        folder=folder)
+        controllable=controllable, placeholder=table.placeholder, folder=folder,
+        doubts=tuple(row.doubts for row in rows) if any(row.doubts for row in rows) else ())
     _check_ways(network, path)
     return network
+
+
+def _by_pair(rows: Sequence[RegionTable], name: str) -> PerPair | None:
+    """(R, R), [i, h]: a key of every region that has a number for each region into which roads lead."""
+    if getattr(rows[0], name) is None:
+        return None
+    found = np.zeros((len(rows),) * 2)
+    for i, row in enumerate(rows):
+        found[i, list(row.onward)] = getattr(row, name)
+    return found
 
 
 def _check_ways(network: RegionalModel, path: Path) -> None:

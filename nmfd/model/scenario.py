@@ -14,8 +14,9 @@ from nmfd.arrays import Intervals, PairsOverTime
 from nmfd.errors import InputError
 from nmfd.faults import Fault, parse
 from nmfd.model.regional_model import RegionalModel, check_step, load_network
-from nmfd.model.scenario_file import MOST_NUMBERS, ScenarioTable, read_tables
+from nmfd.model.scenario_file import MOST_NUMBERS, OWN_TIME_LIMIT, ScenarioTable, read_tables
 from nmfd.runs import config
+from nmfd.runs.files import check_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +36,7 @@ class Scenario:
     forecast_seed: of that error
     controller_options: controller name -> its table in [controllers], checked by that controller
     faults: injected into every run (nmfd.faults)
+    own_time_limit: of every call of a controller of the user's own [s], 0 for none; no result depends on it
     folder: where scenario.toml was, or None
     """
 
@@ -52,6 +54,7 @@ class Scenario:
     forecast_error: float = 0.0
     forecast_seed: int = 0
     faults: tuple[str, ...] = ()
+    own_time_limit: float = OWN_TIME_LIMIT
     folder: Path | None = None
 
     @cached_property
@@ -96,6 +99,11 @@ def with_faults(scenario: Scenario, texts: Sequence[str]) -> Scenario:
     return replace(scenario, faults=(*scenario.faults, *texts))
 
 
+def with_time_limit(scenario: Scenario, seconds: float | None) -> Scenario:
+    """`scenario` with the option --time-limit, if it is given."""
+    return scenario if seconds is None else replace(scenario, own_time_limit=seconds)
+
+
 def trapezoid(
     time: Intervals, *, start: float, peak: float, ramp_up: float, flat: float, ramp_down: float,
 ) -> Intervals:
@@ -124,7 +132,8 @@ def read_scenario(folder: Path | str) -> Scenario:
         name=table.name, network=network, step=table.step, steps=table.steps, demand=table.demand_factor * demand,
         measurement_std=table.noise.measurement_std, integrator=table.integrator, substeps=table.substeps,
         protected=table.protected, controller_options=table.controllers, demand_factor=table.demand_factor,
-        forecast_error=table.forecast.error, forecast_seed=table.forecast.seed, faults=table.faults, folder=folder)
+        forecast_error=table.forecast.error, forecast_seed=table.forecast.seed, faults=table.faults,
+        own_time_limit=table.own_time_limit, folder=folder)
     _ = scenario.ordered_faults  # checked here, where the file is known
     return scenario
 
@@ -162,6 +171,7 @@ def _demand_file(path: Path, steps: int, regions: int) -> PairsOverTime:
     Raises InputError.
     """
     demand = np.zeros((steps, regions, regions))
+    check_file(path, "give a csv file")
     try:
         with path.open(newline="", encoding="utf-8") as stream:
             rows = list(csv.reader(stream))

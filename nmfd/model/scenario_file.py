@@ -11,6 +11,7 @@ from nmfd.runs.config import Flow, Name, Problem, Region, Regions, Rows, Seconds
 
 MOST_NUMBERS = 2 * 10**8  # of a demand table: more would not fit into memory
 LONGEST_STEP = 86_400.0   # s
+OWN_TIME_LIMIT = 600.0    # s
 
 
 class NoiseTable(Settings):
@@ -64,6 +65,9 @@ class ScenarioTable(Settings):
     demand_factor: float = setting("multiplies the whole demand", 1.0, unit="-", ge=0.0, le=1000.0)
     demand_file: Text | None = setting("csv with the columns interval, from, to, veh_s, added to [[demand]]", None)
     faults: Texts = setting("injected into every run: KIND[:VALUE][@FROM-TO], as of --fault", ())
+    own_time_limit: float = setting(
+        "of every call of a controller of your own: its import, making, reset and every act; 0: none; --time-limit "
+        "goes before it", OWN_TIME_LIMIT, unit="s", ge=0.0)
     noise: NoiseTable = setting("of the measurements", NoiseTable())
     forecast: ForecastTable = setting("of the demand", ForecastTable())
     demand: Rows[DemandTable] | None = setting("one table per flow; may be left out beside demand_file", None)

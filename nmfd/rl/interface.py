@@ -114,8 +114,9 @@ class Episode:
         return self._seen()
 
     def step(self, controls: Controls) -> tuple[Observation, PerRegion, bool]:
-        """What the agent sees next; vehicles (R,) [veh] in and before each region when the interval began; the end."""
-        spent = (self._state.accumulation + self._state.backlog).sum(axis=1)
+        """What the agent sees next; vehicles (R,) [veh] in and before each region, and removed there, when the interval
+        began; the end."""
+        spent = self._state.unfinished.sum(axis=1)
         self._state = self._plant.step(controls)
         self.steps += 1
         return self._seen(), spent, self.steps >= self.scenario.steps

@@ -4,19 +4,22 @@ A declaration is a subclass of `Settings` whose fields are made by `setting` and
 JSON schemas for editors come from it (nmfd.runs.reference).
 """
 
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from nmfd.errors import InputError, did_you_mean
 from nmfd.runs import schema
+from nmfd.runs.files import check_file
 
 MOST = 10**9        # of a whole number without a limit of its own
 LONGEST = 1000      # characters of a text
 LONGEST_NAME = 100  # characters: names become file names
+DEEP = re.compile(rb"(?:\s*\.\s*[\"']?[\w-]+[\"']?){100}")  # a dotted key of so many parts
 SHOWN = 60          # characters of a wrong value that a message repeats
 S = TypeVar("S", bound="Settings")
 
@@ -82,6 +85,7 @@ Rows = Annotated[tuple[S, ...], Field(strict=False)]  # a list of tables
 def read(path: Path) -> dict[str, Any]:
     """The content of a TOML file; InputError if it is missing or not TOML."""
     path = Path(path)
+    check_file(path, "give a TOML file")
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -90,11 +94,15 @@ def read(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give a readable file") from None
     try:
+        if DEEP.search(content):  # the parser would take hours
+            raise RecursionError
         return tomllib.loads(content.decode())
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not UTF-8 text; save it as UTF-8") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: is not valid TOML: {error}; correct the line named") from None
+    except ValueError:  # of Python, which reads no whole numbers of thousands of digits
+        raise InputError(f"{path}: is not valid TOML: a number of thousands of digits; give a shorter one") from None
     except RecursionError:
         raise InputError(f"{path}: is not valid TOML: nested too deeply; write it anew") from None
 
@@ -105,6 +113,13 @@ def checked(declaration: type[S], values: Mapping[str, Any], where: Path | str, 
         return declaration.model_validate(values)
     except ValidationError as error:
         raise InputError(f"{where}: {prefix}{_told(declaration, values, error)}") from None
+
+
+def parsed(declaration: type[S], key: str, text: str | list[str]) -> Any:
+    """The value of a setting, or those of a list, from what the command line says. ValueError."""
+    field = declaration.model_fields[key]
+    kind: Any = Annotated[field.annotation, field]
+    return TypeAdapter(kind, config=declaration.model_config).validate_python(text, strict=False)
 
 
 def error(where: Path | str, key: str, problem: str) -> InputError:

@@ -78,7 +78,8 @@ def read_trajectory(path: Path) -> Trajectory:
 
 def trajectory_in(file: netCDF4.Dataset) -> Trajectory:
     """That of a run's file (`opened`)."""
-    arrays = {name: file[name][...] for name in quantities(Trajectory) if name != "decision_time"}
+    arrays = {name: file[name][...] for name in quantities(Trajectory)
+              if name != "decision_time" and (name in file.variables or name != "removed")}  # older runs had none
     arrays["note"] = tuple(arrays["note"])
     return Trajectory(
         controller=file.controller, plant=file.plant, seed=int(file.seed), step=float(file.step),
@@ -89,6 +90,7 @@ def trajectory_in(file: netCDF4.Dataset) -> Trajectory:
 @contextmanager
 def opened(path: Path) -> Iterator[netCDF4.Dataset]:
     """The file of a run. Raises InputError, also where the body finds something missing."""
+    files.check_file(path, "delete it and run it again")
     try:
         with netCDF4.Dataset(path) as file:
             file.set_auto_mask(False)
@@ -120,6 +122,7 @@ def write_summary(path: Path, rows: list[dict]) -> None:
 
 def read_manifest(path: Path) -> dict:
     """manifest.json of a run folder: configuration, controllers, sessions. Raises InputError."""
+    files.check_file(path, "choose another folder with --out")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(content["configuration"], dict) or not isinstance(content["controllers"], dict):
@@ -261,6 +264,8 @@ def manifest(
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
+        for folder in made:
+            files.synced(folder.parent)
         with files.locked(path / LOCK, path):
             files.sweep(path)
             if file.is_file():

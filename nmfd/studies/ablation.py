@@ -84,6 +84,7 @@ def alternating_or_joint(
     chosen = training.settings(scenario, controller, steps)
     if not training.NAMES[controller]:
         raise InputError(f"--controller: {controller} has one decoder only; choose one with route guidance")
+    training.check(scenario, controller)
     common, _ = configuration(scenario, [], plant, {})
     compiled = chosen.steps >= training.WORTH_COMPILING and rollout.can_compile()
     work = partial(

@@ -93,7 +93,7 @@ def adaptation(
         if case not in CASES:
             raise InputError(f"--cases: {case!r} is unknown; choose from {', '.join(CASES)}")
     for name in controllers:
-        registry.make(name, scenario, policy=policies.get(name))
+        registry.verify(name, scenario, policy=policies.get(name))
     common, settings = configuration(scenario, controllers, plant, policies)
     wanted = [Run(case, seed, name) for case in cases for seed in seeds for name in controllers]
     file, failures = out / "adaptation.csv", []

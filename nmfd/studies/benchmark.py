@@ -2,7 +2,7 @@
 
 import math
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -10,23 +10,30 @@ from scipy.special import stdtrit
 
 from nmfd import closed_loop, faults
 from nmfd.controllers import registry
-from nmfd.metrics import COUNTED
+from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
 from nmfd.runs.tables import text_table
-from nmfd.runs.workers import Failure, attempt, ended, outcomes
+from nmfd.runs.workers import Failure, Worker, attempt, ended, outcomes
 from nmfd.studies import plots
+from nmfd.studies.traffic_states import OutflowOf, model_outflow, remembered
 from nmfd.types import Plant, Trajectory
 
 PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
 CAPTION = (
-    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against no-control; control: time of all "
+    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against {against}; control: time of all "
     "decisions of a run; step: median / longest decision; decisions of all seeds: " + "; ".join(
         f"{heading}: {what}" for heading, what in COUNTED.values()))
 BOUND_CAPTION = (
     "; above bound: TTS against the bound with the same controls, perimeter alone (PC) or with routes (PCRG)")
+
+
+def compared_with(controllers: Iterable[str]) -> str:
+    """What controllers are compared with: no control, or the first of them where that is not among them."""
+    names = list(controllers)
+    return REFERENCE if REFERENCE in names else names[0]
 
 
 def run_one(
@@ -40,7 +47,7 @@ def run_one(
     return run_folder.labelled(trajectory, controller=name, plant=plant)
 
 
-def benchmark(
+def run_all(
     scenario: Scenario, controllers: Sequence[str], seeds: Sequence[int], plant: str, *, out: Path,
     policies: Mapping[str, Path] | None = None, workers: int = 1,
     progress: Callable[[int, int, str], None] | None = None,
@@ -54,7 +61,7 @@ def benchmark(
     """
     policies = policies or {}
     for name in controllers:
-        registry.make(name, scenario, policy=policies.get(name))
+        registry.verify(name, scenario, policy=policies.get(name))
     common, settings = configuration(scenario, controllers, plant, policies)
     wanted = [(name, seed) for name in controllers for seed in seeds]
     session = {"scenario_folder": str(scenario.folder), "workers": workers}
@@ -101,7 +108,8 @@ def results(
     work: Callable, todo: Sequence[tuple], workers: int, steps: int,
     progress: Callable[[int, int, str], None] | None, *, label: Callable[..., str],
 ) -> Iterator[tuple]:
-    """(run, result or Failure) of every run, in this process if there is one worker.
+    """(run, result or Failure) of every run, in this process if there is one worker; those of controllers of the
+    user's own in processes of their own.
 
     work(run), or work(run, progress=...) in this process, is one closed loop of `steps` control intervals; progress
     as in `benchmark`, with the `label` of the run.
@@ -109,15 +117,36 @@ def results(
     report = progress or (lambda done, total, note: None)
     total = steps * len(todo)
     if workers > 1:
-        for done, (run, outcome) in enumerate(outcomes(work, todo, min(workers, len(todo))), start=1):
+        found = outcomes(work, todo, min(workers, len(todo)), group=_apart)
+        for done, (run, outcome) in enumerate(found, start=1):
             report(done * steps, total, f"{done}/{len(todo)} runs, last {label(run)}")
             yield run, outcome
         return
-    for done, run in enumerate(todo):
-        def tick(k: int, _: int, before: int = done * steps, run: tuple = run) -> None:
-            report(before + k, total, label(run))
+    apart: dict[str, Worker] = {}
+    try:
+        for done, run in enumerate(todo):
+            def tick(k: int, _: int, before: int = done * steps, run: tuple = run) -> None:
+                report(before + k, total, label(run))
 
-        yield run, attempt(partial(work, progress=tick), run)
+            if name := _apart(run):
+                tick(0, steps)
+                if name not in apart or not apart[name].alive:
+                    apart[name] = Worker(work)
+                apart[name].hand(run)
+                yield run, apart[name].receive()
+            else:
+                yield run, attempt(partial(work, progress=tick), run)
+    finally:
+        for worker in apart.values():
+            worker.terminate()
+            worker.close()
+
+
+def _apart(run: tuple) -> str:
+    """The controller of the user's own, which has a process to itself, "" for others; run: (controller, ...), or with a
+    field of that name."""
+    name = getattr(run, "controller", run[0])
+    return name if registry.runs_apart(name) else ""
 
 
 def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -> None:
@@ -128,11 +157,12 @@ def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -
 
 def draw_accumulations(
     folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory], *, seed: int | None = None,
-    title: str | None = None,
+    title: str | None = None, outflow: OutflowOf | None = None,
 ) -> None:
     """Total and regional accumulation over time, as png files in `folder`.
 
-    seed: shown instead of the mean over seeds; title: above both pictures.
+    seed: shown instead of the mean over seeds; title: above both pictures; outflow: what left every region of a run,
+    where it was measured; else that of the regional model, of runs on it.
     """
     drawing = plots.figure(8.0, 4.6)
     ax = plots.total_accumulation(drawing.subplots(), trajectories, seed)
@@ -140,9 +170,10 @@ def draw_accumulations(
     plots.legend_below(drawing, [ax], columns=6)
     plots.save(drawing, folder / "total_accumulation.png")
     network = scenario.network
+    outflow = remembered(outflow or model_outflow(network))
     drawing, axes = plots.panels(network.regions)
     for region, ax in enumerate(axes):
-        plots.region_accumulation(ax, network, region, trajectories, seed)
+        plots.region_accumulation(ax, network, region, trajectories, seed, outflow)
     drawing.suptitle(title, fontsize="medium")
     plots.legend_below(drawing, axes, columns=3)
     plots.save(drawing, folder / "region_accumulation.png")
@@ -173,8 +204,8 @@ def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
 
 
 def interval(values: Sequence[float]) -> float:
-    """Half of the 95 % interval of the mean of `values` (Student's t); NaN of a single one."""
-    if len(values) < 2:
+    """Half of the 95 % interval of the mean of `values` (Student's t); NaN of a single one, or where one is NaN."""
+    if len(values) < 2 or any(map(math.isnan, values)):
         return math.nan
     return float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
 
@@ -185,6 +216,7 @@ def summary_table(rows: Sequence[Mapping]) -> str:
     for row in rows:
         groups.setdefault(row["controller"], []).append(row)
     tts = {name: [row["total_time_spent_veh_s"] for row in group] for name, group in groups.items()}
+    against = compared_with(tts) if tts else REFERENCE
     with_bound = any(name in tts for name in ("bound-pc", "bound-pcrg"))
     lines = []
     for name, group in groups.items():
@@ -192,9 +224,7 @@ def summary_table(rows: Sequence[Mapping]) -> str:
             return statistics.fmean(row[column] for row in group)
 
         spread = interval(tts[name])
-        change = ""
-        if REFERENCE in tts and name != REFERENCE:
-            change = _percent(tts[name], tts[REFERENCE])
+        change = _percent(tts[name], tts[against]) if name != against else ""
         bound = "bound-pcrg" if "-pcrg" in name else "bound-pc"
         above = _percent(tts[name], tts[bound]) if bound in tts and name != bound else ""
         lines.append({
@@ -208,12 +238,13 @@ def summary_table(rows: Sequence[Mapping]) -> str:
             "step [ms]": f"{mean('control_step_ms_median'):.3g} / "
                          f"{max(row['control_step_ms_max'] for row in group):.3g}",
             **{heading: sum(row[column] for row in group) for column, (heading, _) in COUNTED.items()}})
-    return text_table(lines, CAPTION + BOUND_CAPTION * with_bound)
+    return text_table(lines, CAPTION.format(against=against) + BOUND_CAPTION * with_bound)
 
 
 def _percent(values: Sequence[float], reference: Sequence[float]) -> str:
-    """How far the mean of `values` is above that of `reference`, like +1.7 %."""
-    return f"{100 * (statistics.fmean(values) / statistics.fmean(reference) - 1):+.1f} %"
+    """How far the mean of `values` is above that of `reference`, like +1.7 %; - where that is 0."""
+    change = percent_change(statistics.fmean(values), statistics.fmean(reference))
+    return "-" if math.isnan(change) else f"{change:+.1f} %"
 
 
 def _scientific(value: float, digits: int = 4) -> str:

@@ -23,9 +23,10 @@ from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import atomic
+from nmfd.studies.traffic_states import LOOKS, OutflowOf, draw_strips, states
 from nmfd.types import Trajectory
 
-# Colours that stay apart for colour-blind readers and on the green band and the red zone.
+# Colours that stay apart for colour-blind readers and on coloured zones.
 CONTROLLER_COLOURS = {
     "no-control": "#333333", "pi-gating": "#e69f00", "mpc-pc": "#56b4e9", "mpc-pcrg": "#0059a8",
     "dpc-pc": "#e377c2", "dpc-pcrg": "#882255", "dpc-pc-robust": "#b07aa1", "dpc-pcrg-robust": "#d62d20",
@@ -41,11 +42,13 @@ OTHER_COLOURS = ("#17becf", "#5254a3", "#843c39", "#66c2a5", "#bc80bd", "#1b5e20
 PLANT_LABELS = {"nmfd": "regional model", "acyclic": "acyclic model", "sumo": "SUMO", "estimate": "estimate"}
 LINE_STYLES = ("-", "--", ":", "-.")
 GREEN, RED = "#2ca02c", "#d62728"
-ZONES = (  # of a region's accumulation: label, colour, opacity
-    ("within 10 % of maximum outflow", GREEN, 0.22),
-    ("congested, up to the jam accumulation", RED, 0.13),
+ZONES = (  # of a curve without samples: label, colour, opacity
+    ("within 10 % of the curve's maximum", GREEN, 0.22),
+    ("less outflow, up to the jam accumulation", RED, 0.13),
     ("beyond the jam accumulation", RED, 0.30),
 )
+CRITICAL, UNSEEN = "critical accumulation of the model", "beyond all samples: a guess"
+LAST = (CRITICAL, UNSEEN, *(look[0] for look in LOOKS.values()), *(zone[0] for zone in ZONES))  # in legends
 
 
 def colour(controller: str) -> str:
@@ -88,9 +91,9 @@ def panels(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def legend_below(drawing: Figure, axes: Sequence[Axes], columns: int = 4) -> None:
-    """One legend for all `axes`, below them, in as many `columns` as fit; every label once, zones last."""
+    """One legend for all `axes`, below them, in as many `columns` as fit; every label once, LAST last."""
     entries = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    entries |= {label: entries.pop(label) for label, _, _ in ZONES if label in entries}
+    entries |= {label: entries.pop(label) for label in LAST if label in entries}
     for number in range(min(columns, len(entries)), 0, -1):
         legend = drawing.legend(
             entries.values(), entries.keys(), loc="outside lower center", ncols=number, frameon=False)
@@ -116,34 +119,61 @@ def total_accumulation(ax: Axes, trajectories: Sequence[Trajectory], seed: int |
 
 def region_accumulation(
     ax: Axes, network: RegionalModel, region: int, trajectories: Sequence[Trajectory], seed: int | None = None,
+    outflow: OutflowOf | None = None,
 ) -> Axes:
-    """Accumulation of one region over time, over its green band (within 10 % of maximum outflow) and red zone.
+    """Accumulation of one region over time, and the critical one of the model; above, a strip per curve in the colours
+    of the states that the region was in (traffic_states).
 
-    seed: shown instead of the mean over seeds.
-
-    The red zone is what lies between the green band and the jam accumulation, and darker beyond it. Trajectories of
-    several plants, such as the microsimulation and the regional model, share the controller's colour and differ in
-    line style.
+    seed: shown instead of the mean over seeds; the strips show it or, without one, the first seed. outflow: what left
+    every region of a run (T, R) [veh/s], of which the states are told; None, or where it gives None: no strip.
+    Trajectories of several plants, such as the microsimulation and the regional model, share the controller's colour
+    and differ in line style; the marks of strips are hollow for all but the first plant.
     """
     mfd = network.mfds[region]
     highest = max((t.accumulation[:, region].sum(axis=1).max() for t in trajectories), default=0.0)
-    top = 1.06 * max(highest, 1.25 * optimal_band(mfd)[1])
-    _zones(ax.axhspan, mfd, top)
+    ax.hlines(mfd.critical, 0.0, 1.0, transform=ax.get_yaxis_transform(), color="0.35", linewidth=1.0, linestyle=":",
+              label=CRITICAL, zorder=1)
     _curves(ax, trajectories, lambda t: t.accumulation[:, region].sum(axis=1), seed)
+    left = _strips(ax, mfd, region, trajectories, seed, outflow)
     ax.set_ylabel("accumulation [veh]")
-    ax.set_ylim(0.0, top)
+    top = 1.06 * max(highest, 1.25 * mfd.critical)
+    ax.set_ylim(0.0, top / left)
+    ax.set_yticks([tick for tick in ax.get_yticks() if 0.0 <= tick <= top])  # none beside the strips
     ax.set_title(_region_title(network, region), fontsize="medium")
     return ax
 
 
-def region_estimate(ax: Axes, network: RegionalModel, region: int, trajectory: Trajectory) -> Axes:
+def _strips(
+    ax: Axes, mfd: Mfd, region: int, trajectories: Sequence[Trajectory], seed: int | None, outflow: OutflowOf | None,
+) -> float:
+    """The strips of a region; returns the share of `ax` below them."""
+    chosen: dict[tuple[str, str], Trajectory] = {}
+    for t in sorted(trajectories, key=lambda t: t.seed != seed):  # stable: the first where none has the seed
+        chosen.setdefault((t.controller, t.plant), t)
+    known = {key: out for key, t in chosen.items() if (out := outflow(t) if outflow else None) is not None}
+    shown = [chosen[key] for key in known]
+    if not shown:
+        return 1.0
+    found = states(mfd, shown[0].step, [t.accumulation[:, region].sum(axis=1) for t in shown],
+                   [out[:, region] for out in known.values()])
+    tones = colours([t.controller for t in trajectories])
+    time = [time_axis(ax, t.step * np.arange(len(t.accumulation))) for t in shown]
+    return draw_strips(
+        ax, time, found, [tones[t.controller] for t in shown], [t.plant != trajectories[0].plant for t in shown])
+
+
+def region_estimate(
+    ax: Axes, network: RegionalModel, region: int, trajectory: Trajectory, outflow: OutflowOf | None = None,
+) -> Axes:
     """Accumulation of one region over time, and the estimate of it that the controller saw."""
     estimate = replace(trajectory, accumulation=trajectory.observed, plant="estimate")
-    return region_accumulation(ax, network, region, [trajectory, estimate])
+    return region_accumulation(
+        ax, network, region, [trajectory, estimate],
+        outflow=lambda t: None if outflow is None or t.plant == "estimate" else outflow(t))
 
 
 def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> Axes:
-    """Outflow against accumulation, over the green band and the red zone.
+    """Outflow against accumulation. Without samples, the curve's own zones; with some, what they do not reach.
 
     samples: label -> (n, 2) of accumulation [veh] and outflow [veh/s], such as {"loading": ..., "unloading": ...}, or
         by controller
@@ -154,7 +184,13 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> 
     right = 1.15 * jam
     if clouds:
         right = min(right, max([1.25 * optimal_band(mfd)[1], *(1.1 * cloud[:, 0].max() for cloud in clouds.values())]))
-    _zones(ax.axvspan, mfd, right)
+    if clouds:  # which tell what flows themselves
+        seen = max(cloud[:, 0].max() for cloud in clouds.values())
+        ax.axvspan(seen, max(right, seen), facecolor="none", edgecolor="0.75", hatch="///", linewidth=0, label=UNSEEN)
+        ax.vlines(mfd.critical, 0.0, 1.0, transform=ax.get_xaxis_transform(), color="0.35", linewidth=1.0,
+                  linestyle=":", label=CRITICAL, zorder=1)
+    else:
+        _zones(ax, mfd, right)
     for (label, cloud), tone in zip(clouds.items(), _tones(len(clouds)), strict=True):
         tone = (CONTROLLER_COLOURS | CITY_COLOURS).get(label, tone)
         ax.scatter(cloud[:, 0], cloud[:, 1], s=7, color=tone, alpha=0.6, linewidths=0, label=label)
@@ -264,13 +300,12 @@ def _curves(
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def _zones(span: Callable, mfd: Mfd, top: float) -> None:
-    """Draw the ZONES between accumulation 0 and `top` with `span`, which is ax.axhspan or ax.axvspan."""
-    low, high = optimal_band(mfd)
-    limits = (low, high, mfd.jam, max(top, mfd.jam))
+def _zones(ax: Axes, mfd: Mfd, right: float) -> None:
+    """Draw the ZONES between accumulation 0 and `right`."""
+    limits = (*optimal_band(mfd), mfd.jam, max(right, mfd.jam))
     for (label, tone, opacity), begin, end in zip(ZONES, limits[:-1], limits[1:], strict=True):
-        if begin < top:
-            span(begin, min(end, top), color=tone, alpha=opacity, linewidth=0, label=label)
+        if begin < right:
+            ax.axvspan(begin, min(end, right), color=tone, alpha=opacity, linewidth=0, label=label)
 
 
 def time_axis(ax: Axes, seconds: np.ndarray) -> np.ndarray:

@@ -53,7 +53,8 @@ def training_curves(ax: Axes, rows: Sequence[Mapping]) -> Axes:
                 label=f"{method}, mean and range of {len(best)} seed{'s' * (len(best) > 1)}")
         ax.fill_between(steps, best.min(axis=0), best.max(axis=0), color=METHOD_COLOURS[method], alpha=0.2, linewidth=0)
     ax.set_xscale("log")  # most is gained early
-    ax.set_yscale("log")
+    if any(row["total_time_spent_veh_s"] > 0 for row in rows):
+        ax.set_yscale("log")
     ax.xaxis.set_major_formatter(ScalarFormatter())
     ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.xaxis.set_minor_locator(NullLocator())

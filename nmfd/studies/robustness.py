@@ -4,6 +4,7 @@ Every controller is made for the nominal scenario (MPC has its forecast, the pol
 perturbed demand; its improvement is over no control in the same perturbed scenario.
 """
 
+import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -12,7 +13,7 @@ from typing import NamedTuple
 
 from nmfd import closed_loop
 from nmfd.controllers import registry
-from nmfd.metrics import summary
+from nmfd.metrics import percent_change, summary
 from nmfd.model.demand_noise import perturbed
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
@@ -64,7 +65,7 @@ def robustness(
     """
     policies, names = policies or {}, [REFERENCE, *(name for name in controllers if name != REFERENCE)]
     for name in names:
-        registry.make(name, scenario, policy=policies.get(name))
+        registry.verify(name, scenario, policy=policies.get(name))
     common, settings = configuration(scenario, names, plant, policies)
     wanted = [Run(sigma, number, name) for sigma in sigmas for number in range(scenarios) for name in names]
     file, failures = out / "robustness.csv", []
@@ -107,7 +108,7 @@ def improvements(rows: Sequence[Mapping], controller: str) -> dict[float, tuple[
     gains: dict[float, list[float]] = {}
     for row in rows:
         if row["controller"] == controller and _run(row)[:2] in reference:
-            gain = 100.0 * (1.0 - row["total_time_spent_veh_s"] / reference[_run(row)[:2]])
+            gain = -percent_change(row["total_time_spent_veh_s"], reference[_run(row)[:2]])
             gains.setdefault(row["sigma_veh_per_s"], []).append(gain)
     return {sigma: (statistics.fmean(values), interval(values)) for sigma, values in sorted(gains.items())}
 
@@ -145,5 +146,6 @@ def improvement_table(rows: Sequence[Mapping]) -> str:
     lines = [["trips", *(f"{total:,.0f}" for total in count.values())]]
     for name in compared(rows):
         gains = improvements(rows, name)
-        lines.append([name, *("{:.1f} ± {:.1f}".format(*gains[s]) if s in gains else "-" for s in count)])
+        defined = {s for s in gains if not math.isnan(gains[s][0])}
+        lines.append([name, *("{:.1f} ± {:.1f}".format(*gains[s]) if s in defined else "-" for s in count)])
     return text_columns(["sigma", *(f"{sigma:g}" for sigma in count)], lines, CAPTION)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nmfd.controllers.dpc.policy import Policy, load_policy
+from nmfd.controllers.dpc.policy import Policy, load_policy, read_policy_file
 from nmfd.errors import InputError, RunFailed
 from nmfd.extras import need
 from nmfd.model.planning import PlanningModel, planning_model
@@ -53,12 +53,10 @@ def export(policy_file: Path, out: Path, scenario_folder: Path | None = None) ->
 
 def _planning(policy_file: Path, folder: Path | None) -> tuple[PlanningModel, dict]:
     """The planning model that the policy was trained on, and the checkpoint."""
+    content = read_policy_file(policy_file)
     try:
-        content = torch.load(policy_file, map_location="cpu", weights_only=True)
         name = str(content["configuration"].get("controller", ""))
-    except FileNotFoundError:
-        raise InputError(f"{policy_file}: no such policy; train one with 'nmfd train'") from None
-    except Exception:
+    except (LookupError, TypeError, AttributeError):
         raise InputError(f"{policy_file}: is not a policy file; train one with 'nmfd train'") from None
     if folder is None and not (policy_file.parent / "scenario.toml").is_file():
         raise InputError(f"{policy_file}: lies in no scenario's folder; say for which it was trained with --scenario")

@@ -1,12 +1,14 @@
 """The options of DPC policies, declared: how they are trained, and how one goes on learning while it drives."""
 
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import model_validator
 
 from nmfd.controllers.options import Options
-from nmfd.model.planning import PlanningModel
 from nmfd.runs.config import Flow, Problem, Share, setting, whole
+
+if TYPE_CHECKING:
+    from nmfd.model.planning import PlanningModel
 
 MOST_STEPS = 10**7
 WIDEST, DEEPEST = 10_000, 100  # units per layer, layers: of a policy that fits into memory
@@ -61,7 +63,7 @@ class Training(Options):
             raise Problem("from_gating", "a policy cannot begin as both, a gate and no control; omit one")
         return self
 
-    def misfit(self, planning: PlanningModel) -> Problem | None:
+    def misfit(self, planning: "PlanningModel") -> Problem | None:
         """A gate without a region to protect."""
         if not self.from_gating or planning.protected:
             return None

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from nmfd.controllers.dpc.options import DEEPEST, WIDEST, Activation
 from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
+from nmfd.runs.files import check_file
 from nmfd.tensors import PerPair, PerTurn
 from nmfd.types import Controls, Observation, Status
 
@@ -191,17 +193,26 @@ def checkpoint(policy: Policy, network: RegionalModel, configuration: Mapping, s
         "weights": {key: value.detach().cpu().clone() for key, value in policy.state_dict().items()}}
 
 
-def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
-    """The policy in `path` and its whole checkpoint. InputError if it is none, or was trained for another network.
-
-    No code of the file is executed (weights_only).
-    """
+def read_file(path: Path, missing: str, damaged: str) -> Any:
+    """What torch wrote to `path`, on the CPU; InputError in these words. No code of the file is executed."""
+    check_file(path, "train one with 'nmfd train'")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
-        raise InputError(f"{path}: no such policy; train one with 'nmfd train'") from None
+        raise InputError(f"{path}: {missing}") from None
     except Exception:
-        raise InputError(f"{path}: is not a policy file; train one with 'nmfd train'") from None
+        raise InputError(f"{path}: {damaged}") from None
+
+
+def read_policy_file(path: Path) -> Any:
+    """The checkpoint in `path`, unchecked. InputError if there is none."""
+    return read_file(
+        path, "no such policy; train one with 'nmfd train'", "is not a policy file; train one with 'nmfd train'")
+
+
+def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
+    """The policy in `path` and its whole checkpoint. InputError if it is none, or was trained for another network."""
+    content = read_policy_file(path)
     try:
         if content["format"] != FORMAT:
             raise InputError(f"{path}: format: expected {FORMAT}, got {content['format']!r} instead; train it again")
@@ -220,6 +231,16 @@ def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
             raise
         raise InputError(f"{path}: is damaged or of another version; train it again with 'nmfd train'") from None
     return policy, content
+
+
+def outside_training(content: Mapping, level: float) -> str:
+    """What to say of a run at `level` times the demand, outside of what the policy of this checkpoint was trained on;
+    "" within it."""
+    low, high = (content["configuration"].get(key, 1.0) for key in ("demand_low", "demand_high"))
+    if low - 1e-9 <= level <= high + 1e-9:
+        return ""
+    trained = f"{low:g} times" if low == high else f"{low:g} to {high:g} times"
+    return f"demand times {level:g} is outside of what the policy was trained on, {trained} that of the scenario"
 
 
 def check_guidance(policy: Policy, path: Path, guidance: bool) -> None:

@@ -6,6 +6,7 @@ validation on the scenario itself is kept. The same seed gives the same weights.
 
 import io
 import math
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,12 @@ from jaxtyping import Float
 
 from nmfd.controllers.dpc import fallback
 from nmfd.controllers.dpc.options import TRAINED, Training
-from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
+from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint, read_file
 from nmfd.controllers.dpc.rollout import Rollout, compiled_step
 from nmfd.controllers.options import options
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError, RunFailed
+from nmfd.model.authority import NO_GATEWAY
 from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
@@ -53,6 +55,26 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
     return chosen if steps is None else chosen.changed(steps=steps)
 
 
+def check(scenario: Scenario, controller: str) -> RegionalModel:
+    """The regional model on which `controller` is trained. InputError where training would be for nothing: no gateway
+    of the city can be controlled, or the MFDs are placeholders that no run has measured."""
+    city, believed = scenario.network, planning_model(scenario, controller).network
+    if city.controllable is not None and not city.controllable.any():
+        raise InputError(
+            f"{_file(city)}: controllable: is 0 at every boundary: {NO_GATEWAY}; --anyway trains {controller} all the "
+            "same")
+    if believed.placeholder:
+        raise InputError(
+            f"{_file(believed)}: placeholder: is true: its MFDs are guesses from lanes and speed limits, and a policy "
+            f"would learn these; run 'cosim identify {os.path.dirname(_file(city)) or 'NETWORK'}' first, or set it to "
+            f"false once you have put in MFDs of your own; --anyway trains {controller} all the same")
+    return believed
+
+
+def _file(network: RegionalModel) -> str:
+    return network.name if network.folder is None else os.path.normpath(network.folder / "network.toml")
+
+
 def available(device: str) -> str:
     """"cpu" or "cuda", with "auto" the GPU where there is one. InputError for a GPU that is not there."""
     if device == "cuda" and not torch.cuda.is_available():
@@ -60,82 +82,84 @@ def available(device: str) -> str:
     return "cuda" if device == "auto" and torch.cuda.is_available() else device.replace("auto", "cpu")
 
 
-@one_thread()
 def train(
     scenario: Scenario, controller: str, *, seed: int, out: Path, steps: int | None = None, resume: bool = False,
-    device: str = "cpu", compiled: bool = False, progress: Callable[[int, int, str], None] | None = None,
-    log: Callable[[int, float], None] | None = None,
+    device: str = "cpu", compiled: bool = False, anyway: bool = False,
+    progress: Callable[[int, int, str], None] | None = None, log: Callable[[int, float], None] | None = None,
 ) -> Path:
     """Train `controller`, one that `settings` knows, on the regional model and write the policy to `out`.
 
     `out` holds the best policy so far after every validation; `out`.resume beside it holds what `resume` needs and
     goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done, TTS)` after
     every validation. `compiled` makes a step about twice as fast, after up to a minute or two of compilation; the
-    weights differ by rounding.
+    weights differ by rounding. `anyway`: even where `check` refuses.
     """
-    chosen = settings(scenario, controller, steps)
-    planning = planning_model(scenario, controller)
-    configuration = {
-        "controller": controller, "scenario": planning.name, "seed": seed, "compiled": compiled, **vars(chosen)}
-    torch.manual_seed(seed)
-    generator = torch.Generator().manual_seed(seed)
-    guidance = NAMES[controller.partition("+")[0]]
-    architecture = Architecture(
-        width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=guidance)
-    policy = Policy(planning.network, architecture)
-    if chosen.from_no_control:
-        begin_as_no_control(policy, planning.network)
-    policy = policy.to(device)
-    rollout = Rollout(planning, device=device, detour_cost=chosen.detour_cost)
-    if chosen.from_gating and not resume:
-        begin_as_gate(policy, rollout, generator)
-    advance = compiled_step(rollout.step) if compiled else rollout.step
-    optimizer = torch.optim.Adam(policy.parameters(), lr=chosen.learning_rate)
-    first, best, history = 0, float("inf"), list[list[float]]()
-    state_file = out.with_name(out.name + ".resume")
-    with locked(out.with_name(f".{out.name}.lock"), out):
-        sweep(out.parent, {out.stem, state_file.stem})
-        if resume:
-            first, best, history = _restore(state_file, configuration, policy, optimizer, generator)
-        for step in range(first, chosen.steps):
-            for group in optimizer.param_groups:
-                cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
-                group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
-            rollout.draw_model(chosen.batch, chosen.mfd_spread, generator, chosen.mfd_scale)
-            x, demand = rollout.random_start(
-                chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
-            demand = rollout.perturb(
-                demand, torch.rand(chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
-            # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
-            loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
-            optimizer.zero_grad()
-            loss.backward()
-            if architecture.guidance and chosen.alternating:
-                # Not by requires_grad, which would compile the step once for each decoder.
-                for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
-                    weights.grad = None
-            torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
-            optimizer.step()
-            last = step + 1 == chosen.steps
-            if (step + 1) % VALIDATE_EVERY == 0 or last:
-                score = validate(policy, rollout, seed, chosen)
-                history.append([step + 1, math.exp(loss.item()), score])
-                if log:
-                    log(step + 1, score)
-                if score < best:
-                    best = score
-                    states = fallback.statistics(visited(policy, rollout, chosen, seed))
-                    _write(checkpoint(
-                        policy, planning.network, {**configuration, "validation_veh_s": best}, states), out)
-                if not last:
-                    _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
-            if progress:
-                progress(step + 1, chosen.steps, f"best {best:.4g} veh s")
-        if not math.isfinite(best):
-            raise RunFailed(
-                f"{controller}: every validation of {chosen.steps} steps diverged; lower the learning rate")
-        state_file.unlink(missing_ok=True)
-    return out
+    with one_thread():
+        chosen = settings(scenario, controller, steps)
+        if not anyway:
+            check(scenario, controller)
+        planning = planning_model(scenario, controller)
+        configuration = {
+            "controller": controller, "scenario": planning.name, "seed": seed, "compiled": compiled, **vars(chosen)}
+        torch.manual_seed(seed)
+        generator = torch.Generator().manual_seed(seed)
+        guidance = NAMES[controller.partition("+")[0]]
+        architecture = Architecture(
+            width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=guidance)
+        policy = Policy(planning.network, architecture)
+        if chosen.from_no_control:
+            begin_as_no_control(policy, planning.network)
+        policy = policy.to(device)
+        rollout = Rollout(planning, device=device, detour_cost=chosen.detour_cost)
+        if chosen.from_gating and not resume:
+            begin_as_gate(policy, rollout, generator)
+        advance = compiled_step(rollout.step) if compiled else rollout.step
+        optimizer = torch.optim.Adam(policy.parameters(), lr=chosen.learning_rate)
+        first, best, history = 0, float("inf"), list[list[float]]()
+        state_file = out.with_name(out.name + ".resume")
+        with locked(out.with_name(f".{out.name}.lock"), out):
+            sweep(out.parent, {out.stem, state_file.stem})
+            if resume:
+                first, best, history = _restore(state_file, configuration, policy, optimizer, generator)
+            for step in range(first, chosen.steps):
+                for group in optimizer.param_groups:
+                    cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
+                    group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
+                rollout.draw_model(chosen.batch, chosen.mfd_spread, generator, chosen.mfd_scale)
+                x, demand = rollout.random_start(
+                    chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
+                demand = rollout.perturb(
+                    demand, torch.rand(chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
+                # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
+                loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
+                optimizer.zero_grad()
+                loss.backward()
+                if architecture.guidance and chosen.alternating:
+                    # Not by requires_grad, which would compile the step once for each decoder.
+                    for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
+                        weights.grad = None
+                torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+                optimizer.step()
+                last = step + 1 == chosen.steps
+                if (step + 1) % VALIDATE_EVERY == 0 or last:
+                    score = validate(policy, rollout, seed, chosen)
+                    history.append([step + 1, math.exp(loss.item()), score])
+                    if log:
+                        log(step + 1, score)
+                    if score < best:
+                        best = score
+                        states = fallback.statistics(visited(policy, rollout, chosen, seed))
+                        _write(checkpoint(
+                            policy, planning.network, {**configuration, "validation_veh_s": best}, states), out)
+                    if not last:
+                        _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
+                if progress:
+                    progress(step + 1, chosen.steps, f"best {best:.4g} veh s")
+            if not math.isfinite(best):
+                raise RunFailed(
+                    f"{controller}: every validation of {chosen.steps} steps diverged; lower the learning rate")
+            state_file.unlink(missing_ok=True)
+        return out
 
 
 def begin_as_no_control(policy: Policy, network: RegionalModel) -> None:
@@ -150,9 +174,10 @@ def begin_as_no_control(policy: Policy, network: RegionalModel) -> None:
 
 
 def begin_as_gate(policy: Policy, rollout: Rollout, generator: torch.Generator) -> None:
-    """Let `policy` close the entries of every protected region as this fills, half at the set point of pi-gating."""
-    network, protected = rollout.planning.network, list(rollout.planning.protected)
-    set_point = torch.tensor(PiGating(rollout.planning).set_point, dtype=rollout.dtype, device=rollout.device)
+    """Let `policy` close the entries of every region that pi-gating holds as this fills, half at its set point."""
+    network, gate = rollout.planning.network, PiGating(rollout.planning)
+    protected = gate.regions.tolist()
+    set_point = torch.tensor(gate.set_point, dtype=rollout.dtype, device=rollout.device)
     counts = rollout.parameters.adjacency.expand(GATE_BATCH, -1, -1)
     optimizer = torch.optim.Adam(policy.parameters(), lr=GATE_RATE)
     for _ in range(GATE_STEPS):
@@ -215,12 +240,8 @@ def _restore(
     state_file: Path, configuration: Mapping[str, Any], policy: Policy, optimizer: torch.optim.Optimizer,
     generator: torch.Generator,
 ) -> tuple[int, float, list[list[float]]]:
-    try:
-        state = torch.load(state_file, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise InputError(f"{state_file}: nothing to resume; train without --resume") from None
-    except Exception:
-        raise InputError(f"{state_file}: is damaged; remove it and train without --resume") from None
+    state = read_file(
+        state_file, "nothing to resume; train without --resume", "is damaged; remove it and train without --resume")
     try:
         there = dict(state["configuration"])
         for key, value in configuration.items():

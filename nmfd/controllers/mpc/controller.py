@@ -7,6 +7,7 @@ in a simplex and acts linearly on the model, so that nearly all of them end at a
 gradients, while an interior-point method factorises the whole horizon some twenty times.
 """
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -18,7 +19,7 @@ from nmfd.arrays import PerPair, PerTurn
 from nmfd.controllers.mpc import edge_model
 from nmfd.controllers.mpc.edge_model import Decision, Demands, PerCell, Plan, Turns
 from nmfd.controllers.mpc.ipopt import Ipopt
-from nmfd.controllers.mpc.projected_gradient import AT_REST, Minimum, minimise
+from nmfd.controllers.mpc.projected_gradient import AT_REST, TIME_LIMIT, Late, Minimum, minimise
 from nmfd.controllers.options import Options, options
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.model.planning import PlanningModel
@@ -32,6 +33,7 @@ ROUNDING = 0.005    # of the smallest jam accumulation: over which the solver se
 TOLERANCE = 1e-6
 ACCEPTABLE = 1e-5
 FAILED = Status.SOLVER_FAILURE | Status.FALLBACK
+IN_TIME = 0.9       # share of the deadline that the solver has; the rest is for what becomes of its plan
 FEW = 5.0           # veh: added to the vehicles that a control decides on, where these scale the solver's steps
 
 
@@ -44,8 +46,8 @@ class Mpc(Options):
         "projected-gradient")
     max_iterations: int = whole("of the solver, per decision", 1000)
     time_limit: float | None = setting(
-        "deadline of the solver, per decision; without one, the control interval: a later answer is of no use", None,
-        unit="s", gt=0.0)
+        "deadline of a decision; without one, the control interval: a later answer is of no use. What is later all the "
+        "same is late in the books", None, unit="s", gt=0.0)
 
 
 class Admissible:
@@ -149,11 +151,12 @@ class EconomicMpc:
         self.admissible = Admissible(network, self._model, guidance=guidance)
         self._open = self.admissible.open(self._moves)
         self._gating = PiGating(planning) if planning.protected else None
+        self.deadline = self.options.time_limit or planning.step  # s, per decision
         self._ipopt = None
         if self.options.solver == "ipopt":
             self._ipopt = Ipopt(
                 planning, guidance=guidance, horizon=horizon, iterations=self.options.max_iterations,
-                seconds=self.options.time_limit or planning.step)
+                seconds=IN_TIME * self.deadline)
         self.fault: str | None = None  # injected (nmfd.faults)
         self.reset()
 
@@ -162,12 +165,15 @@ class EconomicMpc:
         self._gates = False  # PI gating is in control
 
     def act(self, observation: Observation) -> Controls:
+        deadline = time.perf_counter() + IN_TIME * self.deadline
         start, demand = self.forecast(observation)
         last = np.concatenate([self._plan[1:], self._plan[-1:]]) if self._left else self._open
-        if self._left and self._exact(start, demand, self._open)[0] < self._exact(start, demand, last)[0]:
-            last = self._open
         try:
-            found = self._solve(start, demand, last)
+            if self._left and self._cheaper(self._open, last, start, demand, deadline):
+                last = self._open
+            found = self._solve(start, demand, last, deadline)
+        except Late:
+            return self._without(observation, last, TIME_LIMIT)
         except (ArithmeticError, ValueError, RuntimeError) as error:  # of NumPy and SciPy, LinAlgError too
             return self._without(observation, last, f"solver failed ({type(error).__name__})")
         known = np.isfinite(found.gap)
@@ -177,6 +183,11 @@ class EconomicMpc:
         self._plan, self._left, self._gates = found.point, self._moves - 1, False
         return self._first() if reason is None else self._first(
             Status.SOLVER_FAILURE, f"{reason}: best plan so far used")
+
+    def _cheaper(self, plan: Plan, than: Plan, start: PerCell, demand: Demands, deadline: float) -> bool:
+        """Whether `plan` costs less, by the exact model. Raises Late."""
+        return self._exact(start, demand, plan, deadline=deadline)[0] < self._exact(
+            start, demand, than, deadline=deadline)[0]
 
     def _without(self, observation: Observation, last: Plan, reason: str) -> Controls:
         """The controls of an interval for which no plan was found."""
@@ -212,19 +223,23 @@ class EconomicMpc:
         start = np.maximum(observation.accumulation, 0.0)[:, self._used].ravel()
         return start, demand[:, :, self._used].reshape(horizon, -1)
 
-    def _solve(self, start: PerCell, demand: Demands, plan: Plan) -> Minimum:
-        """The best plan found from `plan` (moves, E + V); its value, in vehicles, is that of the rounded model."""
+    def _solve(self, start: PerCell, demand: Demands, plan: Plan, deadline: float) -> Minimum:
+        """The best plan found from `plan` (moves, E + V); its value, in vehicles, is that of the rounded model.
+
+        deadline: by time.perf_counter [s]. Raises Late.
+        """
         if self.fault == "solver-fails":
             raise FloatingPointError("ordered")
         if self.fault == "solver-late":
-            return Minimum(point=plan, value=np.inf, gap=np.inf, evaluations=0, reason="time limit")
-        objective = _diverging if self.fault == "solver-diverges" else partial(self._rounded, start, demand)
+            return Minimum(point=plan, value=np.inf, gap=np.inf, evaluations=0, reason=TIME_LIMIT)
+        objective = _diverging if self.fault == "solver-diverges" else partial(
+            self._rounded, start, demand, deadline=deadline)
         if self._ipopt is not None and self.fault is None:
             return self._by_ipopt(self._ipopt, start, demand)
         return minimise(
             objective, self.admissible.project, self.admissible.gap, plan,
-            metric=(self._affected(start, demand, plan) + FEW) ** 2, tolerance=TOLERANCE,
-            iterations=self.options.max_iterations, seconds=self.options.time_limit or self._step)
+            metric=(self._affected(start, demand, plan, deadline=deadline) + FEW) ** 2, tolerance=TOLERANCE,
+            iterations=self.options.max_iterations, seconds=deadline - time.perf_counter())
 
     def _by_ipopt(self, solver: Ipopt, start: PerCell, demand: Demands) -> Minimum:
         """The plan of IPOPT, made admissible: it keeps to bounds and sums up to its tolerance only."""

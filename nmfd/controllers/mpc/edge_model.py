@@ -6,12 +6,15 @@ and destinations in use are listed, so that a plane city costs R^2 and not R^3. 
 cost of two more rollouts.
 """
 
+import math
+import time
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nmfd.arrays import PerRegion
+from nmfd.controllers.mpc.projected_gradient import Late
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 # Weights of the slopes of an explicit Runge-Kutta scheme, and where each slope but the first is taken, in steps along
@@ -195,17 +198,19 @@ def pull_advance(
 
 def vehicle_steps(
     model: Turns, start: PerCell, demand: Demands, plan: Plan, step: float, *, substeps: int = 1,
-    integrator: str = "euler", gradient: bool = False,
+    integrator: str = "euler", gradient: bool = False, deadline: float = math.inf,
 ) -> tuple[float, Plan | None]:
     """Vehicles in the network, summed over the ends of H control intervals of `step` [s], and its gradient.
 
     start: (C,) [veh]; demand: (H, C) [veh/s]
     plan: (K, E + V) [-], u of the edges and theta of the turns in every interval; the last stays in force
-    The gradient (K, E + V) is None unless asked for.
+    deadline: by time.perf_counter [s]
+    The gradient (K, E + V) is None unless asked for. Raises Late.
     """
     interval, edges = _intervals(plan, len(demand), substeps), len(model.edges)
     x, total, tape = start, 0.0, []
     for node, k in enumerate(interval):
+        _look(deadline)
         x, records = advance(
             model, x, demand[node // substeps], plan[k, :edges], plan[k, edges:], step / substeps, integrator)
         if gradient:
@@ -216,6 +221,7 @@ def vehicle_steps(
         return total, None
     of_plan, adjoint = np.zeros_like(plan), np.zeros_like(x)
     for node, k in reversed(list(enumerate(interval))):
+        _look(deadline)
         if (node + 1) % substeps == 0:
             adjoint = adjoint + 1.0
         adjoint, of_decision = pull_advance(
@@ -226,7 +232,7 @@ def vehicle_steps(
 
 def affected_vehicles(
     model: Turns, start: PerCell, demand: Demands, plan: Plan, step: float, *, substeps: int = 1,
-    integrator: str = "euler",
+    integrator: str = "euler", deadline: float = math.inf,
 ) -> Plan:
     """How many vehicles every number of the plan decides on (K, E + V) [veh]; arguments as in `vehicle_steps`.
 
@@ -236,12 +242,18 @@ def affected_vehicles(
     x, leaving = start, np.zeros((len(plan), len(model.turns)))
     wish = np.zeros((len(plan), edges))
     for node, k in enumerate(_intervals(plan, len(demand), substeps)):
+        _look(deadline)
         x, records = advance(
             model, x, demand[node // substeps], plan[k, :edges], plan[k, edges:], step / substeps, integrator)
         now = step / substeps * records[0][1][model.source]
         leaving[k] += now
         wish[k] += np.bincount(model.edge, plan[k, edges:] * now, edges)
     return np.concatenate([wish, leaving], axis=1)
+
+
+def _look(deadline: float) -> None:
+    if time.perf_counter() > deadline:
+        raise Late
 
 
 def _intervals(plan: Plan, horizon: int, substeps: int) -> Int[np.ndarray, " N"]:

@@ -15,6 +15,11 @@ SUFFICIENT = 1e-4       # of the decrease that the slope promises
 SHORTEST = 1e-10        # of a step, below which the line search gives up
 LONGEST = 1e10          # spectral step length
 AT_REST = "no further descent"
+TIME_LIMIT = "time limit"
+
+
+class Late(Exception):
+    """The deadline came in the middle of one evaluation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +45,8 @@ def minimise(
 ) -> Minimum:
     """Descend from the admissible `start` until gap <= tolerance * |value|.
 
-    function: point -> value and gradient
+    function: point -> value and gradient; it may raise Late
+    seconds: from now on; the clock is looked at after every evaluation, in the line search, too
     project: the nearest admissible point
     gap: (point, gradient) -> the most by which any admissible point is lower on the linear model (Frank-Wolfe)
     metric: weights of the squared length of a step, about in proportion to the second derivatives; the nearest point
@@ -48,32 +54,43 @@ def minimise(
     """
     deadline = time.perf_counter() + seconds
     point = start
-    value, gradient = function(point)
+    try:
+        value, gradient = function(point)
+    except Late:
+        return Minimum(point=start, value=np.inf, gap=np.inf, evaluations=1, reason=TIME_LIMIT)
     if not (np.isfinite(value) and np.isfinite(gradient).all()):
         return Minimum(point=start, value=value, gap=np.inf, evaluations=1, reason="not a number")
     recent, evaluations = deque([value], MEMORY), 1
     length = 1.0 / max(np.abs(gradient / metric).max(initial=0.0), 1.0 / LONGEST)
     best, least = (point, np.inf), np.inf
+
+    def stopped(reason: str) -> Minimum:
+        return Minimum(point=best[0], value=best[1], gap=least, evaluations=evaluations, reason=reason)
+
     for iteration in range(iterations + 1):
         if (now := gap(point, gradient)) <= tolerance * abs(value):
             return Minimum(point=point, value=value, gap=now, evaluations=evaluations, reason=None)
         least = min(least, now)
         if value < best[1]:
             best = point, value
-        reason = "iteration limit" if iteration == iterations else "time limit"
+        reason = "iteration limit" if iteration == iterations else TIME_LIMIT
         if iteration == iterations or time.perf_counter() > deadline:
             break
         direction = project(point - length * gradient / metric) - point
         slope, share, limit = float((gradient * direction).sum()), 1.0, max(recent)
         while True:
             other = point + share * direction
-            other_value, other_gradient = function(other)
             evaluations += 1
+            try:
+                other_value, other_gradient = function(other)
+            except Late:
+                return stopped(TIME_LIMIT)
             if other_value <= limit + SUFFICIENT * share * slope:
                 break
+            if time.perf_counter() > deadline:
+                return stopped(TIME_LIMIT)
             if share < SHORTEST:
-                return Minimum(
-                    point=best[0], value=best[1], gap=least, evaluations=evaluations, reason=AT_REST)
+                return stopped(AT_REST)
             lowest = -0.5 * share**2 * slope / (other_value - value - share * slope)  # of the parabola through both
             share = lowest if 0.1 * share <= lowest <= 0.5 * share else 0.5 * share
         moved, turned = other - point, other_gradient - gradient
@@ -81,4 +98,4 @@ def minimise(
         length = min(float((metric * moved**2).sum()) / curvature if curvature > 0 else 4.0 * length, LONGEST)
         point, value, gradient = other, other_value, other_gradient
         recent.append(value)
-    return Minimum(point=best[0], value=best[1], gap=least, evaluations=evaluations, reason=reason)
+    return stopped(reason)

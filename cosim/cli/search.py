@@ -1,0 +1,120 @@
+"""The commands tune and frontier of `cosim`: what many runs are searched for.
+
+Heavy modules are imported inside them: help takes 0.1 s instead of 3 s.
+"""
+
+from pathlib import Path
+
+import click
+
+from cosim.cli.options import CONTROLLER, CONTROLLER_HELP, tell
+from nmfd.cli.declared import declared
+from nmfd.cli.options import (
+    POLICIES,
+    SCENARIO,
+    STEPS,
+    controller_names,
+    controllers_option,
+    out_option,
+    policy_files,
+)
+from nmfd.cli.progress import resumable
+from nmfd.errors import InputError, RunFailed
+from nmfd.runs.files import file_name
+from nmfd.runs.workers import cores
+
+
+@click.command()
+@SCENARIO
+@CONTROLLER
+@click.option("--option", "knobs", required=True, multiple=True, metavar="KEY=LOW:HIGH",
+              help="An option of the controller and the range that is searched; KEY[0], KEY[1], ... for the numbers of "
+                   "a list. May be repeated, up to 20 numbers. One with which a policy is trained trains one for "
+                   "every candidate.")
+@declared("cosim.evaluation.settings:Search", "candidates", "seeds", "first_seed", "demand", "search_seed")
+@declared("cosim.evaluation.settings:Search", "population", instead="the rule of CMA-ES")
+@declared("cosim.evaluation.settings:Search", "workers", instead="one per core")
+@click.option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster that does the runs (as of cosim sweep).")
+@STEPS
+@out_option("tune", "The folder.")
+def tune(
+    scenario: Path, controller: str, knobs: tuple[str, ...], candidates: int, seeds: int, first_seed: int,
+    demand: tuple[float, ...], search_seed: int, population: int | None, workers: int | None, scheduler: str | None,
+    steps: int | None, out: Path | None,
+) -> None:
+    """Search for the options of a controller that do best in the microsimulation, by CMA-ES.
+
+    Candidates are compared by the geometric mean of the total time spent over seeds and demand levels. Writes
+    tune.csv and tune.toml, the best options as scenario.toml takes them. The same command goes on where it was
+    interrupted, and with more --candidates from where it ended.
+
+    \b
+    Examples:
+      cosim tune scenarios/grid7_peak --controller pi-gating --option kp=0.1:10 --option ki=0.001:0.1
+      cosim tune scenarios/grid7_peak --controller pi-gating+guided+max-pressure --demand 1,1.6 \\
+          --option set_point[0]=250:600 --option kp=0.1:10 --option ki=0.001:0.1 --candidates 60
+      cosim tune scenarios/grid7_peak --controller dpc-pcrg+max-pressure --option mfd_scale=0.6:1 \\
+          --option mfd_spread=0:0.5
+    """
+    from cosim.evaluation import tuning  # heavy
+
+    if scheduler is not None and workers is not None:
+        raise InputError("--workers: is for processes here, and --scheduler has workers of its own; omit one")
+    order = tuning.Tuning(
+        scenario=scenario, controller=controller, knobs=tuple(tuning.knob(text) for text in knobs),
+        candidates=candidates, seeds=range(first_seed, first_seed + seeds),
+        levels=demand, search_seed=search_seed, population=population, steps=steps,
+        out=Path("runs") / f"{file_name(scenario.name)}-tune" if out is None else out)
+    with resumable("tune", order.out, "tune.csv") as progress:
+        table = tuning.tune(
+            order, workers=cores() if workers is None else workers, scheduler=scheduler, progress=progress, tell=tell)
+    click.echo(tuning.text(order, table))
+    click.echo(f"Written to {order.out}: see tune.toml and tune.csv")
+
+
+@click.command()
+@SCENARIO
+@controllers_option("Separated by commas. " + CONTROLLER_HELP)
+@declared("cosim.evaluation.settings:Range", "demand", "seeds", "first_seed")
+@click.option("--everything", is_flag=True,
+              help="Run every controller at every level, also beyond one at which it served all trips with no seed.")
+@POLICIES
+@declared("cosim.evaluation.settings:Range", "workers", instead="one per core")
+@STEPS
+@out_option("frontier", "The folder.")
+def frontier(
+    scenario: Path, controllers: str, demand: tuple[float, ...], seeds: int, first_seed: int, everything: bool,
+    policies: tuple[str, ...], workers: int | None, steps: int | None, out: Path | None,
+) -> None:
+    """Find up to which demand every controller serves all trips: a picture, frontier.png, and a table.
+
+    A controller that serves all trips with none of the seeds of a demand level is not run at higher ones. The runs lie
+    as those of cosim evaluate, which finds them there; every one is kept as soon as it is finished.
+
+    \b
+    Example:
+      cosim frontier scenarios/grid7_peak --controllers max-pressure,pi-gating+guided+max-pressure --seeds 5
+    """
+    from cosim.plant.strategy import parse  # heavy
+
+    names = controller_names(controllers, parse)
+    files = policy_files(policies, names)
+
+    from cosim.evaluation import evaluate  # heavy
+    from cosim.evaluation import frontier as method
+    from cosim.report import frontier as picture
+    from nmfd.api import load_scenario
+
+    order = evaluate.Evaluation(
+        scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
+        levels=demand, steps=steps, policies=files,
+        out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-frontier" if out is None else out)
+    with resumable("frontier", order.out) as progress:
+        table, failures = method.frontier(
+            order, everything=everything, workers=cores() if workers is None else workers, progress=progress,
+            tell=tell)
+        picture.draw(order.out / "frontier.png", table)
+    click.echo(method.text(table))
+    click.echo(f"Written to {order.out}: see frontier.png and frontier.md")
+    if failures:
+        raise RunFailed(f"{len(failures)} runs failed, and the same command tries them again: {'; '.join(failures)}")

@@ -1,0 +1,182 @@
+"""A fit that explains nothing says so, and predictions stand beside the one that nothing changes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import tiny
+from commands import error_line, good, nmfd
+
+from cosim.evaluation import fit_quality, model_validation, prediction_error
+from cosim.evaluation.fit_quality import MEANINGS, fit_table, prediction_table, region_fits, write_fits
+from cosim.report import html
+from nmfd.api import load_scenario, train
+from nmfd.errors import InputError
+from nmfd.model import identification
+from nmfd.model.authority import Boundaries, verdict
+from nmfd.model.identification import Observed
+from nmfd.model.mfd import Mfd
+from nmfd.model.model_file import network_toml
+from nmfd.model.regional_model import load_network
+
+
+@pytest.fixture
+def network(tmp_path):
+    tiny.write(tmp_path, network=tiny.row_network(3))
+    return load_network(tmp_path / "network")
+
+
+def cloud(x, outflow):
+    return {"loading": np.column_stack([x, outflow]).astype(float), "unloading": np.empty((0, 2))}
+
+
+def doubts(network, samples, most=2.0, seeds=2):
+    state = np.repeat(np.diag([most * mfd.critical for mfd in network.mfds])[None], 3, axis=0)
+    return [fit.doubts for fit in region_fits(network, samples, [state], seeds)]
+
+
+def test_good_fits_have_no_warning_and_bad_ones_say_what_is_wrong(network):
+    random, curve = np.random.default_rng(0), network.mfds[0]
+    x = random.uniform(1.0, 1000.0, 200)
+    good_one = cloud(x, curve.outflow(x) + random.normal(0.0, 0.01, 200))
+    noise = cloud(x, random.uniform(0.0, 1.0, 200))
+    few = cloud(x[:3], x[:3])
+    assert doubts(network, [good_one] * 3) == [()] * 3
+    bad = doubts(network, [good_one, noise, few])
+    assert bad[0] == () and bad[1][0].startswith("R2 ") and bad[2] == ("few samples (3)",)
+    assert doubts(network, [good_one] * 3, most=0.4)[0] == ("not reached (40 % of critical)",)
+    assert doubts(network, [good_one] * 3, seeds=1)[2] == ("one seed",)
+    assert doubts(network, [cloud(x, np.ones(200))] * 3)[0] == ("R2 nan",)
+    endless = replace(network, mfds=(Mfd(a=0.0, b=-1e-6, c=0.004, jam=1000.0), *network.mfds[1:]))
+    assert doubts(endless, [cloud(x, endless.mfds[0].outflow(x))] * 3)[0] == (
+        "no falling branch (jam 1000, critical 1000 veh)",)
+
+
+def test_warnings_are_in_the_table_the_files_and_the_network(network, tmp_path):
+    fits = region_fits(network, [cloud([1.0], [1.0])] * 3, seeds=1)
+    table = fit_table(network, [cloud([1.0], [1.0])] * 3, fits)
+    assert "WARNINGS" in table.splitlines()[0] and table.count("few samples (1); not reached (0 % of critical)") == 3
+    for kind in ("few samples", "not reached", "one seed"):
+        assert f"WARNING, {kind}: " in table and kind in MEANINGS
+    write_fits(tmp_path / "fit.csv", fits, None)
+    rows = pd.read_csv(tmp_path / "fit.csv")
+    assert rows["doubts"].str.endswith("one seed").all() and rows["held_out_ahead_model_rmse_share"].isna().all()
+    doubted = replace(network, doubts=tuple(fit.doubts for fit in fits), placeholder=True,
+                      controllable=np.where(network.adjacency, 0.25, 0.0))
+    (tmp_path / "again").mkdir()
+    (tmp_path / "again" / "network.toml").write_text(network_toml(doubted, {}, "a test"))
+    again = load_network(tmp_path / "again")
+    assert again.doubts == doubted.doubts and again.placeholder and again.hash == network.hash
+    np.testing.assert_array_equal(again.controllable, doubted.controllable)
+
+
+def observed(network, states):
+    steps, r = len(states) - 1, network.regions
+    return Observed(
+        accumulation=states, demand=np.zeros((steps, r, r)), perimeter=np.zeros((steps, r, r)),
+        splits=np.zeros((steps, r, r, r)), crossings=np.zeros((steps, r, r)))
+
+
+def test_persistence_is_what_it_says(network):
+    """A region that gains 10 vehicles in every interval: 10 after one, 40 after four."""
+    state = np.zeros((9, 3, 3))
+    state[:, 0, 0] = 10.0 * np.arange(9)
+    run, critical = observed(network, state), network.mfds[0].critical
+    shares = identification.persistence_shares(network, [run, run], (1, 4))
+    assert shares[:, 0] * critical == pytest.approx([10.0, 40.0]) and (shares[:, 1:] == 0.0).all()
+    table = prediction_table(network, [run], {"step": 30.0, "substeps": 1, "integrator": "euler"})
+    assert table.splitlines()[0].count("if nothing changed") == 2
+    assert f"{100 * shares[0, 0]:.1f} %" in table.splitlines()[1]
+
+
+def test_every_table_of_predictions_has_persistence():
+    assert {"next_interval_persistence_rmse_share", "ahead_persistence_rmse_share"} <= set(prediction_error.COLUMNS)
+    assert {"persistence_rmse_veh", "next_interval_persistence_rmse_veh"} <= set(model_validation.COLUMNS)
+    still = np.full((3, 2), 0.25)[:2]
+    one = prediction_error.ModelError(
+        demand=1.0, controller="x", runs=1, model=None, critical=np.ones(2), most=np.ones(2), ahead=900.0,
+        errors=0.5 * still, persistence=still)
+    line = prediction_error.foresight_table([one]).splitlines()
+    assert line[0].count("if nothing changed") == 2 and line[1].count("25.0 %") == 2
+    simulated = np.array([0.0, 3.0, 3.0])
+    row = model_validation._row(0, "a", 10.0, simulated, np.zeros(3), np.zeros(2))
+    assert row["persistence_rmse_veh"] == pytest.approx(np.sqrt(6.0))
+    assert row["next_interval_persistence_rmse_veh"] == pytest.approx(np.sqrt(4.5))
+    assert model_validation.error_table(pd.DataFrame([row])).splitlines()[0].count("if nothing changed") == 2
+
+
+def crossing(flow, share):
+    flow = np.array(flow, dtype=float)
+    gateways = (flow >= 0).astype(int) - np.eye(len(flow), dtype=int)
+    return Boundaries(flow=flow, controlled=share * flow, gateways=gateways,
+                      controllable=gateways * int(share > 0))
+
+
+FLOW = [[0, 300, 0], [100, 0, 100], [0, 300, 0]]
+
+
+@pytest.mark.parametrize("most, started, share, answer", [
+    ((0.5, 0.9, 0.2), (10, 10, 10), 1.0, "No: no region is ever critical, region 1 comes nearest with 0.90"),
+    ((0.5, 1.9, 0.2), (10, 10, 10), 0.0, "No: no gateway has a signal"),
+    ((0.5, 1.9, 0.2), (10, 600, 10), 1.0, "It may: region 1 becomes critical, and gateways could hold 50 %"),
+    ((0.5, 1.9, 0.2), (10, 5400, 10), 1.0, "Hardly: regions become critical, but gateways could hold no more than 10"),
+    ((0.5, 1.9, 0.2), (10, 600, 10), 0.06, "No: regions become critical, but gateways could hold no more than 3 %"),
+    (None, None, 1.0, "Unknown: nothing was simulated"),
+])
+def test_the_verdict_has_reasons_and_numbers(network, most, started, share, answer):
+    most, started = (None if part is None else np.array(part, dtype=float) for part in (most, started))
+    found = verdict(network, crossing(FLOW, share), most=most, started=started, where="in 2 runs")
+    assert found.answer.startswith(f"Can perimeter control help? {answer}"), found.answer
+    text = found.text()
+    assert f"{100 * share:.0f} % of the 800 crossings in 2 runs" in text or most is None
+    table = text.partition("\n\n")[2].splitlines()
+    assert table[-1].split()[:3] == ["all", "all", "800"] and len(table) == 2 + (crossing(FLOW, 1.0).gateways > 0).sum()
+
+
+def test_nobody_crosses(network):
+    found = verdict(network, crossing(np.zeros((3, 3)), 1.0), most=np.ones(3), started=np.ones(3), where="in 1 run")
+    assert "No: nobody crosses" in found.answer or "no gateway" in found.answer
+
+
+TRAIN = ("--controller", "dpc-pc", "--steps", 1, "--no-compile", "--out")
+
+
+@pytest.mark.parametrize("line, named", [
+    ('placeholder = true\n\n[perimeter]', ("placeholder: is true", "cosim identify")),
+    ('CONTROLLABLE', ("controllable: is 0 at every boundary", "route guidance")),
+])
+def test_nothing_is_trained_where_it_cannot_help(tmp_path, line, named):
+    text = tiny.row_network()
+    text = (text.replace("[perimeter]", line) if "placeholder" in line else
+            text.replace("adjacent = [1]", "adjacent = [1]\ncontrollable = [0.0]").replace(
+                "adjacent = [0]", "adjacent = [0]\ncontrollable = [0.0]"))
+    scenario = tiny.write(tmp_path, network=text)
+    said = error_line(nmfd("train", scenario, *TRAIN, tmp_path / "p.pt"), "nmfd")
+    assert "network.toml" in said and all(part in said for part in (*named, "--anyway"))
+    assert not (tmp_path / "p.pt").exists()
+    with pytest.raises(InputError, match=named[0]):
+        train(scenario, "dpc-pc", out=tmp_path / "p.pt", steps=1)
+    with pytest.raises(InputError, match=named[0]):
+        train(scenario, "dpc-pcrg", out=tmp_path / "p.pt", steps=1)
+    good(nmfd("train", scenario, *TRAIN, tmp_path / "p.pt", "--anyway"))
+    assert (tmp_path / "p.pt").exists()
+
+
+def test_training_on_a_doubtful_model_says_so(tmp_path):
+    text = tiny.row_network().replace("adjacent = [1]", 'adjacent = [1]\ndoubts = ["R2 -0.50", "one seed"]')
+    result = nmfd("train", tiny.write(tmp_path, network=text), *TRAIN, tmp_path / "p.pt")
+    assert result.exit_code == 0 and "region 0 is doubtful: R2 -0.50; one seed" in result.stderr
+
+
+def test_the_page_tells_doubts_and_verdict(tmp_path):
+    from types import SimpleNamespace
+
+    text = tiny.row_network().replace("adjacent = [1]", 'adjacent = [1]\ndoubts = ["R2 -0.50"]')
+    scenario = load_scenario(tiny.write(tmp_path, network=text))
+    (tmp_path / "network" / "verdict.txt").write_text("Can perimeter control help? No: x.\nOf 3 gateways.\n\nfrom to\n")
+    run = SimpleNamespace(scenario=scenario, rows=pd.DataFrame({"controller": ["no-control"]}))
+    lines = html._models(run)
+    assert "is doubtful in region 0: R2 -0.50." in lines[0] and lines[-2:] == [
+        "Can perimeter control help? No: x.", "Of 3 gateways."]
+    assert any(line.startswith("WARNING, R2: ") for line in lines) and fit_quality.meanings([]) == []

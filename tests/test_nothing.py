@@ -1,0 +1,62 @@
+"""Nobody drives: no demand, or runs too short for anybody to spend time. Percentages are then not defined, and every
+table, picture and sentence says so."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+import tiny
+from commands import good, nmfd
+from made_up import rows_of
+
+from cosim.evaluation import explain, statistics
+from cosim.evaluation.experiment import overview_table
+from cosim.report import pictures, summary_text
+from nmfd.api import load_scenario
+from nmfd.studies.benchmark import interval
+
+
+@pytest.fixture
+def rows() -> pd.DataFrame:
+    return rows_of({
+        (level, name): {1: 0.0, 2: time} for level in (1.0, 1.3)
+        for name, time in (("no-control", 0.0), ("pi-gating", 0.0), ("mpc-pc", 5.0))})
+
+
+@pytest.mark.parametrize("command", [
+    "benchmark scenario --controllers no-control,pi-gating,mpc-pcrg --seeds 2 --out out",
+    "robustness scenario --controllers pi-gating --scenarios 2 --out out",
+    "ablation horizon scenario --horizons 2,3 --out out", "show scenario --out out",
+    "bound scenario --controller bound-pc --iterations 1 --out plan.npz"])
+def test_commands_without_demand(tmp_path, monkeypatch, command):
+    tiny.write(tmp_path, scenario=tiny.SCENARIO.replace("peak = 2.0", "peak = 0.0"))
+    monkeypatch.chdir(tmp_path)
+    said = good(nmfd(*command.split()))
+    assert "nan" not in said and "inf" not in said, said
+
+
+def test_tables(rows, tmp_path):
+    assert math.isnan(statistics.paired({1: 0.0, 2: 3.0}, {1: 0.0, 2: 2.0}).percent)
+    assert math.isnan(interval([math.nan, 1.0, 2.0]))
+    table = statistics.write_tables(tmp_path, rows, "pi-gating")
+    assert table["change_percent"].isna().all() and not table["change_excludes_zero"].astype(bool).any()
+    text = statistics.text(table, "pi-gating")
+    assert "nan" not in text and "inf" not in text and text.splitlines()[3].split()[:6] == [
+        "pi-gating", "2", "0.000e+00", "±", "0.0e+00", "-"]
+    facts = rows[rows["demand"] == 1.0].assign(trips=0.0, overhead_share=0.5)
+    assert "nan" not in overview_table(facts)
+
+
+@pytest.mark.filterwarnings("ignore:Mean of empty slice", "ignore:invalid value encountered")
+def test_sentences_and_pictures(rows, tmp_path):
+    one = rows[rows["demand"] == 1.0].assign(trips=0, completed_veh=0.0, teleports=0)
+    words = " ".join([summary_text.head(one), *summary_text.details(one)])
+    assert "a change in percent is not defined" in words and "nan" not in words
+    assert pictures.ranked(one)[-1] == "mpc-pc"
+    pictures.demand_levels(tmp_path / "levels.png", rows)
+    assert not (tmp_path / "levels.png").exists()
+    network = load_scenario(tiny.write(tmp_path)).network
+    found = explain.load(network, [], [])
+    line = explain.verdict(one, 1.0, "pi-gating", found, 0.0, explain.ControlActivity(held=0.0, guided=0.0), network)
+    assert "not told in percent" in line and "nan" not in line and np.isfinite(one["seed"]).all()

@@ -1,0 +1,176 @@
+"""Signals that SUMO actuates: held back and rationed, with yellow and minimum green; untouched elsewhere."""
+
+from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+import tiny_city
+from commands import cosim
+from signal_rules import MIN_GREEN, check
+
+from cosim.plant.plant import SumoPlant
+from cosim.plant.settings import settings
+from nmfd.api import load_scenario
+from nmfd.model.scenario import with_faults
+from nmfd.types import Controls
+
+CONFIG = """<configuration>
+  <input><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></input><time><end value="450"/></time>
+</configuration>"""
+CARS = """<routes>
+  <flow id="east" begin="0" end="450" period="3" from="A1B1" to="C1D1"/>
+  <flow id="west" begin="0" end="450" period="4" from="D2C2" to="B2A2"/>
+  <flow id="down" begin="0" end="450" period="5" from="B3B2" to="B1B0"/>
+  <flow id="up" begin="0" end="450" period="6" from="C0C1" to="C2C3"/>
+</routes>"""
+
+
+def imported(folder, name, *options, signals):
+    """The scenario of a city of two regions, left and right."""
+    folder.mkdir()
+    tiny_city.network(folder, *signals)
+    (folder / "cars.rou.xml").write_text(CARS)
+    (folder / "city.sumocfg").write_text(CONFIG)
+    done = cosim("import", folder / "city.sumocfg", "--regions", 2, "--method", "geometric", "--no-run", "--out",
+                 folder / "networks" / name, *options)
+    assert done.exit_code == 0, done.output + str(done.exception)
+    return folder / "scenarios" / name
+
+
+@pytest.fixture(scope="module", params=("actuated", "delay_based"))
+def town(request, tmp_path_factory):
+    """The kind of all signals, and the scenario."""
+    return request.param, imported(
+        tmp_path_factory.mktemp("town") / request.param, "town",
+        signals=("--tls.set", "B1,B2,C1,C2", "--tls.default-type", request.param))
+
+
+@pytest.fixture(scope="module")
+def opened(town):
+    """A run with open gates, in which SUMO does all by itself."""
+    return drive(town[1], [0.9] * 4)
+
+
+def drive(folder, gates, faults=(), **overrides):
+    """A run under u = gates[k] in interval k: what every signal shows second by second, and more."""
+    scenario = with_faults(replace(load_scenario(folder), steps=len(gates)), faults)
+    plant = SumoPlant(scenario, overrides=settings(scenario).changed(**overrides))
+    try:
+        plant.reset(1)
+        session, shown, step = plant.session, {}, plant.session.step
+        plans = {name: session.programme(name) for name in session.signals()}
+        plans |= {signal.id: signal for signal in plant.simple_signals}
+
+        def watch():
+            step()
+            for name in plans:
+                shown.setdefault(name, []).append(session.signal_state(name))
+
+        session.step = watch
+        for gate in gates:
+            plant.step(Controls(perimeter=np.where(scenario.network.adjacency, gate, 0.0), splits=None))
+        return SimpleNamespace(
+            shown=shown, plans=plans, record=plant.record(), leaks=plant.leaks(), gateways=plant.city.gateways,
+            programmes={name: session.programme_id(name) for name in plans})
+    finally:
+        plant.close()
+
+
+def rules(run):
+    """Yellow, minimum green and conflicts, of all signals."""
+    for name, states in run.shown.items():
+        check(states, [(phase.state, phase.duration) for phase in run.plans[name].phases])
+
+
+def test_gateways_of_actuated_signals_are_controlled(town):
+    """The table tells them from fixed ones and from missing ones."""
+    kind, scenario = town
+    gateways = pd.read_csv(scenario.parents[1] / "networks" / "town" / "gateways.csv", keep_default_na=False)
+    assert set(zip(gateways.control, gateways.kind, strict=True)) == {("controlled", kind), ("no signal", "")}
+
+
+def test_held_back_safely(town, opened):
+    """Less flow at u_min, and the minimum green; never red without yellow; given back to SUMO afterwards."""
+    run = drive(town[1], [0.1, 0.1, 0.5, 0.9, 0.9, 0.9])
+    rules(run)
+    assert run.leaks and all(gateway.signal is None for gateway in run.leaks)
+    reached = ~np.isnan(run.record.gateway_green[0])
+    green, free = run.record.gateway_green[:, reached], opened.record.gateway_green[:, reached]
+    assert (green[1] <= MIN_GREEN + 1.0).all() and (free[1] > 2 * MIN_GREEN).all()
+    assert (green[2] > MIN_GREEN + 1.0).any() and (green[-1] > 2 * MIN_GREEN).all()
+    assert run.record.gateway_flow[1].sum() < 0.5 * opened.record.gateway_flow[1].sum()
+    assert set(run.programmes.values()) == {"0"}  # not "online", as signals that are told their states
+
+
+def test_open_gates_leave_sumo_s_own_signals_to_the_byte(town, opened):
+    """As if no gateway signal could be held."""
+    rules(opened)
+    alone = drive(town[1], [0.9] * 4, leave_signals=tuple(opened.plans))
+    assert opened.shown == alone.shown and (opened.record.edge_vehicles == alone.record.edge_vehicles).all()
+    assert np.isnan(alone.record.gateway_green).all() and not np.isnan(opened.record.gateway_green).all()
+
+
+@pytest.mark.parametrize("signals", ["max-pressure", "max-pressure-cyclic"])
+def test_rationed_under_max_pressure(town, signals, opened):
+    """Max-pressure runs their stages, and closed gateways let less through."""
+    run = drive(town[1], [0.1] * 3, signals=signals)
+    rules(run)
+    assert run.record.gateway_flow[1:3].sum() < 0.6 * opened.record.gateway_flow[1:3].sum()
+    assert all(gateway.signal is None for gateway in run.leaks)
+
+
+def test_a_deaf_signal_runs_its_own_programme_and_can_be_held_again(town):
+    """Green to red by way of yellow all the time."""
+    run = drive(town[1], [0.1, 0.1, 0.1], faults=("signal:B2@1-2",))
+    assert not any(a in "Gg" and b == "r" for before, after in pairwise(run.shown["B2"])
+                   for a, b in zip(before, after, strict=True))
+    green = run.record.gateway_green[:, [n for n, g in enumerate(run.gateways) if g.signal == "B2"]]
+    held = ~np.isnan(green[0])
+    assert (green[[0, 2]][:, held] <= MIN_GREEN + 1.0).all() and (green[1, held] > 2 * MIN_GREEN).all()
+
+
+OWN = """
+import numpy as np
+from nmfd import Controls
+class Mine:
+    def __init__(self, scenario):
+        self.shape = scenario.network.adjacency.shape
+    def reset(self, seed=0):
+        pass
+    def act(self, measurement):
+        return Controls(perimeter=np.full(self.shape, 0.5), splits=None)
+"""
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    """Scenarios: a city in SUMO's queue model, and one without any signal."""
+    folder, made = tmp_path_factory.mktemp("places"), {}
+    for name, signals, options in (
+            ("queues", ("--tls.set", "B1,B2"), ("--mesoscopic",)),
+            ("bare", ("--default-junction-type", "priority"), ())):
+        made[name] = imported(folder / name, name, *options, signals=signals)
+    return made
+
+
+@pytest.mark.parametrize("command, name, city, said", [
+    ("run", "max-pressure", "queues", "max-pressure counts vehicles lane by lane"),
+    ("sweep", "pi-gating+max-pressure-cyclic", "queues", "max-pressure-cyclic counts vehicles lane by lane"),
+    ("evaluate", "route-guidance+estimate", "queues", "needs loop detectors on lanes"),
+    ("evaluate", "mine.py:Mine+max-pressure", "queues", "counts vehicles lane by lane"),
+    ("run", "webster", "bare", "webster needs fixed-time signals"),
+    ("evaluate", "pi-gating+max-pressure", "bare", "max-pressure needs signals")])
+def test_what_cannot_run_here_is_refused_before_the_first_run(
+        places, tmp_path, monkeypatch, command, name, city, said):
+    """One line that names it, though another strategy comes first; nothing is written."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(OWN)
+    names = ("--controller", "no-control", "--against", name) if command == "run" else (
+        "--controllers", f"no-control,{name}")
+    done = cosim(command, places[city], *names, "--steps", 1, "--out", "out")
+    assert done.exit_code != 0 and len(done.stderr.strip().splitlines()) == 1, done.stderr
+    assert f"controller {name} cannot run here: " in done.stderr and said in done.stderr
+    assert not (tmp_path / "out").exists()
