@@ -12,7 +12,7 @@ import click
 
 from cosim.cli.options import parsed_level
 from nmfd.cli.declared import declared
-from nmfd.cli.options import COUNT, FILE, FOLDER, SCENARIO, SEED, out_option
+from nmfd.cli.options import FILE, FOLDER, SCENARIO, SEED, out_option
 from nmfd.cli.progress import progress_line, resumable
 from nmfd.errors import InputError
 from nmfd.runs import files
@@ -98,7 +98,7 @@ def identify(
 @click.option("--level", default="1", show_default=True, metavar="X|auto",
               help="Times the city's vehicles, or the usual peak; auto: the lowest at which without control a region "
               "comes to its critical accumulation.")
-@click.option("--seeds", type=COUNT, default=3, show_default=True, metavar="N",
+@click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, metavar="N",
               help="Runs without control whose densities are averaged.")
 @declared("cosim.plant.settings:SumoTable", "mesoscopic", is_flag=True)
 @click.option("--begin", metavar="TIME", help="Instead of the sumocfg's, in seconds or as hours:minutes:seconds.")
