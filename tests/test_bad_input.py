@@ -541,6 +541,9 @@ LINES = {
         import {net} --regions 3 --out {out}
         import {net} --regions 3 --out {out} --begin x|nan|inf|1:2
         import {net} --regions 3 --out {out} --demand peak --level 0|nan|x|-1
+        import {net} --regions 3 --out {out} --demand peak --iterations -1|x
+        import {net} --regions 3 --out {out} --demand peak --gap -1|2|x|nan
+        import {net} --regions 3 --out {out} --seeds 0|x
         import {net} --regions 3 --out {out} --method magic
         import {net} --regions 3 --out {out} --no-run
         import {net} --edges {none} --out {out} --demand peak

@@ -13,7 +13,6 @@ import pytest
 import tiny_city
 from commands import cosim, error_line, good, nmfd
 
-from cosim.importing import level
 from cosim.importing.case import read_sumo_input
 from cosim.importing.demand import read_traffic
 from cosim.importing.streets import graph, read_streets
@@ -284,27 +283,13 @@ def test_one_clear_line(config, tmp_path, change, expected):
     assert not (tmp_path / "networks").exists() or not list((tmp_path / "networks").iterdir())
 
 
-def test_level_auto_finds_where_it_congests():
-    """Made-up paces: the search ends at the lowest level beyond the limit in the scenario's own model."""
-    asked = []
-
-    def pace(times, mesoscopic):
-        asked.append((times, mesoscopic))
-        return 2.0 + (3.0 if mesoscopic else 2.0) * max(times - 1.0, 0.0)  # 3 from 1.33 on, and from 1.5 on
-
-    assert level.congesting(pace, mesoscopic=True, tell=lambda line: None) == (1.44, True)
-    assert level.congesting(pace, mesoscopic=False, tell=lambda line: None) == (1.73, True)
-    assert asked[-1] == (1.73, False) and (1.44, False) in asked and (1.2, False) not in asked
-    assert level.congesting(lambda *_: 2.0, mesoscopic=True, tell=lambda line: None) == (2.99, False)
-
-
 def test_import_at_a_congested_level(config, tmp_path):
     """The factor reaches the scenario: vehicles, demand and all; mesoscopic too."""
     text = good(cosim("import", config, "--regions", 2, "--method", "geometric", "--mesoscopic", "--level", "auto",
                       "--out", tmp_path / "networks" / "busy"))
     scenario = load_scenario(tmp_path / "scenarios" / "busy")
     assert "level: " in text and settings(scenario).mesoscopic
-    assert f"demand times {scenario.demand_factor:g}" in text
+    assert f"demand times {scenario.demand_factor:g} " in text
     vehicles = read_recorded_trips([scenario.folder / "vehicles.rou.xml.gz"])
     total = scenario.demand.sum() * scenario.step
     assert total == pytest.approx(scenario.demand_factor * len(vehicles.depart), rel=1e-4)

@@ -91,8 +91,15 @@ def identify(
               help="OD matrix between TAZ: tazRelation XML, or VISUM's O- or V-format. May be repeated.")
 @click.option("--zones", type=FILE, multiple=True, metavar="FILE", help="The TAZ of --od, if not in the sumocfg.")
 @click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak, for a city without demand.")
+@click.option("--iterations", type=click.IntRange(min=0), default=20, show_default=True, metavar="N",
+              help="Of the assignment of that peak, at most; 0: everybody goes as if alone, no basis for comparisons.")
+@click.option("--gap", type=float, default=0.05, show_default=True, metavar="X",
+              help="The relative gap at which the assignment ends.")
 @click.option("--level", default="1", show_default=True, metavar="X|auto",
-              help="Times the city's vehicles, or the usual peak; auto: the lowest that congests without control.")
+              help="Times the city's vehicles, or the usual peak; auto: the lowest at which without control a region "
+              "comes to its critical accumulation.")
+@click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, metavar="N",
+              help="Runs without control whose densities are averaged.")
 @declared("cosim.plant.settings:SumoTable", "mesoscopic", is_flag=True)
 @click.option("--begin", metavar="TIME", help="Instead of the sumocfg's, in seconds or as hours:minutes:seconds.")
 @click.option("--end", metavar="TIME", help="Later departures are left out.")
@@ -102,8 +109,8 @@ def identify(
 def import_(
     source: Path, regions: int | None, out: Path, scenario: Path | None, method: Literal["density", "geometric"],
     edges: Path | None, taz: Path | None, polygons: Path | None, routes: tuple[Path, ...], od: tuple[Path, ...],
-    zones: tuple[Path, ...], demand: str | None, level: str, mesoscopic: bool, begin: str | None, end: str | None,
-    seed: int, no_run: bool, force: bool,
+    zones: tuple[Path, ...], demand: str | None, iterations: int, gap: float, level: str, seeds: int, mesoscopic: bool,
+    begin: str | None, end: str | None, seed: int, no_run: bool, force: bool,
 ) -> None:
     """Turn any SUMO city into a network and a scenario: regions, gateways, demand by pair of regions, map.
 
@@ -116,6 +123,7 @@ def import_(
       cosim import city.net.xml.gz --regions 6 --demand peak --out networks/mycity
       cosim import city.sumocfg --taz districts.taz.xml --out networks/mycity --begin 7:00:00 --end 9:00:00
     """
+    from cosim.importing.assignment import Effort
     from cosim.importing.importer import ImportOptions, import_city, parse_time  # heavy
     from cosim.importing.partition import Clustered, Drawn
 
@@ -127,12 +135,14 @@ def import_(
         raise InputError("--regions: give a number of regions, or else one of --edges, --taz and --polygons")
     if no_run and cuts[0].method == "density":
         raise InputError("--no-run: the densities come from that run; add --method geometric")
+    if not 0.0 <= gap <= 1.0:
+        raise InputError(f"--gap: expected a share from 0 to 1, got {gap:g} instead")
     order = ImportOptions(
         source=source, out=out, cut=cuts[0], seed=seed, run=not no_run, force=force,
         peak=demand is not None, level=parsed_level(level, no_run), mesoscopic=mesoscopic,
         scenario=scenario or out.parent.parent / "scenarios" / out.name,
         begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"), routes=routes, od=od,
-        zones=zones)
+        zones=zones, effort=Effort(iterations=iterations, gap=gap), seeds=seeds)
     with progress_line("import") as progress:
         report = import_city(order, (lambda stage: progress(0, 1, stage)) if progress else lambda stage: None)
     click.echo(report)

@@ -1,10 +1,10 @@
-"""One no-control run of the imported city by SUMO's own program: densities of its streets, and who crossed what."""
+"""No-control runs of the imported city by SUMO's own program: densities of its streets, and who crossed what."""
 
 import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ import sumo
 from jaxtyping import Float
 
 from cosim.importing.streets import Streets
-from cosim.sumo.arrays import EdgeNumbers, PerEdge
+from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.arrays import PerRegion, PerTurn
 from nmfd.errors import InputError
@@ -26,7 +26,7 @@ PEAK = 3          # such intervals, one after the other: those with the most veh
 class Baseline:
     """What a no-control run showed.
 
-    presence: (K, E) [veh s] on every edge during intervals of INTERVAL
+    presence: (K, E) [veh s] on every edge during intervals of INTERVAL; production: (K, E) [veh m] driven there
     ways: the edges that vehicles drove to the end, one after the other, and the last edge of their route, alike ones
         together -> how many
     teleports; waiting: vehicles not inserted at the end; running: on the road at the end
@@ -35,6 +35,7 @@ class Baseline:
     """
 
     presence: Float[np.ndarray, "K E"]
+    production: Float[np.ndarray, "K E"]
     ways: Mapping[tuple[tuple[int, ...], int], int]
     teleports: int
     waiting: int
@@ -50,11 +51,27 @@ class Baseline:
 
     def density(self, streets: Streets) -> PerEdge:
         """(E,) [veh/m of lane] in the quarter of an hour with the most vehicles; 0 on edges without car lanes."""
-        total = self.presence.sum(axis=1)
-        sums = np.convolve(total, np.ones(min(PEAK, len(total))), mode="valid")
-        first = int(np.argmax(sums))
-        mean = self.presence[first : first + PEAK].sum(axis=0) / (INTERVAL * min(PEAK, len(total)))
+        mean = self.peak().mean(axis=0) / INTERVAL
         return np.where(streets.lane_metres > 0, mean / np.maximum(streets.lane_metres, 1.0), 0.0)
+
+    def peak(self) -> Float[np.ndarray, "K E"]:
+        """(up to PEAK, E): `presence` in the quarter of an hour with the most vehicles."""
+        return self.presence[busiest(self.presence)]
+
+    def concentration(self, edges: EdgeMask) -> tuple[int, int]:
+        """(the fewest of some edges that hold half of all vehicles on these, how many edges) when there are most."""
+        return len(self._crowded(edges)), int(edges.sum())
+
+    def pace_of_crowded(self, streets: Streets, edges: EdgeMask) -> float:
+        """Time that vehicles spend on these fewest edges over what it takes at the speed limits [-], when there are
+        most: whether they stand there, or only many pass."""
+        crowded, when = self._crowded(edges), busiest(self.presence[:, edges])
+        driven = self.production[when][:, crowded].sum(axis=0)
+        return float(self.presence[when][:, crowded].sum() / max((driven / streets.speed[crowded]).sum(), 1.0))
+
+    def _crowded(self, edges: EdgeMask) -> np.ndarray:
+        held = np.where(edges, self.presence[busiest(self.presence[:, edges])].sum(axis=0), 0.0)
+        return np.argsort(-held, kind="stable")[:holding_half(held)]
 
     def moves(self) -> Counter[tuple[int, int]]:
         """(edge, next edge) -> vehicles that went from one to the other."""
@@ -86,11 +103,25 @@ class Baseline:
         return np.where(visits > 0, metres / np.maximum(visits, 1.0), np.nan)
 
 
+def busiest(presence: Float[np.ndarray, "K E"]) -> slice:
+    """Those PEAK intervals, one after the other, in which the edges hold most."""
+    total = presence.sum(axis=1)
+    first = int(np.argmax(np.convolve(total, np.ones(min(PEAK, len(total))), mode="valid")))
+    return slice(first, first + PEAK)
+
+
+def holding_half(held: Float[np.ndarray, " E"]) -> int:
+    """The fewest edges that hold half of what all hold; 0 if they hold nothing."""
+    return int(np.searchsorted(np.cumsum(np.sort(held)[::-1]), held.sum() / 2) + 1) if held.sum() > 0 else 0
+
+
 def run_baseline(
     streets: Streets, *, routes: Sequence[Path], additional: Sequence[Path], begin: float, end: float,
-    vehicles: Collection[str] = (), options: Sequence[str] = (),
+    vehicles: Collection[str] = (), options: Sequence[str] = (), seed: int = 0,
+    look: Callable[[Path], None] = lambda edges: None,
 ) -> Baseline:
-    """Simulate without control; vehicles: ids of the demand. Raises InputError with SUMO's own words if it refuses."""
+    """Simulate without control; vehicles: ids of the demand; look: is called with SUMO's edgeData, which goes then.
+    Raises InputError with SUMO's own words if it refuses."""
     # A vehicle that a rerouter gives another route makes SUMO fail when it writes the times of the edges it has left.
     rerouted = any(next(read_xml(path).iter("routeProbReroute"), None) is not None for path in additional)
     with Scratch("cosim-") as folder:
@@ -100,7 +131,7 @@ def run_baseline(
         run_sumo(
             "sumo", "--net-file", file_list([streets.path]), "--route-files", file_list(routes),
             "--additional-files", file_list([*additional, folder / "measure.add.xml"]), "--begin", str(begin),
-            "--end", str(end), "--seed", "0", "--no-step-log", "true", "--no-warnings", "true",
+            "--end", str(end), "--seed", str(seed), "--no-step-log", "true", "--no-warnings", "true",
             "--ignore-route-errors", "true", "--vehroute-output", str(folder / "ways.xml"),
             "--vehroute-output.exit-times", str(not rerouted).lower(), "--vehroute-output.last-route", "true",
             "--vehroute-output.write-unfinished", "true", "--statistic-output", str(folder / "statistic.xml"),
@@ -110,8 +141,10 @@ def run_baseline(
         counts, trips = child(statistic, "vehicles"), child(statistic, "vehicleTripStatistics")
         waiting = int(attribute(counts, "waiting"))
         ways, driven = _ways(folder / "ways.xml", streets)
+        look(edges)
+        presence, production = _measured(edges, streets, begin, end)
         return Baseline(
-            presence=_presence(edges, streets, begin, end), ways=ways,
+            presence=presence, production=production, ways=ways,
             teleports=int(attribute(child(statistic, "teleports"), "total")), waiting=waiting,
             running=int(attribute(counts, "running")), dropped=max(len(set(vehicles) - driven) - waiting, 0),
             delay=float(attribute(trips, "totalDepartDelay"))
@@ -127,16 +160,27 @@ def run_sumo(program: str, *arguments: str, where: str) -> None:
         raise InputError(f"{where}: {program} cannot run it: {' '.join(lines[0].split())}; correct the input")
 
 
-def _presence(path: Path, streets: Streets, begin: float, end: float) -> np.ndarray:
+def averaged(runs: Sequence[Baseline]) -> Baseline:
+    """The first run, with the presence and the production of all on average."""
+    return replace(
+        runs[0], presence=np.mean([run.presence for run in runs], axis=0),
+        production=np.mean([run.production for run in runs], axis=0))
+
+
+def _measured(path: Path, streets: Streets, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
+    """(Baseline.presence, Baseline.production)"""
     presence = np.zeros((max(1, int(np.ceil((end - begin) / INTERVAL))), len(streets.edges)))
+    production = np.zeros_like(presence)
     for _, element in ElementTree.iterparse(path):
         if element.tag == "interval":
             k = int((float(attribute(element, "begin")) - begin) / INTERVAL + 0.5)
             for edge in element:
                 if (n := streets.number.get(attribute(edge, "id"))) is not None and k < len(presence):
-                    presence[k, n] += float(attribute(edge, "sampledSeconds"))
+                    spent = float(attribute(edge, "sampledSeconds"))
+                    presence[k, n] += spent
+                    production[k, n] += spent * float(edge.get("speed", 0.0))
             element.clear()
-    return presence
+    return presence, production
 
 
 def _ways(path: Path, streets: Streets) -> tuple[Counter[tuple[tuple[int, ...], int]], set[str]]:

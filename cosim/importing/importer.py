@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from cosim.importing import level, model, quality, verdict, written
-from cosim.importing.baseline import Baseline, run_baseline
+from cosim.importing.assignment import Assigned, Effort, relative_gap
+from cosim.importing.baseline import Baseline
 from cosim.importing.case import SumoInput, read_sumo_input, seconds
 from cosim.importing.demand import Traffic, read_traffic
-from cosim.importing.generated import morning_peak
-from cosim.importing.partition import Clustered, Drawn, partition
+from cosim.importing.partition import Clustered, Drawn, alternatives, partition
 from cosim.importing.regions import positions
 from cosim.importing.streets import Streets, read_streets
+from cosim.importing.trials import Peaks, Trials, routed
 from cosim.sumo.net import City, load_city
-from cosim.sumo.recorded_trips import MESOSCOPIC, read_recorded_trips, write_recorded_trips
 from cosim.sumo.signals import HELD
 from nmfd.errors import InputError
 from nmfd.model.planning import GUIDED
@@ -26,6 +26,7 @@ from nmfd.runs.files import synced
 from nmfd.runs.scratch import LOCK, Scratch
 
 LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
+STANDING = 2.0  # times as long as at the speed limits: the vehicles on a few streets queue there
 LITTLE = 0.3  # of the flow over the boundaries passes no signal under control: worth a word
 
 
@@ -40,6 +41,8 @@ class ImportOptions:
     mesoscopic: the scenario uses SUMO's queue model
     begin, end [s]: instead of the sumocfg's
     od: matrices between the TAZ of the sumocfg or of `zones`
+    effort: of the assignment of a peak; without a run everybody stays on their way at free flow
+    seeds: runs without control whose densities are averaged
     """
 
     source: Path
@@ -57,6 +60,8 @@ class ImportOptions:
     routes: tuple[Path, ...] = ()
     od: tuple[Path, ...] = ()
     zones: tuple[Path, ...] = ()
+    effort: Effort = Effort()
+    seeds: int = 3
 
 
 def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage: None) -> str:
@@ -70,21 +75,31 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
     order = replace(order, mesoscopic=order.mesoscopic or case.mesoscopic)
     scale = 1.0 if order.peak else case.scale
     traffic = _traffic(case, streets, order)
-    if order.begin is None:
+    if order.begin is None and not order.peak:
         case = model.without_idle(case, traffic)
+    mesoscopic = order.mesoscopic or streets.drivable.sum() > LARGE
+    effort = order.effort if order.run else replace(order.effort, iterations=0)
+    peaks = Peaks(streets, case, traffic, seed=order.seed, effort=effort, mesoscopic=mesoscopic, tell=tell)
+    times, congests = order.level or 1.0, True
+    if order.level is None:
+        times, congests = level.congesting(
+            _probe(order, case, streets, traffic, peaks, scale), mesoscopic=mesoscopic, tell=tell)
+    factor, assigned = scale * times, None
+    if order.peak:
+        factor, (traffic, assigned) = 1.0, peaks.at(times)
     clock = model.clock(case, streets, traffic)
     with _folders(order) as (net_folder, folder):
         files = written.write_traffic(folder, traffic)
-        simulate = _Baselines(streets, case, clock, folder, files, [v.get("id", "") for v in traffic.vehicles])
-        mesoscopic = order.mesoscopic or streets.drivable.sum() > LARGE
-        factor, congests, baseline = 1.0 if order.peak else scale * (order.level or 1.0), True, None
-        if order.level is None:
-            times, congests = level.congesting(
-                lambda times, meso: simulate.run(scale * times, meso).pace(streets), mesoscopic=mesoscopic, tell=tell)
-            factor = scale * times
+        if assigned is not None:
+            written.write_assignment(folder / "assignment.csv", assigned)
+        baseline, gaps = None, []
         if order.run:
-            tell("simulating without control")
-            baseline = simulate.run(factor, mesoscopic)
+            def judge(edges: Path) -> None:
+                if assigned is not None:
+                    gaps.append(relative_gap(streets.path, routed(traffic), edges, begin=clock.begin, seed=order.seed))
+
+            baseline = Trials(streets, case, clock, folder, files).averaged(
+                factor, mesoscopic, order.seeds, tell, judge)
         left = left_alone(streets, traffic)
         tell("partition")
         regions, asked, moved = partition(streets, baseline, order.cut, seed=order.seed, left_alone=left)
@@ -93,7 +108,10 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
         written.write_net(case.net, net_folder / written.NET)
         written.write_table(net_folder / "regions.csv", ("edge", "region"), zip(streets.edges, regions, strict=True))
         city = load_city(net_folder / written.NET, net_folder / "regions.csv", network.regions)
-        found = quality.tables(streets, regions, network.region_names, city, baseline, left)
+        tell("other numbers of regions")
+        others = {} if baseline is None else alternatives(
+            streets, baseline, order.cut, regions, seed=order.seed, left_alone=left)
+        found = quality.tables(streets, regions, network.region_names, city, baseline, left, others)
         judged = verdict.of_import(network, found.gateways, regions, baseline)
         network = replace(network, controllable=judged.boundaries.shares)
         verdict.write_verdict(net_folder, judged)
@@ -106,8 +124,9 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
             network_path=os.path.relpath(order.out, order.scenario).replace(os.sep, "/"),
             protected=_protected(streets, regions, baseline, network), factor=factor, mesoscopic=order.mesoscopic))
         report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
+        report += _demand_lines(order, streets, assigned, baseline, gaps)
         report += "".join(f"\n{sentence}" for sentence in judged.sentences)
-        report += _level_line(order, factor, congests)
+        report += _level_line(order, times if order.peak else factor, congests)
         if moved and isinstance(order.cut, Drawn):
             report += (f"\n{moved:,} streets are in other regions than {order.cut.file.name} says: theirs was in "
                        "several pieces, or could not be reached from the rest")
@@ -125,7 +144,7 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
 
 
 def _traffic(case: SumoInput, streets: Streets, order: ImportOptions) -> Traffic:
-    """The city's own vehicles, or a generated demand beside what else its files hold."""
+    """The city's own vehicles, or what its files hold beside a demand that is to be generated."""
     zones = order.zones
     if order.od and not zones and isinstance(order.cut, Drawn) and order.cut.method == "taz":
         zones = (order.cut.file,)
@@ -140,12 +159,7 @@ def _traffic(case: SumoInput, streets: Streets, order: ImportOptions) -> Traffic
         raise InputError(
             f"--demand: {order.source} has {len(traffic.depart):,} vehicles of its own; omit --demand, or give "
             "the network alone")
-    peak = morning_peak(streets, level=order.level or 1.0, begin=case.begin, seed=order.seed)
-    known = {part.get("id") for element in traffic.shared for part in element.iter("vType")}
-    own = tuple(element for element in peak.shared if element.get("id") not in known)  # a type car of the city will do
-    return replace(
-        peak, background=traffic.background, shared=traffic.shared + own, switched=traffic.switched,
-        notes={**traffic.notes, **peak.notes})
+    return traffic
 
 
 def left_alone(streets: Streets, traffic: Traffic) -> dict[str, str]:
@@ -206,43 +220,63 @@ def _folders(order: ImportOptions) -> Iterator[tuple[Path, Path]]:
                     synced(folder)
 
 
-class _Baselines:
-    """Runs without control at any multiple of the demand; the last one is kept."""
+def _probe(
+    order: ImportOptions, case: SumoInput, streets: Streets, traffic: Traffic, peaks: Peaks, scale: float,
+) -> level.Probe:
+    """Runs of other levels, seen by provisional regions: the user's own, or as many of similar size."""
+    if isinstance(order.cut, Drawn):
+        regions = partition(streets, None, order.cut, seed=order.seed)[0]
+    else:
+        regions = partition(streets, None, replace(order.cut, method="geometric"), seed=order.seed)[0]
 
-    def __init__(self, streets: Streets, case: SumoInput, clock: model.Clock, folder: Path, files: Mapping,
-                 vehicles: Sequence[str]):
-        self._streets, self._clock, self._files, self._vehicles = streets, clock, files, vehicles
-        self._routes, self._background, self._additional = (
-            [folder / name for name in files[key]] for key in ("routes", "background", "additional"))
-        self._options = ["--step-length", f"{model.step_length(case, clock):g}",
-                         "--time-to-teleport", f"{case.time_to_teleport:g}"]
-        self._last: tuple[tuple[float, bool], Baseline] | None = None
+    def probe(times: float, mesoscopic: bool) -> level.Loaded:
+        vehicles, factor = (peaks.at(times)[0], 1.0) if order.peak else (traffic, scale * times)
+        with Scratch("cosim-") as folder:
+            files = written.write_traffic(folder, vehicles)
+            trials = Trials(streets, case, model.clock(case, streets, vehicles), folder, files)
+            return level.loaded(trials.run(factor, mesoscopic), streets, regions)
 
-    def run(self, factor: float, mesoscopic: bool) -> Baseline:
-        """With the demand times `factor`."""
-        if self._last is None or self._last[0] != (factor, mesoscopic):
-            with Scratch("cosim-") as folder:
-                routes, vehicles = self._routes, self._vehicles
-                if factor != 1.0:
-                    routes = [folder / "vehicles.rou.xml"]
-                    vehicles = write_recorded_trips(
-                        read_recorded_trips(self._routes), routes[0], seed=0, factor=factor, jitter=0.0,
-                        begin=self._clock.begin)
-                self._last = (factor, mesoscopic), run_baseline(
-                    self._streets, routes=[*routes, *self._background], additional=self._additional,
-                    begin=self._clock.begin, end=self._clock.end, vehicles=vehicles,
-                    options=[*self._options, *(MESOSCOPIC if mesoscopic else ())])
-        return self._last[1]
+    return probe
 
 
-def _level_line(order: ImportOptions, factor: float, congests: bool) -> str:
+def _demand_lines(
+    order: ImportOptions, streets: Streets, assigned: Assigned | None, baseline: Baseline | None,
+    gaps: Sequence[float],
+) -> str:
+    """How far a generated demand is from an equilibrium, and whether a few streets hold it, for the report. gaps: of
+    the run without control, in which SUMO's model may be another one than in the assignment."""
+    text = ""
+    if assigned is not None:
+        last = assigned.iterations[assigned.best]
+        text = (f"\nroutes by duaIterate.py: relative gap {100 * assigned.iterations[0].gap:.1f} % at free flow, "
+                f"{100 * assigned.gap:.1f} % in iteration {assigned.best + 1} of {len(assigned.iterations)}, "
+                f"{'mesoscopic' if last.mesoscopic else 'car-following'} (assignment.csv)"
+                + "".join(f", {100 * gap:.1f} % in the run without control" for gap in gaps))
+        if not assigned.reached:
+            text += (f"\nWARNING: the relative gap of {100 * assigned.effort.gap:g} % was not reached: some of what "
+                     "rerouting gains here it would gain from drivers who know the city, too; more --iterations, or a "
+                     "lower --level")
+    elif order.peak:
+        text = ("\nWARNING: everybody takes a way that is fastest at free flow: no routes were assigned; omit "
+                "--no-run and --iterations 0 for a demand on which controllers can be compared")
+    if baseline is not None:
+        half, of = baseline.concentration(streets.drivable)
+        text += (f"\nhalf of all vehicles are on {half:,} of {of:,} edges ({100 * half / max(of, 1):.1f} %) in the "
+                 "busiest quarter of an hour")
+        if half < level.FEW * of and baseline.pace_of_crowded(streets, streets.drivable) > STANDING:
+            text += ("\nWARNING: these are queues on a few streets rather than a congested network: what relieves them "
+                     "gains much, for drivers who know the city as well")
+    return text
+
+
+def _level_line(order: ImportOptions, times: float, congests: bool) -> str:
     """What came of --level, for the report."""
     if order.level is not None:
         return ""
     if congests:
-        return (f"\nlevel: demand times {factor:g} is the lowest tried at which driving without control takes "
-                f"{level.CONGESTED:g} times as long as in light traffic")
-    return f"\nlevel: not even demand times {factor:g} congests this city without control"
+        return (f"\nlevel: demand times {times:g} is the lowest tried at which a region comes to its critical "
+                "accumulation without control")
+    return f"\nlevel: not even demand times {times:g} brings a region to its critical accumulation without control"
 
 
 def _protected(streets: Streets, regions: np.ndarray, baseline: Baseline | None, network: RegionalModel) -> int:

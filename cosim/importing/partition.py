@@ -1,6 +1,7 @@
 """Cutting a city into regions, by one of several methods."""
 
 from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,6 +20,7 @@ from cosim.sumo.arrays import EdgeNumbers
 from nmfd.errors import InputError
 
 STARTS = 4  # of k-means, from which the partition is refined
+SIDE_BY_SIDE = 20  # partitions, about, that are compared
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +78,22 @@ def partition(
             f"{streets.path}: no two regions can be made that can be reached from each other; give a network with "
             "more streets, or other regions")
     return found, regions, moved
+
+
+def alternatives(
+    streets: Streets, baseline: Baseline, cut: Clustered | Drawn, regions: EdgeNumbers, *, seed: int,
+    left_alone: Collection[str] = (),
+) -> dict[int, EdgeNumbers]:
+    """How many regions were asked for -> (E,) region of every edge, from 2 to twice as many as in `regions`, by the
+    same method, or "density" beside regions of the user's own; what cannot be had is left out."""
+    method = cut.method if isinstance(cut, Clustered) else "density"
+    found: dict[int, EdgeNumbers] = {}
+    most = 2 * (int(regions.max()) + 1)
+    for number in np.unique(np.linspace(2, most, min(most - 1, SIDE_BY_SIDE)).astype(int)):
+        with suppress(InputError):
+            found[int(number)], *_ = partition(
+                streets, baseline, Clustered(method=method, regions=int(number)), seed=seed, left_alone=left_alone)
+    return found
 
 
 def _moved(labels: np.ndarray, found: np.ndarray, members: np.ndarray) -> int:

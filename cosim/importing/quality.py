@@ -8,26 +8,39 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from cosim.importing.baseline import Baseline
+from cosim.importing.homogeneity import ncut_silhouettes, variance_shares
+from cosim.importing.regions import digraph
 from cosim.importing.streets import Streets, graph
-from cosim.sumo.arrays import EdgeMask, EdgeNumbers
+from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge
 from cosim.sumo.net import City
 from cosim.sumo.signals import FIXED
+from nmfd.arrays import PerRegion
 from nmfd.runs.tables import text_table
 
 QUALITY = (
     "region", "name", "edges", "lane_km", "signals", "pieces", "mean_density_veh_km", "variance_before",
-    "variance_within", "gateways", "controlled_gateways", "boundary_flow_veh", "uncontrolled_share")
+    "variance_within", "ncut_silhouette", "tv_n", "half_on_edges", "gateways", "controlled_gateways",
+    "boundary_flow_veh", "uncontrolled_share")
 GATEWAYS = (
     "source", "target", "from_edge", "to_edge", "lanes", "shared_lanes", "signal", "links", "signal_serves", "control",
     "kind", "flow_veh")
 
 
+PARTITIONS = ("asked", "regions", "ncut_silhouette", "tv_n", "smallest_lane_share", "chosen")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Tables:
-    """quality: a row of QUALITY per region and one for "all"; gateways: a row of GATEWAYS per boundary crossing."""
+    """quality: a row of QUALITY per region and one for "all"; gateways: a row of GATEWAYS per boundary crossing;
+    partitions: one of PARTITIONS for each number of regions that was tried, none without densities.
+
+    NcutSilhouette, of a region and of the whole, and TV_n are those of cosim.importing.homogeneity, over the streets
+    for cars in the busiest quarter of an hour; a region's TV_n is its part of the sum. half_on_edges: the fewest edges
+    that hold half of all vehicles then."""
 
     quality: Sequence[Mapping]
     gateways: Sequence[Mapping]
+    partitions: Sequence[Mapping] = ()
 
     @property
     def uncontrolled(self) -> float:
@@ -37,9 +50,10 @@ class Tables:
 
 def tables(
     streets: Streets, regions: EdgeNumbers, names: Sequence[str], city: City, baseline: Baseline | None,
-    left_alone: Mapping[str, str],
+    left_alone: Mapping[str, str], others: Mapping[int, EdgeNumbers] | None = None,
 ) -> Tables:
-    """left_alone: signal -> why perimeter control does not touch it."""
+    """left_alone: signal -> why perimeter control does not touch it; others: partitions to compare with, by the number
+    of regions that was asked for."""
     moves = Counter() if baseline is None else baseline.moves()
     pairs: dict[str, set[tuple[int, int]]] = {}
     for gateway in city.gateways:
@@ -63,7 +77,47 @@ def tables(
     weight = np.array([row["lane_km"] for row in rows])
     total["variance_within"] = round(float(np.average([row["variance_within"] for row in rows], weights=weight)), 2)
     total["pieces"] = sum(row["pieces"] for row in rows)
-    return Tables(quality=[*rows, total], gateways=gateways)
+    for row, half in zip([*rows, total], _halves(streets, regions, baseline), strict=True):
+        row["half_on_edges"] = half
+    for row, silhouette, share in zip(rows, *_homogeneity(streets, regions, density), strict=True):
+        row |= {"ncut_silhouette": round(silhouette, 3), "tv_n": round(share, 4)}
+    total |= _overall(streets, regions, density)
+    partitions = [] if baseline is None else [
+        _compared(streets, found, density, number, chosen=False) for number, found in (others or {}).items()
+        if found.max() != regions.max()]
+    if baseline is not None:
+        partitions.append(_compared(streets, regions, density, len(rows), chosen=True))
+    return Tables(quality=[*rows, total], gateways=gateways, partitions=sorted(
+        partitions, key=lambda row: (row["regions"], row["asked"])))
+
+
+def _homogeneity(streets: Streets, regions: EdgeNumbers, density: PerEdge) -> tuple[PerRegion, PerRegion]:
+    """(NS of every region, its part of TV_n), each (R,) [-]"""
+    links = streets.drivable
+    joined = digraph(streets, regions) > 0
+    silhouettes = ncut_silhouettes(density[links], regions[links], joined | joined.T)
+    return silhouettes, variance_shares(density[links], regions[links], len(joined))
+
+
+def _overall(streets: Streets, regions: EdgeNumbers, density: PerEdge) -> dict[str, float]:
+    """NcutSilhouette and TV_n of a partition; NaN where nothing tells."""
+    silhouettes, parts = _homogeneity(streets, regions, density)
+    told = silhouettes[~np.isnan(silhouettes)]
+    return {"ncut_silhouette": round(float(told.mean()), 3) if len(told) else np.nan,
+            "tv_n": round(float(parts.sum()), 4)}
+
+
+def _compared(streets: Streets, regions: EdgeNumbers, density: PerEdge, asked: int, *, chosen: bool) -> dict:
+    """A row of PARTITIONS."""
+    lanes = np.bincount(regions, streets.lane_metres)
+    return {"asked": asked, "regions": len(lanes), **_overall(streets, regions, density),
+            "smallest_lane_share": round(float(lanes.min() / lanes.sum()), 3), "chosen": int(chosen)}
+
+
+def _halves(streets: Streets, regions: EdgeNumbers, baseline: Baseline | None) -> list[int]:
+    """The fewest edges that hold half of all vehicles, of every region and of all, when these have the most."""
+    members = [streets.drivable & (regions == region) for region in range(int(regions.max()) + 1)]
+    return [0 if baseline is None else baseline.concentration(edges)[0] for edges in (*members, streets.drivable)]
 
 
 def kind(streets: Streets, signal: str | None) -> str:
@@ -81,7 +135,7 @@ def _row(streets: Streets, members: np.ndarray, region: str, name: str, signals:
     return dict(zip(QUALITY, (
         region, name, int(usable.sum()), round(float(streets.lane_metres[usable].sum()) / 1000.0, 2), int(signals),
         pieces(streets, usable & streets.main_part), round(mean, 2), round(everywhere, 2), round(variance, 2),
-        len(gateways), sum(g["control"] == "controlled" for g in gateways), flow,
+        np.nan, np.nan, 0, len(gateways), sum(g["control"] == "controlled" for g in gateways), flow,
         round(free / flow, 3) if flow else float("nan")), strict=True))
 
 
@@ -119,8 +173,11 @@ def text(tables: Tables) -> str:
         lines.append({
             "region": title, "lane-km": row["lane_km"], "signals": row["signals"],
             "density": row["mean_density_veh_km"], "var. before": row["variance_before"],
-            "within": row["variance_within"], "gateways": row["gateways"], "controlled": row["controlled_gateways"],
+            "within": row["variance_within"], "NS": row["ncut_silhouette"], "TV_n": row["tv_n"],
+            "gateways": row["gateways"], "controlled": row["controlled_gateways"],
             "uncontrolled": share})
     return text_table(
         lines, "density: vehicles per lane-km in the busiest quarter of an hour without control; its variance over "
-        "lanes; uncontrolled: share of the flow over the region's boundary that no controlled signal sees")
+        "lanes; NS: NcutSilhouette, below 1 where streets are more like each other than like those of the most similar "
+        "neighbour; TV_n: share of the variance over streets that is left within; uncontrolled: share of the flow over "
+        "the region's boundary that no controlled signal sees")

@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from cosim.importing import atlas, layers, model, quality
+from cosim.importing.assignment import Assigned
 from cosim.importing.baseline import Baseline
 from cosim.importing.demand import Traffic, wrapped
 from cosim.importing.streets import Streets
@@ -61,6 +62,13 @@ def write_demand(path: Path, demand: PairsOverTime) -> None:
         (k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)))
 
 
+def write_assignment(path: Path, assigned: Assigned) -> None:
+    """A row per iteration; the routes of the chosen one are those of the vehicles."""
+    write_table(path, ("iteration", "mesoscopic", "relative_gap", "mean_trip_s", "arrived_veh", "chosen"), (
+        (n + 1, int(one.mesoscopic), f"{one.gap:.5f}", f"{one.trip_time:.1f}", one.arrived, int(n == assigned.best))
+        for n, one in enumerate(assigned.iterations)))
+
+
 def write_network(folder: Path, streets: Streets, regions: EdgeNumbers, network: RegionalModel, found: quality.Tables,
                    baseline: Baseline | None, source: str) -> None:
     """network.toml, its tables, layers and map; source: the name of what the user gave."""
@@ -69,6 +77,9 @@ def write_network(folder: Path, streets: Streets, regions: EdgeNumbers, network:
     for name, columns, rows in (("quality.csv", quality.QUALITY, found.quality),
                                 ("gateways.csv", quality.GATEWAYS, found.gateways)):
         write_table(folder / name, columns, ([row[column] for column in columns] for row in rows))
+    if found.partitions:
+        write_table(folder / "partitions.csv", quality.PARTITIONS, (
+            [row[column] for column in quality.PARTITIONS] for row in found.partitions))
     names = network.region_names
     (folder / "regions.taz.xml").write_text(layers.taz_xml(streets, regions, names))
     (folder / "regions.poly.xml").write_text(layers.polygons_xml(streets, regions, names))
