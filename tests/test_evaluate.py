@@ -140,6 +140,7 @@ def test_command_line_errors(tmp_path, arguments, expected):
     assert result.exit_code == 2 and expected in result.stderr and result.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_small_evaluation_in_sumo(city, tmp_path):
     file = city / "scenario.toml"
     file.write_text(re.sub(r"ramp_up = [\d.]+", "ramp_up = 60.0", file.read_text()))
