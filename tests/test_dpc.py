@@ -351,17 +351,10 @@ def test_swings_of_the_gates_cost_what_they_are(scenario):
             perimeter[..., i, h] = along[:, None]
         return perimeter, None
 
-    totals = [rollout.total_time_spent(_Acting(made, act), x, demand, torch.Generator().manual_seed(1))
+    made.forward = act
+    totals = [rollout.total_time_spent(made, x, demand, torch.Generator().manual_seed(1))
               for rollout in (still, costly)]
     torch.testing.assert_close(totals[1] - totals[0], torch.full((2,), 7.0 * 1.75), rtol=1e-3, atol=1.0)
-
-
-class _Acting(torch.nn.Module):
-    """A policy that does what `act` says."""
-
-    def __init__(self, policy, act):
-        super().__init__()
-        self.architecture, self.forward = policy.architecture, act
 
 
 def test_detours_cost_what_they_divert(scenario):

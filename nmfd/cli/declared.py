@@ -4,7 +4,7 @@ Type, unit, range, default and text are read there, but only for the option's ow
 declarations bring pydantic, and the help that lists the commands is quicker than that.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from importlib import import_module
 from typing import Any
@@ -19,7 +19,7 @@ class Declared(click.Option):
     instead: what a command does without the option, where that is not the declared default, which is {} in it
     """
 
-    def __init__(self, names: list[str], *, declaration: str, instead: str | None = None, **options: Any):
+    def __init__(self, names: Sequence[str], *, declaration: str, instead: str | None = None, **options: Any):
         super().__init__(names, type=None if options.get("is_flag") else click.UNPROCESSED, **options)
         self._declaration, self._instead = declaration, instead
 
