@@ -7,7 +7,8 @@ the highest pressure gets the green, after the original yellow and all-red. Peri
 gateway movements (cosim.plant.green_quota); one whose ration is spent exerts no pressure.
 
 x counts vehicles per lane, as loops and cameras see them; on lanes that several movements share, and upstream of the
-turn lanes, they are shared out by r, from the demand's static routes.
+turn lanes, they are shared out by r, from the demand's static routes. On streets that are closed to cars, whoever
+stands there, such as buses, presses for the stages that serve them.
 
 Who is first on a shared lane holds up all behind until the green is theirs: a stage that serves a part of a lane moves
 a few vehicles, whatever the queue. So a shared lane counts for the stages that serve all of it; where there is none,
@@ -57,6 +58,7 @@ class MaxPressure:
         roads = Roads(city, signals, flows)
         self._lanes, self._weights, self._movements = roads.lanes, roads.weights, roads.movements
         self._gain, self._begins = roads.stages(signals)
+        self._apart = roads.apart(signals)
         self._shared, self._start = roads.shared(signals), session.time
         pairs = gateway_movements(city)
         self._programmed = float(np.mean([_intergreen(signal) for signal in signals])) if signals else 0.0
@@ -129,7 +131,7 @@ class MaxPressure:
         for junction in self._rationed:
             for movement in junction.exhausted():
                 weight[self._movements[movement]] = 0.0
-        return self._gain @ weight
+        return self._gain @ weight + self._apart @ present
 
 
 class Junction:
@@ -399,6 +401,18 @@ class Roads:
             for before, part in self._arriving(last, length).items():
                 queue |= {self.lane_number[lane]: share * part for lane in self._city.lane_ids[before]}
         return queue
+
+    def apart(self, signals: Iterable[Signal]) -> csr_array:
+        """(S, L) saturation flows [lanes] of the lanes in the stages, on streets that are closed to cars: what stands
+        there, such as buses, presses as it is, for no turning shares are known of it."""
+        rows = []
+        for signal in signals:
+            for number in stages_of(signal):
+                state = signal.phases[number].state
+                rows.append({
+                    self.lane_number[lane_id(link)]: 1.0 if state[link.index] == "G" else PERMISSIVE
+                    for link in signal.others if state[link.index] in GREEN and lane_id(link) not in self._cars})
+        return _sparse(rows, len(self.lanes))
 
     def watched(self, link: Link) -> set[int]:
         """The numbers of the lanes on which somebody may wait for a link: its own, and those behind a piece of road
