@@ -48,7 +48,6 @@ def test_tables(rows, tmp_path):
     assert "nan" not in overview_table(facts)
 
 
-@pytest.mark.filterwarnings("ignore:Mean of empty slice", "ignore:invalid value encountered")
 def test_sentences_and_pictures(rows, tmp_path):
     one = rows[rows["demand"] == 1.0].assign(trips=0, completed_veh=0.0, teleports=0)
     words = " ".join([summary_text.head(one), *summary_text.details(one)])
@@ -57,6 +56,7 @@ def test_sentences_and_pictures(rows, tmp_path):
     pictures.demand_levels(tmp_path / "levels.png", rows)
     assert not (tmp_path / "levels.png").exists()
     network = load_scenario(tiny.write(tmp_path)).network
-    found = explain.load(network, [], [])
+    nothing = np.full(network.regions, np.nan)
+    found = explain.Loading(most=nothing, beyond=nothing, inside=nothing)
     line = explain.verdict(one, 1.0, "pi-gating", found, 0.0, explain.ControlActivity(held=0.0, guided=0.0), network)
     assert "not told in percent" in line and "nan" not in line and np.isfinite(one["seed"]).all()

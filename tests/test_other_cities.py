@@ -11,7 +11,6 @@ from tiny_city import driven
 from cosim.importing.case import read_sumo_input
 from cosim.importing.demand import read_traffic
 from cosim.importing.importer import left_alone
-from cosim.importing.level import congesting
 from cosim.importing.streets import read_streets
 from cosim.plant.meter import Meter
 from cosim.plant.plant import SumoPlant
@@ -298,11 +297,3 @@ def test_a_generated_peak_beside_types_of_the_city(net, city):
     config = city("", '<vType id="car" vClass="passenger" sigma="0.9"/>')
     text, _ = imported(config, "--demand", "peak", "--level", 0.1)
     assert "trips of a generated morning peak" in text
-
-
-def test_level_of_a_city_with_a_vehicle_or_two():
-    """A tenth of them is none, who drive in no time at all: that is not what the others are compared with."""
-    def pace(times, mesoscopic):
-        return 0.0 if times < 0.5 else 1.2
-
-    assert congesting(pace, mesoscopic=False, tell=lambda line: None) == (2.99, False)

@@ -63,8 +63,8 @@ def drive_one(
     """The closed loop of one MPC, `run` = (controller, horizon), as a single row."""
     controller = registry.make(run[0], with_horizon(scenario, *run))
     row = summary(closed_loop.run(PLANTS[plant](scenario), controller, scenario, seed=0, progress=progress))
-    kept = {name: row[name] for name in HORIZON_COLUMNS if name in row}
-    return {"horizon": [{**kept, "controller": run[0], "horizon": run[1]}]}
+    known = {**row, "controller": run[0], "horizon": run[1]}
+    return {"horizon": [{name: known[name] for name in HORIZON_COLUMNS}]}
 
 
 def with_horizon(scenario: Scenario, controller: str, horizon: int) -> Scenario:
