@@ -1,0 +1,103 @@
+"""The page: the maps, the curves and the numbers of some runs, and their place; no server, and nothing that is done."""
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from bokeh.core.templates import get_env
+from bokeh.document import Document
+from bokeh.models import Div, Model
+
+from cosim.view import colours
+from cosim.view.city_map import DENSITY, CityMap
+from cosim.view.curves import HOUR, MINUTE, Curves, Load
+from cosim.view.picture import CityPicture, Frame
+
+HERE = Path(__file__).parent
+CELL = "padding:2px 18px 2px 0;text-align:right;font-variant-numeric:tabular-nums"
+
+
+class Page:
+    """The runs `names` side by side."""
+
+    def __init__(self, picture: CityPicture, names: Sequence[str]):
+        """The busiest region to begin with: that with the least room."""
+        self.picture, self.names = picture, names
+        self.maps = [CityMap(picture, name) for name in names]
+        self.loads = [Load(picture, f"{name}: how full the regions are") for name in names]
+        self.curves = Curves(picture, names)
+        self.numbers = Div(text="", sizing_mode="stretch_width")
+        self.choose(0, self.gate_of(0))
+
+    def gate_of(self, region: int) -> tuple[int, int] | None:
+        """The first gate out of a region, or into it; None where there is none with a signal."""
+        gates = self.picture.boundaries
+        return next((gate for gate in gates if gate[0] == region), next(
+            (gate for gate in gates if gate[1] == region), None))
+
+    def choose(self, region: int, gate: tuple[int, int] | None) -> None:
+        """The region and the gate whose curves are shown, from the next `curves` on."""
+        for one in self.maps:
+            one.choose(region)
+        self.curves.choose(region, gate)
+
+    def show(
+        self, frames: Sequence[Frame | None], time: float, by: str = DENSITY,
+        held: Sequence[frozenset[tuple[int, int]]] = (),
+    ) -> None:
+        """The runs at `time` [s]: a frame of each, None where there is none yet; by: the colour of streets; held: of
+        each, the gates that were switched by hand."""
+        for n, (one, frame) in enumerate(zip(self.maps, frames, strict=True)):
+            if frame is not None:
+                one.show(frame, by, held[n] if held else frozenset())
+        for load in self.loads:
+            load.now.location = time / MINUTE
+        self.curves.mark(time)
+        self.numbers.text = numbers(self.names, frames, time)
+
+    def trace(self, runs: Sequence[Sequence[Frame]], time: float) -> None:
+        """The curves: the frames at the ends of control intervals of every run, and the time [s] that is looked at."""
+        for load, whole in zip(self.loads, runs, strict=True):
+            load.show(whole)
+        self.curves.show(runs, time)
+
+    def place(self, document: Document, subtitle: str, bar: Sequence[Model], choices: Sequence[Model]) -> None:
+        """Put it into a document. bar, choices: what one can press, with names."""
+        curves = self.curves
+        roots = {
+            "numbers": self.numbers,
+            **{f"map{n}": one.plot for n, one in enumerate(self.maps)},
+            **{f"load{n}": one.plot for n, one in enumerate(self.loads)},
+            "region_curve": curves.region, "plane": curves.plane, "gate_curve": curves.gate, "trips": curves.trips,
+            "spent": curves.spent, **{str(model.name): model for model in (*bar, *choices)}}
+        for name, model in roots.items():
+            model.name = name
+            document.add_root(model)
+        document.title = f"{self.picture.name}: {' against '.join(self.names)}"
+        document.template = get_env().from_string((HERE / "page.html.j2").read_text(encoding="utf-8"))
+        document.template_variables.update(
+            heading=document.title, subtitle=subtitle, css=(HERE / "page.css").read_text(encoding="utf-8"),
+            bar=[model.name for model in bar], choices=[model.name for model in choices],
+            maps=[name for name in roots if name.startswith("map")],
+            loads=[name for name in roots if name.startswith("load")],
+            curves=["region_curve", "plane", "gate_curve", "trips", "spent"])
+
+
+def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -> str:
+    """A table of what has come of the runs so far, in HTML."""
+    head = ("inside [veh]", "waiting to enter [veh]", "completed trips [veh]", "total time spent [veh h]",
+            "removed [veh]", "what was not as it should be")
+    rows = [
+        "<tr><th style='text-align:left'>" + f"{time / MINUTE:.1f} min</th>"
+        + "".join(f"<th style='{CELL};font-weight:400;color:{colours.FAINT}'>{text}</th>" for text in head) + "</tr>"]
+    for n, (name, frame) in enumerate(zip(names, frames, strict=True)):
+        if frame is None:
+            cells = [""] * len(head)
+        else:
+            cells = [f"{value:,.0f}" for value in (
+                frame.accumulation.sum(), frame.waiting, frame.completed, frame.time_spent / HOUR, frame.removed)]
+            cells.append(escape(frame.note[:160]))
+        rows.append(
+            f"<tr><th style='text-align:left;padding-right:18px;color:{colours.RUNS[n][0]}'>{escape(name)}</th>"
+            + "".join(f"<td style='{CELL}'>{cell}</td>" for cell in cells) + "</tr>")
+    return f"<div style='overflow-x:auto'><table style='font-size:14px;border-spacing:0'>{''.join(rows)}</table></div>"
