@@ -174,5 +174,5 @@ def _tell(controller: str, seed: int, trajectory: "Trajectory") -> None:
 
 def _has_screen() -> bool:
     """Whether a browser of this machine may be opened: somebody sits there, as far as one can tell."""
-    screen = not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    screen = not sys.platform.startswith("linux") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
     return screen and sys.stdout.isatty()

@@ -52,12 +52,18 @@ def outlines(streets: Streets, regions: EdgeNumbers) -> list[list[Points]]:
     return rings_round(streets.shapes, streets.drivable, regions)
 
 
-def rings_round(shapes: Sequence[Points], members: np.ndarray, regions: EdgeNumbers) -> list[list[Points]]:
-    """The same of `members`, (E,) bool, of some edges: E `shapes` (n, 2) [m], and their `regions`."""
+def rings_round(
+    shapes: Sequence[Points], members: np.ndarray, regions: EdgeNumbers, blocks: float = 0.0,
+) -> list[list[Points]]:
+    """The same of `members`, (E,) bool, of some edges: E `shapes` (n, 2) [m], and their `regions`.
+
+    blocks: the share of the map's extent that is between streets and still no hole
+    """
     points, of = sampled(shapes, members)
     low, high = points.min(axis=0), points.max(axis=0)
     cell = max(float((high - low).max()) / CELLS, 1.0)
-    reach = 2.5 * max(cell, SPACING)  # beyond, a place belongs to no street; the map must end there, or rings stay open
+    # Beyond, a place belongs to no street; the map must end there, or rings stay open.
+    reach = max(2.5 * max(cell, SPACING), blocks * float((high - low).max()))
     x, y = (np.arange(low[a] - reach - 2 * cell, high[a] + reach + 3 * cell, cell) for a in (0, 1))
     distance, nearest = cKDTree(points).query(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     label = np.where(distance < reach, regions[of[nearest]], -1).reshape(len(y), len(x))

@@ -50,8 +50,9 @@ class CityMap:
         self.gates = self._gateways(plot)
         _numbers(plot, picture)
         plot.add_layout(ScaleBar(
-            range=plot.x_range, unit="m", location="bottom_left", background_fill_alpha=0.0, border_line_alpha=0.0,
-            label_text_color=colours.FAINT, bar_line_color=colours.FAINT, label_text_font_size="11px"))
+            range=plot.x_range, unit="m", location="bottom_left", bar_length=0.15, background_fill_alpha=0.0,
+            border_line_alpha=0.0, label_text_color=colours.FAINT, bar_line_color=colours.FAINT,
+            label_text_font_size="11px"))
 
     def show(self, frame: Frame, by: str = DENSITY, held: frozenset[tuple[int, int]] = frozenset()) -> None:
         """by: DENSITY or SPEED, the colour of the streets; held: gates (i, h) that were switched by hand"""
@@ -69,8 +70,9 @@ class CityMap:
         """Mark a region."""
         of = self.regions.data["region"]
         self.regions.patch({
-            "width": [(slice(len(of)), np.where(np.asarray(of) == region, 3.0, 1.0).astype(np.float32))],
-            "line": [(slice(len(of)), [colours.CHOSEN if r == region else colours.FAINT for r in of])]})
+            "width": [(slice(len(of)), np.where(np.asarray(of) == region, 2.5, 1.0).astype(np.float32))],
+            "line": [(slice(len(of)), [colours.CHOSEN if r == region else colours.FAINT for r in of])],
+            "fill": [(slice(len(of)), [colours.CHOSEN_LAND if r == region else colours.LAND for r in of])]})
 
     def _regions(self, plot: Plot) -> ColumnDataSource:
         picture = self._picture
@@ -78,9 +80,10 @@ class CityMap:
         source = ColumnDataSource({
             "xs": [_floats(ring[:, 0]) for _, ring in rings], "ys": [_floats(ring[:, 1]) for _, ring in rings],
             "region": [r for r, _ in rings], "name": [picture.region_names[r] for r, _ in rings],
-            "width": np.ones(len(rings), np.float32), "line": [colours.FAINT] * len(rings)})
+            "width": np.ones(len(rings), np.float32), "line": [colours.FAINT] * len(rings),
+            "fill": [colours.LAND] * len(rings)})
         drawn = plot.patches(
-            "xs", "ys", source=source, fill_color=colours.LAND, line_color="line", line_width="width",
+            "xs", "ys", source=source, fill_color="fill", line_color="line", line_width="width",
             nonselection_fill_alpha=1.0, nonselection_line_alpha=1.0)
         plot.add_tools(TapTool(renderers=[drawn]))
         return source

@@ -68,8 +68,9 @@ class Curves:
         for plot in overtime:
             plot.x_range.start, plot.x_range.end = 0.0, horizon
         self.gate.y_range.start, self.gate.y_range.end = -0.04, 1.08
-        self._critical = Span(dimension="width", line_color=colours.INK, line_dash="dotted", line_width=1.5)
-        self.region.add_layout(self._critical)
+        self._critical = ColumnDataSource({"x": [], "y": []})
+        self.region.line("x", "y", source=self._critical, color=colours.INK, line_dash="dotted", line_width=1.5,
+                         legend_label="critical")
         self._curve = ColumnDataSource({"x": [], "y": []})
         self.plane.line("x", "y", source=self._curve, color=colours.FAINT, line_width=2, legend_label="fitted MFD")
         for n, name in enumerate(names):
@@ -80,9 +81,9 @@ class Curves:
             for plot, key in ((self.region, "accumulation"), (self.trips, "completed"), (self.spent, "spent")):
                 plot.line("time", key, source=line, color=colour, line_dash=dash, line_width=2, legend_label=name)
             self.gate.step("time", "u", source=line, color=colour, line_dash=dash, line_width=2, mode="before",
-                           legend_label=f"u of {name}")
+                           legend_label=f"u commanded, {name}")
             self.gate.scatter("time", "green", source=line, size=5, marker=("circle", "square")[n], line_color=colour,
-                              fill_color=colours.PAPER, legend_label=f"green of {name}")
+                              fill_color=colours.PAPER, legend_label=f"green / original, {name}")
             trail, point = ColumnDataSource({"x": [], "y": []}), ColumnDataSource({"x": [], "y": []})
             self.plane.line("x", "y", source=trail, color=colour, line_dash=dash, alpha=0.5, line_width=1.5)
             self.plane.scatter("x", "y", source=trail, color=colour, alpha=0.35, size=4)
@@ -93,6 +94,7 @@ class Curves:
             self.points.append(point)
         for plot in (*overtime, self.plane):
             _legend(plot)
+        self.gate.legend.location = "bottom_left"
         self._now = [_now(plot) for plot in overtime]
 
     def choose(self, region: int, gate: tuple[int, int] | None) -> None:
@@ -101,11 +103,12 @@ class Curves:
         name, curve = picture.region_names[region], picture.curves[region]
         self._region, self._gate = region, gate
         self._members = [n for one in picture.gates if (one.source, one.target) == gate for n in one.gateways]
-        self.region.title.text = f"Region {region}, {name}: accumulation (dotted: critical)"
-        self.plane.title.text = f"Region {region}, {name}: MFD plane, the last {TRAIL} intervals"
+        self.region.title.text = f"Region {region}, {name}: accumulation"
+        self.plane.title.text = f"Region {region}, {name}: MFD plane"
         self.gate.title.text = "No gate with a signal" if gate is None else (
-            f"Gate {gate[0]} → {gate[1]}: u as commanded, and green as a share of the original")
-        self._critical.location = float(picture.critical[region])
+            f"Gate {gate[0]} → {gate[1]}: command and green")
+        self._critical.data = {"x": [0.0, picture.steps * picture.step / MINUTE],
+                               "y": [float(picture.critical[region])] * 2}
         self._curve.data = {"x": curve[:, 0].astype(np.float32), "y": curve[:, 1].astype(np.float32)}
 
     def show(self, runs: Sequence[Sequence[Frame]], time: float) -> None:

@@ -1,4 +1,4 @@
-"""The live page of one viewer: what they look at, and the buttons. Everybody's runs are the same, and so is the pace."""
+"""The live page of one viewer: what they look at, and the buttons. Runs and pace are everybody's."""
 
 from functools import partial
 
@@ -59,7 +59,8 @@ class Viewer:
         self._pause.on_click(lambda: self._do(self._show.go if self._show.paused else self._show.pause))
         step = Button(label="Step", name="step", width=70)
         step.on_click(lambda: self._do(self._show.step))
-        slower, faster = Button(label="Slower", name="slower", width=80), Button(label="Faster", name="faster", width=80)
+        slower, faster = (Button(label=label, name=label.lower(), width=80) for label in ("Slower", "Faster"))
+        self._running = [self._pause, step, slower, faster]
         slower.on_click(lambda: self._do(partial(self._show.hurry, -1)))
         faster.on_click(lambda: self._do(partial(self._show.hurry, 1)))
         picture = self._page.picture
@@ -85,11 +86,13 @@ class Viewer:
         self._gates.on_change("value", lambda _, __, new: self._choose(self._region, _pair(new)))
         self._whose = Select(title="of the run", name="whose", value="0", width=200, options=[
             (str(n), seen.name) for n, seen in enumerate(self._show.runs)])
-        buttons = []
-        for label, name, share in (("Close gate", "close", 0.0), ("Open gate", "open", 1.0), ("Let go", "release", None)):
+        buttons: list[Button] = []
+        for label, name, share in (
+                ("Close gate", "close", 0.0), ("Open gate", "open", 1.0), ("Let go", "release", None)):
             button = Button(label=label, name=name, width=100, disabled=self._gate is None)
             button.on_click(partial(self._switch, share))
             buttons.append(button)
+        self._running += buttons
         return [colour, self._regions, self._gates, self._whose, *buttons]
 
     def _do(self, command: object) -> None:
@@ -145,6 +148,8 @@ class Viewer:
         self._time.value = min(time / MINUTE, self._time.end)
         self._moving = False
         self._live.button_type = "success" if self._at is None else "default"
+        for button in self._running if show.over else ():
+            button.disabled = True
         rate = "as fast as SUMO goes" if not show.pace.delay else f"{1.0 / show.pace.delay:,.0f} s per second at most"
         self._state.label = "finished" if show.over else ("paused" if show.paused else rate)
 

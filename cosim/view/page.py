@@ -14,7 +14,6 @@ from cosim.view.curves import HOUR, MINUTE, Curves, Load
 from cosim.view.picture import CityPicture, Frame
 
 HERE = Path(__file__).parent
-CELL = "padding:2px 18px 2px 0;text-align:right;font-variant-numeric:tabular-nums"
 
 
 class Page:
@@ -84,20 +83,24 @@ class Page:
 
 
 def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -> str:
-    """A table of what has come of the runs so far, in HTML."""
-    head = ("inside [veh]", "waiting to enter [veh]", "completed trips [veh]", "total time spent [veh h]",
-            "removed [veh]", "what was not as it should be")
-    rows = [
-        "<tr><th style='text-align:left'>" + f"{time / MINUTE:.1f} min</th>"
-        + "".join(f"<th style='{CELL};font-weight:400;color:{colours.FAINT}'>{text}</th>" for text in head) + "</tr>"]
+    """What has come of the runs so far, in HTML."""
+    lines = []
     for n, (name, frame) in enumerate(zip(names, frames, strict=True)):
-        if frame is None:
-            cells = [""] * len(head)
-        else:
-            cells = [f"{value:,.0f}" for value in (
-                frame.accumulation.sum(), frame.waiting, frame.completed, frame.time_spent / HOUR, frame.removed)]
-            cells.append(escape(frame.note[:160]))
-        rows.append(
-            f"<tr><th style='text-align:left;padding-right:18px;color:{colours.RUNS[n][0]}'>{escape(name)}</th>"
-            + "".join(f"<td style='{CELL}'>{cell}</td>" for cell in cells) + "</tr>")
-    return f"<div style='overflow-x:auto'><table style='font-size:14px;border-spacing:0'>{''.join(rows)}</table></div>"
+        told = () if frame is None else (
+            ("inside [veh]", frame.accumulation.sum()), ("waiting to enter [veh]", frame.waiting),
+            ("completed trips [veh]", frame.completed), ("total time spent [veh h]", frame.time_spent / HOUR),
+            ("removed [veh]", frame.removed))
+        cells = "".join(
+            f"<div style='flex:0 0 142px'><div style='font-size:19px;font-variant-numeric:tabular-nums'>{value:,.0f}"
+            f"</div><div style='font-size:12px;color:{colours.FAINT}'>{text}</div></div>" for text, value in told)
+        note = "" if frame is None or not frame.note else (
+            f"<div style='flex-basis:100%;font-size:13px;color:{colours.QUEUE}'>{escape(frame.note[:200])}</div>")
+        colour, dash = colours.RUNS[n]
+        lines.append(
+            f"<div style='display:flex;flex-wrap:wrap;gap:2px 10px;align-items:center;border-left:4px {dash} {colour};"
+            f"padding-left:12px;margin:5px 0'><div style='flex:0 0 230px;font-weight:650;color:{colour}'>{escape(name)}"
+            f"</div>{cells}{note}</div>")
+    return (
+        "<div style='display:flex;flex-wrap:wrap;gap:4px 36px;align-items:center'>"
+        f"<div style='font-size:24px;font-weight:650;flex:0 0 110px'>{time / MINUTE:.1f} min</div>"
+        f"<div style='flex:1 1 280px;min-width:0'>{''.join(lines)}</div></div>")

@@ -20,6 +20,8 @@ from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, State, Trajectory
 
 CURVE = 60    # points of an MFD
+BLOCKS = 0.06  # of the map's extent: no hole in a region
+BACK = 0.015   # of it: how far before the end of a street its gate is drawn
 BEYOND = 2.0  # critical accumulations: where a curve ends, or at the jam if that comes first
 
 
@@ -85,7 +87,7 @@ class CityPicture:
             lane_km=np.array([city.length[edge] * city.lanes[edge] for edge in city.edges]) / 1000.0,
             limit=np.array([city.speed[edge] for edge in city.edges]),
             lanes=np.array([city.lanes[edge] for edge in city.edges]), region=region,
-            outlines=rings_round(shapes, np.ones(len(shapes), dtype=bool), region),
+            outlines=rings_round(shapes, np.ones(len(shapes), dtype=bool), region, BLOCKS),
             places=np.stack([middles[region == r].mean(axis=0) for r in range(city.regions)]),
             gates=_gates(city, dict(zip(city.edges, shapes, strict=True))),
             critical=np.array([mfd.critical for mfd in network.mfds]),
@@ -195,13 +197,20 @@ def _curve(critical: float, jam: float, outflow: object) -> Points:
     return np.stack([x, outflow(x)], axis=1)  # type: ignore[operator]
 
 
+def _before_end(shape: Float[np.ndarray, "n 2"], distance: float) -> tuple[float, float]:
+    """A point of a line so far before its end [m], or in its middle: gates of both ways must not lie on one another."""
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shape, axis=0).T))])
+    at = max(along[-1] - distance, 0.5 * along[-1])
+    return float(np.interp(at, along, shape[:, 0])), float(np.interp(at, along, shape[:, 1]))
+
+
 def _gates(city: City, shapes: Mapping[str, Float[np.ndarray, "n 2"]]) -> tuple[Gate, ...]:
     """One for every edge that ends at a boundary and region behind it."""
     members: dict[tuple[str, int], list[int]] = {}
     for n, gateway in enumerate(city.gateways):
         members.setdefault((gateway.from_edge, gateway.target), []).append(n)
+    back = BACK * float(np.ptp(np.concatenate(list(shapes.values())), axis=0).max())
     return tuple(
-        Gate(source=city.gateways[numbers[0]].source, target=target,
-             place=(float(shapes[edge][-1][0]), float(shapes[edge][-1][1])), gateways=tuple(numbers),
-             signal=any(city.gateways[n].signal is not None for n in numbers))
+        Gate(source=city.gateways[numbers[0]].source, target=target, place=_before_end(shapes[edge], back),
+             gateways=tuple(numbers), signal=any(city.gateways[n].signal is not None for n in numbers))
         for (edge, target), numbers in members.items())

@@ -15,7 +15,7 @@ from cosim.evaluation.simulate import Result, Task, scenario_of, simulate
 from cosim.plant.settings import settings
 from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
-from cosim.view.picture import CityPicture, Frame, after, between, first
+from cosim.view.picture import CityPicture, after, between, first
 from nmfd.errors import RunFailed
 from nmfd.types import Controls, State
 

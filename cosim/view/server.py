@@ -18,9 +18,10 @@ from bokeh.application.handlers import FunctionHandler
 from bokeh.document import Document
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
+from bokeh.util.token import check_token_signature
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPServerRequest
-from tornado.ioloop import IOLoop
+from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.netutil import bind_sockets
 from tornado.web import ErrorHandler
 
@@ -58,14 +59,22 @@ class Guarded(BokehTornado):
         if any(origin.lower() != f"http://{host[0].lower()}" for origin in origins):
             return False
         path = request.path.rstrip("/")
-        if path == "/ws":  # signed sessions only; browsers always name an origin there
-            return True
+        if path == "/ws":
+            return self._signed(request.headers.get("Sec-WebSocket-Protocol", ""))
         if path.startswith("/static/") or path == "/favicon.ico":
             return True
         given = parse_qs(request.query).get("token", [""])[-1]
         if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
             return False
         return len(self.get_sessions("/")) < MOST_VIEWERS
+
+    def _signed(self, protocol: str) -> bool:
+        """Whether a websocket is of a page that this server gave out: "bokeh, TOKEN"."""
+        words = [word.strip() for word in protocol.split(",")]
+        try:
+            return len(words) == 2 and check_token_signature(words[1], secret_key=self.secret_key, signed=True)
+        except (ValueError, KeyError, TypeError):  # anything may stand there
+            return False
 
     def _known(self, name: str) -> bool:
         if name in self._names:
@@ -94,7 +103,8 @@ class Server:
         application = Application(FunctionHandler(page))  # type: ignore[arg-type]
         self._loop = IOLoop.current()
         self._tornado = Guarded(application, frozenset(names), self._token)
-        http = HTTPServer(self._tornado, max_buffer_size=10 * LARGEST, max_body_size=LARGEST, idle_connection_timeout=60)
+        http = HTTPServer(
+            self._tornado, max_buffer_size=10 * LARGEST, max_body_size=LARGEST, idle_connection_timeout=60)
         http.add_sockets(sockets)
         self._server = BaseServer(self._loop, self._tornado, http)
         shown = host if host not in ("0.0.0.0", "::") else socket.gethostname()
@@ -108,8 +118,6 @@ class Server:
 
     def serve(self, every: float, look: Callable[[], bool]) -> None:
         """Until `look`, asked every so many seconds, says that it is enough, or somebody presses Ctrl-C."""
-        from tornado.ioloop import PeriodicCallback
-
         def ask() -> None:
             if look():
                 self._loop.stop()

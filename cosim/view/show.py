@@ -13,7 +13,7 @@ from cosim.view.run import Pace, Switch, Switched, run
 from nmfd import faults
 from nmfd.runs.workers import LEAVE, Failure, Worker
 
-DELAYS = (0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s of wall time per simulated second, to choose from
+DELAYS = (0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s of wall time per simulated second
 
 
 @dataclass
@@ -50,7 +50,9 @@ class Seen:
 class Show:
     """Runs side by side. All of it may be asked from any thread; frames come by threads of its own."""
 
-    def __init__(self, tasks: Sequence[Task], *, delay: float = 0.0, progress: Callable[[int, int], None] | None = None):
+    def __init__(
+        self, tasks: Sequence[Task], *, delay: float = 0.0, progress: Callable[[int, int], None] | None = None,
+    ):
         """Starts them. delay: [s] of wall time per simulated second at least; progress: of the first one"""
         self.runs = [Seen(task.controller) for task in tasks]
         self.picture: CityPicture | None = None

@@ -1,5 +1,6 @@
 """`cosim watch`: the runs, their server, and how it ends."""
 
+import logging
 import time
 import webbrowser
 from collections.abc import Callable, Sequence
@@ -28,6 +29,8 @@ def watch(
     Raises InputError and RunFailed.
     """
     over_at: float | None = None
+    for name in ("bokeh", "tornado"):  # what strangers send is no news
+        logging.getLogger(name).setLevel(logging.CRITICAL)
 
     def done() -> bool:
         nonlocal over_at
