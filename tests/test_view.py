@@ -192,7 +192,8 @@ def test_looking_back():
     for frame in frames:
         run.add(frame)
     run.add(replace(frames[-1], time=200.0, whole=False))
-    assert [run.at(time).time for time in (0.0, 61.0, 179.0, 180.0, 199.0, 1e9)] == [0.0, 60.0, 120.0, 180.0, 180.0, 200.0]
+    times = {0.0: 0.0, 61.0: 60.0, 179.0: 120.0, 180.0: 180.0, 199.0: 180.0, 1e9: 200.0}
+    assert {time: run.at(time).time for time in times} == times
     assert len(run.whole) == 4 and DELAYS[0] == 0.0 == min(DELAYS)
     text = numbers([EVIL], [replace(frames[-1], note=EVIL)], 180.0)
     assert "<script" not in text and text.count("&lt;script&gt;") == 2 and "3.0 min" in text
@@ -272,7 +273,7 @@ def test_beyond_this_machine_nothing_without_the_token(guards):
 
 
 def test_the_guard_stands_before_everything():
-    """A server in a thread, asked over its socket: no page for a foreign Host, no websocket without a signed session."""
+    """A server in a thread, asked over its socket: nothing for foreign Hosts, no websocket without a signed session."""
     ready, loop, box = threading.Event(), [], []
 
     def serve():

@@ -24,8 +24,8 @@ JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
 DENSITY, SPEED = "density", "speed"
 LABELS = {DENSITY: "density [veh/km and lane]", SPEED: "speed, share of what is allowed [-]"}
 SIDE = 0.006    # of the map's width: how far the lines of the two directions of a street are drawn apart
-HEIGHT = 470    # pixels
-RADIUS = 6.0    # pixels, of a gateway
+HEIGHT = 500    # pixels
+RADII = ((60, 6.0), (150, 4.5), (10**9, 3.5))  # up to so many gates, pixels of each
 WIDEST = 9.0    # pixels, of an arrow
 NOTHING = -1.0  # where a street has no value
 
@@ -35,7 +35,8 @@ class CityMap:
 
     def __init__(self, picture: CityPicture, title: str):
         """Streets are coloured by density at first."""
-        self._picture, self._shown, self._by = picture, None, DENSITY
+        self._picture, self._by = picture, DENSITY
+        self._radius = next(radius for most, radius in RADII if len(picture.gates) <= most)
         self.plot = plot = figure(
             height=HEIGHT, sizing_mode="stretch_width", match_aspect=True, title=title, tools="",
             toolbar_location=None, background_fill_color=colours.PAPER, outline_line_color=None,
@@ -120,8 +121,8 @@ class CityMap:
             "way": [f"{gate.source} → {gate.target}" for gate in gates],
             "end": np.full(len(gates), _end(1.0), np.float32), "green": ["all"] * len(gates),
             "queue": np.zeros(len(gates), np.float32), "halo": np.zeros(len(gates), np.float32),
-            "size": np.where(signal, 2.0 * RADIUS + 2.0, 6.0).astype(np.float32),
-            "radius": np.where(signal, RADIUS, 0.0).astype(np.float32),
+            "size": np.where(signal, 2.0 * self._radius + 2.0, self._radius).astype(np.float32),
+            "radius": np.where(signal, self._radius, 0.0).astype(np.float32),
             "rim": [colours.INK if one else colours.FAINT for one in signal],
             "rim_width": np.ones(len(gates), np.float32)})
         plot.scatter("x", "y", size="halo", source=source, color=colours.QUEUE, alpha=0.3, line_color=None,
@@ -145,11 +146,12 @@ class CityMap:
         every = slice(len(gates))
         if not gates:
             return
+        halo = np.where(queue >= 0.5, 2.0 * self._radius + 4.0 * np.sqrt(queue), 0.0)
         self.gates.patch({
             "end": [(every, _end(whole).astype(np.float32))],
             "green": [(every, ["not controlled" if np.isnan(one) else f"{one:.0%}" for one in share])],
             "queue": [(every, queue.astype(np.float32))],
-            "halo": [(every, np.where(queue >= 0.5, 2.0 * RADIUS + 4.0 * np.sqrt(queue), 0.0).astype(np.float32))],
+            "halo": [(every, halo.astype(np.float32))],
             "rim": [(every, [colours.HELD if by else (colours.INK if gate.signal else colours.FAINT)
                              for by, gate in zip(by_hand, gates, strict=True)])],
             "rim_width": [(every, np.where(by_hand, 3.0, 1.0).astype(np.float32))]})

@@ -1,5 +1,6 @@
 """The live page of one viewer: what they look at, and the buttons. Runs and pace are everybody's."""
 
+import time
 from functools import partial
 
 from bokeh.document import Document
@@ -11,6 +12,7 @@ from cosim.view.page import Page
 from cosim.view.show import Show
 
 EVERY = 250  # ms of wall time between two pictures: 4 Hz
+SHARE = 0.2  # of a core, for the pictures of all viewers: with many of them, everybody's come more seldom
 
 
 class Viewer:
@@ -22,7 +24,7 @@ class Viewer:
         self._show, picture = show, show.picture
         self._page = Page(picture, [seen.name for seen in show.runs])
         self._at: float | None = None  # the time that is looked back at [s], None for the present
-        self._by, self._region, self._gate = DENSITY, 0, self._page.gate_of(0)
+        self._by = DENSITY
         self._drawn: tuple[object, ...] = ()
         self._traced: tuple[object, ...] = ()
         self._moving = False
@@ -33,26 +35,39 @@ class Viewer:
         self._page.place(
             document, f"{len(picture.edges):,} streets, {picture.regions} regions, control interval "
             f"{picture.step:g} s, {picture.steps} intervals", bar, choices)
+        self._next = 0.0
         self.refresh()
-        document.add_periodic_callback(self.refresh, EVERY)
+        show.viewers += 1
+        document.on_session_destroyed(self._leave)
+        document.add_periodic_callback(self._look, EVERY)
+
+    def _leave(self, _: object) -> None:
+        self._show.viewers -= 1
+
+    def _look(self) -> None:
+        """Draw, if this viewer's share of the time allows it."""
+        begin = time.perf_counter()
+        if begin >= self._next:
+            self.refresh()
+            self._next = begin + self._show.viewers * (time.perf_counter() - begin) / SHARE
 
     def refresh(self) -> None:
         """Draw what has changed."""
         show = self._show
-        time = show.now if self._at is None else min(self._at, show.now)
-        frames = [seen.at(time) for seen in show.runs]
+        now = show.now if self._at is None else min(self._at, show.now)
+        frames = [seen.at(now) for seen in show.runs]
         held = [frozenset((i, h) for (i, h), share in {
             (i, h): share for _, i, h, share in seen.switched}.items() if share is not None) for seen in show.runs]
-        drawn = (time, self._by, *held, *(None if frame is None else (frame.time, frame.whole) for frame in frames))
+        drawn = (now, self._by, *held, *(None if frame is None else (frame.time, frame.whole) for frame in frames))
         whole = [[frame for frame in seen.whole if frame.time <= show.now] for seen in show.runs]
-        traced = (self._region, self._gate, self._at, *(len(frames) for frames in whole))
+        traced = (self._page.region, self._page.gate, self._at, *(len(frames) for frames in whole))
         if drawn != self._drawn:
-            self._page.show(frames, time, self._by, held)
+            self._page.show(frames, now, self._by, held)
             self._drawn = drawn
         if traced != self._traced:
-            self._page.trace(whole, time)
+            self._page.trace(whole, now)
             self._traced = traced
-        self._label(time)
+        self._label(now)
 
     def _buttons(self) -> list:
         self._pause = Button(label="Pause", button_type="primary", name="pause", width=90)
@@ -78,18 +93,18 @@ class Viewer:
         colour = RadioButtonGroup(labels=["Density", "Speed"], active=0, name="colour")
         colour.on_change("active", lambda _, __, new: self._coloured((DENSITY, SPEED)[new]))
         self._regions = Select(
-            title="Region", name="region", value="0", width=210,
+            title="Region", name="region", value=str(self._page.region), width=210,
             options=[(str(n), f"{n} {name}") for n, name in enumerate(picture.region_names)])
         self._regions.on_change("value", lambda _, __, new: self._choose(int(new), None))
-        self._gates = Select(title="Gate", name="gate", value=_text(self._gate), width=110, options=[
+        self._gates = Select(title="Gate", name="gate", value=_text(self._page.gate), width=110, options=[
             _text(gate) for gate in picture.boundaries])
-        self._gates.on_change("value", lambda _, __, new: self._choose(self._region, _pair(new)))
+        self._gates.on_change("value", lambda _, __, new: self._choose(self._page.region, _pair(new)))
         self._whose = Select(title="of the run", name="whose", value="0", width=200, options=[
             (str(n), seen.name) for n, seen in enumerate(self._show.runs)])
         buttons: list[Button] = []
         for label, name, share in (
                 ("Close gate", "close", 0.0), ("Open gate", "open", 1.0), ("Let go", "release", None)):
-            button = Button(label=label, name=name, width=100, disabled=self._gate is None)
+            button = Button(label=label, name=name, width=100, disabled=self._page.gate is None)
             button.on_click(partial(self._switch, share))
             buttons.append(button)
         self._running += buttons
@@ -100,8 +115,8 @@ class Viewer:
         self.refresh()
 
     def _switch(self, share: float | None) -> None:
-        if self._gate is not None:
-            self._show.switch(int(self._whose.value), *self._gate, share)
+        if self._page.gate is not None:
+            self._show.switch(int(self._whose.value), *self._page.gate, share)
 
     def _coloured(self, by: str) -> None:
         self._by = by
@@ -129,23 +144,26 @@ class Viewer:
             self._page.maps[n].gates.selected.indices = []
             self._whose.value = str(n)
             if gate.signal:
-                self._choose(gate.source, (gate.source, gate.target))
+                self._choose(gate.target, (gate.source, gate.target))
 
     def _choose(self, region: int, gate: tuple[int, int] | None) -> None:
         """gate: None for the region's first one"""
-        gate = gate or self._page.gate_of(region)
-        if (region, gate) == (self._region, self._gate):
+        if self._moving:
             return
-        self._region, self._gate = region, gate
-        self._regions.value, self._gates.value = str(region), _text(gate)
+        gate = gate or self._page.gate_of(region)
+        if (region, gate) == (self._page.region, self._page.gate):
+            return
         self._page.choose(region, gate)
+        self._moving = True
+        self._regions.value, self._gates.value = str(region), _text(gate)
+        self._moving = False
         self.refresh()
 
-    def _label(self, time: float) -> None:
+    def _label(self, now: float) -> None:
         show = self._show
         self._pause.label = "Go on" if show.paused else "Pause"
         self._moving = True
-        self._time.value = min(time / MINUTE, self._time.end)
+        self._time.value = min(now / MINUTE, self._time.end)
         self._moving = False
         self._live.button_type = "success" if self._at is None else "default"
         for button in self._running if show.over else ():

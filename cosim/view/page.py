@@ -20,22 +20,26 @@ class Page:
     """The runs `names` side by side."""
 
     def __init__(self, picture: CityPicture, names: Sequence[str]):
-        """The busiest region to begin with: that with the least room."""
+        """A region in the middle to begin with: that with the most boundaries."""
         self.picture, self.names = picture, names
         self.maps = [CityMap(picture, name) for name in names]
         self.loads = [Load(picture, f"{name}: how full the regions are") for name in names]
         self.curves = Curves(picture, names)
         self.numbers = Div(text="", sizing_mode="stretch_width")
-        self.choose(0, self.gate_of(0))
+        ends = [region for gate in picture.gates for region in (gate.source, gate.target)]
+        self.region = max(range(picture.regions), key=ends.count)
+        self.gate = self.gate_of(self.region)
+        self.choose(self.region, self.gate)
 
     def gate_of(self, region: int) -> tuple[int, int] | None:
-        """The first gate out of a region, or into it; None where there is none with a signal."""
+        """The first gate into a region, or out of it; None where there is none with a signal."""
         gates = self.picture.boundaries
-        return next((gate for gate in gates if gate[0] == region), next(
-            (gate for gate in gates if gate[1] == region), None))
+        return next((gate for gate in gates if gate[1] == region), next(
+            (gate for gate in gates if gate[0] == region), None))
 
     def choose(self, region: int, gate: tuple[int, int] | None) -> None:
         """The region and the gate whose curves are shown, from the next `curves` on."""
+        self.region, self.gate = region, gate
         for one in self.maps:
             one.choose(region)
         self.curves.choose(region, gate)
@@ -88,10 +92,10 @@ def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -
     for n, (name, frame) in enumerate(zip(names, frames, strict=True)):
         told = () if frame is None else (
             ("inside [veh]", frame.accumulation.sum()), ("waiting to enter [veh]", frame.waiting),
-            ("completed trips [veh]", frame.completed), ("total time spent [veh h]", frame.time_spent / HOUR),
+            ("completed trips [veh]", frame.completed), ("time spent [veh h]", frame.time_spent / HOUR),
             ("removed [veh]", frame.removed))
         cells = "".join(
-            f"<div style='flex:0 0 142px'><div style='font-size:19px;font-variant-numeric:tabular-nums'>{value:,.0f}"
+            f"<div style='flex:0 0 138px'><div style='font-size:19px;font-variant-numeric:tabular-nums'>{value:,.0f}"
             f"</div><div style='font-size:12px;color:{colours.FAINT}'>{text}</div></div>" for text, value in told)
         note = "" if frame is None or not frame.note else (
             f"<div style='flex-basis:100%;font-size:13px;color:{colours.QUEUE}'>{escape(frame.note[:200])}</div>")
@@ -102,5 +106,5 @@ def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -
             f"</div>{cells}{note}</div>")
     return (
         "<div style='display:flex;flex-wrap:wrap;gap:4px 36px;align-items:center'>"
-        f"<div style='font-size:24px;font-weight:650;flex:0 0 110px'>{time / MINUTE:.1f} min</div>"
+        f"<div style='font-size:24px;font-weight:650;flex:0 0 130px;white-space:nowrap'>{time / MINUTE:.1f} min</div>"
         f"<div style='flex:1 1 280px;min-width:0'>{''.join(lines)}</div></div>")

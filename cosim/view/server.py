@@ -100,7 +100,7 @@ class Server:
         names = {"localhost", LOOPBACK, "::1", host.lower()}
         if not local:
             names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
-        application = Application(FunctionHandler(page))  # type: ignore[arg-type]
+        application = Application(FunctionHandler(page))
         self._loop = IOLoop.current()
         self._tornado = Guarded(application, frozenset(names), self._token)
         http = HTTPServer(
