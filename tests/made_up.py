@@ -39,6 +39,8 @@ def result(task, city) -> Result:
     record = {
         "departures": random.integers(0, 9, (steps, regions, regions)), "crossings": crossings,
         "arrivals": random.integers(0, 50, (steps, regions)),
+        **{name: np.zeros((steps, regions, regions), dtype=int) for name in ("removals", "given_up")},
+        **{name: np.zeros((steps, *[regions] * 3), dtype=int) for name in ("jumps", "redirected")},
         "edge_vehicles": random.uniform(0.0, 20.0, (steps, edges)).astype(np.float16),
         "gateway_green": original * (0.7 if acts else 1.0), "gateway_original_green": original,
         "gateway_flow": random.uniform(0.0, 9.0, (steps, gateways)),

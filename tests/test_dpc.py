@@ -334,6 +334,36 @@ def test_a_gate_needs_a_protected_region(scenario):
         training.settings(both, "dpc-pc")
 
 
+def test_swings_of_the_gates_cost_what_they_are(scenario):
+    """All gates of one pair of regions from closed to open are one swing."""
+    network = scenario.network
+    still, costly = (training.Rollout(planning_model(scenario), swing_cost=cost) for cost in (0.0, 7.0))
+    made = Policy(network, Architecture(width=8))
+    x, demand = still.random_start(2, 0.2, 1.0, torch.Generator().manual_seed(0))
+    demand = demand[:4]
+    i, h = np.argwhere(network.adjacency)[0]
+    shares = iter([0.0, 1.0, 1.0, 0.25] * 3)  # of this gate, over time; the others do not move
+
+    def act(seen):
+        perimeter = torch.full(seen.shape, 0.5)
+        if seen.ndim == 4:  # all at once: what the objective looks at
+            along = network.u_min + (network.u_max - network.u_min) * torch.tensor([next(shares) for _ in range(4)])
+            perimeter[..., i, h] = along[:, None]
+        return perimeter, None
+
+    totals = [rollout.total_time_spent(_Acting(made, act), x, demand, torch.Generator().manual_seed(1))
+              for rollout in (still, costly)]
+    torch.testing.assert_close(totals[1] - totals[0], torch.full((2,), 7.0 * 1.75), rtol=1e-3, atol=1.0)
+
+
+class _Acting(torch.nn.Module):
+    """A policy that does what `act` says."""
+
+    def __init__(self, policy, act):
+        super().__init__()
+        self.architecture, self.forward = policy.architecture, act
+
+
 def test_detours_cost_what_they_divert(scenario):
     """Everybody who leaves a region by another way than usual loses the time that a detour costs."""
     torch.manual_seed(0)

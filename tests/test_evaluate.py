@@ -13,6 +13,8 @@ from commands import cosim
 from cosim.evaluation import evaluate, experiment
 from cosim.evaluation.simulate import FACTS, Result
 from cosim.report import pictures
+from nmfd.api import load_scenario
+from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.runs.workers import Failure
 
@@ -140,6 +142,7 @@ def test_command_line_errors(tmp_path, arguments, expected):
     assert result.exit_code == 2 and expected in result.stderr and result.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_small_evaluation_in_sumo(city, tmp_path):
     file = city / "scenario.toml"
     file.write_text(re.sub(r"ramp_up = [\d.]+", "ramp_up = 60.0", file.read_text()))
@@ -168,3 +171,17 @@ def test_titles_name_the_most_teleports():
         ("a", 1), ("b", 9), ("c", 4), ("d", 0), ("b", 2))])
     assert pictures.teleports(rows) == "teleports: b 11, c 4, others fewer"
     assert pictures.teleports(rows[rows["controller"] != "a"]) == "teleports: b 11, c 4"
+
+
+@pytest.mark.parametrize("name, level, said", [
+    ("dpc-pc", 1.3, ""), ("dpc-pc", 1.31, "1.31 is outside of what the policy was trained on, 0.8 to 1.3 times"),
+    ("dpc-pc+rerouting-30", 1.6, ""), ("dpc-pcrg+max-pressure", 0.7, "0.7 is outside"), ("pi-gating", 9.0, "")])
+def test_a_run_outside_of_what_its_policy_was_trained_on_says_so(name, level, said):
+    found = registry.outside_training(name, load_scenario(ROOT / "scenarios" / "grid7_peak"), level)
+    assert said in found and bool(said) == bool(found)
+
+
+def test_remarks_name_every_controller_once():
+    rows = pd.DataFrame({"controller": ["a", "a", "b", "c"], "outside_training": ["far", "far", np.nan, ""]})
+    assert experiment.remarks(rows) == ["a: far"]
+    assert experiment.remarks(rows.drop(columns="outside_training")) == []

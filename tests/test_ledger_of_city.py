@@ -330,7 +330,8 @@ def test_a_vehicle_that_sumo_tells_nothing_of_is_an_error(city, tmp_path):
     silent = Case(vehicles='<vType id="s"><param key="has.tripinfo.device" value="false"/></vType>'
                   '<flow id="f" type="s" begin="0" end="50" period="5" from="A1B1" to="B1C1"/>', trips=5)
     for prompt in (True, False):
-        with pytest.raises(LedgerError, match=r"such as f\.\d\); does their type have has\.tripinfo\.device = false"):
+        with pytest.raises(LedgerError, match=(
+            r"such as f\.\d\): is the disk full\? Or does their type have has\.tripinfo\.device = false")):
             run(tmp_path, city, silent, mesoscopic=False, seed=1, prompt=prompt)
 
 

@@ -83,6 +83,7 @@ def test_it_has_a_table_of_its_own(place):
     assert perimeter[0, 1] == 0.9  # without gain nothing is held back
 
 
+@pytest.mark.slow
 def test_processes_and_sumo_take_it(place):
     (place / "mine.py").write_text(GOOD)
     copies.peak(place)

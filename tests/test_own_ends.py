@@ -148,6 +148,7 @@ def test_a_process_that_ends_or_hangs_costs_its_own_run(tmp_path, scenario, monk
             assert "\n" not in found[name].reason
 
 
+@pytest.mark.slow
 def test_commands_name_it_and_keep_the_others(tmp_path, monkeypatch):
     tiny.write(tmp_path)
     monkeypatch.chdir(tmp_path)

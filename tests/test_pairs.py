@@ -49,7 +49,7 @@ def test_reasons_are_told_against_the_first(folder):
 
 def test_the_page_speaks_of_the_first(folder, monkeypatch):
     for name in ("draw", "draw_more", "region_map"):
-        monkeypatch.setattr(html.report, name, lambda *_: None)
+        monkeypatch.setattr(html.pictures, name, lambda *_: None)
     good(cosim("report", folder))
     page = (folder / "report.html").read_text()
     plain = re.sub(r"base64,[\w+/=]+", "", page)

@@ -1,5 +1,6 @@
 """Figures: fixed colours, units on the axes, the right bands, and data that arrives in them."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -116,9 +117,8 @@ def test_the_legend_fits_the_figure(scenario, width):
     assert drawing.legends[0].get_window_extent(drawing.canvas.get_renderer()).width <= drawing.bbox.width
 
 
-def test_plots_leave_pyplot_alone(scenario, tmp_path):
-    import sys
-
+def test_plots_leave_pyplot_alone(scenario, tmp_path, monkeypatch):
+    monkeypatch.delitem(sys.modules, "matplotlib.pyplot", raising=False)  # others may have it
     drawing = plots.figure(4, 3)
     plots.total_accumulation(drawing.subplots(), runs_of(scenario))
     plots.save(drawing, tmp_path / "a.png")

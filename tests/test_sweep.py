@@ -188,6 +188,7 @@ def test_no_scheduler_answers(peak, tmp_path, monkeypatch):
         assert done.stderr.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_two_dask_workers_one_killed_in_mid_run(peak, tmp_path):
     distributed = pytest.importorskip("distributed", reason="the extra dask is not installed")
     with distributed.LocalCluster(

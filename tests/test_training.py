@@ -22,12 +22,13 @@ from nmfd.model.planning import planning_model
 CHOSEN = {
     "width": 8, "layers": 1, "activation": "relu", "steps": 3, "batch": 4, "learning_rate": 0.25, "alternating": False,
     "demand_spread": 0.5, "demand_low": 0.75, "demand_high": 1.5, "initial_share": 0.25, "noise": 0.125,
-    "noise_all": 0.0625, "mfd_spread": 0.375, "mfd_scale": 0.875, "detour_cost": 20.0, "from_no_control": True}
+    "noise_all": 0.0625, "mfd_spread": 0.375, "mfd_scale": 0.875, "detour_cost": 20.0, "swing_cost": 3.0,
+    "from_no_control": True}
 BEYOND = {
     "width": (0, 10**9), "layers": (0, 10**9), "steps": (0, 10**9), "batch": (0, 10**9), "learning_rate": (0.0, 1.1),
     "demand_spread": (-0.1, 1.1), "demand_low": (0.0, 1.1), "demand_high": (0.9, 101.0), "initial_share": (-0.1, 1.1),
     "noise": (-0.1, 1e7), "noise_all": (-0.1, 1e7), "mfd_spread": (-0.1, 1.1), "mfd_scale": (0.05, 1.1),
-    "detour_cost": (-0.1, 1e7)}
+    "detour_cost": (-0.1, 1e7), "swing_cost": (-0.1, 1e10)}
 
 
 @pytest.fixture
@@ -313,3 +314,29 @@ def test_a_wrong_setting_names_the_table_of_its_variant(scenario):
         training.settings(replace(scenario, controller_options=tables), "dpc-pc+webster")
     with pytest.raises(InputError, match=r"controllers\.dpc-pc\.width: "):
         training.settings(replace(scenario, controller_options={"dpc-pc": {"width": 0}}), "dpc-pc")
+
+
+def test_the_model_that_a_controller_is_trained_on_must_be_measured(scenario):
+    """Its own one, whatever the city's is; and somewhere something must be controllable."""
+    own = replace(scenario.network, placeholder=True)
+    city = replace(scenario, network=own)
+    with pytest.raises(InputError, match="placeholder: is true.*--anyway trains dpc-pc all the same"):
+        training.check(city, "dpc-pc")
+    believed = training.check(scenario, "dpc-pc")
+    assert believed is not scenario.network and believed.hash == scenario.network.hash
+    shut = replace(scenario.network, controllable=np.zeros_like(scenario.network.adjacency, dtype=float))
+    with pytest.raises(InputError, match="controllable: is 0 at every boundary.*dpc-pcrg all the same"):
+        training.check(replace(scenario, network=shut), "dpc-pcrg")
+
+
+def test_a_model_of_its_own_counts(tmp_path):
+    folder = tiny.write(tmp_path)
+    shutil.copytree(tmp_path / "network", tmp_path / "guessed")
+    file = tmp_path / "guessed" / "network.toml"
+    file.write_text(file.read_text().replace("[perimeter]", "placeholder = true\n\n[perimeter]"))
+    with (folder / "scenario.toml").open("a") as stream:
+        stream.write('\n[controllers.dpc-pc]\nmodel = "../guessed"\n')
+    scenario = load_scenario(folder)
+    training.check(scenario, "dpc-pcrg")
+    with pytest.raises(InputError, match="guessed/network.toml: placeholder"):
+        training.check(scenario, "dpc-pc")

@@ -232,8 +232,8 @@ def read_run(folder: Path, controller: str, seed: int) -> Result:
     """A finished run of the run folder. Raises InputError."""
     with run_folder.opened(run_folder.run_path(folder, controller, seed)) as file:
         return Result(
-            trajectory=run_folder.trajectory_in(file), facts={}, record={  # older versions recorded less
-                name: file[name][...] for name in quantities(Record) if name in file.variables})
+            trajectory=run_folder.trajectory_in(file), record={name: file[name][...] for name in quantities(Record)},
+            facts={})
 
 
 def measured_outflow(folder: Path) -> OutflowOf:

@@ -243,7 +243,7 @@ class Meter:
             return ""
         return (
             f": SUMO's tripinfo does not tell how the trips of {len(self._gone)} vehicles ended (such as "
-            f"{min(self._gone)}); does their type have has.tripinfo.device = false? Remove that")
+            f"{min(self._gone)}): is the disk full? Or does their type have has.tripinfo.device = false? Remove that")
 
     def _book(self, gone: _Gone, end: End, sign: int = 1) -> None:
         """In the books of a vehicle that is in no region any more; sign: -1 to take it back."""

@@ -108,8 +108,10 @@ def is_own(name: str) -> bool:
 
 
 def runs_apart(name: str) -> bool:
-    """Whether NAME or NAME+... is a controller of the user's own, each run of which has a process of its own."""
-    return is_own(split(name)[0])
+    """Whether NAME or NAME+... is a controller of the user's own, each run of which has a process of its own; any
+    other word is none."""
+    first = split(name)[0]
+    return first not in _ENTRIES and (custom.is_file(first) or first in custom.entry_points())
 
 
 def guides(name: str) -> bool:

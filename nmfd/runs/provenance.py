@@ -4,6 +4,7 @@ import platform
 import subprocess
 from contextlib import suppress
 from datetime import datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -16,14 +17,21 @@ def provenance() -> dict:
     for package in PACKAGES:
         with suppress(metadata.PackageNotFoundError):
             versions[package] = metadata.version(package)
+    commit, dirty = _checkout()
+    return {
+        "date": datetime.now().astimezone().isoformat(timespec="seconds"), "versions": versions, "commit": commit,
+        "dirty": dirty}
+
+
+@cache
+def _checkout() -> tuple[str | None, bool | None]:
+    """Commit, and whether files differ from it; as this process found them first, for that is the code that it runs."""
     here = Path(__file__).resolve()
     # An installed copy may lie inside somebody else's checkout: the commit counts only if this file is tracked.
     tracked = _git(here.parent, "ls-files", "--error-unmatch", here.name) is not None
     commit = _git(here.parent, "rev-parse", "HEAD") if tracked else None
     changes = _git(here.parent, "status", "--porcelain", "--untracked-files=no") if commit else None
-    return {
-        "date": datetime.now().astimezone().isoformat(timespec="seconds"), "versions": versions,
-        "commit": commit, "dirty": None if changes is None else bool(changes)}
+    return commit, None if changes is None else bool(changes)
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

@@ -51,6 +51,9 @@ class Training(Options):
     detour_cost: float = setting(
         "what a vehicle loses that is guided off the drivers' own split ratios, in the objective", 0.0, unit="s",
         ge=0.0, le=1e6)
+    swing_cost: float = setting(
+        "what it costs in the objective to open or close the gates between two regions once, whole and within one "
+        "control interval", 0.0, unit="veh s", ge=0.0, le=1e9)
     from_no_control: bool = setting(
         "the first policy is nearly no control, so that what training finds no reason to change stays open", False)
     from_gating: bool = setting(

@@ -110,7 +110,8 @@ def train(
         if chosen.from_no_control:
             begin_as_no_control(policy, planning.network)
         policy = policy.to(device)
-        rollout = Rollout(planning, device=device, detour_cost=chosen.detour_cost)
+        rollout = Rollout(
+            planning, device=device, detour_cost=chosen.detour_cost, swing_cost=chosen.swing_cost)
         if chosen.from_gating and not resume:
             begin_as_gate(policy, rollout, generator)
         advance = compiled_step(rollout.step) if compiled else rollout.step
