@@ -12,7 +12,7 @@ import tiny_city
 from bokeh.document import Document
 from bokeh.embed import file_html
 from bokeh.models import Button
-from bokeh.resources import CDN
+from bokeh.resources import CDN, INLINE
 from commands import call, cosim, error_line
 from tornado.httputil import HTTPHeaders, HTTPServerRequest, RequestStartLine
 from tornado.ioloop import IOLoop
@@ -20,10 +20,10 @@ from tornado.ioloop import IOLoop
 from cosim.evaluation.simulate import Task, scenario_of, simulate
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import load_city
-from cosim.view import city_map, picture
+from cosim.view import city_map, picture, replay, run
 from cosim.view.page import Page, numbers
 from cosim.view.picture import CityPicture, Frame
-from cosim.view.run import Pace, Reporter, Switch, Switched
+from cosim.view.run import Pace, Switch, Switched
 from cosim.view.server import Server
 from cosim.view.show import DELAYS, Seen
 from nmfd import faults
@@ -84,9 +84,8 @@ def watched(task, *, orders=()):
     thread = threading.Thread(target=listen)
     thread.start()
     try:
-        result = simulate(task, observer=Reporter(task, there, Pace(until=step)))
+        result = run.run(there, Pace(until=step), task)
     finally:
-        there.close()
         thread.join()
     assert waited == [True]
     return result, shown
@@ -187,14 +186,14 @@ def test_looking_back():
         time=60.0 * k, intervals=k, whole=True, **dict.fromkeys(("density", "speed"), np.zeros(1, np.float16)),
         accumulation=np.zeros(1), outflow=np.zeros(1), waiting=0.0, completed=k, removed=0.0, time_spent=0.0,
         perimeter=np.zeros((1, 1)), green=np.zeros(0), queue=np.zeros(0), guided=np.zeros((1, 1))) for k in range(4)]
-    run = Seen("x")
-    assert run.at(100.0) is None
+    seen = Seen("x")
+    assert seen.at(100.0) is None
     for frame in frames:
-        run.add(frame)
-    run.add(replace(frames[-1], time=200.0, whole=False))
+        seen.add(frame)
+    seen.add(replace(frames[-1], time=200.0, whole=False))
     times = {0.0: 0.0, 61.0: 60.0, 179.0: 120.0, 180.0: 180.0, 199.0: 180.0, 1e9: 200.0}
-    assert {time: run.at(time).time for time in times} == times
-    assert len(run.whole) == 4 and DELAYS[0] == 0.0 == min(DELAYS)
+    assert {time: seen.at(time).time for time in times} == times
+    assert len(seen.whole) == 4 and DELAYS[0] == 0.0 == min(DELAYS)
     text = numbers([EVIL], [replace(frames[-1], note=EVIL)], 180.0)
     assert "<script" not in text and text.count("&lt;script&gt;") == 2 and "3.0 min" in text
 
@@ -223,6 +222,28 @@ def test_a_page_shows_every_street_and_trusts_no_name(task, city, seen):
     curves = page.curves
     for plot in (curves.region, curves.plane, curves.gate, curves.trips, curves.spent):
         assert all("[" in axis.axis_label for axis in plot.axis)  # units
+
+
+def test_finished_runs_on_one_page_with_a_slider(task, city, plain, switched, tmp_path):
+    drawn = replace(CityPicture.of(scenario_of(task), city), name=EVIL)
+    runs = {"plain": picture.frames(drawn, plain.trajectory, plain.record),
+            EVIL: picture.frames(drawn, switched[0].trajectory, switched[0].record)}
+    made = replay.document(drawn, runs, "seed 3")
+    callback = made.get_model_by_name("time").js_property_callbacks["change:value"][0]
+    film, choices = callback.args["film"].data, callback.args["choices"].data
+    assert {len(rows) for rows in film.values()} == {STEPS + 1}
+    assert {len(rows) for rows in choices.values()} == {drawn.regions}
+    for n, frames in enumerate(runs.values()):
+        for k, frame in enumerate(frames):
+            np.testing.assert_array_equal(film[f"streets{n}.value"][k], frame.density.astype(np.float32))
+        for r in range(drawn.regions):
+            wanted = [frame.accumulation[r] for frame in frames]
+            np.testing.assert_array_equal(choices[f"lines{n}.accumulation"][r], np.array(wanted, np.float32))
+    assert film["streets0.value"][-1].tolist() != film["streets1.value"][-1].tolist()
+    html = replay.write(tmp_path / "replay.html", drawn, runs, "seed 3").read_text()
+    assert EVIL not in html
+    for elsewhere in ('src="http', 'href="http'):  # those in the scripts themselves are texts
+        assert html.count(elsewhere) == INLINE.render().count(elsewhere)
 
 
 # The server.

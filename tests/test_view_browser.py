@@ -44,6 +44,41 @@ def browser():
         found.close()
 
 
+def test_the_slider_of_a_report_moves_both_maps(scenario, browser, tmp_path):
+    out = tmp_path / "run"
+    for command in (("run", scenario, "--controller", "no-control+guided", "--against", "no-control", "--seed", 3,
+                     "--steps", 6, "--out", out), ("report", out, "--replay")):
+        result = call("cosim", *command)
+        assert result.exit_code == 0, result.output
+    assert str(out / "replay.html") in result.stdout and (out / "report.html").is_file()
+    page, wrong = browser.new_page(viewport={"width": 1200, "height": 900}), []
+    page.on("console", lambda said: said.type in ("error", "warning") and wrong.append(said.text))
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("dialog", lambda dialog: wrong.append(dialog.message))
+    page.on("request", lambda asked: asked.url.startswith(("file:", "data:", "blob:")) or wrong.append(asked.url))
+    page.goto((out / "replay.html").as_uri())
+    page.wait_for_function("() => window.Bokeh && Bokeh.documents.length && document.querySelector('h1')")
+
+    def shown():
+        return page.evaluate("""() => [0, 1].map(n => Array.from(Bokeh.documents[0].get_model_by_name(`map${n}`)
+            .renderers.map(one => one.data_source.data).find(data => data.edge).value))""")
+
+    page.locator(".noUi-handle").wait_for()
+    at_the_end = shown()
+    page.locator(".noUi-handle").focus()
+    for _ in range(3):
+        page.keyboard.press("ArrowLeft")
+    page.wait_for_timeout(500)
+    before = shown()
+    assert before[0] != at_the_end[0] and before[1] != at_the_end[1]
+    page.locator("select").select_option(index=1)
+    page.wait_for_timeout(300)
+    assert page.evaluate("() => Bokeh.documents[0].get_model_by_name('plane').title.text").startswith("Region 1")
+    page.get_by_role("button", name="Play").click()
+    page.wait_for_timeout(2000)
+    assert shown() == at_the_end and wrong == []
+
+
 @pytest.mark.parametrize("width", [1400, 390])
 def test_the_page_lives(scenario, browser, width):
     command = [sys.executable, "-m", "cosim", "watch", str(scenario), "--controller", "no-control", "--against",

@@ -27,7 +27,12 @@ if TYPE_CHECKING:
 @click.option("--out", type=FILE, metavar="FILE", help="The page. [default: report.html in the first RUN]")
 @REFERENCE
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="The runs' scenario, if it is no longer where it was.")
-def report(folders: tuple[Path, ...], out: Path | None, reference: str | None, scenario: Path | None) -> None:
+@click.option("--replay", is_flag=True,
+              help="Write replay.html beside the page, too: the best run of the first RUN and what it is compared "
+                   "with, on the map of the city, with a slider over their time.")
+def report(
+    folders: tuple[Path, ...], out: Path | None, reference: str | None, scenario: Path | None, replay: bool,
+) -> None:
     """Write one self-contained HTML page about finished runs: what came of them, in words, tables and pictures.
 
     RUN is a folder of `cosim run` or `cosim evaluate`; several come on one page. The page works without a network.
@@ -36,6 +41,7 @@ def report(folders: tuple[Path, ...], out: Path | None, reference: str | None, s
     Examples:
       cosim report runs/grid7_peak-evaluate
       cosim report runs/monday runs/tuesday --out both.html
+      cosim report runs/gating --replay
     """
     from cosim.evaluation import results  # heavy
     from cosim.report import html
@@ -47,6 +53,10 @@ def report(folders: tuple[Path, ...], out: Path | None, reference: str | None, s
     with progress_line("report") as progress:
         path = html.write_page(out or folders[0] / "report.html", found, reference, progress)
     click.echo(f"Written to {path}: open it in a browser")
+    if replay:
+        from cosim.report.replay import write_replay  # heavy
+
+        click.echo(f"Written to {write_replay(path.with_name('replay.html'), found[0], reference)}: the runs over time")
 
 
 @click.command()

@@ -47,7 +47,7 @@ class CityMap:
         plot.toolbar.active_scroll = wheel
         self.regions = self._regions(plot)
         self.streets, self._scale = self._streets(plot)
-        self._arrows = self._guidance(plot)
+        self.arrows = self._guidance(plot)
         self.gates = self._gateways(plot)
         _numbers(plot, picture)
         plot.add_layout(ScaleBar(
@@ -182,7 +182,7 @@ class CityMap:
         guided = np.array([frame.guided[pair] for pair in self._pairs])
         width = WIDEST * np.sqrt(guided / max(guided.max(), 1.0))
         every = slice(len(guided))
-        self._arrows.patch({
+        self.arrows.patch({
             "width": [(every, width.astype(np.float32))],
             "head": [(every, np.where(guided > 0, 6.0 + 1.5 * width, 0.0).astype(np.float32))],
             "guided": [(every, guided.astype(np.float32))]})

@@ -68,15 +68,15 @@ class Curves:
         for plot in overtime:
             plot.x_range.start, plot.x_range.end = 0.0, horizon
         self.gate.y_range.start, self.gate.y_range.end = -0.04, 1.08
-        self._critical = ColumnDataSource({"x": [], "y": []})
-        self.region.line("x", "y", source=self._critical, color=colours.INK, line_dash="dotted", line_width=1.5,
+        self.critical = ColumnDataSource({"x": [], "y": []})
+        self.region.line("x", "y", source=self.critical, color=colours.INK, line_dash="dotted", line_width=1.5,
                          legend_label="critical")
-        self._curve = ColumnDataSource({"x": [], "y": []})
-        self.plane.line("x", "y", source=self._curve, color=colours.FAINT, line_width=2, legend_label="fitted MFD")
+        self.curve = ColumnDataSource({"x": [], "y": []})
+        self.plane.line("x", "y", source=self.curve, color=colours.FAINT, line_width=2, legend_label="fitted MFD")
         for n, name in enumerate(names):
             colour, dash = colours.RUNS[n]
             empty: dict[str, list[float]] = {key: [] for key in (
-                "time", "accumulation", "u", "green", "completed", "spent")}
+                "time", "accumulation", "outflow", "u", "green", "completed", "spent")}
             line = ColumnDataSource(empty)
             for plot, key in ((self.region, "accumulation"), (self.trips, "completed"), (self.spent, "spent")):
                 plot.line("time", key, source=line, color=colour, line_dash=dash, line_width=2, legend_label=name)
@@ -95,7 +95,7 @@ class Curves:
         for plot in (*overtime, self.plane):
             _legend(plot)
         self.gate.legend.location = "bottom_left"
-        self._now = [_now(plot) for plot in overtime]
+        self.now = [_now(plot) for plot in overtime]
 
     def choose(self, region: int, gate: tuple[int, int] | None) -> None:
         """The region and the gate whose curves are shown."""
@@ -107,9 +107,9 @@ class Curves:
         self.plane.title.text = f"Region {region}, {name}: MFD plane"
         self.gate.title.text = "No gate with a signal" if gate is None else (
             f"Gate {gate[0]} → {gate[1]}: command and green")
-        self._critical.data = {"x": [0.0, picture.steps * picture.step / MINUTE],
+        self.critical.data = {"x": [0.0, picture.steps * picture.step / MINUTE],
                                "y": [float(picture.critical[region])] * 2}
-        self._curve.data = {"x": curve[:, 0].astype(np.float32), "y": curve[:, 1].astype(np.float32)}
+        self.curve.data = {"x": curve[:, 0].astype(np.float32), "y": curve[:, 1].astype(np.float32)}
 
     def show(self, runs: Sequence[Sequence[Frame]], time: float) -> None:
         """runs: the whole frames of every run so far; time: [s], that is looked at"""
@@ -119,6 +119,7 @@ class Curves:
             self.lines[n].data = {
                 "time": np.array([frame.time for frame in whole], np.float32) / MINUTE,
                 "accumulation": np.array([frame.accumulation[self._region] for frame in whole], np.float32),
+                "outflow": np.array([frame.outflow[self._region] for frame in whole], np.float32),
                 "u": np.array([u for u, _ in shares], np.float32),
                 "green": np.array([green for _, green in shares], np.float32),
                 "completed": np.array([frame.completed for frame in whole], np.float32),
@@ -131,7 +132,7 @@ class Curves:
 
     def mark(self, time: float) -> None:
         """A line at the time [s] that is looked at."""
-        for now in self._now:
+        for now in self.now:
             now.location = time / MINUTE
 
     def _shares(self, frame: Frame) -> tuple[float, float]:

@@ -4,10 +4,13 @@ The run is that of `cosim run`: it is shown (cosim.plant.observer), and changed 
 switches, which are ordered faults. It waits at the next look at the streets, a few simulated seconds on.
 """
 
+import queue
+import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from typing import Self
 
 import numpy as np
 
@@ -19,6 +22,7 @@ from cosim.view.picture import CityPicture, after, between, first
 from nmfd.errors import RunFailed
 from nmfd.types import Controls, State
 
+ALONE = "nobody watches any more"
 RATE = 8.0  # frames per second of wall time within control intervals, at most
 
 
@@ -50,15 +54,49 @@ class Switched:
 
 def run(connection: Connection, pace: Pace, task: Task) -> Result:
     """Run `task`, watched at the other end of `connection`, at first at `pace`. Raises InputError."""
-    with connection:
-        return simulate(task, observer=Reporter(task, connection, pace))
+    with connection, Outbox(connection) as outbox:
+        return simulate(task, observer=Reporter(task, connection, outbox, pace))
+
+
+class Outbox:
+    """Sends by a thread of its own, so that a run does not wait for somebody who is slow to look."""
+
+    def __init__(self, connection: Connection):
+        """connection: of which nobody else sends"""
+        self._connection, self._waiting, self._lost = connection, queue.SimpleQueue[object](), False
+        self._thread = threading.Thread(target=self._send, daemon=True)
+
+    def put(self, what: object, *, omit: bool = False) -> None:
+        """omit: not if something else is still to be sent. RunFailed where nobody is at the other end any more."""
+        if self._lost:
+            raise RunFailed(ALONE)
+        if not omit or self._waiting.empty():
+            self._waiting.put(what)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Send what is left."""
+        self._waiting.put(None)
+        self._thread.join()
+
+    def _send(self) -> None:
+        while (what := self._waiting.get()) is not None:
+            try:
+                self._connection.send(what)
+            except OSError:
+                self._lost = True
+                return
 
 
 class Reporter:
     """The observer of one run (cosim.plant.observer.Observer)."""
 
-    def __init__(self, task: Task, connection: Connection, pace: Pace):
-        self._connection, self._pace = connection, pace
+    def __init__(self, task: Task, connection: Connection, outbox: Outbox, pace: Pace):
+        """connection: where orders come from; outbox: where frames go; pace: at first"""
+        self._connection, self._outbox, self._pace = connection, outbox, pace
         self._scenario = scenario_of(task)
         self._begin = settings(self._scenario).begin
         self._switches: list[Switch] = []
@@ -87,7 +125,7 @@ class Reporter:
         paused = now >= self._pace.until
         if now < (self._state.step + 1) * self._picture.step - 1e-6:  # the interval's own frame comes in a moment
             if paused or time.perf_counter() - self._sent > 1.0 / RATE:
-                self._send(between(self._picture, self._frame, now, vehicles, speed))
+                self._send(between(self._picture, self._frame, now, vehicles, speed), omit=not paused)
             self._wait(now)
 
     def recorded(self, controls: Controls, state: State, row: Mapping[str, np.ndarray]) -> None:
@@ -98,11 +136,8 @@ class Reporter:
         self._send(self._frame)
         self._wait(state.time)
 
-    def _send(self, what: object) -> None:
-        try:
-            self._connection.send(what)
-        except OSError:
-            raise RunFailed("nobody watches any more") from None
+    def _send(self, what: object, *, omit: bool = False) -> None:
+        self._outbox.put(what, omit=omit)
         self._sent = time.perf_counter()
 
     def _wait(self, now: float) -> None:
@@ -120,4 +155,4 @@ class Reporter:
                 else:
                     self._pace, self._due = order, time.perf_counter()
         except (EOFError, OSError):
-            raise RunFailed("nobody watches any more") from None
+            raise RunFailed(ALONE) from None
