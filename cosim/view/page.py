@@ -73,9 +73,10 @@ class Page:
             **{f"load{n}": one.plot for n, one in enumerate(self.loads)},
             "region_curve": curves.region, "plane": curves.plane, "gate_curve": curves.gate, "trips": curves.trips,
             "spent": curves.spent, **{str(model.name): model for model in (*bar, *choices)}}
-        for name, model in roots.items():
-            model.name = name
-            document.add_root(model)
+        with document.models.freeze():  # else all models are looked through anew with every root
+            for name, model in roots.items():
+                model.name = name
+                document.add_root(model)
         document.title = f"{self.picture.name}: {' against '.join(self.names)}"
         document.template = get_env().from_string((HERE / "page.html.j2").read_text(encoding="utf-8"))
         document.template_variables.update(

@@ -28,7 +28,7 @@ from tornado.web import ErrorHandler
 from nmfd.errors import InputError
 
 LOOPBACK = "127.0.0.1"
-MOST_VIEWERS = 60
+MOST_VIEWERS = 12    # at a time: a page takes half a second of processor time to make
 LARGEST = 1_000_000  # bytes of a message to the server
 LEFT = 5.0           # s without a viewer, after which nobody is looking
 
