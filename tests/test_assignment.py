@@ -110,7 +110,7 @@ def test_an_import_assigns_its_peak(tmp_path):
     assert partitions.regions.min() == 2 and partitions.chosen.sum() == 1 and len(partitions) >= 2
     for gap in ("2", "nan"):
         line = error_line(cosim("import", net, "--regions", 2, "--demand", "peak", "--gap", gap, "--out", "x/y"))
-        assert f"--gap: expected a share from 0 to 1, got {gap} instead" in line
+        assert f"'--gap': expected a number in [0, 1], got '{gap}' instead" in line
 
 
 def test_without_a_run_the_report_says_that_nobody_avoids_queues(tmp_path):

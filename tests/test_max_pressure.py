@@ -1,15 +1,18 @@
 """Max-pressure without SUMO: the ways between stages, rations of green, and pressures worked out by hand."""
 
+from dataclasses import replace
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import tiny_city
 from signal_rules import CROSS, MIN_GREEN, PHASES, SINGLE, check, signal
 
 from cosim.plant.max_pressure import EVERY, MAX_RED, PERMISSIVE, Junction, MaxPressure, Roads, stages_of, transition
-from cosim.sumo.net import Gateway
+from cosim.sumo.net import Gateway, load_city
 from cosim.sumo.session import Phase
-from cosim.sumo.signals import Link
+from cosim.sumo.signals import Link, read_signals
 
 
 @pytest.mark.parametrize("phases", [PHASES, SINGLE, CROSS])
@@ -257,6 +260,35 @@ def test_who_waits_too_long_comes_first():
         session.time += 1.0
     assert [entry for entry in shown if entry[1] == "rG"] == [(MAX_RED + 3.0, "rG")]
     assert shown[-1] == (MAX_RED + 13.0, "Gr")
+
+
+def test_who_waits_on_a_street_that_is_closed_to_cars_gets_a_green():
+    """Buses on k are in no count of cars; without a look at their lane they would wait for ever."""
+    crossing = replace(CROSSING, links=(link(0, "a", "b"),), others=(link(1, "k", "d"),))
+    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 5.0, "k": 1.0}.get(lane[0], 0.0))
+    shown = []
+    control = MaxPressure(session, TOWN, [crossing], FLOWS, min_green=5.0, max_green=500.0,
+                          show=lambda name, state: shown.append((session.time, state)))
+    for _ in range(150):
+        control.play(session.time)
+        session.time += 1.0
+    assert (MAX_RED + 3.0, "rG") in shown and shown[-1] == (MAX_RED + 13.0, "Gr")
+
+
+def test_streets_that_are_closed_to_cars_are_read_with_their_signals(tmp_path):
+    """A bus street from the north into B1 of the tiny city; footways at its signal are nobody's."""
+    file = tiny_city.network(tmp_path, "--tls.set", "B1,B2,C1,C2,B3,C0")
+    root = ElementTree.parse(file)
+    for lane in root.iterfind("edge[@id='B2B1']/lane"):
+        lane.set("allow", "bus")
+    root.write(file)
+    edges = [edge.get("id") for edge in root.iterfind("edge") if edge.get("function") != "internal"]
+    (tmp_path / "regions.csv").write_text("edge,region\n" + "".join(f"{edge},0\n" for edge in edges))
+    city = load_city(file, tmp_path / "regions.csv", 1)
+    (found,) = (one for one in read_signals(city)[0] if one.id == "B1")
+    assert {each.from_edge for each in found.others} == {"B2B1"}
+    assert "B2B1" not in {each.from_edge for each in found.links}
+    assert {each.index for each in (*found.links, *found.others)} == set(range(len(found.phases[0].state)))
 
 
 def test_the_green_goes_where_the_pressure_is_after_the_minimum(junctions):

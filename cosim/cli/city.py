@@ -77,7 +77,7 @@ def identify(
 
 @click.command(name="import")
 @click.argument("source", type=FILE, metavar="SUMOCFG|NET")
-@click.option("--regions", type=click.IntRange(min=2), metavar="N", help="How many regions to cut the city into.")
+@declared("cosim.importing.settings:Import", "regions", instead="those of --edges, --taz or --polygons")
 @click.option("--out", type=FOLDER, required=True, metavar="DIR", help="The network's folder, such as networks/mycity.")
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="[default: scenarios/<name>, beside the networks]")
 @click.option("--method", type=click.Choice(["density", "geometric"]), default="density", show_default=True,
@@ -91,15 +91,11 @@ def identify(
               help="OD matrix between TAZ: tazRelation XML, or VISUM's O- or V-format. May be repeated.")
 @click.option("--zones", type=FILE, multiple=True, metavar="FILE", help="The TAZ of --od, if not in the sumocfg.")
 @click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak, for a city without demand.")
-@click.option("--iterations", type=click.IntRange(min=0), default=20, show_default=True, metavar="N",
-              help="Of the assignment of that peak, at most; 0: everybody goes as if alone, no basis for comparisons.")
-@click.option("--gap", type=float, default=0.05, show_default=True, metavar="X",
-              help="The relative gap at which the assignment ends.")
+@declared("cosim.importing.settings:Import", "iterations", "gap")
 @click.option("--level", default="1", show_default=True, metavar="X|auto",
               help="Times the city's vehicles, or the usual peak; auto: the lowest at which without control a region "
               "comes to its critical accumulation.")
-@click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, metavar="N",
-              help="Runs without control whose densities are averaged.")
+@declared("cosim.importing.settings:Import", "seeds")
 @declared("cosim.plant.settings:SumoTable", "mesoscopic", is_flag=True)
 @click.option("--begin", metavar="TIME", help="Instead of the sumocfg's, in seconds or as hours:minutes:seconds.")
 @click.option("--end", metavar="TIME", help="Later departures are left out.")
@@ -135,8 +131,6 @@ def import_(
         raise InputError("--regions: give a number of regions, or else one of --edges, --taz and --polygons")
     if no_run and cuts[0].method == "density":
         raise InputError("--no-run: the densities come from that run; add --method geometric")
-    if not 0.0 <= gap <= 1.0:
-        raise InputError(f"--gap: expected a share from 0 to 1, got {gap:g} instead")
     order = ImportOptions(
         source=source, out=out, cut=cuts[0], seed=seed, run=not no_run, force=force,
         peak=demand is not None, level=parsed_level(level, no_run), mesoscopic=mesoscopic,

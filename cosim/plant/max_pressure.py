@@ -273,7 +273,7 @@ class Approaches:
     def __init__(self, signal: Signal, watched: Callable[[Link], set[int]], now: float):
         """watched: the lanes, by their number, whose vehicles may wait for a link"""
         self.serves = np.array([_green(signal.phases[n].state) for n in stages_of(signal)], dtype=float)
-        pairs = sorted({(link.index, lane) for link in signal.links for lane in watched(link)})
+        pairs = sorted({(link.index, lane) for link in (*signal.links, *signal.others) for lane in watched(link)})
         self._link, self._lane = np.array(pairs).T
         self._last_green = np.full(self.serves.shape[1], now)
 
@@ -316,7 +316,8 @@ class Roads:
                 self._before[other].append(edge)
         cars = [lane for edge in city.edges for lane in city.lane_ids[edge]]
         links = [link for signal in signals for link in signal.links]
-        self.lanes = list(dict.fromkeys([*cars, *(lane_id(link) for link in links)]))
+        others = [link for signal in signals for link in signal.others]
+        self.lanes = list(dict.fromkeys([*cars, *(lane_id(link) for link in (*links, *others))]))
         self.lane_number = {lane: n for n, lane in enumerate(self.lanes)}
         self._links: dict[str, list[Link]] = {}
         self._cars = frozenset(cars)
@@ -403,7 +404,7 @@ class Roads:
         """The numbers of the lanes on which somebody may wait for a link: its own, and those behind a piece of road
         that is too short for a vehicle to be seen there."""
         own = {self.lane_number[lane_id(link)]}
-        if lane_id(link) in self._cars and self._city.length[link.from_edge] < SHORT:
+        if (link.from_edge, link.to_edge) in self.movements and self._city.length[link.from_edge] < SHORT:
             own |= self._queue(link.from_edge, link.to_edge, arriving=True).keys()
         return own
 

@@ -37,7 +37,8 @@ def lane_id(link: Link) -> str:
 class Signal:
     """A simple signal: one programme of phases in one order, fixed-time unless others were asked for.
 
-    links: of cars; several may have one index
+    links: from streets open to cars; several may have one index; others: from streets that are closed to them, such
+        as bus streets
     stages: the phases that are green and have no yellow, by their number
     """
 
@@ -45,6 +46,7 @@ class Signal:
     offset: float
     phases: tuple[Phase, ...]
     links: tuple[Link, ...]
+    others: tuple[Link, ...] = ()
 
     @property
     def stages(self) -> tuple[int, ...]:
@@ -78,11 +80,13 @@ def _signals(
 ) -> tuple[list[Signal], list[str]]:
     root = read_xml(city.net_file)
     links: dict[str, list[Link]] = {}
+    closed: dict[str, list[Link]] = {}
     for connection in root.iter("connection"):
         source, target = attribute(connection, "from"), attribute(connection, "to")
         signal = connection.get("tl")
-        if signal is not None and source in city.lanes and target in city.lanes:
-            links.setdefault(signal, []).append(Link(
+        if signal is not None and not source.startswith(":"):  # those are crossings for pedestrians
+            open_ = source in city.lanes and target in city.lanes
+            (links if open_ else closed).setdefault(signal, []).append(Link(
                 index=int(attribute(connection, "linkIndex")), from_edge=source,
                 lane=int(attribute(connection, "fromLane")), to_edge=target,
                 turn=connection.get("dir", "s").lower()))
@@ -91,7 +95,7 @@ def _signals(
         for file in (root, *map(read_xml, additional)) for logic in file.iter("tlLogic")}
     simple, others = [], []
     for name, logic in logics.items():
-        found = _simple(logic, tuple(links.get(name, ())), kinds)
+        found = _simple(logic, tuple(links.get(name, ())), tuple(closed.get(name, ())), kinds)
         if found is not None:
             simple.append(found)
         else:
@@ -99,12 +103,15 @@ def _signals(
     return sorted(simple, key=lambda signal: signal.id), sorted(others)
 
 
-def _simple(logic: ElementTree.Element, links: tuple[Link, ...], kinds: Collection[str]) -> Signal | None:
+def _simple(
+    logic: ElementTree.Element, links: tuple[Link, ...], others: tuple[Link, ...], kinds: Collection[str],
+) -> Signal | None:
     rows = list(logic.iter("phase"))
     if logic.get("type", FIXED) not in kinds or any(row.get("next") for row in rows) or not links:
         return None
     phases = tuple(Phase(duration=float(attribute(row, "duration")), state=attribute(row, "state")) for row in rows)
-    signal = Signal(id=attribute(logic, "id"), offset=float(logic.get("offset", 0.0)), phases=phases, links=links)
+    signal = Signal(
+        id=attribute(logic, "id"), offset=float(logic.get("offset", 0.0)), phases=phases, links=links, others=others)
     plain = set("".join(phase.state for phase in phases)) <= set("Ggyr")
     return signal if plain and len(signal.stages) > 1 else None
 
