@@ -16,7 +16,7 @@ def write_replay(path: Path, finished: Finished, reference: str | None = None) -
     the demand nearest to the scenario's own, with the first seed that both have. Raises InputError."""
     level = finished.level(None)
     best, *others = ranked(level.rows)
-    other = reference or compared_with(level.rows)
+    other: str | None = reference or compared_with(level.rows)
     if other == best:
         other = others[0] if others else None
     names, seed = choose(finished, level, best, other, None)
