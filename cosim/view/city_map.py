@@ -46,7 +46,7 @@ class CityMap:
         plot.add_tools(pan, wheel, ResetTool())
         plot.toolbar.active_scroll = wheel
         self.regions = self._regions(plot)
-        self.streets, self._scale = self._streets(plot)
+        self.streets = self._streets(plot)
         self.arrows = self._guidance(plot)
         self.gates = self._gateways(plot)
         _numbers(plot, picture)
@@ -59,9 +59,9 @@ class CityMap:
         """by: DENSITY or SPEED, the colour of the streets; held: gates (i, h) that were switched by hand"""
         if by != self._by:
             self._by = by
-            self._scale.update(palette=colours.scale(by == SPEED), high=1.0 if by == SPEED else JAM_DENSITY)
-            self._bar.title = LABELS[by]
-            self._bar.ticker = _ticks(by)
+            self._drawn.glyph.line_color = {"field": "value", "transform": self._bars[by].color_mapper}
+            for name, bar in self._bars.items():
+                bar.visible = name == by
         value = np.nan_to_num((frame.speed if by == SPEED else frame.density).astype(np.float32), nan=NOTHING)
         self.streets.patch({"value": [(slice(len(value)), value)]})
         self._show_gates(frame, held)
@@ -89,7 +89,7 @@ class CityMap:
         plot.add_tools(TapTool(renderers=[drawn]))
         return source
 
-    def _streets(self, plot: Plot) -> tuple[ColumnDataSource, LinearColorMapper]:
+    def _streets(self, plot: Plot) -> ColumnDataSource:
         picture = self._picture
         apart = SIDE * float(np.ptp(np.concatenate(picture.shapes)[:, 0]))
         lines = [_to_the_right(shape, apart) for shape in picture.shapes]
@@ -98,19 +98,14 @@ class CityMap:
             "xs": [_floats(line[:, 0]) for line in lines], "ys": [_floats(line[:, 1]) for line in lines],
             "edge": list(picture.edges), "value": np.zeros(len(lines), np.float32),
             "width": ((0.8 if many else 1.6) + (0.4 if many else 0.9) * picture.lanes).astype(np.float32)})
-        mapper = LinearColorMapper(
-            palette=colours.scale(), low=0.0, high=JAM_DENSITY, low_color=colours.NOBODY)
-        drawn = plot.multi_line(
+        self._bars = {by: _bar(by) for by in LABELS}
+        self._drawn = plot.multi_line(
             "xs", "ys", source=source, line_width="width", line_cap="round",
-            line_color={"field": "value", "transform": mapper})
-        plot.add_tools(HoverTool(renderers=[drawn], tooltips=[("street", "@edge"), ("value", "@value{0.00}")]))
-        self._bar = ColorBar(
-            color_mapper=mapper, title=LABELS[DENSITY], height=8, width=220, location=(0, 0), padding=4,
-            orientation="horizontal", ticker=_ticks(DENSITY), title_text_font_style="normal",
-            title_text_font_size="11px", title_text_color=colours.FAINT, major_label_text_font_size="11px",
-            bar_line_color=None, major_tick_line_color=None)
-        plot.add_layout(self._bar, "below")
-        return source, mapper
+            line_color={"field": "value", "transform": self._bars[DENSITY].color_mapper})
+        plot.add_tools(HoverTool(renderers=[self._drawn], tooltips=[("street", "@edge"), ("value", "@value{0.00}")]))
+        for bar in self._bars.values():
+            plot.add_layout(bar, "below")
+        return source
 
     def _gateways(self, plot: Plot) -> ColumnDataSource:
         gates = self._picture.gates
@@ -205,8 +200,16 @@ def _numbers(plot: Plot, picture: CityPicture) -> None:
               text_font_size="12px", text_font_style="bold", text_color=colours.INK)
 
 
-def _ticks(by: str) -> FixedTicker:
-    return FixedTicker(ticks=[0.0, 0.5, 1.0] if by == SPEED else [0.0, 50.0, 100.0])
+def _bar(by: str) -> ColorBar:
+    """The scale of the streets; only that of density is there at first."""
+    mapper = LinearColorMapper(
+        palette=colours.scale(by == SPEED), low=0.0, high=1.0 if by == SPEED else JAM_DENSITY,
+        low_color=colours.NOBODY)
+    return ColorBar(
+        color_mapper=mapper, title=LABELS[by], height=8, width=220, location=(0, 0), padding=4, visible=by == DENSITY,
+        orientation="horizontal", ticker=FixedTicker(ticks=[0.0, 0.5, 1.0] if by == SPEED else [0.0, 50.0, 100.0]),
+        title_text_font_style="normal", title_text_font_size="11px", title_text_color=colours.FAINT,
+        major_label_text_font_size="11px", bar_line_color=None, major_tick_line_color=None)
 
 
 def _end(share: np.ndarray | float) -> np.ndarray:

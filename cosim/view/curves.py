@@ -94,7 +94,9 @@ class Curves:
             self.points.append(point)
         for plot in (*overtime, self.plane):
             _legend(plot)
-        self.gate.legend.location = "bottom_left"
+        legend = self.gate.legend[0]  # values are at the top and at the bottom: below them
+        legend.update(location="left", ncols=2, margin=0)
+        self.gate.add_layout(legend, "below")
         self.now = [_now(plot) for plot in overtime]
 
     def choose(self, region: int, gate: tuple[int, int] | None) -> None:
