@@ -19,23 +19,36 @@ from nmfd.types import Controller, Controls, Observation, Status
 # Kind -> what its value is, or None. Of the measurements, of what computes the controls, and of the city.
 SENSORS = {"frozen": None, "delayed": "intervals", "missing": "region", "detectors": "share", "off": "factor"}
 COMPUTING = {"solver-fails": None, "solver-diverges": None, "solver-late": None, "policy-nan": None}
-CITY = {"closed": "edge", "signal": "signal", "sumo-exits": None}
+CITY = {"closed": "edge", "signal": "signal", "gate": "gate", "sumo-exits": None}
 KINDS = {**SENSORS, **COMPUTING, **CITY}
 EXAMPLES = {
     "intervals": "delayed:2", "region": "missing:3", "share": "detectors:0.2", "factor": "off:1.5",
-    "edge": "closed:A0A1", "signal": "signal:B1"}
+    "edge": "closed:A0A1", "signal": "signal:B1", "gate": "gate:2-3=0"}
+GATE = re.compile(r"(?P<source>\d{1,4})-(?P<target>\d{1,4})=(?P<share>[^=]+)")
+LAST = 999_999  # the last control interval that a text can name
 FORM = re.compile(r"(?P<kind>[a-z-]+)(:(?P<value>[^@]+))?(@(?P<begin>\d{1,6})-(?P<end>\d{1,6}))?")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """kind: one of KINDS; number, name: its value; begin, end: control intervals, begin <= k < end."""
+    """kind: one of KINDS; number, name: its value; begin, end: control intervals, begin <= k < end.
+
+    pair: (i, h) of a gate, which is held at the share `number` between u_min (0) and u_max (1)
+    """
 
     kind: str
     number: float = 0.0
     name: str = ""
     begin: int = 0
     end: int = 10**9
+    pair: tuple[int, int] | None = None
+
+    @property
+    def text(self) -> str:
+        """As it is ordered: what `parse` makes the same fault of."""
+        value = self.name if self.name or KINDS[self.kind] is None else f"{self.number:g}"
+        when = f"@{self.begin}-{min(self.end, LAST)}" if self.begin or self.end <= LAST else ""
+        return self.kind + (f":{value}" if value else "") + when
 
     def active(self, k: int) -> bool:
         """Whether it is there in control interval k."""
@@ -58,6 +71,8 @@ def parse(text: str, where: str, regions: int) -> Fault:
     if (value is None) != (unit is None):
         what = f"needs a {unit}, such as {EXAMPLES[unit]}" if unit else "takes no value"
         raise InputError(f"{where}: {text}: {kind} {what}")
+    if unit == "gate":
+        return replace(gate(value or "", f"{where}: {text}", regions), begin=begin, end=end)
     if unit in (None, "edge", "signal"):
         return Fault(kind=kind, name=value or "", begin=begin, end=end)
     low, high, whole = {"intervals": (1, 1000, True), "region": (0, regions - 1, True), "share": (0.0, 1.0, False),
@@ -71,6 +86,38 @@ def parse(text: str, where: str, regions: int) -> Fault:
         raise InputError(
             f"{where}: {kind}: expected a {kind_of} from {low:g} to {high:g} as its {unit}, got {value[:60]!r} instead")
     return Fault(kind=kind, number=number, begin=begin, end=end)
+
+
+def gate(value: str, where: str, regions: int) -> Fault:
+    """The fault that I-H=SHARE orders. InputError, which begins with `where`."""
+    match = GATE.fullmatch(value)
+    source, target = (int(match["source"]), int(match["target"])) if match else (0, 0)
+    try:
+        share = float(match["share"]) if match else np.nan
+    except ValueError:
+        share = np.nan
+    if source == target or max(source, target) >= regions or not 0.0 <= share <= 1.0:
+        raise InputError(
+            f"{where}: expected I-H=SHARE, two regions from 0 to {regions - 1} and a share from 0 (the least green) to "
+            f"1 (all), such as {EXAMPLES['gate']}, got {value[:60]!r} instead")
+    return Fault(kind="gate", number=share, name=f"{source}-{target}={share:g}", pair=(source, target))
+
+
+def by_hand(orders: Sequence[tuple[int, int, int, float | None]]) -> list[str]:
+    """The faults that would have ordered the same beforehand: gates that were switched while a run went on.
+
+    orders: (k, i, h, share) in their order: from control interval k on; share None: let go of
+    """
+    held: dict[tuple[int, int], Fault] = {}
+    found = []
+    for k, source, target, share in orders:
+        before = held.pop((source, target), None)
+        if before is not None and before.begin < k:
+            found.append(replace(before, end=k))
+        if share is not None:
+            value = f"{source}-{target}={share:g}"
+            held[source, target] = Fault(kind="gate", number=share, name=value, begin=k, pair=(source, target))
+    return [fault.text for fault in sorted([*found, *held.values()], key=lambda fault: (fault.begin, fault.name))]
 
 
 def without_city(faults: Sequence[Fault], where: str) -> None:

@@ -96,10 +96,11 @@ def test_a_closed_window_ends_the_run_and_another_can_begin(task, monkeypatch):
 
 def test_without_a_screen_one_line_points_to_the_film(monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
-    line = error_line(cosim("watch", ROOT / "scenarios" / "grid7_peak", "--controller", "pi-gating"))
+    line = error_line(cosim("watch", ROOT / "scenarios" / "grid7_peak", "--controller", "pi-gating", "--gui"))
     assert "no screen" in line and "`cosim video RUN`" in line
     monkeypatch.setenv("DISPLAY", ":9876")
-    line = error_line(cosim("watch", ROOT / "scenarios" / "grid7_peak", "--controller", "no-control", "--steps", "1"))
+    line = error_line(cosim(
+        "watch", ROOT / "scenarios" / "grid7_peak", "--controller", "no-control", "--steps", "1", "--gui"))
     assert "sumo-gui cannot show" in line and "unable to open display :9876" in line
 
 
@@ -110,7 +111,8 @@ def test_in_a_window(task, monkeypatch):
     try:
         monkeypatch.setenv("DISPLAY", f":{server.stdout.readline().strip()}")
         result = cosim(
-            "watch", task.scenario, "--controller", "pi-gating", "--seed", "3", "--steps", "1", "--delay", "1")
+            "watch", task.scenario, "--controller", "pi-gating", "--seed", "3", "--steps", "1", "--delay", "1",
+            "--gui")
         assert result.exit_code == 0, result.output + str(result.exception)
         assert "pi-gating, seed 3: total time spent" in result.stdout
     finally:

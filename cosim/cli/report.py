@@ -4,7 +4,10 @@ What brings numpy, pandas, torch or libsumo is imported inside the commands, so 
 instead of 3 s.
 """
 
+import os
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,13 +17,22 @@ from nmfd.cli.options import FILE, FOLDER, SCENARIO, SEED, STEPS
 from nmfd.cli.progress import progress_line
 from nmfd.errors import InputError
 
+if TYPE_CHECKING:
+    from cosim.evaluation.simulate import Task
+    from nmfd.types import Trajectory
+
 
 @click.command()
 @click.argument("folders", type=FOLDER, metavar="RUN...", nargs=-1, required=True)
 @click.option("--out", type=FILE, metavar="FILE", help="The page. [default: report.html in the first RUN]")
 @REFERENCE
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="The runs' scenario, if it is no longer where it was.")
-def report(folders: tuple[Path, ...], out: Path | None, reference: str | None, scenario: Path | None) -> None:
+@click.option("--replay", is_flag=True,
+              help="Write replay.html beside the page, too: the best run of the first RUN and what it is compared "
+                   "with, on the map of the city, with a slider over their time.")
+def report(
+    folders: tuple[Path, ...], out: Path | None, reference: str | None, scenario: Path | None, replay: bool,
+) -> None:
     """Write one self-contained HTML page about finished runs: what came of them, in words, tables and pictures.
 
     RUN is a folder of `cosim run` or `cosim evaluate`; several come on one page. The page works without a network.
@@ -29,6 +41,7 @@ def report(folders: tuple[Path, ...], out: Path | None, reference: str | None, s
     Examples:
       cosim report runs/grid7_peak-evaluate
       cosim report runs/monday runs/tuesday --out both.html
+      cosim report runs/gating --replay
     """
     from cosim.evaluation import results  # heavy
     from cosim.report import html
@@ -40,6 +53,10 @@ def report(folders: tuple[Path, ...], out: Path | None, reference: str | None, s
     with progress_line("report") as progress:
         path = html.write_page(out or folders[0] / "report.html", found, reference, progress)
     click.echo(f"Written to {path}: open it in a browser")
+    if replay:
+        from cosim.report.replay import write_replay  # heavy
+
+        click.echo(f"Written to {write_replay(path.with_name('replay.html'), found[0], reference)}: the runs over time")
 
 
 @click.command()
@@ -80,36 +97,92 @@ def video(
 @click.command()
 @SCENARIO
 @CONTROLLER
+@click.option("--against", metavar="NAME", help="A second run on the same trips, shown beside it.")
 @click.option("--seed", type=SEED, default=0, show_default=True)
 @STEPS
-@declared("cosim.evaluation.settings:Window", "demand", "delay")
+@declared("cosim.evaluation.settings:Window", "demand")
+@declared("cosim.evaluation.settings:Window", "delay", instead="0; {} with --gui")
 @POLICY
+@click.option("--port", type=click.IntRange(0, 65535), help="Of the page. [default: any that is free]")
+@click.option("--host", metavar="ADDRESS",
+              help="Of this machine, where others can reach the page: who has its address, with its token, can watch "
+                   "and command. [default: 127.0.0.1, this machine alone]")
+@click.option("--open/--no-open", "browse", default=None,
+              help="Open the page in this machine's browser. [default: where there is a screen and a terminal]")
+@click.option("--gui", is_flag=True, help="SUMO's own window instead of a page; one run, and nothing to switch.")
 def watch(
-    scenario: Path, controller: str, seed: int, steps: int | None, demand: float, policy: Path | None, delay: float,
+    scenario: Path, controller: str, against: str | None, seed: int, steps: int | None, demand: float,
+    delay: float | None, policy: Path | None, port: int | None, host: str | None,
+    browse: bool | None, gui: bool,
 ) -> None:
-    """Watch a controller steer the city in SUMO's own window; nothing is written.
+    """Watch controllers steer the city on a live page in the browser; nothing is written.
 
-    Streets lie on the colour of their region. A dot at every gateway is green where its signal shows all of its
-    original green, red where it shows the least, and grey where no controlled signal is. Vehicles are red where they
-    stand. Without a screen, use `cosim run` and `cosim video`.
+    The map has the streets by density or speed, the regions, and every gateway with the part of its original green that
+    it shows; beside it are accumulations against critical, the MFD plane, a gate, and what came of it so far. Runs can
+    be paused, stepped, slowed down and looked back at, and gates switched by hand: at the end comes the --fault that
+    orders the same again. The runs are those of `cosim run`, to the byte. The command ends when they have ended and
+    nobody looks any more.
 
     \b
-    Example:
-      cosim watch scenarios/grid7_peak --controller pi-gating
+    Examples:
+      cosim watch scenarios/grid7_peak --controller pi-gating --against no-control
+      cosim watch scenarios/grid7_peak --controller dpc-pcrg --no-open --port 8080
+      cosim watch scenarios/grid7_peak --controller pi-gating --gui
     """
-    from cosim.evaluation.simulate import Task  # heavy
-    from cosim.report import watch
-    from nmfd.metrics import summary
+    from cosim.evaluation.simulate import Result, Task, scenario_of  # heavy
+    from cosim.plant.strategy import parse
+    from cosim.view.server import LOOPBACK
+    from cosim.view.watch import watch
 
-    task = Task(
-        scenario=scenario, controller=controller, seed=seed, policy=policy, steps=steps, demand_factor=demand)
+    names = [controller] + ([against] if against and against != controller else [])
+    tasks = [
+        Task(scenario=scenario, controller=name, seed=seed, policy=policy if name == controller else None, steps=steps,
+             demand_factor=demand)
+        for name in names]
+    if gui:
+        if len(tasks) > 1 or port is not None or host is not None or browse is not None:
+            raise InputError("--gui: shows one run, without a page; omit --against, --port, --host and --open")
+        _window(tasks[0], delay)
+        return
+    for name in names:
+        parse(name)
+    scenario_of(tasks[0])  # what is wrong with it is said before anything starts
+    with progress_line("watch") as progress:
+        runs = watch(
+            tasks, host=host or LOOPBACK, port=port or 0, delay=(delay or 0.0) / 1000.0,
+            browse=_has_screen() if browse is None else browse, tell=lambda line: click.echo(line), progress=progress)
+    for seen in runs:
+        if isinstance(seen.outcome, Result):
+            _tell(seen.name, seed, seen.outcome.trajectory)
+        if seen.faults:
+            click.echo("Gates were switched by hand; the same run: --controller " + seen.name + "".join(
+                f" --fault {text}" for text in seen.faults))
+
+
+def _window(task: "Task", delay: float | None) -> None:
+    """In sumo-gui."""
+    from cosim.evaluation.settings import Window
+    from cosim.report import watch
+
     try:
         with progress_line("watch") as progress:
-            trajectory = watch.watch(task, delay=delay, progress=progress)
-            row = summary(trajectory)
+            trajectory = watch.watch(task, delay=Window().delay if delay is None else delay, progress=progress)
     except watch.WindowClosed:
         click.echo("The window was closed before the end.")
         return
+    _tell(task.controller, task.seed, trajectory)
+
+
+def _tell(controller: str, seed: int, trajectory: "Trajectory") -> None:
+    from nmfd.metrics import summary
+
+    row = summary(trajectory)
     click.echo(f"{controller}, seed {seed}: total time spent {row['total_time_spent_veh_s']:.4g} veh s, "
                f"{row['completed_veh']:,.0f} trips completed"
                + (f", {removed:,.0f} vehicles removed" if (removed := trajectory.removed[-1].sum()) else ""))
+
+
+def _has_screen() -> bool:
+    """Whether a browser of this machine may be opened: somebody sits there, as far as one can tell."""
+    screen = not sys.platform.startswith("linux") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    return screen and sys.stdout.isatty()

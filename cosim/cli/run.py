@@ -28,7 +28,7 @@ from nmfd.errors import InputError
               help="SUMO's own outputs in the run folder too: tripinfo, summary, edgedata (per control interval), "
                    "emission (of every vehicle in every step, large).")
 @PARQUET
-@fault_option("closed:EDGE, signal:NAME, sumo-exits")
+@fault_option("closed:EDGE, signal:NAME, gate:I-H=SHARE, sumo-exits")
 @TIME_LIMIT
 @out_option()
 def run(

@@ -11,6 +11,7 @@ import numpy as np
 
 from cosim.evaluation import estimation_errors, run_metrics
 from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
+from cosim.plant.observer import Observer
 from cosim.plant.plant import SumoPlant
 from cosim.plant.record import settled
 from cosim.plant.settings import settings
@@ -79,15 +80,20 @@ def scenario_of(task: Task) -> Scenario:
     return replace(scenario, controller_options={**tables, table: {**tables.get(table, {}), **dict(task.options)}})
 
 
-def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> Result:
-    """Run `task` in this process, which must hold no other SUMO session. Raises InputError."""
+def simulate(
+    task: Task, progress: Callable[[int, int], None] | None = None, observer: Observer | None = None,
+) -> Result:
+    """Run `task` in this process, which must hold no other SUMO session. Raises InputError.
+
+    observer: is shown the run while it goes on, which stays the same
+    """
     begin = time.perf_counter()
     scenario, strategy = scenario_of(task), parse(task.controller)
     variant = configured(task.controller, scenario.controller_options)
     controller = registry.make(variant, scenario, policy=task.policy)
     result = drive(
         scenario, strategy, controller, seed=task.seed, progress=progress, begin=begin, outputs=dict(task.sumo_output),
-        planning=planning_of(scenario, task.controller))
+        planning=planning_of(scenario, task.controller), observer=observer)
     outside = registry.outside_training(variant, scenario, task.demand_factor, file=task.policy)
     return replace(result, facts={**result.facts, "outside_training": outside})
 
@@ -95,12 +101,13 @@ def simulate(task: Task, progress: Callable[[int, int], None] | None = None) -> 
 def drive(
     scenario: Scenario, strategy: Strategy, controller: Controller, *, seed: int,
     progress: Callable[[int, int], None] | None = None, begin: float | None = None,
-    outputs: Mapping[str, Path] | None = None, planning: PlanningModel | None = None,
+    outputs: Mapping[str, Path] | None = None, planning: PlanningModel | None = None, observer: Observer | None = None,
 ) -> Result:
     """The closed loop of `controller` in SUMO, filed under `strategy.name`, whose options the city takes.
 
     begin: when the setting up began (time.perf_counter); outputs: SUMO's own, kind (cosim.sumo.outputs) -> file, there
-    only if all goes well; planning: what states are estimated with, if not the scenario itself.
+    only if all goes well; planning: what states are estimated with, if not the scenario itself; observer: is shown the
+    run while it goes on.
     Raises InputError.
     """
     begin = time.perf_counter() if begin is None else begin
@@ -108,7 +115,7 @@ def drive(
         files = {kind: stack.enter_context(atomic(path)) for kind, path in (outputs or {}).items()}
         plant = SumoPlant(
             scenario, overrides=settings(scenario).changed(**strategy.overrides), outputs=files,
-            planning=planning)
+            planning=planning, observer=observer)
         stack.callback(plant.close)
         trajectory = run_folder.labelled(
             closed_loop.run(plant, controller, scenario, seed=seed, progress=progress),

@@ -77,7 +77,7 @@ def make_blocks(streets: Streets) -> Blocks:
 
 def _carriageways(streets: Streets, label: np.ndarray) -> np.ndarray:
     """Join the two sides of divided roads: an edge and the one that runs the other way beside most of it."""
-    points, of = sampled(streets, streets.main_part)
+    points, of = sampled(streets.shapes, streets.main_part)
     first = np.searchsorted(of, of, side="left")
     last = np.searchsorted(of, of, side="right") - 1
     place = np.arange(len(of))

@@ -1,6 +1,7 @@
 """Regions as SUMO files that sumo-gui and netedit show: a TAZ file and a polygon file."""
 
 import io
+from collections.abc import Sequence
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -48,10 +49,21 @@ def polygons_xml(streets: Streets, regions: EdgeNumbers, names: tuple[str, ...])
 
 def outlines(streets: Streets, regions: EdgeNumbers) -> list[list[Points]]:
     """Rings (n, 2) [m] round every region, the largest first: the places nearer to its streets than to others'."""
-    points, of = sampled(streets, streets.drivable)
+    return rings_round(streets.shapes, streets.drivable, regions)
+
+
+def rings_round(
+    shapes: Sequence[Points], members: np.ndarray, regions: EdgeNumbers, blocks: float = 0.0,
+) -> list[list[Points]]:
+    """The same of `members`, (E,) bool, of some edges: E `shapes` (n, 2) [m], and their `regions`.
+
+    blocks: the share of the map's extent that is between streets and still no hole
+    """
+    points, of = sampled(shapes, members)
     low, high = points.min(axis=0), points.max(axis=0)
     cell = max(float((high - low).max()) / CELLS, 1.0)
-    reach = 2.5 * max(cell, SPACING)  # beyond, a place belongs to no street; the map must end there, or rings stay open
+    # Beyond, a place belongs to no street; the map must end there, or rings stay open.
+    reach = max(2.5 * max(cell, SPACING), blocks * float((high - low).max()))
     x, y = (np.arange(low[a] - reach - 2 * cell, high[a] + reach + 3 * cell, cell) for a in (0, 1))
     distance, nearest = cKDTree(points).query(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     label = np.where(distance < reach, regions[of[nearest]], -1).reshape(len(y), len(x))
@@ -65,11 +77,11 @@ def outlines(streets: Streets, regions: EdgeNumbers) -> list[list[Points]]:
     return found
 
 
-def sampled(streets: Streets, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def sampled(shapes: Sequence[Points], members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n, 2) points along the shapes of some edges, and (n,) the edges they stand for."""
     points, of = [], []
     for n in np.flatnonzero(members):
-        shape = streets.shapes[n]
+        shape = shapes[n]
         steps = np.hypot(*np.diff(shape, axis=0).T) if len(shape) > 1 else np.zeros(0)
         along = np.concatenate([[0.0], np.cumsum(steps)])
         marks = np.linspace(0.0, along[-1], max(2, int(along[-1] / SPACING) + 1))

@@ -13,6 +13,7 @@ from cosim.plant.guidance import Guide
 from cosim.plant.incidents import Incidents
 from cosim.plant.launch import Launch
 from cosim.plant.meter import Meter
+from cosim.plant.observer import Observer
 from cosim.plant.record import Record, Recorder
 from cosim.plant.sensing import Estimation, Sensing
 from cosim.plant.settings import ESTIMATE, PRESSURES, Settings, settings
@@ -39,15 +40,17 @@ class SumoPlant:
 
     def __init__(
         self, scenario: Scenario, *, overrides: Settings | None = None, outputs: Mapping[str, Path] | None = None,
-        window: Window | None = None, planning: PlanningModel | None = None,
+        window: Window | None = None, planning: PlanningModel | None = None, observer: Observer | None = None,
     ):
         """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network.
 
         outputs: kind (cosim.sumo.outputs) -> file, of SUMO's own outputs; complete after `trip_facts` or `close`
         window: to watch; the simulation is the same, only slower
         planning: what states are estimated with; of the scenario itself, if None
+        observer: is shown the run while it goes on, which stays the same
         """
         self._scenario, self._planning = scenario, planning or planning_model(scenario)
+        self._observer = observer
         self._settings = chosen = overrides or settings(scenario)
         check_lanes(scenario, chosen)
         files = ensure_built(scenario.network)
@@ -75,17 +78,27 @@ class SumoPlant:
         self.booked, self._facts = 0, TripFacts()
         self._standing = self._stands(state)
         self._recorder = Recorder(self._sensing.meter, self._guide, self._actuation)
+        if self._observer:
+            self._observer.began(self.city, state)
         return state
 
     def step(self, controls: Controls) -> State:
         """One control interval: in every simulation step actuate, simulate, measure and guide; then record."""
-        if self._standing:
-            return self._book()
+        state = self._book() if self._standing else self._drive(controls)
+        if self._observer:
+            self._observer.recorded(controls, state, self._recorder.last)
+        return state
+
+    def _drive(self, controls: Controls) -> State:
         session, streets = self.session, self._sensing.streets
         end = session.time + self._scenario.step
         vehicles, speed = (None, None) if streets is None else (streets.vehicles, streets.speed)
+        for source, target, share in self._observer.orders(self._k) if self._observer else ():
+            self._incidents.hold(source, target, share)
         self._incidents.begin(self._k)
-        self._actuation.command(controls.perimeter, vehicles)
+        network = self._scenario.network
+        self._actuation.command(
+            self._incidents.gated(controls.perimeter, network.u_min, network.u_max), vehicles)
         self._guide.command(self._splits(controls), speed)
         self._sensing.begin()
         for _ in range(round(self._scenario.step / session.step_length)):
@@ -188,7 +201,8 @@ class SumoPlant:
             known = probes(self._launch.vehicles, chosen.probe_share, seed)
             meter = Meter(self.session, self.city, known, self._trips)
             estimation = Estimation(self.session, self.city, self._layout, meter, self._instruments, self._planning)
-        return Sensing(self._scenario, self.session, self.city, self._incidents, meter, estimation)
+        return Sensing(
+            self._scenario, self.session, self.city, self._incidents, meter, estimation, self._observer)
 
     def _new_guide(self, seed: int) -> Guide:
         chosen = self._settings

@@ -97,6 +97,11 @@ class Recorder:
         counted = [key for key in self._before if key != "gateway_green"]
         self._rows.append({**self._rows[-1], **{key: np.zeros_like(self._before[key]) for key in counted}})
 
+    @property
+    def last(self) -> dict[str, np.ndarray]:
+        """The fields of the record in the last control interval."""
+        return self._rows[-1]
+
     def record(self) -> Record:
         """Of all control intervals so far."""
         return Record(**{key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]})

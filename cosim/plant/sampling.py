@@ -47,13 +47,18 @@ class StreetSampler:
         self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in city.gateways], dtype=int)
         self._begin()
 
+    @property
+    def last(self) -> tuple[PerEdge, PerEdge]:
+        """Vehicles (E,) [veh] and mean speed (E,) [m/s] of the sample that was taken last."""
+        return self._last
+
     def _begin(self) -> None:
         self._vehicles, self._metres = np.zeros((2, len(self._city.edges)))  # sums over the samples: n and n v
         self._queues: list[list[int]] = []
 
     def sample(self) -> None:
         """Take one sample."""
-        counts, speeds = self.present()
+        self._last = counts, speeds = self.present()
         self._vehicles, self._metres = self._vehicles + counts, self._metres + counts * speeds
         self._queues.append([self._session.halting(edge) for edge in self._upstream])
 

@@ -11,6 +11,7 @@ from cosim.plant import detectors, sampling
 from cosim.plant.detectors import Detectors, Layout
 from cosim.plant.incidents import Incidents
 from cosim.plant.meter import Event, Meter
+from cosim.plant.observer import Observer
 from cosim.plant.sampling import StreetMeans, StreetSampler, samples_apart
 from cosim.sumo.net import City
 from cosim.sumo.session import Session
@@ -58,9 +59,10 @@ class Sensing:
 
     def __init__(
         self, scenario: Scenario, session: Session, city: City, incidents: Incidents, meter: Meter,
-        estimation: Estimation | None,
+        estimation: Estimation | None, observer: Observer | None = None,
     ):
-        """estimation: None where controllers see the exact state"""
+        """estimation: None where controllers see the exact state; observer: is shown every sample of the streets"""
+        self._session, self._observer = session, observer
         self._interval, self._incidents, self._estimation = scenario.step, incidents, estimation
         self._sampler = StreetSampler(session, city)
         steps = round(scenario.step / session.step_length)
@@ -92,6 +94,8 @@ class Sensing:
             self._estimation.sample()
         if self._measured % self._samples_apart == 0:
             self._sampler.sample()
+            if self._observer:
+                self._observer.sampled(self._session.time, *self._sampler.last)
         return events
 
     def finish(self, step: int, controls: Controls) -> tuple[State, StreetMeans]:

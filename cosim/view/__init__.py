@@ -1,0 +1,1 @@
+"""The city to look at, live and afterwards."""

@@ -1,0 +1,141 @@
+"""The live page in a real browser: numbers move, pausing stops SUMO, a gate that is closed is told, nothing comes from
+elsewhere, and names stay names."""
+
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+import tiny_city
+from commands import call
+
+from cosim.evaluation.simulate import Task, scenario_of
+from cosim.sumo.build import ensure_built
+from cosim.sumo.net import load_city
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+EVIL = "<script>alert(1)</script>"
+EDGES = """() => Math.max(...Bokeh.documents[0].get_model_by_name("map0").renderers.map(
+    one => (one.data_source.data.edge || []).length))"""
+TEXT = """() => Bokeh.documents[0].get_model_by_name("numbers").text"""
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no browser")]
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("browser")
+    result = call("cosim", "import", tiny_city.city(folder), "--regions", 3, "--no-run", "--method", "geometric",
+                  "--out", folder / "networks" / "tiny")
+    assert result.exit_code == 0, result.output
+    path = folder / "scenarios" / "tiny" / "scenario.toml"
+    path.write_text(re.sub(r'(?m)^name = ".*"$', f'name = "{EVIL}"', path.read_text(), count=1))
+    assert EVIL in path.read_text()
+    return path.parent
+
+
+@pytest.fixture
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield found
+        found.close()
+
+
+def test_the_slider_of_a_report_moves_both_maps(scenario, browser, tmp_path):
+    out = tmp_path / "run"
+    for command in (("run", scenario, "--controller", "no-control+guided", "--against", "no-control", "--seed", 3,
+                     "--steps", 6, "--out", out), ("report", out, "--replay")):
+        result = call("cosim", *command)
+        assert result.exit_code == 0, result.output
+    assert str(out / "replay.html") in result.stdout and (out / "report.html").is_file()
+    page, wrong = browser.new_page(viewport={"width": 1200, "height": 900}), []
+    page.on("console", lambda said: said.type in ("error", "warning") and wrong.append(said.text))
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("dialog", lambda dialog: wrong.append(dialog.message))
+    page.on("request", lambda asked: asked.url.startswith(("file:", "data:", "blob:")) or wrong.append(asked.url))
+    page.goto((out / "replay.html").as_uri())
+    page.wait_for_function("() => window.Bokeh && Bokeh.documents.length && document.querySelector('h1')")
+
+    def shown():
+        return page.evaluate("""() => [0, 1].map(n => Array.from(Bokeh.documents[0].get_model_by_name(`map${n}`)
+            .renderers.map(one => one.data_source.data).find(data => data.edge).value))""")
+
+    page.locator(".noUi-handle").wait_for()
+    at_the_end = shown()
+    page.locator(".noUi-handle").focus()
+    for _ in range(3):
+        page.keyboard.press("ArrowLeft")
+    page.wait_for_timeout(500)
+    before = shown()
+    assert before[0] != at_the_end[0] and before[1] != at_the_end[1]
+    page.locator("select").select_option(index=1)
+    page.wait_for_timeout(300)
+    assert page.evaluate("() => Bokeh.documents[0].get_model_by_name('plane').title.text").startswith("Region 1")
+    page.get_by_role("button", name="Play").click()
+    page.wait_for_timeout(2000)
+    assert shown() == at_the_end and wrong == []
+
+
+@pytest.mark.parametrize("width", [1400, 390])
+def test_the_page_lives(scenario, browser, width):
+    command = [sys.executable, "-m", "cosim", "watch", str(scenario), "--controller", "no-control", "--against",
+               "no-control+guided", "--seed", "3", "--no-open", "--delay", "20"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        address = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())[0]
+        page, wrong = browser.new_page(viewport={"width": width, "height": 900}), []
+        page.on("console", lambda said: said.type in ("error", "warning") and wrong.append(said.text))
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("dialog", lambda dialog: wrong.append(dialog.message))
+        page.on("request", lambda asked: asked.url.startswith((address, "data:", "blob:")) or wrong.append(asked.url))
+        page.goto(address)
+        page.wait_for_function("() => window.Bokeh && Bokeh.documents.length && document.querySelector('h1')")
+        assert page.locator("h1").inner_text().startswith(EVIL)
+
+        def minutes():
+            return float(re.search(r">([\d.]+) min<", page.evaluate(TEXT))[1])
+
+        def press(name):
+            page.get_by_role("button", name=name, exact=True).click()
+
+        page.wait_for_function(f"before => ({TEXT})() !== before", arg=page.evaluate(TEXT), timeout=20_000)
+        network = scenario_of(Task(scenario=scenario, controller="no-control", seed=3)).network
+        files = ensure_built(network)
+        assert page.evaluate(EDGES) == len(load_city(files.net_file, files.regions_csv, network.regions).edges)
+        press("Pause")
+        page.get_by_role("button", name="Go on").wait_for()
+        page.wait_for_timeout(1500)
+        before = minutes()
+        page.wait_for_timeout(1500)
+        assert minutes() == before
+        press("Step")
+        page.wait_for_function(f"before => ({TEXT})() !== before", arg=page.evaluate(TEXT), timeout=10_000)
+        page.wait_for_timeout(1500)
+        stepped = minutes()
+        assert before < stepped <= before + 2 * scenario_of(
+            Task(scenario=scenario, controller="no-control", seed=3)).step / 60
+        press("Faster")  # while it waits: at the end these buttons are off
+        press("Close gate")
+        press("Go on")
+        page.wait_for_function(f"() => ({TEXT})().includes('held at 0')", timeout=30_000)
+        page.locator(".noUi-handle").focus()
+        for _ in range(3):
+            page.keyboard.press("ArrowLeft")
+        page.wait_for_timeout(800)
+        back = minutes()
+        assert back < minutes() + 0.01 and back <= stepped
+        press("Live")
+        page.get_by_role("button", name="Speed").click()
+        page.get_by_role("button", name="finished").wait_for(timeout=60_000)
+        assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth + 1")
+        page.close()
+        told, errors = process.communicate(timeout=60)
+        assert process.returncode == 0 and not errors, errors
+        assert re.search(r"--fault gate:\d-\d=0@\d+-999999", told) and told.count("total time spent") == 2
+        assert wrong == []
+    finally:
+        process.kill()
+        process.wait()
