@@ -12,9 +12,11 @@ import sumo
 from commands import cosim
 from tiny_city import driven
 
+from cosim.evaluation.simulate import Task, simulate
 from cosim.importing.quality import pieces
 from cosim.importing.streets import read_streets
 from nmfd.api import load_scenario
+from nmfd.metrics import total_time_spent
 
 GAMES = Path(sumo.SUMO_HOME) / "tools" / "game"
 CITIES = Path(os.environ.get("CITIES", Path(__file__).parents[2] / "shared" / "cities"))
@@ -64,3 +66,23 @@ def test_real_cities(tmp_path, name):
     assert result.exit_code == 0, result.output + str(result.exception)
     assert f"{count} regions by method geometric" in result.stdout
     check(tmp_path, name, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("level", [0.5, 1.0])
+@pytest.mark.parametrize("name", ["cologne8", "ingolstadt21", "bologna"])
+def test_max_pressure_takes_no_longer_than_fixed_time(tmp_path, name, level):
+    """With lanes that movements share, bus lanes and streets of buses; all trips end."""
+    (config,) = (CITIES / name).glob("*.sumocfg") if (CITIES / name).is_dir() else (None,)
+    if config is None:
+        pytest.skip(f"no real city: {CITIES / name} is not there")
+    result = cosim("import", config, "--regions", 3, "--method", "geometric", "--no-run", "--out",
+                   tmp_path / "networks" / name)
+    assert result.exit_code == 0, result.output + str(result.exception)
+    spent = {}
+    for signals in ("no-control", "max-pressure", "max-pressure-cyclic"):
+        run = simulate(Task(
+            scenario=tmp_path / "scenarios" / name, controller=signals, seed=1, demand_factor=level))
+        spent[signals] = total_time_spent(run.trajectory)
+        assert run.trajectory.completed[-1] == run.facts["trips"], signals
+    assert max(spent, key=spent.get) == "no-control", spent
