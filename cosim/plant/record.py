@@ -71,6 +71,11 @@ def settled(trajectory: Trajectory, record: Record) -> Trajectory:
         completed=since_start(record.arrivals.sum(axis=1)), removed=since_start(record.removals + record.given_up))
 
 
+def _small(counts: np.ndarray) -> np.ndarray:
+    """Whole numbers of one control interval in half the memory, which a record of days fills."""
+    return counts.astype(np.int32) if counts.dtype.kind == "i" else counts
+
+
 class Recorder:
     """Adds up a record: `add` at the end of every control interval."""
 
@@ -83,7 +88,7 @@ class Recorder:
     def add(self, streets: StreetMeans) -> None:
         """streets: means of the interval that has just ended; all else is what was added since the last call"""
         totals = self._totals()
-        added = {key: total - self._before[key] for key, total in totals.items()}
+        added = {key: _small(total - self._before[key]) for key, total in totals.items()}
         self._rows.append({
             **added, "gateway_green": self._actuation.as_shown(added["gateway_green"]),
             "gateway_original_green": self._actuation.original_green,
@@ -95,7 +100,7 @@ class Recorder:
     def repeat(self) -> None:
         """Another interval in which everything stands and is shown as in the last one, and nothing was counted."""
         counted = [key for key in self._before if key != "gateway_green"]
-        self._rows.append({**self._rows[-1], **{key: np.zeros_like(self._before[key]) for key in counted}})
+        self._rows.append({**self._rows[-1], **{key: np.zeros_like(self._rows[-1][key]) for key in counted}})
 
     @property
     def last(self) -> dict[str, np.ndarray]:
