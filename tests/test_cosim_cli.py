@@ -53,6 +53,7 @@ def test_every_controller_runs(small, tmp_path, controller):
     assert (out / "total_accumulation.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy, against", [
     ("pi-gating+max-pressure+rerouting-30", "actuated"), ("dpc-pcrg+webster+redistribute+compliance-50", None)])
 def test_strategies_run_and_are_filed_under_their_names(small, tmp_path, strategy, against):
@@ -66,6 +67,7 @@ def test_strategies_run_and_are_filed_under_their_names(small, tmp_path, strateg
     good(cosim("compare", out, "--controller", strategy))
 
 
+@pytest.mark.slow
 def test_run_against_and_compare(small, tmp_path):
     out = tmp_path / "run"
     arguments = ("run", small, "--controller", "pi-gating", "--against", "no-control", "--steps", STEPS, "--out", out)
@@ -99,6 +101,7 @@ def test_run_against_and_compare(small, tmp_path):
     assert "several demand levels" in error_line(cosim("compare", tmp_path / "several", "--controller", "pi-gating"))
 
 
+@pytest.mark.slow
 def test_compare_runs_a_scenario_itself(small, tmp_path):
     good(cosim("compare", small, "--steps", STEPS, "--out", tmp_path / "run"))
     assert (tmp_path / "run" / "compare-no-control-0.csv").is_file()

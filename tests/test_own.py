@@ -42,6 +42,7 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_template_runs_beside_the_others_and_a_changed_file_does_not_count(place):
     (place / "sub").mkdir()
     assert nmfd("new-controller", "sub/mine.py").exit_code == 0
