@@ -213,18 +213,23 @@ def junctions():
     return control, vehicles, play
 
 
+def shown_by(crossing, vehicles, seconds, *, town=TOWN, **limits):
+    """(time, state) of all that max-pressure shows at one signal, with so many vehicles on every lane of an edge."""
+    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane.partition("_")[0], 0.0))
+    shown = []
+    control = MaxPressure(session, town, [crossing], FLOWS, min_green=5.0,
+                          show=lambda name, state: shown.append((session.time, state)), **limits)
+    for _ in range(seconds):
+        control.play(session.time)
+        session.time += 1.0
+    return shown
+
+
 @pytest.mark.parametrize("cyclic", [False, True])
 def test_no_green_outlasts_the_maximum_while_others_wait(cyclic):
     """A single vehicle waits on c, a hundred on a; nobody anywhere else: then a keeps its green."""
     def greens(**vehicles):
-        session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane.partition("_")[0], 0.0))
-        shown = []
-        control = MaxPressure(
-            session, TOWN, [CROSSING], FLOWS, min_green=5.0, max_green=40.0, cyclic=cyclic,
-            show=lambda name, state: shown.append((session.time, state)))
-        for _ in range(200):
-            control.play(session.time)
-            session.time += 1.0
+        shown = shown_by(CROSSING, vehicles, 200, max_green=40.0, cyclic=cyclic)
         return [time for time, state in shown if state == "rG"]
 
     assert greens(a=100.0) == []
@@ -251,13 +256,7 @@ def test_stages_keep_their_order_if_cyclic(cyclic, order):
 def test_who_waits_too_long_comes_first():
     """c has no pressure at all, as its road ahead is full; after 120 s of red its link gets the minimum green."""
     town = SimpleNamespace(**{**vars(TOWN), "successors": {**AFTER, "d": ("e",)}})
-    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 5.0, "c": 2.0, "d": 30.0}.get(lane[0], 0.0))
-    shown = []
-    control = MaxPressure(session, town, [CROSSING], FLOWS, min_green=5.0, max_green=500.0,
-                          show=lambda name, state: shown.append((session.time, state)))
-    for _ in range(150):
-        control.play(session.time)
-        session.time += 1.0
+    shown = shown_by(CROSSING, {"a": 5.0, "c": 2.0, "d": 30.0}, 150, town=town, max_green=500.0)
     assert [entry for entry in shown if entry[1] == "rG"] == [(MAX_RED + 3.0, "rG")]
     assert shown[-1] == (MAX_RED + 13.0, "Gr")
 
@@ -266,13 +265,7 @@ def test_who_waits_too_long_comes_first():
 def test_who_waits_on_a_street_that_is_closed_to_cars_gets_a_green(buses, first):
     """Buses on k are in no count of cars: they press by their number, and a single one does not wait for ever."""
     crossing = replace(CROSSING, links=(link(0, "a", "b"),), others=(link(1, "k", "d"),))
-    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 5.0, "k": buses}.get(lane[0], 0.0))
-    shown = []
-    control = MaxPressure(session, TOWN, [crossing], FLOWS, min_green=5.0, max_green=500.0,
-                          show=lambda name, state: shown.append((session.time, state)))
-    for _ in range(150):
-        control.play(session.time)
-        session.time += 1.0
+    shown = shown_by(crossing, {"a": 5.0, "k": buses}, 150, max_green=500.0)
     assert next(time for time, state in shown if state == "rG") == first
 
 

@@ -21,17 +21,7 @@ from nmfd.runs import run_folder
 from nmfd.runs.workers import Watch
 
 ROOT = Path(__file__).parents[1]
-GOOD = """
-import numpy as np
-from nmfd import Controls
-class Mine:
-    def __init__(self, scenario):
-        self.shape = scenario.network.adjacency.shape
-    def reset(self, seed=0):
-        pass
-    def act(self, measurement):
-        return Controls(perimeter=np.full(self.shape, 0.5, dtype=np.float32), splits=None)
-"""
+GOOD = tiny.CONTROLLER
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+import tiny
 import tiny_city
 from commands import cosim
 from signal_rules import MIN_GREEN, check
@@ -132,19 +133,6 @@ def test_a_deaf_signal_runs_its_own_programme_and_can_be_held_again(town):
     assert (green[[0, 2]][:, held] <= MIN_GREEN + 1.0).all() and (green[1, held] > 2 * MIN_GREEN).all()
 
 
-OWN = """
-import numpy as np
-from nmfd import Controls
-class Mine:
-    def __init__(self, scenario):
-        self.shape = scenario.network.adjacency.shape
-    def reset(self, seed=0):
-        pass
-    def act(self, measurement):
-        return Controls(perimeter=np.full(self.shape, 0.5), splits=None)
-"""
-
-
 @pytest.fixture(scope="module")
 def places(tmp_path_factory):
     """Scenarios: a city in SUMO's queue model, and one without any signal."""
@@ -167,7 +155,7 @@ def test_what_cannot_run_here_is_refused_before_the_first_run(
         places, tmp_path, monkeypatch, command, name, city, said):
     """One line that names it, though another strategy comes first; nothing is written."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.py").write_text(OWN)
+    (tmp_path / "mine.py").write_text(tiny.CONTROLLER)
     names = ("--controller", "no-control", "--against", name) if command == "run" else (
         "--controllers", f"no-control,{name}")
     done = cosim(command, places[city], *names, "--steps", 1, "--out", "out")

@@ -13,7 +13,7 @@ from bokeh.document import Document
 from bokeh.embed import file_html
 from bokeh.models import Button
 from bokeh.resources import CDN, INLINE
-from commands import call, cosim, error_line
+from commands import cosim, error_line
 from tornado.httputil import HTTPHeaders, HTTPServerRequest, RequestStartLine
 from tornado.ioloop import IOLoop
 
@@ -38,11 +38,8 @@ EVIL = "<script>alert(1)</script>"
 @pytest.fixture(scope="module")
 def task(tmp_path_factory):
     """A tiny city with gates that are closed to half."""
-    folder = tmp_path_factory.mktemp("view")
-    result = call("cosim", "import", tiny_city.city(folder), "--regions", 3, "--no-run", "--method", "geometric",
-                  "--out", folder / "networks" / "tiny")
-    assert result.exit_code == 0, result.output
-    return Task(scenario=folder / "scenarios" / "tiny", controller="no-control+guided", seed=3, steps=STEPS)
+    return Task(scenario=tiny_city.imported(tmp_path_factory.mktemp("view")), controller="no-control+guided", seed=3,
+                steps=STEPS)
 
 
 @pytest.fixture(scope="module")

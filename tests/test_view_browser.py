@@ -24,11 +24,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no 
 
 @pytest.fixture(scope="module")
 def scenario(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("browser")
-    result = call("cosim", "import", tiny_city.city(folder), "--regions", 3, "--no-run", "--method", "geometric",
-                  "--out", folder / "networks" / "tiny")
-    assert result.exit_code == 0, result.output
-    path = folder / "scenarios" / "tiny" / "scenario.toml"
+    path = tiny_city.imported(tmp_path_factory.mktemp("browser")) / "scenario.toml"
     path.write_text(re.sub(r'(?m)^name = ".*"$', f'name = "{EVIL}"', path.read_text(), count=1))
     assert EVIL in path.read_text()
     return path.parent

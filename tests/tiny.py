@@ -44,6 +44,18 @@ ramp_up = 60.0
 flat = 120.0
 ramp_down = 60.0
 """
+# A file with a controller of one's own, Mine: every gate half open.
+CONTROLLER = """
+import numpy as np
+from nmfd import Controls
+class Mine:
+    def __init__(self, scenario):
+        self.shape = scenario.network.adjacency.shape
+    def reset(self, seed=0):
+        pass
+    def act(self, measurement):
+        return Controls(perimeter=np.full(self.shape, 0.5, dtype=np.float32), splits=None)
+"""
 
 
 def row_network(regions: int = 2) -> str:

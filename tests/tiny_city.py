@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import sumo
+from commands import cosim, good
 
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
@@ -74,6 +75,13 @@ def city(folder: Path, *options: str) -> Path:
         stream.write(CARS)
     (folder / "city.sumocfg").write_text(CONFIG)
     return folder / "city.sumocfg"
+
+
+def imported(folder: Path) -> Path:
+    """The scenario of the city with demand in `folder`, which is cut into three regions and not run first."""
+    good(cosim("import", city(folder), "--regions", 3, "--no-run", "--method", "geometric", "--out",
+               folder / "networks" / "tiny"))
+    return folder / "scenarios" / "tiny"
 
 
 def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tuple:

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from cosim.cli.city import identify, import_
-from cosim.cli.options import CONTROLLER_HELP, REFERENCE, tell
+from cosim.cli.options import CONTROLLER_HELP, REFERENCE, chosen_scheduler, scheduler_options, tell
 from cosim.cli.reference import reference
 from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
@@ -17,7 +17,6 @@ from cosim.cli.search import frontier, tune
 from nmfd.cli.declared import declared
 from nmfd.cli.errors import Commands
 from nmfd.cli.options import (
-    FILE,
     POLICIES,
     SCENARIO,
     STEPS,
@@ -28,7 +27,7 @@ from nmfd.cli.options import (
     policy_files,
 )
 from nmfd.cli.progress import resumable
-from nmfd.errors import InputError, RunFailed
+from nmfd.errors import RunFailed
 from nmfd.runs.files import file_name
 from nmfd.runs.workers import cores
 
@@ -103,14 +102,7 @@ def evaluate(
 @declared("cosim.evaluation.settings:Sweep", "compliance", instead="the scenario's")
 @POLICIES
 @declared("cosim.evaluation.settings:Sweep", "workers", instead="one per core")
-@click.option("--scheduler", metavar="ADDRESS",
-              help="Of a Dask cluster that does the runs, such as tls://host:8786 (extra dask). Its workers need this "
-                   "package, and the same files under the same paths. Whoever reaches a tcp:// scheduler runs code on "
-                   "the cluster and here.")
-@click.option("--scheduler-ca", type=FILE, metavar="PEM", help="Authority that a tls:// scheduler is trusted by.")
-@click.option("--scheduler-cert", type=FILE, metavar="PEM", help="Certificate that this side shows to it.")
-@click.option("--scheduler-key", type=FILE, metavar="PEM", help="The key of that certificate. [default, of all three: "
-                                                                "Dask's own configuration, distributed.comm.tls]")
+@scheduler_options
 @STEPS
 @TIME_LIMIT
 @out_option("sweep", "The folder.")
@@ -134,17 +126,11 @@ def sweep(
     from cosim.plant.strategy import parse  # heavy
 
     names = controller_names(controllers, parse)
-    if scheduler is not None and workers is not None:
-        raise InputError("--workers: is for processes here, and --scheduler has workers of its own; omit one")
     files = policy_files(policies, names)
+    cluster = chosen_scheduler(workers, scheduler, scheduler_ca, scheduler_cert, scheduler_key)
 
-    from cosim.evaluation import dask_cluster, sweeps  # heavy
+    from cosim.evaluation import sweeps  # heavy
     from nmfd.api import load_scenario
-
-    cluster = None if scheduler is None else dask_cluster.Scheduler(
-        address=scheduler, ca=scheduler_ca, cert=scheduler_cert, key=scheduler_key)
-    if cluster is None and any((scheduler_ca, scheduler_cert, scheduler_key)):
-        raise InputError("--scheduler: missing; the certificates are those of its connection")
 
     order = sweeps.Sweep(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),

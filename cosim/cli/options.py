@@ -1,9 +1,16 @@
 """Options that commands of `cosim` share."""
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 import click
 
 from nmfd.cli.options import FILE
 from nmfd.errors import InputError
+
+if TYPE_CHECKING:  # heavy
+    from cosim.evaluation.dask_cluster import Scheduler
 
 CONTROLLER_HELP = (
     "no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc or dpc-pcrg; what else the city does is joined by +: webster, "
@@ -16,6 +23,42 @@ POLICY = click.option(
 REFERENCE = click.option(
     "--reference", metavar="NAME",
     help="Pair all controllers with this one too, besides no-control, or the first one if that is not there.")
+
+
+def scheduler_options(command: Callable) -> Callable:
+    """--scheduler, and the certificates of its connection; the command makes `chosen_scheduler` of them."""
+    for option in reversed((
+            click.option(
+                "--scheduler", metavar="ADDRESS",
+                help="Of a Dask cluster that does the runs, such as tls://host:8786 (extra dask). Its workers need "
+                     "this package, and the same files under the same paths. Whoever reaches a tcp:// scheduler runs "
+                     "code on the cluster and here."),
+            click.option(
+                "--scheduler-ca", type=FILE, metavar="PEM", help="Authority that a tls:// scheduler is trusted by."),
+            click.option(
+                "--scheduler-cert", type=FILE, metavar="PEM", help="Certificate that this side shows to it."),
+            click.option(
+                "--scheduler-key", type=FILE, metavar="PEM",
+                help="The key of that certificate. [default, of all three: Dask's own configuration, "
+                     "distributed.comm.tls]"))):
+        command = option(command)
+    return command
+
+
+def chosen_scheduler(
+    workers: int | None, address: str | None, ca: Path | None, cert: Path | None, key: Path | None,
+) -> "Scheduler | None":
+    """What the runs are done by instead of `workers` processes here, None for these. InputError for both at once, and
+    for certificates of nothing."""
+    if address is not None and workers is not None:
+        raise InputError("--workers: is for processes here, and --scheduler has workers of its own; omit one")
+    if address is None:
+        if any((ca, cert, key)):
+            raise InputError("--scheduler: missing; the certificates are those of its connection")
+        return None
+    from cosim.evaluation.dask_cluster import Scheduler  # heavy
+
+    return Scheduler(address=address, ca=ca, cert=cert, key=key)
 
 
 def parsed_level(text: str, no_run: bool) -> float | None:

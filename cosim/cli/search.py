@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from cosim.cli.options import CONTROLLER, CONTROLLER_HELP, tell
+from cosim.cli.options import CONTROLLER, CONTROLLER_HELP, chosen_scheduler, scheduler_options, tell
 from nmfd.cli.declared import declared
 from nmfd.cli.options import (
     POLICIES,
@@ -19,7 +19,7 @@ from nmfd.cli.options import (
     policy_files,
 )
 from nmfd.cli.progress import resumable
-from nmfd.errors import InputError, RunFailed
+from nmfd.errors import RunFailed
 from nmfd.runs.files import file_name
 from nmfd.runs.workers import cores
 
@@ -34,13 +34,14 @@ from nmfd.runs.workers import cores
 @declared("cosim.evaluation.settings:Search", "candidates", "seeds", "first_seed", "demand", "search_seed")
 @declared("cosim.evaluation.settings:Search", "population", instead="the rule of CMA-ES")
 @declared("cosim.evaluation.settings:Search", "workers", instead="one per core")
-@click.option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster that does the runs (as of cosim sweep).")
+@scheduler_options
 @STEPS
 @out_option("tune", "The folder.")
 def tune(
     scenario: Path, controller: str, knobs: tuple[str, ...], candidates: int, seeds: int, first_seed: int,
     demand: tuple[float, ...], search_seed: int, population: int | None, workers: int | None, scheduler: str | None,
-    steps: int | None, out: Path | None,
+    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None,
+    out: Path | None,
 ) -> None:
     """Search for the options of a controller that do best in the microsimulation, by CMA-ES.
 
@@ -56,10 +57,10 @@ def tune(
       cosim tune scenarios/grid7_peak --controller dpc-pcrg+max-pressure --option mfd_scale=0.6:1 \\
           --option mfd_spread=0:0.5
     """
+    cluster = chosen_scheduler(workers, scheduler, scheduler_ca, scheduler_cert, scheduler_key)
+
     from cosim.evaluation import tuning  # heavy
 
-    if scheduler is not None and workers is not None:
-        raise InputError("--workers: is for processes here, and --scheduler has workers of its own; omit one")
     order = tuning.Tuning(
         scenario=scenario, controller=controller, knobs=tuple(tuning.knob(text) for text in knobs),
         candidates=candidates, seeds=range(first_seed, first_seed + seeds),
@@ -67,7 +68,7 @@ def tune(
         out=Path("runs") / f"{file_name(scenario.name)}-tune" if out is None else out)
     with resumable("tune", order.out, "tune.csv") as progress:
         table = tuning.tune(
-            order, workers=cores() if workers is None else workers, scheduler=scheduler, progress=progress, tell=tell)
+            order, workers=cores() if workers is None else workers, scheduler=cluster, progress=progress, tell=tell)
     click.echo(tuning.text(order, table))
     click.echo(f"Written to {order.out}: see tune.toml and tune.csv")
 

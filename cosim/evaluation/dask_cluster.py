@@ -9,7 +9,7 @@ alone).
 import ipaddress
 import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -61,6 +61,16 @@ def _here(address: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:  # a name
         return False
+
+
+def checked(scheduler: Scheduler | str, tell: Callable[[str], None] | None = None) -> Scheduler:
+    """The scheduler, of which somebody has answered; before anything is written. tell: takes one line where others
+    may listen. InputError as `connect`."""
+    found = Scheduler(address=scheduler) if isinstance(scheduler, str) else scheduler
+    connect(found).close()
+    if tell and found.warning:
+        tell(found.warning)
+    return found
 
 
 def outcomes(scheduler: Scheduler | str, tasks: Sequence[Task]) -> Iterator[tuple[Task, Result | Failure]]:

@@ -56,8 +56,7 @@ def evaluate(
     The tables are of all runs in the folder. progress, tell: as in `experiment.perform`. Raises InputError.
     """
     out = evaluation.out
-    if (out / "manifest.json").is_file():
-        raise InputError(f"{out}: is the folder of another command; choose another folder with --out")
+    check_folder(out)
     known = {*evaluation.controllers, *all_runs(evaluation)["controller"]}
     if evaluation.reference is not None and evaluation.reference not in known:
         raise InputError(
@@ -77,6 +76,12 @@ def evaluate(
     if failures and table.empty and all(failure.mistake for _, failure in failures):
         raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])
     return table, [f"{experiment.label(task)}: {failure.reason}" for task, failure in failures]
+
+
+def check_folder(out: Path) -> None:
+    """InputError for a folder that is a run folder itself, instead of holding one for each demand level."""
+    if (out / "manifest.json").is_file():
+        raise InputError(f"{out}: is the folder of another command; choose another folder with --out")
 
 
 def level_folders(out: Path) -> dict[float, Path]:

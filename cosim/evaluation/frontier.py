@@ -17,15 +17,14 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from cosim.evaluation import experiment
-from cosim.evaluation.evaluate import Evaluation, all_runs
-from nmfd.errors import InputError
+from cosim.evaluation.evaluate import Evaluation, all_runs, check_folder
+from cosim.evaluation.statistics import TTS
 from nmfd.runs import files
 from nmfd.runs.tables import markdown_table, text_table
 from nmfd.runs.workers import ended
 from nmfd.studies.benchmark import interval
 
 SERVED = 0.9  # share of the seeds
-TTS = "total_time_spent_veh_s"
 CAPTION = (
     "served: runs in which every trip was completed within the horizon, of all runs; TTS: total time spent, running "
     f"and waiting to be inserted, mean over seeds ± 95 % interval; highest demand served: in {SERVED:.0%} of the seeds "
@@ -41,8 +40,7 @@ def frontier(
     everything: every strategy at every level. The table is of all runs in the folder. Raises InputError, and RunFailed
     if no run went well.
     """
-    if (order.out / "manifest.json").is_file():
-        raise InputError(f"{order.out}: is the folder of another command; choose another folder with --out")
+    check_folder(order.out)
     failed: list[str] = []
     left = list(order.controllers)
     for level in sorted(order.levels):

@@ -12,7 +12,7 @@ from pathlib import Path
 import pandas as pd
 
 from cosim.evaluation import dask_cluster, experiment
-from cosim.evaluation.evaluate import level_folders
+from cosim.evaluation.evaluate import check_folder, level_folders
 from cosim.evaluation.simulate import Result, Task
 from cosim.plant.settings import settings
 from cosim.plant.strategy import parse
@@ -74,8 +74,7 @@ def sweep(
     processes here. progress, tell: as in `experiment.perform`. Raises InputError, and
     RunFailed if no run at all went well.
     """
-    if (order.out / "manifest.json").is_file():
-        raise InputError(f"{order.out}: is the folder of another command; choose another folder with --out")
+    check_folder(order.out)
     plan, file = order.plan(), order.out / "sweep.parquet"
     failures = _failures(file)
     own = settings(load_scenario(order.scenario)).compliance
@@ -95,15 +94,10 @@ def sweep(
         failures[task.controller, task.seed, task.demand_factor] = reason
         write()
 
-    if scheduler is not None:
-        if isinstance(scheduler, str):
-            scheduler = dask_cluster.Scheduler(address=scheduler)
-        dask_cluster.connect(scheduler).close()  # before anything is written
-        if tell and scheduler.warning:
-            tell(scheduler.warning)
+    cluster = None if scheduler is None else dask_cluster.checked(scheduler, tell)
     failed_now = experiment.perform(
         plan, workers=workers, progress=progress, tell=tell, kept=write, failed=failed,
-        source=partial(_local, workers=workers) if scheduler is None else partial(dask_cluster.outcomes, scheduler))
+        source=partial(_local, workers=workers) if cluster is None else partial(dask_cluster.outcomes, cluster))
     rows = write()
     if failed_now and (rows["status"] == FAILED).all():
         raise ended([(experiment.label(task), failure) for task, failure in failed_now[:1]])

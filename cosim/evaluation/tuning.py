@@ -24,6 +24,7 @@ import pandas as pd
 
 from cosim.evaluation import dask_cluster, experiment
 from cosim.evaluation.simulate import Task, scenario_of
+from cosim.evaluation.statistics import TTS
 from cosim.plant.strategy import configured, parse
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
@@ -34,7 +35,6 @@ from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, ended, outcomes
 
 SCORE = "score_veh_s"
-TTS = "total_time_spent_veh_s"
 NAME = re.compile(r"[a-z_]\w*(\[[0-9]\])?")  # of an option, or of one number of a list
 MOST = 20           # numbers to tune: with more, the runs that CMA-ES needs are beyond what a city allows
 DECADES = 1.0       # a range that spans more is searched in the logarithm
@@ -164,8 +164,8 @@ def check(order: Tuning) -> None:
 
 
 def tune(
-    order: Tuning, *, workers: int = 1, scheduler: str | None = None, progress: experiment.Progress | None = None,
-    tell: Callable[[str], None] | None = None,
+    order: Tuning, *, workers: int = 1, scheduler: dask_cluster.Scheduler | str | None = None,
+    progress: experiment.Progress | None = None, tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Try candidates; returns the table of tune.csv.
 
@@ -175,6 +175,7 @@ def tune(
     Raises InputError, and RunFailed if none of a generation could be scored.
     """
     check(order)
+    cluster = None if scheduler is None else dask_cluster.checked(scheduler, tell)
     search, rows = _search(order), list[dict[str, object]]()
     file = order.out / "tune.csv"
     with run_folder.manifest(
@@ -182,7 +183,7 @@ def tune(
             session={"scenario_folder": str(order.scenario), "workers": workers}):
         points = [_start(order)]
         while points:
-            found = _scored(order, points, len(rows), workers, scheduler, progress, tell)
+            found = _scored(order, points, len(rows), workers, cluster, progress, tell)
             rows += found
             files.write_text(file, pd.DataFrame(rows).to_csv(index=False))
             files.write_text(order.out / "tune.toml", toml(order, pd.DataFrame(rows)))
@@ -267,8 +268,8 @@ def _configuration(order: Tuning) -> dict[str, object]:
 
 
 def _scored(
-    order: Tuning, points: Sequence[Sequence[float]], begin: int, workers: int, scheduler: str | None,
-    progress: experiment.Progress | None, tell: Callable[[str], None] | None,
+    order: Tuning, points: Sequence[Sequence[float]], begin: int, workers: int,
+    cluster: dask_cluster.Scheduler | None, progress: experiment.Progress | None, tell: Callable[[str], None] | None,
 ) -> list[dict[str, object]]:
     """Run the candidates `begin`, `begin` + 1, ... at `points`; their rows of tune.csv."""
     options = {begin + n: order.options(point) for n, point in enumerate(points)}
@@ -282,7 +283,7 @@ def _scored(
 
     failures = experiment.perform(
         plan, workers=workers, fresh=True, progress=report, tell=tell,
-        source=None if scheduler is None else partial(dask_cluster.outcomes, scheduler))
+        source=None if cluster is None else partial(dask_cluster.outcomes, cluster))
     rows = [_row(order, candidate, points[candidate - begin]) for candidate in options]
     if all(math.isnan(row[SCORE]) for row in rows):
         raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])

@@ -167,11 +167,12 @@ class SumoPlant:
 
     def _stands(self, state: State) -> bool:
         """Whether what is left of the run may be booked."""
+        if not self._settings.book_standstill:
+            return False
         meter = self._sensing.meter
         left = meter.arrivals.sum() + meter.removals.sum() + meter.given_up.sum()
         standing = self._standstill.reached(state, float(left))
-        return standing and self._settings.book_standstill and self.session.expected() <= (
-            state.accumulation.sum() + state.backlog.sum())
+        return standing and self.session.expected() <= state.accumulation.sum() + state.backlog.sum()
 
     def _with_standstill(self, facts: TripFacts, co2: float, fuel: float) -> TripFacts:
         """And what was booked without being simulated. co2, fuel: of everybody on the road at the end [kg/s]"""
