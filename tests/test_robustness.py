@@ -206,6 +206,42 @@ def test_a_city_that_the_model_does_not_predict_is_noticed(scenario):
     assert watched.act(at(scenario, 0.5, 0)).status == Status.OK
 
 
+def foreseen(policy, gates):
+    ahead = np.ones(fallback.LOOK_AHEAD)
+    return fallback.Foreseen(policy=policy * ahead, gates=gates * ahead, none=gates * ahead)
+
+
+@pytest.mark.parametrize(("with_them", "without", "kept"), [
+    pytest.param(1.0, 1.0, True, id="as foreseen"), pytest.param(1.2, 1.0, False, id="worse than foreseen"),
+    pytest.param(1.2, 1.2, True, id="model wrong either way"), pytest.param(1.05, 1.0, True, id="half the gain")])
+def test_split_ratios_stay_while_they_pay(with_them, without, kept):
+    """Foreseen: 90 vehicles instead of 100. Measured: so many times what was foreseen, with them and without."""
+    judge, ahead = fallback.Judge(), foreseen(90.0, 100.0)
+    commanded = []
+    for step in range(60):
+        commanded.append(not judge.problem(ahead))
+        vehicles = 90.0 * with_them if commanded[-1] else 100.0 * without
+        now = Observation(step=step, time=0.0, accumulation=np.array([[vehicles]]), backlog=np.zeros((1, 1)))
+        judge.command(commanded[-1], ahead, now)
+        judge.see(now)
+    assert commanded[0] and commanded[-1] == kept and all(commanded) == (with_them * 90.0 < 100.0), commanded
+
+
+def test_split_ratios_that_cost_time_are_left_to_the_drivers():
+    """A policy that sends everybody round: its guard leaves guidance by travel times, not less."""
+    benchmark = replace(load_scenario(BENCHMARK), measurement_std=0.0, steps=60)
+    torch.manual_seed(0)
+    astray = Policy(benchmark.network, Architecture(width=4, layers=1, guidance=True))
+    with torch.no_grad():
+        astray.perimeter_decoder.bias += 20.0
+    states = np.random.default_rng(0).uniform(0.0, 1.0, (4000, 49))
+    watched = fallback.Guarded(astray, fallback.statistics(states), planning_model(benchmark))
+    alone, kept, guided = (
+        total_time_spent(closed_loop.run(NmfdPlant(benchmark), controller, benchmark, seed=0))
+        for controller in (dpc.DpcController(astray), watched, registry.make("route-guidance", benchmark)))
+    assert alone > 1.05 * guided and kept < 1.01 * guided
+
+
 def test_the_limit_lets_the_training_states_pass(scenario):
     watched, critical = guard(scenario), scenario.network.mfds[0].critical
     states = critical * (0.5 + 0.1 * np.random.default_rng(1).standard_normal((4000, 2, 2)))
