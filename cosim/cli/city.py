@@ -27,10 +27,13 @@ from nmfd.runs import files
               help="Of a city with such signals or drivers: max-pressure, rerouting-30, ... as in a strategy's name.")
 @click.option("--network", "target", type=FOLDER, metavar="DIR",
               help="The folder whose network.toml is written, for one model. [default: the scenario's network]")
+@click.option("--runs", type=FOLDER, multiple=True, metavar="DIR",
+              help="Finished runs of the same city that the model is fitted to besides, a folder of cosim run or "
+              "evaluate: at a demand at which the loading runs lock, those under a gate say more. May be repeated.")
 @out_option("identify", "Samples and pictures.")
 def identify(
     scenario: Path, levels: tuple[float, ...], seeds: int, workers: int, guided: bool | None, options: str | None,
-    target: Path | None, iterations: int, out: Path | None,
+    target: Path | None, iterations: int, runs: tuple[Path, ...], out: Path | None,
 ) -> None:
     """Fit the regional model and the drivers' own split ratios of a SUMO city; writes a network.toml.
 
@@ -51,6 +54,9 @@ def identify(
       cosim identify scenarios/grid7_peak --guided --network networks/grid7_guided
       cosim identify scenarios/grid7_peak --guided --with max-pressure --network networks/grid7_max_pressure
     """
+    if runs and guided is None and not options:
+        raise InputError("--runs: fits one model; say which, by --guided, --own or --with")
+
     from cosim.evaluation import identify  # heavy
     from cosim.importing import find
     from nmfd.api import load_scenario
@@ -65,7 +71,7 @@ def identify(
             folder = out / "guided"
         loading = identify.Loading(
             levels=levels, seeds=range(1000, 1000 + seeds), guided=guide,
-            options=options.split("+") if options else (), network=target, iterations=iterations)
+            options=options.split("+") if options else (), network=target, iterations=iterations, runs=runs)
         with resumable("identify", folder) as progress:
             text = identify.identify(scenario, loading, out=folder, workers=workers, progress=progress)
         if both:

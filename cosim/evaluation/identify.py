@@ -2,7 +2,8 @@
 
 First the city is loaded without perimeter control, and every region's MFD is fitted to its outflow samples. Then it is
 loaded again under a probing controller, whose set points come from these MFDs, and the whole model is fitted to all
-runs by prediction error (nmfd.model.identification).
+runs by prediction error (nmfd.model.identification). Finished runs of other controllers may be added: where the loading
+runs lock, they alone show what a controlled city does under such a demand.
 """
 
 import csv
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.evaluation import experiment, mfd_bands, verdict
+from cosim.evaluation import experiment, mfd_bands, results, verdict
 from cosim.evaluation.fit_quality import (
     fit_table,
     nearly_empty,
@@ -50,6 +51,7 @@ class Loading:
     network: the folder whose network.toml is written; None for the scenario's own or, if guided, the one where
         controllers that guide look for their model (nmfd.model.planning.guided_model)
     iterations: of the fit
+    runs: folders of finished runs of the same city, which the model is fitted to besides
     """
 
     levels: Sequence[float]
@@ -58,6 +60,7 @@ class Loading:
     options: Sequence[str] = ()
     network: Path | None = None
     iterations: int = identification.ITERATIONS
+    runs: Sequence[Path] = ()
 
     @property
     def stages(self) -> tuple[str, str]:
@@ -100,11 +103,13 @@ def identify(
     if not there.is_dir() or not os.access(there, os.W_OK):  # rather than after hours of loading
         raise InputError(f"--network: {there} is no folder that can be written to; choose another")
     first, second = loading.stages
+    more = [run for folder in loading.runs for run in _finished(folder, scenario)]
     found = _load(scenario, loading, first, {}, out, workers, progress)
     network = static_model(loaded, found, guided=loading.guided)
     set_point = tuple(network.mfds[region].critical for region in loaded.protected)
     found += _load(scenario, loading, second, {"set_point": set_point}, out, workers, progress)
     held_out = [result for result in found if len(loading.seeds) > 1 and result.trajectory.seed == loading.seeds[-1]]
+    found += more
     scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
     def fitted(results: Sequence[Result], samples: Sequence[dict], what: str) -> RegionalModel:
@@ -141,8 +146,8 @@ def identify(
     target.mkdir(parents=True, exist_ok=True)
     files.write_text(target / "network.toml", schema_line(target) + network_toml(
         model, _sumo_table(own, target),
-        f"Regional model: written by cosim identify from {len(found)} loading runs of {loaded.name} under {first} and\n"
-        f"# {second}, demand times {levels}, seeds {seeds}."))
+        f"Regional model: written by cosim identify from {len(found) - len(more)} loading runs of {loaded.name} under "
+        f"{first} and\n# {second}, demand times {levels}, seeds {seeds}{_and_runs(more)}."))
     verdict.write_verdict(target, judged)
     return text
 
@@ -160,6 +165,24 @@ def _load(
     if failures:
         raise ended([(experiment.label(task), failure) for task, failure in failures])
     return [experiment.read_run(folder, controller, task.seed) for folder, task in plan]
+
+
+def _finished(folder: Path, scenario: Path) -> list[Result]:
+    """All runs of a folder of `cosim run` or `cosim evaluate`. Raises InputError for runs of another city."""
+    finished = results.read(folder, scenario)
+    if finished.changed:
+        raise InputError(f"--runs: {folder}: {finished.changed}; run them again, or omit them")
+    return [experiment.read_run(level.folder, row.controller, row.seed)
+            for level in finished.levels for row in level.rows.itertuples()]
+
+
+def _and_runs(runs: Sequence[Result]) -> str:
+    """What the model was fitted to besides, as the first lines of network.toml say it."""
+    if not runs:
+        return ""
+    names = ", ".join(sorted({run.trajectory.controller for run in runs}))
+    seeds = [run.trajectory.seed for run in runs]
+    return f",\n# and from {len(runs)} runs under {names}, seeds {min(seeds)} to {max(seeds)}"
 
 
 def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> RegionalModel:
