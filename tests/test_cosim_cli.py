@@ -121,6 +121,12 @@ def test_identify_writes_a_network_that_loads(small, tmp_path):
     assert after.hash != before.hash and (after.adjacency == before.adjacency).all()
     assert after.observed_split_ratios and all(mfd.problem() is None for mfd in after.mfds)
     assert len(pd.read_csv(out / "samples.csv")) > 40 and (out / "mfd.png").is_file()
+    own = next(out.glob("level-*"))
+    more = ("identify", scenario, "--own", "--levels", "1.0", "--seeds", "2", "--iterations", "2", "--out", out)
+    good(cosim(*more, "--runs", own, "--network", tmp_path / "city" / "networks" / "more"))
+    text = (tmp_path / "city" / "networks" / "more" / "network.toml").read_text()
+    assert "from 4 loading runs of" in text
+    assert "and from 4 runs under no-control, probing-pc, seeds 1000 to 1001." in text
 
 
 @pytest.mark.parametrize("old, new, expected", [
@@ -156,6 +162,8 @@ def test_policy_for_another_network(small, tmp_path):
 @pytest.mark.parametrize("arguments, expected", [
     (("run", "{small}", "--controller", "nobody"), "controller 'nobody' is unknown; choose from no-control"),
     (("run", "{small}"), "--controller"),
+    (("identify", "{small}", "--runs", "{tmp}"), "--runs: fits one model; say which, by --guided, --own or --with"),
+    (("identify", "{small}", "--own", "--network", "{tmp}/more", "--runs", "{tmp}"), "holds no finished runs"),
     (("run", "{tmp}/none", "--controller", "no-control"), "scenario.toml: no such file"),
     (("run", "{small}", "--controller", "no-control", "--steps", "0"), "--steps"),
     (("run", "{small}", "--controller", "no-control", "--policy", "x.pt"), "reads no policy"),
