@@ -123,6 +123,7 @@ def train(
     """
     from nmfd.api import load_scenario  # heavy
     from nmfd.controllers.dpc import rollout, training
+    from nmfd.runs import shipped
 
     loaded = load_scenario(scenario)
     device = training.available(device)
@@ -132,7 +133,8 @@ def train(
         for name, doubts in zip(model.region_names, model.doubts, strict=False):
             if doubts:
                 click.echo(f"nmfd: the model of region {name} is doubtful: {'; '.join(doubts)}", err=True)
-    file = scenario / f"{controller}.pt" if out is None else out
+    file = shipped.beside(
+        loaded.folder, f"{controller}.pt", "--out FILE", based=loaded.folder.name) if out is None else out
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the policy; make it or choose another --out")
     default = compiled is None

@@ -119,12 +119,14 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int, 
     """
     from nmfd.api import load_scenario  # heavy
     from nmfd.controllers import open_loop
+    from nmfd.runs import shipped
     from nmfd.studies import bound as method
 
     method.check(controller)
     names = None if starts is None else controller_names(starts)
     loaded = load_scenario(scenario)
-    file = scenario / f"{controller}.npz" if out is None else out
+    file = shipped.beside(
+        loaded.folder, f"{controller}.npz", "--out FILE", based=loaded.folder.name) if out is None else out
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the plan; make it or choose another --out")
     with progress_line(controller) as progress:

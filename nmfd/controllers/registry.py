@@ -21,7 +21,7 @@ from nmfd.errors import InputError, did_you_mean
 from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.model.scenario_file import PlanningOptions
-from nmfd.runs import config
+from nmfd.runs import config, shipped
 from nmfd.runs.files import file_hash
 from nmfd.types import Controller
 
@@ -151,9 +151,11 @@ def policy_path(name: str, scenario: Scenario, file: Path | None = None) -> Path
             raise InputError(f"controller {name}: scenario {scenario.name} has no folder with policies; give a file")
         path, out = scenario.folder / f"{owner}.{suffix}", ""
     else:
-        path, out = Path(file), f" --out {file}"
+        path, out = shipped.found(file, shipped.SCENARIO), f" --out {file}"
     if not path.is_file():
         scenario_text = "SCENARIO" if scenario.folder is None else scenario.folder
+        if scenario.folder is not None and shipped.installed(scenario.folder):
+            scenario_text, out = scenario.folder.name, out or f" --out {owner}.{suffix}, and give it with --policy"
         command = f"nmfd {'bound' if planned else 'train'} {scenario_text} --controller {owner}{out}"
         raise InputError(f"{path}: no such {kind} for {name}; {verb} one with: {command}")
     return path
