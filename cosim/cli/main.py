@@ -14,6 +14,7 @@ from cosim.cli.reference import reference
 from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
 from cosim.cli.search import frontier, tune
+from nmfd.cli.about import about, listing
 from nmfd.cli.declared import declared
 from nmfd.cli.errors import Commands
 from nmfd.cli.options import (
@@ -33,7 +34,7 @@ from nmfd.runs.workers import cores
 
 
 @click.group(name="cosim", cls=Commands)
-@click.version_option(package_name="perimeter-cosim", prog_name="cosim")
+@about("cosim")
 def main() -> None:
     """Regional controllers in a SUMO city: run, evaluate, compare with the regional model, identify it.
 
@@ -146,5 +147,7 @@ def sweep(
         tell(f"{failed} of {len(rows)} runs failed, see the column reason; the same command tries them again")
 
 
-for command in (run, compare, report, video, watch, identify, import_, reference, tune, frontier):
+for command in (
+        listing("cosim.plant.strategy:options"), run, compare, report, video, watch, identify, import_, reference, tune,
+        frontier):
     main.add_command(command)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import click
 
+from nmfd.cli.about import about, listing
 from nmfd.cli.declared import declared
 from nmfd.cli.errors import Commands, Interrupted
 from nmfd.cli.exchange import export, new_controller
@@ -28,7 +29,7 @@ from nmfd.errors import InputError
 
 
 @click.group(name="nmfd", cls=Commands)
-@click.version_option(package_name="perimeter-cosim", prog_name="nmfd")
+@about("nmfd")
 def main() -> None:
     """Perimeter control and route guidance on the regional traffic model (NMFD).
 
@@ -206,5 +207,5 @@ def _stamp(path: Path) -> int | None:
     return path.stat().st_mtime_ns if path.exists() else None
 
 
-for command in (bound, robustness, adaptation, ablation, scaling, new_controller, export):
+for command in (listing(), bound, robustness, adaptation, ablation, scaling, new_controller, export):
     main.add_command(command)
