@@ -5,7 +5,6 @@ import subprocess
 import sys
 import sysconfig
 import tarfile
-import time
 import zipfile
 from hashlib import sha256
 from pathlib import Path
@@ -94,7 +93,6 @@ def test_a_new_user(installed):
     data = Path(run("python", "-c", "from nmfd.runs import shipped; print(shipped.root())").strip())
     assert data.is_relative_to(installed.parent) and data.name == "data"
     before = hashes(data)
-    begin = time.monotonic()
     assert "grid7_peak" in run("cosim", "list")
     assert "no-control" in run("nmfd", "benchmark", "economic_mpc", "--controllers", "no-control", "--seeds", "1")
     assert "pi-gating" in run("cosim", "run", "grid7_peak", "--controller", "pi-gating", "--steps", "3", "--out", "out")
@@ -104,7 +102,6 @@ def test_a_new_user(installed):
     assert hashes(data) == before
     assert sorted(path.name for path in where.iterdir()) == ["out", "runs", "webster"]
     assert (where.parent / "cache").is_dir()
-    print(f"{time.monotonic() - begin:.0f} s")
 
 
 # Every scenario that comes along can be loaded, every city simulated, every policy read.

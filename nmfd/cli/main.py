@@ -134,8 +134,8 @@ def train(
         for name, doubts in zip(model.region_names, model.doubts, strict=False):
             if doubts:
                 click.echo(f"nmfd: the model of region {name} is doubtful: {'; '.join(doubts)}", err=True)
-    file = shipped.beside(
-        loaded.folder, f"{controller}.pt", "--out FILE", based=loaded.folder.name) if out is None else out
+    file = out or shipped.beside(
+        shipped.found(scenario, shipped.SCENARIO), f"{controller}.pt", "--out FILE", scenario=True)
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the policy; make it or choose another --out")
     default = compiled is None

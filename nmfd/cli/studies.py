@@ -125,8 +125,8 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int, 
     method.check(controller)
     names = None if starts is None else controller_names(starts)
     loaded = load_scenario(scenario)
-    file = shipped.beside(
-        loaded.folder, f"{controller}.npz", "--out FILE", based=loaded.folder.name) if out is None else out
+    file = out or shipped.beside(
+        shipped.found(scenario, shipped.SCENARIO), f"{controller}.npz", "--out FILE", scenario=True)
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the plan; make it or choose another --out")
     with progress_line(controller) as progress:

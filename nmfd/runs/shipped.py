@@ -59,15 +59,15 @@ def installed(path: Path) -> bool:
     return path.resolve().is_relative_to(_DATA.resolve())
 
 
-def beside(folder: Path, file: str, option: str, *, based: str = "") -> Path:
+def beside(folder: Path, file: str, option: str, *, scenario: bool = False) -> Path:
     """Where a `file` goes that is kept in `folder` unless the user says otherwise. InputError for the installed
     package, and for a folder that cannot be written to.
 
-    option: with which they say so; based: the name of a scenario on which one of their own can be based instead
+    option: with which they say so; scenario: whether one of their own can be based on that in `folder` instead
     """
     remedy = f"give {option}"
-    if based:
-        remedy += f', or make a folder of your own whose scenario.toml has name = "..." and base = "{based}"'
+    if scenario:
+        remedy += f', or make a folder of your own whose scenario.toml has name = "..." and base = "{folder.name}"'
     if installed(folder):
         raise InputError(f"{folder.name}: came with the package, where nothing is written; {remedy}")
     if folder.is_dir() and not os.access(folder, os.W_OK):
