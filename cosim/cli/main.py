@@ -40,7 +40,7 @@ def main() -> None:
 
     \b
     Example:
-      cosim run scenarios/grid7_peak --controller dpc-pcrg --against no-control
+      cosim run grid7_peak --controller dpc-pcrg --against no-control
     """
 
 
@@ -66,8 +66,8 @@ def evaluate(
 
     \b
     Examples:
-      cosim evaluate scenarios/grid7_peak --controllers no-control,pi-gating,dpc-pc --seeds 10
-      cosim evaluate scenarios/grid7_peak --controllers no-control,dpc-pc --demand 0.8,1.0,1.3 --out runs/levels
+      cosim evaluate grid7_peak --controllers no-control,pi-gating,dpc-pc --seeds 10
+      cosim evaluate grid7_peak --controllers no-control,dpc-pc --demand 0.8,1.0,1.3 --out runs/levels
     """
     from cosim.plant.strategy import parse  # heavy
 
@@ -120,8 +120,8 @@ def sweep(
 
     \b
     Examples:
-      cosim sweep scenarios/grid7_peak --controllers dpc-pcrg,rerouting-30 --compliance 0,50,100 --seeds 3
-      cosim sweep scenarios/grid7_peak --controllers no-control,pi-gating --demand 0.8,1.0,1.2 \\
+      cosim sweep grid7_peak --controllers dpc-pcrg,rerouting-30 --compliance 0,50,100 --seeds 3
+      cosim sweep grid7_peak --controllers no-control,pi-gating --demand 0.8,1.0,1.2 \\
           --scheduler tcp://localhost:8786 --out runs/cluster
     """
     from cosim.plant.strategy import parse  # heavy

@@ -35,7 +35,7 @@ def main() -> None:
 
     \b
     Example:
-      nmfd benchmark scenarios/economic_mpc --controllers no-control,pi-gating
+      nmfd benchmark economic_mpc --controllers no-control,pi-gating
     """
 
 
@@ -57,14 +57,14 @@ def benchmark(
 ) -> None:
     """Run controllers on a regional model; print a table and write a run folder.
 
-    SCENARIO is a folder with a scenario.toml. The run folder holds summary.csv, the trajectories, manifest.json and
-    figures. Every finished run is kept: the same command with the same --out goes on where it was interrupted, and
-    other controllers or more seeds are added to what is there.
+    SCENARIO is, here and in all commands, a name of nmfd list, or a folder with a scenario.toml. The run folder holds
+    summary.csv, the trajectories, manifest.json and figures. Every finished run is kept: the same command with the same
+    --out goes on where it was interrupted, and other controllers or more seeds are added to what is there.
 
     \b
     Examples:
-      nmfd benchmark scenarios/economic_mpc --controllers no-control,pi-gating
-      nmfd benchmark scenarios/economic_mpc --controllers no-control,dpc-pc \\
+      nmfd benchmark economic_mpc --controllers no-control,pi-gating
+      nmfd benchmark economic_mpc --controllers no-control,dpc-pc \\
           --seeds 5 --plant acyclic --workers 2 --policy dpc-pc=mine.pt --out runs/mine
     """
     names = controller_names(controllers)
@@ -119,8 +119,8 @@ def train(
 
     \b
     Examples:
-      nmfd train scenarios/economic_mpc --controller dpc-pcrg
-      nmfd train scenarios/economic_mpc --controller dpc-pc --steps 200 --out mine.pt
+      nmfd train economic_mpc --controller dpc-pcrg
+      nmfd train economic_mpc --controller dpc-pc --steps 200 --out mine.pt
     """
     from nmfd.api import load_scenario  # heavy
     from nmfd.controllers.dpc import rollout, training
@@ -183,7 +183,7 @@ def show(scenario: Path, out: Path | None) -> None:
 
     \b
     Example:
-      nmfd show scenarios/economic_mpc --out figures
+      nmfd show economic_mpc --out figures
     """
     from nmfd.api import load_scenario  # heavy
     from nmfd.runs.files import file_name
