@@ -37,7 +37,7 @@ def run(
 ) -> None:
     """Run a controller in the microsimulation; print a table and write a run folder.
 
-    SCENARIO is, here and in all commands, a name of cosim list, or a folder with a scenario.toml, on a network that SUMO
+    SCENARIO is, here and in all commands, a name of cosim list or a folder with a scenario.toml, on a network that SUMO
     can simulate. The run folder holds summary.csv, sumo.csv, trajectories and records, manifest.json and pictures. The
     same --out goes on where it was interrupted, even by kill -9: finished runs are kept, and the one that was under way
     starts again from its beginning.
