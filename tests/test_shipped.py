@@ -59,6 +59,9 @@ def test_by_name_from_any_folder(installed):
 
 
 def test_a_path_goes_before_a_name(installed):
+    Path("economic_mpc").mkdir()  # some other folder, say of runs
+    assert load_scenario("economic_mpc").steps == 240
+    Path("economic_mpc").rmdir()
     tiny.write(Path())
     Path("scenario").rename("economic_mpc")
     assert load_scenario("economic_mpc").name == "tiny"

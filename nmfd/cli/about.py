@@ -38,8 +38,8 @@ def listing(*more: str) -> click.Command:
         """List what comes with the package, scenarios and networks, policies and controllers, with a line each.
 
         Scenarios and networks are named without a path, from any folder: nmfd benchmark economic_mpc, cosim run
-        grid7_peak. A folder of that name, where there is one, goes before it. A policy is found by the controller's
-        name; where a file is asked for, it is called as it is here.
+        grid7_peak. A scenario of your own in a folder of that name goes before it. A policy is found by the name of the
+        controller; where a file is asked for, it is called as it is here.
 
         \b
         Examples:
