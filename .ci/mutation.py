@@ -23,7 +23,7 @@ SURVIVED, NO_TESTS = 0, (5, 33)  # exit codes in mutmut's own files
 
 def mutants(module: Path) -> list[str]:
     """The names of all mutants of a module."""
-    mutated = mutate_file_contents(str(module), module.read_text())
+    mutated = mutate_file_contents(str(module), module.read_text(encoding="utf-8"))
     return [get_mutant_name(module, name) for name in mutated.mutant_names]
 
 
@@ -34,7 +34,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--least", type=float, default=0.8, help="the score that each module must have")
     order = parser.parse_args()
-    every = [Path(file) for file in tomllib.loads(Path("pyproject.toml").read_text())["tool"]["mutmut"]["only_mutate"]]
+    project = tomllib.loads(Path("pyproject.toml").read_text(encoding="utf-8"))
+    every = [Path(file) for file in project["tool"]["mutmut"]["only_mutate"]]
     modules = [module for module in every if not order.modules or module.stem in order.modules]
     drawn = {}
     for module in modules:
@@ -47,7 +48,7 @@ def main() -> None:
             sys.exit(f"mutmut failed: see {log.name}")
     weak = []
     for module, names in drawn.items():
-        codes = json.loads(Path(f"mutants/{module}.meta").read_text())["exit_code_by_key"]
+        codes = json.loads(Path(f"mutants/{module}.meta").read_text(encoding="utf-8"))["exit_code_by_key"]
         missed = [name for name in names if codes[name] == SURVIVED or codes[name] in NO_TESTS]
         score = 1.0 - len(missed) / len(names)
         print(f"{score:4.0%} of {len(names)} mutants noticed: {module}", *sorted(missed), sep="\n    ")

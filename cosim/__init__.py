@@ -2,7 +2,7 @@
 
     import cosim
 
-    result = cosim.run("scenarios/grid7_peak", "dpc-pcrg", seed=1)
+    result = cosim.run("grid7_peak", "dpc-pcrg", seed=1)
     print(result.facts["mean_trip_time_s"], result.trajectory.to_frame())
 
 `run` is one closed loop in SUMO, `run_tasks` many with a run folder, `sweep` many more on processes or a cluster;

@@ -21,10 +21,10 @@ def run(
 ) -> Result:
     """One closed loop in SUMO, in this process and without a run folder.
 
-        result = cosim.run("scenarios/grid7_peak", "pi-gating+rerouting-30", seed=3)
+        result = cosim.run("grid7_peak", "pi-gating+rerouting-30", seed=3)
         result.trajectory.to_frame(), result.facts["mean_trip_time_s"], result.record["gateway_flow"]
 
-    scenario: the folder of a scenario.toml, or what nmfd.load_scenario made of it
+    scenario: a name of `cosim list`, the folder of a scenario.toml, or what nmfd.load_scenario made of it
     controller: a strategy as on the command line, or an object with `reset` and `act` (nmfd.Controller)
     seed: of the trips, the drivers and the guidance
     steps: control intervals; the scenario's if None

@@ -2,7 +2,7 @@
 
     import nmfd
 
-    scenario = nmfd.load_scenario("scenarios/economic_mpc")
+    scenario = nmfd.load_scenario("economic_mpc")
     trajectory = nmfd.run(scenario, "dpc-pcrg", seed=1)
     print(nmfd.summary(trajectory)["total_time_spent_veh_s"])
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from nmfd.studies.benchmark import summary_table
     from nmfd.types import Controller, Controls, Observation, Plant, State, Status, Trajectory
 
+__version__ = "0.1.0"  # of the package perimeter-cosim, nmfd and cosim alike
 _MODULES = {
     "api": ("benchmark", "controller", "load_scenario", "run", "train"), "errors": ("InputError",),
     "metrics": ("summary", "total_time_spent"), "model.planning": ("PlanningModel",),

@@ -15,8 +15,9 @@ from nmfd.types import Controller, Plant, Trajectory
 
 
 def load_scenario(folder: Path | str) -> Scenario:
-    """The scenario in `folder`, with its network; the options of all its controllers are checked. Raises InputError."""
-    scenario = read_scenario(Path(folder))
+    """The scenario in `folder`, or of this name among those that come with the package (`nmfd list`), with its network;
+    the options of all its controllers are checked. Raises InputError."""
+    scenario = read_scenario(folder)
     registry.check_options(scenario)
     return scenario
 
@@ -38,10 +39,10 @@ def run(
 ) -> Trajectory:
     """One closed loop on a regional model.
 
-        trajectory = nmfd.run("scenarios/economic_mpc", "pi-gating")
+        trajectory = nmfd.run("economic_mpc", "pi-gating")
         trajectory.to_frame()
 
-    scenario: the folder of a scenario.toml, or what load_scenario made of it
+    scenario: a name of `nmfd list`, the folder of a scenario.toml, or what load_scenario made of it
     controller: a name as on the command line, or an object with `reset` and `act` (nmfd.Controller)
     seed: of the measurement noise
     plant: "nmfd", "acyclic", or an object with `reset`, `step`, `completed` and `close` (nmfd.Plant)

@@ -25,7 +25,7 @@ GROWTH = 1.05  # of the memory, after the first part
 
 def memory() -> float:
     """Of this process [MiB]."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 

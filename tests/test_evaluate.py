@@ -23,9 +23,9 @@ ROOT = Path(__file__).parents[1]
 
 def change(file: Path, pattern: str, new: str) -> None:
     """Replace the first match in a file, which must have one."""
-    text, count = re.subn(pattern, new, file.read_text(), count=1)
+    text, count = re.subn(pattern, new, file.read_text(encoding="utf-8"), count=1)
     assert count == 1
-    file.write_text(text)
+    file.write_text(text, encoding="utf-8")
 
 
 @pytest.fixture

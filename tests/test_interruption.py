@@ -54,9 +54,9 @@ def interrupted(file: Path, *command, after: float, by: int = signal.SIGINT) -> 
     child = os.fork()
     if child == 0:
         with suppress(BaseException):
-            with file.open("w") as stream:
+            with file.open("w", encoding="utf-8") as stream:
                 os.dup2(stream.fileno(), 1), os.dup2(stream.fileno(), 2)
-            sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)
+            sys.stdout, sys.stderr = (open(n, "w", encoding="utf-8", closefd=False) for n in (1, 2))
             signal.signal(signal.SIGINT, signal.default_int_handler)
             program, *arguments = map(str, command)
             os.write(writer, b"x")
@@ -70,7 +70,7 @@ def interrupted(file: Path, *command, after: float, by: int = signal.SIGINT) -> 
     time.sleep(after)
     os.kill(child, by)
     _, status = os.waitpid(child, 0)
-    return os.waitstatus_to_exitcode(status), file.read_text()
+    return os.waitstatus_to_exitcode(status), file.read_text(encoding="utf-8")
 
 
 def test_ctrl_c_at_random_moments(tmp_path):
@@ -257,7 +257,7 @@ def test_workers_do_not_outlive_a_killed_parent(tmp_path):
 def alive(process: int) -> bool:
     """Running, and no zombie that nobody has waited for."""
     try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        return Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
         return False
 

@@ -280,7 +280,7 @@ def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int, prompt: 
 
 def told(path: Path) -> int:
     """How many vehicles SUMO has written of."""
-    return path.read_text().count("<tripinfo ")
+    return path.read_text(encoding="utf-8").count("<tripinfo ")
 
 
 def check(city, meter, states, infos, count):

@@ -48,7 +48,7 @@ def written(path: Path, place: str, code: str) -> str:
         indent = next(line for line in SOURCE.splitlines() if line.strip() == other).partition(other)[0]
         lines = code.replace("\n", f"\n{indent}") if other == place else "pass"
         text = text.replace(f"{indent}{other}\n", f"{indent}{lines}\n")
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     return f"{path}:Mine"
 
 
@@ -173,4 +173,4 @@ def test_it_is_asked_once_for_its_name_and_files(tmp_path, monkeypatch):
     written(Path("mine.py"), "TOP", "open('asked', 'a').write('x')")
     assert custom.table_name("mine.py:Mine") == "mine.py:Mine"
     assert custom.fingerprint("mine.py:Mine") == custom.fingerprint("mine.py:Mine")
-    assert Path("asked").read_text() == "x"
+    assert Path("asked").read_text(encoding="utf-8") == "x"

@@ -240,7 +240,7 @@ def test_progress_is_shown_on_a_terminal_only_and_wiped():
 def test_progress_line_fits_the_terminal():
     behind, terminal = os.openpty()
     termios.tcsetwinsize(terminal, (24, 30))
-    with open(terminal, "w") as stream, progress_line("training", stream) as show:
+    with open(terminal, "w", encoding="utf-8") as stream, progress_line("training", stream) as show:
         show(0, 4, "a long note")
     drawn = os.read(behind, 1000).decode().split("\r")
     os.close(behind)

@@ -54,12 +54,13 @@ def test_what_is_booked(tmp_path, monkeypatch):
     """As if everybody stood from the second interval on: counts end, everybody spends time, and goes on emitting."""
     folder = copies.peak(tmp_path)
     file = Path(folder, "scenario.toml")
-    file.write_text(re.sub(r"ramp_up = [\d.]+", "ramp_up = 60.0", file.read_text()))
+    file.write_text(re.sub(r"ramp_up = [\d.]+", "ramp_up = 60.0", file.read_text(encoding="utf-8")), encoding="utf-8")
     task = Task(scenario=folder, controller="no-control", seed=1030, demand_factor=0.3, steps=4)
     monkeypatch.setattr(Standstill, "reached", lambda self, state, left: state.step >= 2)
     monkeypatch.setattr(Session, "expected", lambda self: 0)
     simulated = simulate(task)
-    file.write_text(file.read_text().replace("[sumo]\n", "[sumo]\nbook_standstill = true\n"))
+    text = file.read_text(encoding="utf-8").replace("[sumo]\n", "[sumo]\nbook_standstill = true\n")
+    file.write_text(text, encoding="utf-8")
     booked = simulate(task)
     assert (simulated.facts["booked_intervals"], booked.facts["booked_intervals"]) == (0, 2)
     there, trajectory = simulated.trajectory.accumulation, booked.trajectory

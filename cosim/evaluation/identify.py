@@ -36,7 +36,7 @@ from nmfd.model.model_file import network_toml, schema_line
 from nmfd.model.planning import GUIDED, GUIDING
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
-from nmfd.runs import config, files
+from nmfd.runs import config, files, shipped
 from nmfd.runs.tables import wrapped
 from nmfd.runs.workers import ended
 
@@ -99,6 +99,8 @@ def identify(
         raise InputError(
             f"{'--guided' if loading.guided else '--with'}: {loaded.name} runs on {target}, whose model must stay that "
             "of its own drivers and signals; name another folder with --network")
+    if shipped.installed(target):
+        shipped.beside(own, "network.toml", "another folder with --network")
     there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
     if not there.is_dir() or not os.access(there, os.W_OK):  # rather than after hours of loading
         raise InputError(f"--network: {there} is no folder that can be written to; choose another")
@@ -235,12 +237,12 @@ def _sumo_table(folder: Path, target: Path) -> dict[str, str]:
     """The table [sumo] of the network in `folder`, its paths seen from `target`."""
     table = config.read(folder / "network.toml").get("sumo", {})
     return {
-        key: os.path.relpath(folder / value, target) if key in PATHS and isinstance(value, str) else value
+        key: files.relative(folder / value, target) if key in PATHS and isinstance(value, str) else value
         for key, value in table.items()}
 
 
 def _write_samples(path: Path, samples: Sequence[dict]) -> None:
-    with files.atomic(path) as temporary, temporary.open("w", newline="") as file:
+    with files.atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["region", "branch", "accumulation_veh", "outflow_veh_s"])
         for region, cloud in enumerate(samples):

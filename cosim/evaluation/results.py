@@ -13,6 +13,7 @@ from cosim.sumo.net import City, load_city
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
+from nmfd.runs import shipped
 from nmfd.runs.files import check_file, file_hash
 
 
@@ -131,11 +132,13 @@ def _manifest(folder: Path) -> dict:
 
 
 def _scenario_folder(level: Level) -> Path:
-    """Where the manifest says, from here or from a folder above the runs."""
+    """Where the manifest says, from here or from a folder above the runs, or as it came with the package."""
     name = Path(level.manifest["sessions"][-1]["scenario_folder"])
     for folder in (Path(), *level.folder.resolve().parents):
         if (folder / name / "scenario.toml").is_file():
             return folder / name
+    if ((folder := shipped.found(name, shipped.SCENARIO, beside=Path())) / "scenario.toml").is_file():
+        return folder
     raise InputError(f"{level.folder / 'manifest.json'}: scenario_folder: there is no {name}; give it with --scenario")
 
 

@@ -3,12 +3,14 @@
 from pathlib import Path
 
 from nmfd.errors import InputError
-from nmfd.runs import config
+from nmfd.runs import config, shipped
 
 
 def scenario_of(target: Path) -> Path:
     """`target` if it is a scenario's folder; for a network's, the scenario on it in the folder scenarios beside the
-    networks: that of the same name, or the only one. Raises InputError."""
+    networks: that of the same name, or the only one. Both may be names of those that come with the package. Raises
+    InputError."""
+    target = shipped.found(target, shipped.SCENARIO, shipped.NETWORK)
     if (target / "scenario.toml").exists() or not (target / "network.toml").exists():
         return target
     scenarios = target.resolve().parent.parent / "scenarios"

@@ -100,7 +100,7 @@ def write_loops(city: City, layout: Layout, period: float, path: Path) -> None:
     rows = [
         f'  <inductionLoop id="{loop}" lane="{lane}" pos="{position:.2f}" period="{period:g}" file="NUL"/>\n'
         for loop, lane, position, _ in _loops(city, layout)]
-    path.write_text(f"<additional>\n{''.join(rows)}</additional>\n")
+    path.write_text(f"<additional>\n{''.join(rows)}</additional>\n", encoding='utf-8')
 
 
 def probes(vehicles: Sequence[str], share: float, seed: int) -> frozenset[str]:

@@ -13,6 +13,7 @@ from cosim.sumo.signals import FIXED as FIXED_TIME
 from cosim.sumo.signals import HELD, Signal, read_signals, write_programmes
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
+from nmfd.runs import shipped
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +52,8 @@ def write_signal_programmes(
     """
     if chosen.signals == WEBSTER:
         return [webster.plan(
-            city, signals.simple, scenario.demand, scenario.step, folder=network_folder(scenario.network) / "build",
-            flows=own_flows)]
+            city, signals.simple, scenario.demand, scenario.step,
+            folder=shipped.build_folder(network_folder(scenario.network)), flows=own_flows)]
     if chosen.signals == ACTUATED:
         path = folder / "actuated.add.xml"
         write_programmes(path, [actuated_row(signal) for signal in signals.steered])

@@ -26,6 +26,7 @@ from cosim.sumo.session import Phase
 from cosim.sumo.signals import Signal, programme_row, write_programmes
 from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
+from nmfd.runs import shipped
 
 CYCLES = (40, 50, 60, 70, 80, 90, 100, 110, 120)  # s
 MIN_GREEN = 5.0           # s
@@ -91,7 +92,7 @@ def plan(
         flows = cosim.sumo.turning_flows.turning_flows(city, demand, step) if flows is None else flows
         rows = [programme_row(signal, "static") for signal in optimised(city, signals, flows)]
         try:
-            folder.mkdir(exist_ok=True)
+            shipped.made(folder)
             write_programmes(path, rows)
         except OSError as error:
             raise InputError(f"{path}: the signal plan cannot be kept ({error.strerror}); make it writable") from None

@@ -1,4 +1,7 @@
-"""Building a SUMO city: city.toml -> plain XML -> netconvert -> <network>/build/<name>.net.xml and regions.csv."""
+"""Building a SUMO city: city.toml -> plain XML -> netconvert -> <network>/build/<name>.net.xml and regions.csv.
+
+Where nothing can be written beside the network, they are kept in the user's cache (nmfd.runs.shipped.build_folder).
+"""
 
 import csv
 import hashlib
@@ -16,7 +19,7 @@ import sumo
 from cosim.sumo.recipe import CityTable, RecipeTable
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs import config
+from nmfd.runs import config, shipped
 from nmfd.runs.files import atomic
 from nmfd.runs.scratch import Scratch
 
@@ -97,15 +100,15 @@ def ensure_built(network: RegionalModel) -> SumoFiles:
 
 
 def _built(recipe_file: Path, network: RegionalModel) -> SumoFiles:
-    folder = recipe_file.parent / "build"
+    folder = shipped.build_folder(recipe_file.parent)
     files = SumoFiles(net_file=folder / f"{network.name}.net.xml", regions_csv=folder / "regions.csv")
     stamp_file = folder / f"{network.name}.stamp"
     recipe = read_recipe(recipe_file, network.regions)
     stamp = _stamp(recipe_file)
-    if stamp_file.is_file() and stamp_file.read_text() == stamp and files.net_file.is_file() and (
+    if stamp_file.is_file() and stamp_file.read_text(encoding="utf-8") == stamp and files.net_file.is_file() and (
             files.regions_csv.is_file()):
         return files
-    folder.mkdir(exist_ok=True)
+    shipped.made(folder)
     stamp_file.unlink(missing_ok=True)  # nothing here counts until it is written again
     net, regions = build(recipe, str(recipe_file))
     # the stamp comes last: whoever sees it finds the files that belong to it
@@ -257,7 +260,7 @@ def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
     with Scratch("cosim-") as folder:
         options = []
         for kind, content in zip(("node", "edge", "connection"), plain, strict=True):
-            (folder / f"{kind}.xml").write_text(content)
+            (folder / f"{kind}.xml").write_text(content, encoding="utf-8")
             options += [f"--{kind}-files", f"{kind}.xml"]
         command = [
             str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"), *options, "--output-file", "net.xml",

@@ -215,7 +215,7 @@ def for_cars(lane: ElementTree.Element) -> bool:
 def _read_regions(path: Path, regions: int) -> dict[str, int]:
     check_file(path, "give a table with the columns edge,region")
     try:
-        with path.open(newline="") as stream:
+        with path.open(encoding="utf-8", newline="") as stream:
             rows = list(csv.reader(stream))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; give a table with the columns edge,region") from None

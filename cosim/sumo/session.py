@@ -326,7 +326,7 @@ def _start_quietly(command: list[str]) -> None:
 def _start(window: Window, command: list[str]) -> None:
     """As libsumo.start, with `window`. Raises FatalTraCIError with what the program has said."""
     program = str(Path(sumo.SUMO_HOME) / "bin" / window.program)
-    with tempfile.TemporaryFile("w+") as said:
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as said:
         port = getFreeSocketPort()
         process = subprocess.Popen(
             [program, *command[1:], *window.options, "--remote-port", str(port)], stdout=said, stderr=said)

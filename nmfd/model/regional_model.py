@@ -14,7 +14,7 @@ from nmfd.arrays import Adjacency, Hops, PerPair, PerRegion, PerTurn, Positions,
 from nmfd.errors import InputError
 from nmfd.model.mfd import Mfd
 from nmfd.model.network_file import NetworkTable, RegionTable
-from nmfd.runs import config
+from nmfd.runs import config, shipped
 
 # Of boundaries with a capacity. What passes is a smooth minimum of wish and limit, (wish^-n + limit^-n)^(-1/n), 84 % of
 # either where they are equal: demand within a control interval is not even.
@@ -121,12 +121,12 @@ def _hops(adjacency: Adjacency) -> Hops:
 
 
 def load_network(folder: Path | str) -> RegionalModel:
-    """Read `folder`/network.toml (nmfd.model.network_file).
+    """Read `folder`/network.toml (nmfd.model.network_file); a name alone is that of one that comes with the package.
 
     Raises InputError for a missing file, an unknown key, a wrong type or range, an adjacency that is not symmetric
     or not connected, or an MFD that is none. The table [sumo] is left to the microsimulation.
     """
-    folder = Path(folder)
+    folder = shipped.found(folder, shipped.NETWORK)
     path = folder / "network.toml"
     table = config.checked(NetworkTable, config.read(path), path)
     rows = table.regions

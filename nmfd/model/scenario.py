@@ -15,7 +15,7 @@ from nmfd.errors import InputError
 from nmfd.faults import Fault, parse
 from nmfd.model.regional_model import RegionalModel, check_step, load_network
 from nmfd.model.scenario_file import MOST_NUMBERS, OWN_TIME_LIMIT, ScenarioTable, read_tables
-from nmfd.runs import config
+from nmfd.runs import config, shipped
 from nmfd.runs.files import check_file
 
 
@@ -115,11 +115,13 @@ def trapezoid(
 
 
 def read_scenario(folder: Path | str) -> Scenario:
-    """Read `folder`/scenario.toml and its network. Raises InputError.
+    """Read `folder`/scenario.toml and its network; a name alone is that of one that comes with the package.
+
+    Raises InputError.
 
     The table [controllers] is left to the controllers (nmfd.controllers.registry.checked_scenario), [sumo] to cosim.
     """
-    folder = Path(folder)
+    folder = shipped.found(folder, shipped.SCENARIO)
     path = folder / "scenario.toml"
     table = config.checked(ScenarioTable, read_tables(folder), path)
     network = load_network(folder / table.network)

@@ -1,12 +1,11 @@
 """scenario.toml, declared: what its tables and keys mean and may be; and scenarios that are based on another one."""
 
-import os
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import model_validator
 
-from nmfd.runs import config
+from nmfd.runs import config, files, shipped
 from nmfd.runs.config import Flow, Name, Problem, Region, Regions, Rows, Seconds, Settings, Text, Texts, setting, whole
 
 MOST_NUMBERS = 2 * 10**8  # of a demand table: more would not fit into memory
@@ -46,8 +45,9 @@ class PlanningOptions(Settings):
     """Of every controller, beside its own options."""
 
     model: Text | None = setting(
-        "folder of the regional model that it plans with; without it, that of the scenario's network or, of "
-        "controllers that guide routes, the one in the folder guided of that network", None)
+        "folder of the regional model that it plans with, or the name of a network that comes with the package; "
+        "without it, that of the scenario's network or, of controllers that guide routes, the one in the folder guided "
+        "of that network", None)
 
 
 class ScenarioTable(Settings):
@@ -55,8 +55,9 @@ class ScenarioTable(Settings):
 
     name: Name = setting("of the scenario")
     base: Text | None = setting(
-        "folder of another scenario that says what this one does not; tables are completed key by key", None)
-    network: Text = setting("folder of the network")
+        "folder of another scenario that says what this one does not, or the name of one that comes with the package; "
+        "tables are completed key by key", None)
+    network: Text = setting("folder of the network, or the name of one that comes with the package")
     step: float = setting("control interval", unit="s", gt=0.0, le=LONGEST_STEP)
     steps: int = whole("control intervals", low=1, high=MOST_NUMBERS)
     integrator: Literal["euler", "rk4"] = setting("of the regional model", "euler")
@@ -98,17 +99,18 @@ def read_tables(folder: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
         return own
     if not isinstance(base, str) or not base.isprintable():
         raise config.error(file, "base", config.got("the folder of a scenario in quotes", base))
-    return _completed(own, read_tables(folder / base, folders))
+    return _completed(own, read_tables(shipped.found(base, shipped.SCENARIO, beside=folder), folders))
 
 
 def _name_from(own: dict, folder: Path, here: Path) -> None:
-    """Files that a scenario.toml names are relative to it: rewrite them as seen from the folder `here`."""
-    def seen(name: str) -> str:
-        return os.path.relpath(folder / name, here)
+    """Files that a scenario.toml names are relative to it, or come with the package: rewrite them as seen from the
+    folder `here`."""
+    def seen(name: str, *kinds: str) -> str:
+        return files.relative(shipped.found(name, *kinds, beside=folder), here)
 
-    for key in ("network", "demand_file"):
+    for key, kinds in (("network", (shipped.NETWORK,)), ("demand_file", ())):
         if isinstance(own.get(key), str):
-            own[key] = seen(own[key])
+            own[key] = seen(own[key], *kinds)
     sumo = own.get("sumo")
     if isinstance(sumo, dict):
         for key in ("routes", "background", "additional"):
@@ -117,7 +119,7 @@ def _name_from(own: dict, folder: Path, here: Path) -> None:
     controllers = own.get("controllers")
     for options in controllers.values() if isinstance(controllers, dict) else ():
         if isinstance(options, dict) and isinstance(options.get("model"), str):
-            options["model"] = seen(options["model"])
+            options["model"] = seen(options["model"], shipped.NETWORK)
 
 
 def _completed(content: dict, base: dict) -> dict:

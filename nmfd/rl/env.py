@@ -15,7 +15,7 @@ from nmfd.types import Observation, Plant
 class RegionalEnv(gymnasium.Env):
     """One episode is the whole scenario; it ends by truncation after its T control intervals.
 
-        env = RegionalEnv(nmfd.load_scenario("scenarios/economic_mpc"), guidance=True)
+        env = RegionalEnv(nmfd.load_scenario("economic_mpc"), guidance=True)
 
     Observations and actions: nmfd.rl.Interface. The reward of an interval is minus the vehicles in and before the city
     when it begins, in `unit` (the sum of the critical accumulations): TTS = - sum of rewards * unit * scenario.step, as

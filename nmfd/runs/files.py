@@ -148,6 +148,14 @@ def file_hash(path: Path) -> str:
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
 
 
+def relative(path: Path, folder: Path) -> str:
+    """`path` as seen from `folder`, with / between its parts; as it is where no way leads there (Windows' drives)."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:
+        return path.absolute().as_posix()
+
+
 def file_name(name: str) -> str:
     """`name` with everything that is awkward in a file name replaced."""
     return re.sub(r"[^\w.-]+", "-", name)

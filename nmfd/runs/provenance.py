@@ -8,12 +8,14 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 
-PACKAGES = ("numpy", "torch", "casadi", "libsumo", "perimeter-cosim")
+from nmfd import __version__
+
+PACKAGES = ("numpy", "torch", "casadi", "libsumo")
 
 
 def provenance() -> dict:
     """Date, versions, and the commit of the checkout that this package lies in; commit is None outside one."""
-    versions = {"python": platform.python_version()}
+    versions = {"python": platform.python_version(), "perimeter-cosim": __version__}
     for package in PACKAGES:
         with suppress(metadata.PackageNotFoundError):
             versions[package] = metadata.version(package)

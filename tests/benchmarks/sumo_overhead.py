@@ -92,7 +92,8 @@ def bare(command: list[str]) -> Timed:
 
 
 def _trips(path: Path) -> list[str]:
-    return sorted(line for line in path.read_text().splitlines() if "<tripinfo " in line or "<emissions " in line)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return sorted(line for line in lines if "<tripinfo " in line or "<emissions " in line)
 
 
 def _programmes(shown: dict[str, list[tuple[float, str]]], end: float) -> str:

@@ -18,6 +18,7 @@ from nmfd.errors import InputError, RunFailed
 from nmfd.extras import need
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import read_scenario
+from nmfd.runs import shipped
 from nmfd.runs.files import atomic
 from nmfd.tensors import PerPair, PerTurn
 
@@ -37,6 +38,7 @@ def export(policy_file: Path, out: Path, scenario_folder: Path | None = None) ->
     the extra `onnx`, and RunFailed, with nothing written, should the graph compute something else than the policy.
     """
     need("nmfd export", "onnx", *MODULES)
+    policy_file = shipped.found(policy_file, shipped.SCENARIO)
     planning, content = _planning(policy_file, scenario_folder)
     policy, _ = load_policy(policy_file, planning.network)
     policy.eval()

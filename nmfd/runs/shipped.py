@@ -1,0 +1,95 @@
+"""Scenarios and networks that come with the package: named without a path from any folder, read and never written.
+
+In a checkout they are its folders scenarios and networks, in an installed package those in nmfd/data; the same relative
+paths lead from one to another in both.
+"""
+
+import hashlib
+import os
+from importlib import resources
+from pathlib import Path
+
+import platformdirs
+
+from nmfd.errors import InputError, did_you_mean
+
+SCENARIO, NETWORK = "scenario", "network"  # kinds: of folders in a folder of that name + "s", with NAME.toml in each
+CACHE = "COSIM_CACHE"  # environment variable: where what is built of cities that come with the package is kept
+_HERE = Path(str(resources.files("nmfd")))
+_DATA = _HERE / "data"  # as pyproject.toml maps it
+
+
+def root() -> Path:
+    """The folder with the folders scenarios and networks."""
+    return _DATA if _DATA.is_dir() else _HERE.parent
+
+
+def folders(kind: str) -> list[Path]:
+    """Those of a kind, by name."""
+    return sorted(file.parent for file in (root() / f"{kind}s").glob(f"[!.]*/{kind}.toml"))
+
+
+def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
+    """The folder of one of these kinds, or the file, `name`: a path, from `beside` if given; where there is none, what
+    comes with the package under this name, or beneath it (as grid7_peak/dpc-pc.pt).
+
+    A path that leads nowhere stays as it is: whoever reads it says so. InputError for a mere word that names nothing.
+    """
+    path, word = Path(name) if beside is None else beside / name, Path(name)
+    if os.path.isfile(path) or any(os.path.exists(path / f"{kind}.toml") for kind in kinds):
+        return path
+    if word.is_absolute() or ".." in word.parts:
+        return path
+    for kind in kinds:
+        folder = root() / f"{kind}s" / word
+        if word.parts and os.path.exists(folder / f"{kind}.toml" if len(word.parts) == 1 else folder):
+            return folder
+    if beside is not None or not kinds or len(word.parts) != 1 or word.suffix or os.path.exists(path):
+        return path
+    near = [folder.name for kind in kinds for folder in (*folders(kind), *(
+        file.parent for file in Path().glob(f"*/{kind}.toml")))]
+    raise InputError(
+        f"{name}: no such folder here, and no {' or '.join(kinds)} of that name comes with the package"
+        f"{did_you_mean(str(name), near)}; `nmfd list` shows those that do")
+
+
+def installed(path: Path) -> bool:
+    """Whether `path` lies in the data of an installed package, which are not the user's to write."""
+    return path.resolve().is_relative_to(_DATA.resolve())
+
+
+def beside(folder: Path, file: str, option: str, *, scenario: bool = False) -> Path:
+    """Where a `file` goes that is kept in `folder` unless the user says otherwise. InputError for the installed
+    package, and for a folder that cannot be written to.
+
+    option: with which they say so; scenario: whether one of their own can be based on that in `folder` instead
+    """
+    remedy = f"give {option}"
+    if scenario:
+        remedy += f', or make a folder of your own whose scenario.toml has name = "..." and base = "{folder.name}"'
+    if installed(folder):
+        raise InputError(f"{folder.name}: came with the package, where nothing is written; {remedy}")
+    if folder.is_dir() and not os.access(folder, os.W_OK):
+        raise InputError(f"{folder}: cannot be written to; {remedy}")
+    return folder / file
+
+
+def build_folder(folder: Path) -> Path:
+    """Where what is built of the city in `folder` is kept, not yet there perhaps: in build beside it, or, of the
+    installed package or where nothing can be written, in the user's cache ($COSIM_CACHE)."""
+    if not installed(folder) and os.access(folder, os.W_OK):
+        return folder / "build"
+    where = os.environ.get(CACHE) or platformdirs.user_cache_dir("perimeter-cosim", appauthor=False)
+    fingerprint = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16]
+    return Path(where) / f"{folder.name}-{fingerprint}"
+
+
+def made(folder: Path) -> Path:
+    """`folder`, a `build_folder`, made if it is not there. InputError if it cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: what is built of a city cannot be kept there ({error.strerror}); name a folder that can be "
+            f"written to in the environment variable {CACHE}") from None
+    return folder
