@@ -38,7 +38,7 @@ def read(file: Path) -> Document:
     if file.suffix == ".ipynb":
         cells = [(cell["cell_type"], "".join(cell["source"])) for cell in json.loads(text)["cells"]]
         text = "\n\n".join(source for kind, source in cells if kind == "markdown")
-        called = [line for kind, source in cells if kind == "code" for line in _called(source)]
+        called = list(_called([source for kind, source in cells if kind == "code"]))
     links, names, headings, blocks = [], [], [], []
     tokens = MarkdownIt("commonmark").enable("table").parse(text)
     for token, before in zip(tokens, [None, *tokens], strict=False):
@@ -87,10 +87,15 @@ def _words(line: str) -> Iterator[list[str]]:
     yield words
 
 
-def _called(source: str) -> Iterator[str]:
-    """The first argument of every call of `command`; {...} in it, which the notebook fills in, as 1."""
-    for node in ast.walk(ast.parse(source)):
+def _called(sources: list[str]) -> Iterator[str]:
+    """The first argument of every call of `command` in the cells of a notebook. {NAME} in it is what NAME = QUICK-value
+    if QUICK else VALUE gives to whoever runs it whole."""
+    nodes = [node for source in sources if not source.startswith("%%") for node in ast.walk(ast.parse(source))]
+    values = {node.targets[0].id: ast.literal_eval(node.value.orelse) for node in nodes if isinstance(
+        node, ast.Assign) and isinstance(node.targets[0], ast.Name) and isinstance(node.value, ast.IfExp)}
+    for node in nodes:
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "command":
             given = node.args[0]
             parts = given.values if isinstance(given, ast.JoinedStr) else [given]
-            yield "".join(part.value if isinstance(part, ast.Constant) else "1" for part in parts)
+            yield "".join(
+                str(part.value if isinstance(part, ast.Constant) else values[part.value.id]) for part in parts)
