@@ -1,4 +1,4 @@
-"""The commands of the READMEs that users begin with run one after another in a folder of their own, in reduced sizes."""
+"""The commands of the READMEs that users begin with run one after another, in reduced sizes."""
 
 import shutil
 
@@ -7,10 +7,11 @@ import tiny_city
 from commands import call, good
 from documents import ROOT, read
 
+STEPS = ["--steps", 2]
 REDUCED = {  # what is added to a command; of an option that is there already the last counts
     "nmfd benchmark": ["--seeds", 1], "nmfd train": ["--steps", 1, "--no-compile", "--anyway"], "nmfd show": [],
     "nmfd new-controller": [], "nmfd export": [],
-    "cosim run": ["--steps", 2], "cosim compare": [], "cosim report": [], "cosim evaluate": ["--steps", 2, "--seeds", 1],
+    "cosim run": STEPS, "cosim compare": [], "cosim report": [], "cosim evaluate": [*STEPS, "--seeds", 1],
     "cosim sweep": ["--steps", 1, "--seeds", 1, "--compliance", 100],
     "cosim import": ["--regions", 3, "--no-run", "--method", "geometric"],
     "cosim identify": ["--levels", 1, "--seeds", 1, "--own"], "cosim list": [], "nmfd list": []}

@@ -1,4 +1,4 @@
-"""The notebooks of scenarios/tutorials run from their first cell to the last, in their reduced form and in any folder."""
+"""The notebooks of scenarios/tutorials run from their first cell to the last, reduced and in any folder."""
 
 import os
 from pathlib import Path
