@@ -48,8 +48,8 @@ def identify(
     Examples:
       cosim identify networks/mycity
       cosim identify networks/mycity --own --levels 0.6,0.8,1.0 --seeds 2
-      cosim identify scenarios/grid7_peak --guided --network networks/grid7_guided
-      cosim identify scenarios/grid7_peak --guided --with max-pressure --network networks/grid7_max_pressure
+      cosim identify grid7_peak --guided --network networks/grid7_guided
+      cosim identify grid7_peak --guided --with max-pressure --network networks/grid7_max_pressure
     """
     from cosim.evaluation import identify  # heavy
     from cosim.importing import find

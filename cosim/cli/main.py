@@ -14,6 +14,7 @@ from cosim.cli.reference import reference
 from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
 from cosim.cli.search import frontier, tune
+from nmfd.cli.about import about, listing
 from nmfd.cli.declared import declared
 from nmfd.cli.errors import Commands
 from nmfd.cli.options import (
@@ -33,13 +34,13 @@ from nmfd.runs.workers import cores
 
 
 @click.group(name="cosim", cls=Commands)
-@click.version_option(package_name="perimeter-cosim", prog_name="cosim")
+@about("cosim")
 def main() -> None:
     """Regional controllers in a SUMO city: run, evaluate, compare with the regional model, identify it.
 
     \b
     Example:
-      cosim run scenarios/grid7_peak --controller dpc-pcrg --against no-control
+      cosim run grid7_peak --controller dpc-pcrg --against no-control
     """
 
 
@@ -65,8 +66,8 @@ def evaluate(
 
     \b
     Examples:
-      cosim evaluate scenarios/grid7_peak --controllers no-control,pi-gating,dpc-pc --seeds 10
-      cosim evaluate scenarios/grid7_peak --controllers no-control,dpc-pc --demand 0.8,1.0,1.3 --out runs/levels
+      cosim evaluate grid7_peak --controllers no-control,pi-gating,dpc-pc --seeds 10
+      cosim evaluate grid7_peak --controllers no-control,dpc-pc --demand 0.8,1.0,1.3 --out runs/levels
     """
     from cosim.plant.strategy import parse  # heavy
 
@@ -119,8 +120,8 @@ def sweep(
 
     \b
     Examples:
-      cosim sweep scenarios/grid7_peak --controllers dpc-pcrg,rerouting-30 --compliance 0,50,100 --seeds 3
-      cosim sweep scenarios/grid7_peak --controllers no-control,pi-gating --demand 0.8,1.0,1.2 \\
+      cosim sweep grid7_peak --controllers dpc-pcrg,rerouting-30 --compliance 0,50,100 --seeds 3
+      cosim sweep grid7_peak --controllers no-control,pi-gating --demand 0.8,1.0,1.2 \\
           --scheduler tcp://localhost:8786 --out runs/cluster
     """
     from cosim.plant.strategy import parse  # heavy
@@ -146,5 +147,7 @@ def sweep(
         tell(f"{failed} of {len(rows)} runs failed, see the column reason; the same command tries them again")
 
 
-for command in (run, compare, report, video, watch, identify, import_, reference, tune, frontier):
+for command in (
+        listing("cosim.plant.strategy:options"), run, compare, report, video, watch, identify, import_, reference, tune,
+        frontier):
     main.add_command(command)

@@ -24,5 +24,5 @@ def reference(folder: Path) -> None:
 
     for path, text in files(folder).items():
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+        path.write_text(text, encoding="utf-8")
         click.echo(path)

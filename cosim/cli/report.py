@@ -125,9 +125,9 @@ def watch(
 
     \b
     Examples:
-      cosim watch scenarios/grid7_peak --controller pi-gating --against no-control
-      cosim watch scenarios/grid7_peak --controller dpc-pcrg --no-open --port 8080
-      cosim watch scenarios/grid7_peak --controller pi-gating --gui
+      cosim watch grid7_peak --controller pi-gating --against no-control
+      cosim watch grid7_peak --controller dpc-pcrg --no-open --port 8080
+      cosim watch grid7_peak --controller pi-gating --gui
     """
     from cosim.evaluation.simulate import Result, Task, scenario_of  # heavy
     from cosim.plant.strategy import parse

@@ -37,17 +37,18 @@ def run(
 ) -> None:
     """Run a controller in the microsimulation; print a table and write a run folder.
 
-    SCENARIO is a folder with a scenario.toml on a network that SUMO can simulate. The run folder holds summary.csv,
-    sumo.csv, trajectories and records, manifest.json and pictures. The same --out goes on where it was interrupted,
-    even by kill -9: finished runs are kept, and the one that was under way starts again from its beginning.
+    SCENARIO is, here and in all commands, a name of cosim list or a folder with a scenario.toml, on a network that SUMO
+    can simulate. The run folder holds summary.csv, sumo.csv, trajectories and records, manifest.json and pictures. The
+    same --out goes on where it was interrupted, even by kill -9: finished runs are kept, and the one that was under way
+    starts again from its beginning.
 
     \b
     Examples:
-      cosim run scenarios/grid7_peak --controller dpc-pcrg --against no-control
-      cosim run scenarios/grid7_peak --controller pi-gating --seed 3 --out runs/gating
-      cosim run scenarios/grid7_peak --controller dpc-pc+rerouting-30 --against rerouting-30
-      cosim run scenarios/grid7_peak --controller pi-gating --sumo-output tripinfo,edgedata --parquet
-      cosim run scenarios/grid7_peak --controller dpc-pc --fault missing:3@20-30 --fault closed:c33-c34@10-40
+      cosim run grid7_peak --controller dpc-pcrg --against no-control
+      cosim run grid7_peak --controller pi-gating --seed 3 --out runs/gating
+      cosim run grid7_peak --controller dpc-pc+rerouting-30 --against rerouting-30
+      cosim run grid7_peak --controller pi-gating --sumo-output tripinfo,edgedata --parquet
+      cosim run grid7_peak --controller dpc-pc --fault missing:3@20-30 --fault closed:c33-c34@10-40
     """
     from cosim.plant import strategy  # heavy
     from cosim.sumo import outputs
@@ -101,7 +102,7 @@ def compare(
 
     \b
     Examples:
-      cosim compare scenarios/grid7_peak --controller no-control
+      cosim compare grid7_peak --controller no-control
       cosim compare runs/gating --controller pi-gating --seed 3
       cosim compare runs/grid7_peak-evaluate
     """

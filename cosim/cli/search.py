@@ -51,10 +51,10 @@ def tune(
 
     \b
     Examples:
-      cosim tune scenarios/grid7_peak --controller pi-gating --option kp=0.1:10 --option ki=0.001:0.1
-      cosim tune scenarios/grid7_peak --controller pi-gating+guided+max-pressure --demand 1,1.6 \\
+      cosim tune grid7_peak --controller pi-gating --option kp=0.1:10 --option ki=0.001:0.1
+      cosim tune grid7_peak --controller pi-gating+guided+max-pressure --demand 1,1.6 \\
           --option set_point[0]=250:600 --option kp=0.1:10 --option ki=0.001:0.1 --candidates 60
-      cosim tune scenarios/grid7_peak --controller dpc-pcrg+max-pressure --option mfd_scale=0.6:1 \\
+      cosim tune grid7_peak --controller dpc-pcrg+max-pressure --option mfd_scale=0.6:1 \\
           --option mfd_spread=0:0.5
     """
     cluster = chosen_scheduler(workers, scheduler, scheduler_ca, scheduler_cert, scheduler_key)
@@ -94,7 +94,7 @@ def frontier(
 
     \b
     Example:
-      cosim frontier scenarios/grid7_peak --controllers max-pressure,pi-gating+guided+max-pressure --seeds 5
+      cosim frontier grid7_peak --controllers max-pressure,pi-gating+guided+max-pressure --seeds 5
     """
     from cosim.plant.strategy import parse  # heavy
 

@@ -219,7 +219,7 @@ def _sumo_table(folder: Path, target: Path) -> dict[str, str]:
 
 
 def _write_samples(path: Path, samples: Sequence[dict]) -> None:
-    with files.atomic(path) as temporary, temporary.open("w", newline="") as file:
+    with files.atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["region", "branch", "accumulation_veh", "outflow_veh_s"])
         for region, cloud in enumerate(samples):

@@ -137,7 +137,7 @@ def _scenario_folder(level: Level) -> Path:
     for folder in (Path(), *level.folder.resolve().parents):
         if (folder / name / "scenario.toml").is_file():
             return folder / name
-    if (folder := shipped.found(name, shipped.SCENARIO, beside=Path())).is_dir():
+    if ((folder := shipped.found(name, shipped.SCENARIO, beside=Path())) / "scenario.toml").is_file():
         return folder
     raise InputError(f"{level.folder / 'manifest.json'}: scenario_folder: there is no {name}; give it with --scenario")
 

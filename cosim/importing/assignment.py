@@ -129,7 +129,7 @@ def _iterate(folder: Path, n: int, options: Sequence[str], *, where: str) -> Non
         "--routing-algorithm", "CH", "--disable-warnings", "--disable-summary", "--continue-on-unbuild", *options])
     if failed or not _tripinfo(folder, n).exists():
         log = folder / "dua.log"
-        said = log.read_text(errors="replace").splitlines() if log.exists() else []
+        said = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.exists() else []
         reason = " ".join(next((line for line in said if "rror" in line), "no reason given").split())
         raise InputError(f"{where}: duaIterate.py cannot assign routes: {reason}; correct the input, or add "
                          "--iterations 0")

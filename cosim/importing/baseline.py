@@ -127,7 +127,8 @@ def run_baseline(
     with Scratch("cosim-") as folder:
         edges = folder / "edges.xml"
         (folder / "measure.add.xml").write_text(
-            f'<additional><edgeData id="all" freq="{INTERVAL:g}" file="{edges}" excludeEmpty="true"/></additional>')
+            f'<additional><edgeData id="all" freq="{INTERVAL:g}" file="{edges}" excludeEmpty="true"/></additional>',
+            encoding="utf-8")
         run_sumo(
             "sumo", "--net-file", file_list([streets.path]), "--route-files", file_list(routes),
             "--additional-files", file_list([*additional, folder / "measure.add.xml"]), "--begin", str(begin),

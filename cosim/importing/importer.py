@@ -122,7 +122,8 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
         (folder / "scenario.toml").write_text(model.scenario_text(
             network, clock, case, name=order.scenario.name, files=files, leave=traffic.switched,
             network_path=os.path.relpath(order.out, order.scenario).replace(os.sep, "/"),
-            protected=_protected(streets, regions, baseline, network), factor=factor, mesoscopic=order.mesoscopic))
+            protected=_protected(streets, regions, baseline, network), factor=factor,
+            mesoscopic=order.mesoscopic), encoding="utf-8")
         report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
         report += _demand_lines(order, streets, assigned, baseline, gaps)
         report += "".join(f"\n{sentence}" for sentence in judged.sentences)
@@ -139,7 +140,7 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
         if mesoscopic and order.run:
             report += "\nsimulated by SUMO's mesoscopic model" + (
                 "" if order.mesoscopic else f": the city has more than {LARGE:,} edges for cars")
-        (net_folder / "import.txt").write_text(report + "\n")
+        (net_folder / "import.txt").write_text(report + "\n", encoding="utf-8")
     return report
 
 

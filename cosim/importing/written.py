@@ -73,7 +73,7 @@ def write_network(folder: Path, streets: Streets, regions: EdgeNumbers, network:
                    baseline: Baseline | None, source: str) -> None:
     """network.toml, its tables, layers and map; source: the name of what the user gave."""
     (folder / "network.toml").write_text(model.network_text(
-        network, {"net": NET, "regions": "regions.csv"}, source))
+        network, {"net": NET, "regions": "regions.csv"}, source), encoding="utf-8")
     for name, columns, rows in (("quality.csv", quality.QUALITY, found.quality),
                                 ("gateways.csv", quality.GATEWAYS, found.gateways)):
         write_table(folder / name, columns, ([row[column] for column in columns] for row in rows))
@@ -81,7 +81,7 @@ def write_network(folder: Path, streets: Streets, regions: EdgeNumbers, network:
         write_table(folder / "partitions.csv", quality.PARTITIONS, (
             [row[column] for column in quality.PARTITIONS] for row in found.partitions))
     names = network.region_names
-    (folder / "regions.taz.xml").write_text(layers.taz_xml(streets, regions, names))
-    (folder / "regions.poly.xml").write_text(layers.polygons_xml(streets, regions, names))
+    (folder / "regions.taz.xml").write_text(layers.taz_xml(streets, regions, names), encoding="utf-8")
+    (folder / "regions.poly.xml").write_text(layers.polygons_xml(streets, regions, names), encoding="utf-8")
     density = None if baseline is None else 1000.0 * baseline.density(streets)
     atlas.draw_map(folder / "map.png", streets, regions, names, network.positions, found, density)

@@ -31,6 +31,19 @@ _NUMBERS = {
     "queue-override": ("queue_override", 1, 100, PERCENT),
     "guidance-period": ("guidance_period", 1, 3600, SECONDS)}
 OPTIONS = (*_WORDS, *(f"{name}-N" for name in _NUMBERS))
+_TEXTS = {
+    "webster": "fixed-time signals, optimised for the scenario's demand",
+    "actuated": "signals that extend green while vehicles come",
+    "max-pressure": "signals that serve the stage with the longest queues before, and the shortest behind it",
+    "max-pressure-cyclic": "the same, with the stages in their order",
+    "hold-back": "green taken from a gateway is red for all",
+    "redistribute": "green taken from a gateway goes to the other movements",
+    "estimate": "the controller sees what loops and probe vehicles tell, not the truth",
+    GUIDED: "drivers are guided by travel times",
+    "rerouting-N": "N percent of the drivers take another route by themselves, every minute",
+    "compliance-N": "N percent of the drivers follow the guidance",
+    "queue-override-N": "a gateway is left open while its road is N percent full",
+    "guidance-period-N": "drivers within a region are guided anew every N seconds"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +87,11 @@ def parse(name: str) -> Strategy:
             raise InputError(f"strategy {name!r}: {chosen[key]} and {word} exclude each other; omit one of them")
         chosen[key], overrides[key] = word, value
     return Strategy(name=name, controller=controller, overrides=overrides)
+
+
+def options() -> list[tuple[str, str]]:
+    """Of every option, which is joined to a controller by +, what it does."""
+    return [(f"+{name}", _TEXTS[name]) for name in OPTIONS]
 
 
 def model_free(name: str) -> bool:

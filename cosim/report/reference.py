@@ -20,7 +20,7 @@ def files(folder: Path) -> dict[Path, str]:
     found = {}
     for name, text in (("scenarios", scenarios_page()), ("networks", networks_page())):
         page = folder / name / "README.md"
-        found[page] = placed(page.read_text() if page.is_file() else "", text)
+        found[page] = placed(page.read_text(encoding="utf-8") if page.is_file() else "", text)
     for name, content in (("scenarios/scenario", scenario_schema()), ("networks/network", network_schema())):
         found[folder / f"{name}.schema.json"] = json.dumps(DIALECT | content, indent=1) + "\n"
     return found

@@ -79,8 +79,8 @@ def watch(
             scenario, overrides=settings(scenario).changed(**strategy.overrides), window=window,
             planning=planning_of(scenario, task.controller))
         shapes = edge_shapes(plant.city)
-        drawn.write_text(layers_xml(plant.city, shapes))
-        view.write_text(view_xml(shapes, delay))
+        drawn.write_text(layers_xml(plant.city, shapes), encoding="utf-8")
+        view.write_text(view_xml(shapes, delay), encoding="utf-8")
         try:
             trajectory = run_folder.labelled(
                 closed_loop.run(Painted(plant, scenario.network), controller, scenario, seed=task.seed,

@@ -54,7 +54,7 @@ def write_trips(city: City, demand: PairsOverTime, step: float, seed: int, path:
     lines.append("</routes>\n")
     path = Path(path)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    with os.fdopen(handle, "w") as stream:
+    with os.fdopen(handle, "w", encoding="utf-8") as stream:
         stream.writelines(lines)
     os.replace(temporary, path)
     return len(trips.routes)

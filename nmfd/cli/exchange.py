@@ -19,7 +19,7 @@ def new_controller(file: Path) -> None:
     \b
     Example:
       nmfd new-controller mine.py
-      nmfd benchmark scenarios/economic_mpc --controllers no-control,pi-gating,mine.py:MyController
+      nmfd benchmark economic_mpc --controllers no-control,pi-gating,mine.py:MyController
     """
     if file.suffix != ".py":
         raise InputError(f"{file}: expected a name that ends in .py, such as {file.with_suffix('.py')}")
@@ -29,7 +29,7 @@ def new_controller(file: Path) -> None:
         raise InputError(f"{file.parent}: no such folder; make it first")
     text = resources.files("nmfd.controllers").joinpath("template.py").read_text(encoding="utf-8")
     file.write_text(text.replace("FILE", str(file)), encoding="utf-8")
-    click.echo(f"Written to {file}; try it with: nmfd benchmark scenarios/economic_mpc "
+    click.echo(f"Written to {file}; try it with: nmfd benchmark economic_mpc "
                f"--controllers no-control,pi-gating,{quoted(file)}:MyController")
 
 
@@ -46,7 +46,7 @@ def export(policy: Path, out: Path, scenario: Path | None) -> None:
 
     \b
     Example:
-      nmfd export scenarios/economic_mpc/dpc-pcrg.pt --out dpc-pcrg.onnx
+      nmfd export economic_mpc/dpc-pcrg.pt --out dpc-pcrg.onnx
     """
     from nmfd.controllers.dpc import onnx_export  # heavy
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import click
 
+from nmfd.cli.about import about, listing
 from nmfd.cli.declared import declared
 from nmfd.cli.errors import Commands, Interrupted
 from nmfd.cli.exchange import export, new_controller
@@ -28,13 +29,13 @@ from nmfd.errors import InputError
 
 
 @click.group(name="nmfd", cls=Commands)
-@click.version_option(package_name="perimeter-cosim", prog_name="nmfd")
+@about("nmfd")
 def main() -> None:
     """Perimeter control and route guidance on the regional traffic model (NMFD).
 
     \b
     Example:
-      nmfd benchmark scenarios/economic_mpc --controllers no-control,pi-gating
+      nmfd benchmark economic_mpc --controllers no-control,pi-gating
     """
 
 
@@ -56,14 +57,14 @@ def benchmark(
 ) -> None:
     """Run controllers on a regional model; print a table and write a run folder.
 
-    SCENARIO is a folder with a scenario.toml. The run folder holds summary.csv, the trajectories, manifest.json and
-    figures. Every finished run is kept: the same command with the same --out goes on where it was interrupted, and
-    other controllers or more seeds are added to what is there.
+    SCENARIO is, here and in all commands, a name of nmfd list, or a folder with a scenario.toml. The run folder holds
+    summary.csv, the trajectories, manifest.json and figures. Every finished run is kept: the same command with the same
+    --out goes on where it was interrupted, and other controllers or more seeds are added to what is there.
 
     \b
     Examples:
-      nmfd benchmark scenarios/economic_mpc --controllers no-control,pi-gating
-      nmfd benchmark scenarios/economic_mpc --controllers no-control,dpc-pc \\
+      nmfd benchmark economic_mpc --controllers no-control,pi-gating
+      nmfd benchmark economic_mpc --controllers no-control,dpc-pc \\
           --seeds 5 --plant acyclic --workers 2 --policy dpc-pc=mine.pt --out runs/mine
     """
     names = controller_names(controllers)
@@ -118,8 +119,8 @@ def train(
 
     \b
     Examples:
-      nmfd train scenarios/economic_mpc --controller dpc-pcrg
-      nmfd train scenarios/economic_mpc --controller dpc-pc --steps 200 --out mine.pt
+      nmfd train economic_mpc --controller dpc-pcrg
+      nmfd train economic_mpc --controller dpc-pc --steps 200 --out mine.pt
     """
     from nmfd.api import load_scenario  # heavy
     from nmfd.controllers.dpc import rollout, training
@@ -133,8 +134,8 @@ def train(
         for name, doubts in zip(model.region_names, model.doubts, strict=False):
             if doubts:
                 click.echo(f"nmfd: the model of region {name} is doubtful: {'; '.join(doubts)}", err=True)
-    file = shipped.beside(
-        loaded.folder, f"{controller}.pt", "--out FILE", based=loaded.folder.name) if out is None else out
+    file = out or shipped.beside(
+        shipped.found(scenario, shipped.SCENARIO), f"{controller}.pt", "--out FILE", scenario=True)
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the policy; make it or choose another --out")
     default = compiled is None
@@ -182,7 +183,7 @@ def show(scenario: Path, out: Path | None) -> None:
 
     \b
     Example:
-      nmfd show scenarios/economic_mpc --out figures
+      nmfd show economic_mpc --out figures
     """
     from nmfd.api import load_scenario  # heavy
     from nmfd.runs.files import file_name
@@ -206,5 +207,5 @@ def _stamp(path: Path) -> int | None:
     return path.stat().st_mtime_ns if path.exists() else None
 
 
-for command in (bound, robustness, adaptation, ablation, scaling, new_controller, export):
+for command in (listing(), bound, robustness, adaptation, ablation, scaling, new_controller, export):
     main.add_command(command)

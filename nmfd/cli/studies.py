@@ -42,7 +42,7 @@ def robustness(
 
     \b
     Example:
-      nmfd robustness scenarios/economic_mpc --controllers pi-gating,dpc-pcrg,dpc-pcrg-robust --out runs/robust
+      nmfd robustness economic_mpc --controllers pi-gating,dpc-pcrg,dpc-pcrg-robust --out runs/robust
     """
     names = controller_names(controllers)
     files = policy_files(policies, names)
@@ -78,8 +78,8 @@ def adaptation(
 
     \b
     Examples:
-      nmfd adaptation scenarios/economic_mpc
-      nmfd adaptation scenarios/economic_mpc --controllers dpc-pc,dpc-pc-online,pi-gating --cases rain,more
+      nmfd adaptation economic_mpc
+      nmfd adaptation economic_mpc --controllers dpc-pc,dpc-pc-online,pi-gating --cases rain,more
     """
     names = controller_names(controllers)
     files = policy_files(policies, names)
@@ -114,8 +114,8 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int, 
 
     \b
     Examples:
-      nmfd bound scenarios/economic_mpc --controller bound-pcrg
-      nmfd bound scenarios/economic_mpc --controller bound-pc --from mpc-pc,dpc-pc
+      nmfd bound economic_mpc --controller bound-pcrg
+      nmfd bound economic_mpc --controller bound-pc --from mpc-pc,dpc-pc
     """
     from nmfd.api import load_scenario  # heavy
     from nmfd.controllers import open_loop
@@ -125,8 +125,8 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int, 
     method.check(controller)
     names = None if starts is None else controller_names(starts)
     loaded = load_scenario(scenario)
-    file = shipped.beside(
-        loaded.folder, f"{controller}.npz", "--out FILE", based=loaded.folder.name) if out is None else out
+    file = out or shipped.beside(
+        shipped.found(scenario, shipped.SCENARIO), f"{controller}.npz", "--out FILE", scenario=True)
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the plan; make it or choose another --out")
     with progress_line(controller) as progress:
@@ -161,8 +161,8 @@ def ablation(
 
     \b
     Examples:
-      nmfd ablation training scenarios/economic_mpc --seeds 3 --out runs/alternating
-      nmfd ablation horizon scenarios/economic_mpc --controllers mpc-pc --out runs/horizon
+      nmfd ablation training economic_mpc --seeds 3 --out runs/alternating
+      nmfd ablation horizon economic_mpc --controllers mpc-pc --out runs/horizon
     """
     names = controller_names(controllers)
 

@@ -25,6 +25,7 @@ from nmfd.runs import config, shipped
 from nmfd.runs.files import file_hash
 from nmfd.types import Controller
 
+ALSO = " and route guidance"
 OWN = "own"  # the table in [controllers] that holds those of controllers of the user's own
 _OWN = re.compile(r".+\.py:\w+(?=\+|$)")
 
@@ -33,12 +34,14 @@ _OWN = re.compile(r".+\.py:\w+(?=\+|$)")
 class Entry:
     """A controller that is built in.
 
+    text: what it does, in a line
     make: of the planning model, and of the policy's file where there is one
     guides: whether it may guide routes
     policy: whose policy it reads, "" for none
     declared: its options
     """
 
+    text: str
     make: Callable[..., Controller]
     guides: bool = False
     policy: str = ""
@@ -46,22 +49,42 @@ class Entry:
 
 
 _ENTRIES = {
-    "no-control": Entry(make=NoControl),
-    "route-guidance": Entry(make=RouteGuidance, guides=True),
-    "pi-gating": Entry(make=PiGating, declared=Gating),
-    "mpc-pc": Entry(make=partial(mpc.EconomicMpc, guidance=False), declared=mpc.Mpc),
-    "mpc-pcrg": Entry(make=partial(mpc.EconomicMpc, guidance=True), guides=True, declared=mpc.Mpc),
-    "probing-pc": Entry(make=partial(Probing, guidance=False), declared=SetPoint),
-    "probing-pcrg": Entry(make=partial(Probing, guidance=True), guides=True, declared=SetPoint),
-    **{name: Entry(make=partial(policy.load, guidance=guides), guides=guides, policy=name, declared=TRAINED[name])
+    "no-control": Entry(text="every gateway open, no guidance: what others are compared with", make=NoControl),
+    "route-guidance": Entry(
+        text="drivers are guided by travel times alone, every gateway open", make=RouteGuidance, guides=True),
+    "pi-gating": Entry(
+        text="a PI gate holds the protected regions at a set point", make=PiGating, declared=Gating),
+    "mpc-pc": Entry(
+        text="economic MPC on the regional model, perimeter control", make=partial(mpc.EconomicMpc, guidance=False),
+        declared=mpc.Mpc),
+    "mpc-pcrg": Entry(
+        text="the same with route guidance", make=partial(mpc.EconomicMpc, guidance=True), guides=True,
+        declared=mpc.Mpc),
+    "probing-pc": Entry(
+        text="excitation for cosim identify, perimeter control", make=partial(Probing, guidance=False),
+        declared=SetPoint),
+    "probing-pcrg": Entry(
+        text="the same with route guidance", make=partial(Probing, guidance=True), guides=True, declared=SetPoint),
+    **{name: Entry(
+        text=f"a policy trained by differentiable predictive control, perimeter control{ALSO * guides}"
+             f"{', with noise on the demand' if 'robust' in name else ''}",
+        make=partial(policy.load, guidance=guides), guides=guides, policy=name, declared=TRAINED[name])
        for name, guides in training.NAMES.items()},
-    "dpc-pc-guarded": Entry(make=partial(fallback.load, guidance=False), policy="dpc-pc"),
-    "dpc-pcrg-guarded": Entry(make=partial(fallback.load, guidance=True), guides=True, policy="dpc-pcrg"),
-    "dpc-pc-online": Entry(make=partial(online.load, guidance=False), policy="dpc-pc", declared=Online),
+    "dpc-pc-guarded": Entry(
+        text="dpc-pc, watched: PI gating where it has seen no such state", make=partial(fallback.load, guidance=False),
+        policy="dpc-pc"),
+    "dpc-pcrg-guarded": Entry(
+        text="dpc-pcrg, watched in the same way", make=partial(fallback.load, guidance=True), guides=True,
+        policy="dpc-pcrg"),
+    "dpc-pc-online": Entry(
+        text="dpc-pc, fine-tuned between control intervals", make=partial(online.load, guidance=False),
+        policy="dpc-pc", declared=Online),
     "dpc-pcrg-online": Entry(
-        make=partial(online.load, guidance=True), guides=True, policy="dpc-pcrg", declared=Online),
-    **{name: Entry(make=partial(open_loop.load, guidance=guides), guides=guides)
-       for name, guides in open_loop.NAMES.items()},
+        text="dpc-pcrg, fine-tuned in the same way", make=partial(online.load, guidance=True), guides=True,
+        policy="dpc-pcrg", declared=Online),
+    **{name: Entry(
+        text=f"replays the best plan found with all demand known (nmfd bound), perimeter control{ALSO * guides}",
+        make=partial(open_loop.load, guidance=guides), guides=guides) for name, guides in open_loop.NAMES.items()},
 }
 
 
@@ -100,6 +123,12 @@ def known(name: str) -> bool:
 def choice() -> tuple[str, ...]:
     """Every controller that has a name of its own, built in or installed."""
     return (*_ENTRIES, *(name for name in custom.entry_points() if name not in _ENTRIES))
+
+
+def texts() -> dict[str, str]:
+    """Of every controller of `choice` what it does, in a line."""
+    return {name: _ENTRIES[name].text if name in _ENTRIES else f"installed: {custom.entry_points()[name].value}"
+            for name in choice()}
 
 
 def is_own(name: str) -> bool:

@@ -1,8 +1,8 @@
 """A controller of your own. Try it, on the regional model and in SUMO, beside the others:
 
-    nmfd benchmark scenarios/economic_mpc --controllers no-control,pi-gating,FILE:MyController
-    cosim run scenarios/grid7_peak --controller FILE:MyController --against no-control
-    cosim evaluate scenarios/grid7_peak --controllers no-control,FILE:MyController+max-pressure --seeds 10
+    nmfd benchmark economic_mpc --controllers no-control,pi-gating,FILE:MyController
+    cosim run grid7_peak --controller FILE:MyController --against no-control
+    cosim evaluate grid7_peak --controllers no-control,FILE:MyController+max-pressure --seeds 10
 
 R regions are numbered from 0. This one is proportional gating: the further a region is beyond its set point, the less
 is let into it. Replace what `act` does.

@@ -30,22 +30,21 @@ def folders(kind: str) -> list[Path]:
 
 
 def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
-    """The folder or file `name`: a path, from `beside` if given; where there is nothing, that of this name, or beneath
-    it (as grid7_peak/dpc-pc.pt), which comes with the package.
+    """The folder of one of these kinds, or the file, `name`: a path, from `beside` if given; where there is none, what
+    comes with the package under this name, or beneath it (as grid7_peak/dpc-pc.pt).
 
     A path that leads nowhere stays as it is: whoever reads it says so. InputError for a mere word that names nothing.
     """
-    path = Path(name) if beside is None else beside / name
-    if os.path.exists(path):
+    path, word = Path(name) if beside is None else beside / name, Path(name)
+    if os.path.isfile(path) or any(os.path.exists(path / f"{kind}.toml") for kind in kinds):
         return path
-    word = Path(name)
     if word.is_absolute() or ".." in word.parts:
         return path
     for kind in kinds:
         folder = root() / f"{kind}s" / word
         if word.parts and os.path.exists(folder / f"{kind}.toml" if len(word.parts) == 1 else folder):
             return folder
-    if beside is not None or len(word.parts) != 1 or not kinds or word.suffix:
+    if beside is not None or not kinds or len(word.parts) != 1 or word.suffix or os.path.exists(path):
         return path
     near = [folder.name for kind in kinds for folder in (*folders(kind), *(
         file.parent for file in Path().glob(f"*/{kind}.toml")))]
@@ -59,15 +58,15 @@ def installed(path: Path) -> bool:
     return path.resolve().is_relative_to(_DATA.resolve())
 
 
-def beside(folder: Path, file: str, option: str, *, based: str = "") -> Path:
+def beside(folder: Path, file: str, option: str, *, scenario: bool = False) -> Path:
     """Where a `file` goes that is kept in `folder` unless the user says otherwise. InputError for the installed
     package, and for a folder that cannot be written to.
 
-    option: with which they say so; based: the name of a scenario on which one of their own can be based instead
+    option: with which they say so; scenario: whether one of their own can be based on that in `folder` instead
     """
     remedy = f"give {option}"
-    if based:
-        remedy += f', or make a folder of your own whose scenario.toml has name = "..." and base = "{based}"'
+    if scenario:
+        remedy += f', or make a folder of your own whose scenario.toml has name = "..." and base = "{folder.name}"'
     if installed(folder):
         raise InputError(f"{folder.name}: came with the package, where nothing is written; {remedy}")
     if folder.is_dir() and not os.access(folder, os.W_OK):

@@ -142,7 +142,7 @@ def _peak_memory() -> int:
     """The most that this process has had at a time [bytes]."""
     if sys.platform == "win32":
         return psutil.Process().memory_info().peak_wset
-    import resource  # Windows has none
+    import resource  # noqa: TID251 (Windows, which has none, is done with)
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 2**10)
 
