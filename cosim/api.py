@@ -21,8 +21,11 @@ def run(
 ) -> Result:
     """One closed loop in SUMO, in this process and without a run folder.
 
-        result = cosim.run("grid7_peak", "pi-gating+rerouting-30", seed=3)
-        result.trajectory.to_frame(), result.facts["mean_trip_time_s"], result.record["gateway_flow"]
+        >>> result = cosim.run("grid7_peak", "pi-gating+rerouting-30", seed=3, steps=2)
+        >>> result.trajectory.accumulation.shape, result.record["crossings"].shape
+        ((3, 7, 7), (2, 7, 7, 7))
+        >>> result.facts["teleports"]
+        0
 
     scenario: a name of `cosim list`, the folder of a scenario.toml, or what nmfd.load_scenario made of it
     controller: a strategy as on the command line, or an object with `reset` and `act` (nmfd.Controller)

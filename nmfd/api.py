@@ -16,7 +16,11 @@ from nmfd.types import Controller, Plant, Trajectory
 
 def load_scenario(folder: Path | str) -> Scenario:
     """The scenario in `folder`, or of this name among those that come with the package (`nmfd list`), with its network;
-    the options of all its controllers are checked. Raises InputError."""
+    the options of all its controllers are checked. Raises InputError.
+
+        >>> nmfd.load_scenario("economic_mpc").network.region_names
+        ('north-west', 'north-east', 'west', 'centre', 'east', 'south-west', 'south-east')
+    """
     scenario = read_scenario(folder)
     registry.check_options(scenario)
     return scenario
@@ -27,6 +31,9 @@ def controller(name: str, scenario: Scenario | Path | str, *, policy: Path | str
 
     name: as on the command line: "pi-gating", "dpc-pcrg", ..., or "path/to/file.py:Class"
     policy: the file of a policy or plan, if not SCENARIO/NAME.pt or .npz
+
+        >>> nmfd.controller("pi-gating", "economic_mpc").regions  # that it protects
+        array([3])
 
     Raises InputError for an unknown name, a wrong option, or a policy that is missing or made for another network.
     """
@@ -39,8 +46,11 @@ def run(
 ) -> Trajectory:
     """One closed loop on a regional model.
 
-        trajectory = nmfd.run("economic_mpc", "pi-gating")
-        trajectory.to_frame()
+        >>> trajectory = nmfd.run("economic_mpc", "pi-gating", steps=20)
+        >>> trajectory.accumulation.shape  # states, regions, destinations
+        (21, 7, 7)
+        >>> bool(trajectory.observed[20].sum() == trajectory.accumulation[20].sum())  # observed with noise
+        False
 
     scenario: a name of `nmfd list`, the folder of a scenario.toml, or what load_scenario made of it
     controller: a name as on the command line, or an object with `reset` and `act` (nmfd.Controller)
@@ -79,6 +89,10 @@ def benchmark(
     policies: controller -> file, if not SCENARIO/NAME.pt
 
     `nmfd.summary_table(rows)` gives the text that the command prints.
+
+        >>> rows = nmfd.benchmark("economic_mpc", ["no-control", "pi-gating"], seeds=3)  # doctest: +SKIP
+        >>> print(nmfd.summary_table(rows))  # doctest: +SKIP
+
     Raises InputError and nmfd.runs.workers.RunFailed.
     """
     scenario = _loaded(scenario)

@@ -23,6 +23,10 @@ def total_time_spent(trajectory: Trajectory) -> float:
     The objective of Tumu et al., with those who wait outside; the state at the end of the horizon is not counted. A
     vehicle that was removed on its way counts as if it were still there until the end of the horizon, the most that it
     could have spent: a trip that is not made never counts as less than one that is.
+
+        >>> run = nmfd.run("economic_mpc", "no-control", steps=2)
+        >>> bool(total_time_spent(run) == run.step * run.accumulation[:2].sum())  # nobody waits or was removed
+        True
     """
     vehicles = (
         trajectory.accumulation[:-1].sum() + trajectory.backlog[:-1].sum() + trajectory.removed[:-1].sum())
@@ -30,7 +34,11 @@ def total_time_spent(trajectory: Trajectory) -> float:
 
 
 def percent_change(value: float, reference: float) -> float:
-    """How far `value` is above `reference` [%]; NaN, not defined, where that is 0."""
+    """How far `value` is above `reference` [%]; NaN, not defined, where that is 0.
+
+        >>> percent_change(150.0, 100.0)
+        50.0
+    """
     return 100.0 * (value / reference - 1.0) if reference else math.nan
 
 
@@ -51,7 +59,11 @@ def notes(trajectory: Trajectory, most: int = 3) -> str:
 
 
 def summary(trajectory: Trajectory) -> dict[str, float | int | str]:
-    """One row of summary.csv: column (with its unit in the name) -> value, such as "total_time_spent_veh_s"."""
+    """One row of summary.csv: column (with its unit in the name) -> value, such as "total_time_spent_veh_s".
+
+        >>> round(summary(nmfd.run("economic_mpc", "no-control", steps=20))["max_accumulation_veh"])
+        12558
+    """
     total = trajectory.accumulation.sum(axis=(1, 2))
     decision_ms = 1e3 * trajectory.decision_time
     return {

@@ -24,6 +24,9 @@ class Status(Flag):
     PLANT_FAULT: the city could not do what was commanded, or was not whole, during the interval
     LATE: the decision took longer than the control interval, or than the controller's own `deadline` [s], by the clock
         of the closed loop. The only part of a run's file that depends on wall time
+
+        >>> Status.FALLBACK in (Status.SOLVER_FAILURE | Status.FALLBACK)
+        True
     """
 
     OK = 0
@@ -201,6 +204,12 @@ class Trajectory:
 
         Columns controller, plant, seed; time_s; region, destination (x_ij: in region i, bound for j);
         accumulation_veh; backlog_veh (waiting to enter region i).
+
+            >>> table = nmfd.run("economic_mpc", "no-control", steps=2).to_frame()
+            >>> table.columns.tolist()[3:]
+            ['time_s', 'region', 'destination', 'accumulation_veh', 'backlog_veh']
+            >>> len(table) == 3 * 7 * 7
+            True
         """
         return self._table({"time": "time_s", "accumulation": "accumulation_veh", "backlog": "backlog_veh"})
 

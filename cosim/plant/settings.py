@@ -97,7 +97,11 @@ def scenario_file(scenario: "Scenario") -> Path:
 
 
 def settings(scenario: "Scenario") -> Settings:
-    """Read and check the table [sumo] of the scenario. Raises InputError."""
+    """Read and check the table [sumo] of the scenario. Raises InputError.
+
+        >>> settings(nmfd.load_scenario("grid7_peak")).signals
+        'fixed'
+    """
     if scenario.folder is None:
         return Settings()
     path = scenario_file(scenario)

@@ -62,7 +62,12 @@ class Strategy:
 
 
 def parse(name: str) -> Strategy:
-    """The strategy `name`. InputError for a controller or option that there is not, and for contradictory ones."""
+    """The strategy `name`. InputError for a controller or option that there is not, and for contradictory ones.
+
+        >>> strategy = parse("pi-gating+max-pressure")
+        >>> strategy.controller, strategy.overrides["signals"]
+        ('pi-gating', 'max-pressure')
+    """
     first, words = registry.split(name)
     controller = first
     if _option(first) is not None:

@@ -20,6 +20,12 @@ class Mfd:
 
     a [veh^-2 s^-1], b [veh^-1 s^-1], c [s^-1]: coefficients of the cubic.
     jam [veh]: the accumulation beyond which the outflow stays at g(jam); infinity for a bare cubic.
+
+        >>> curve = Mfd(a=4.133e-11, b=-8.282e-7, c=0.0042, jam=10000.0)  # the benchmark's
+        >>> round(curve.critical), round(curve.capacity, 2)
+        (3402, 6.33)
+        >>> round(float(curve.outflow(8000.0)), 2)  # more vehicles bring less
+        1.76
     """
 
     a: float

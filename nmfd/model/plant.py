@@ -10,7 +10,15 @@ from nmfd.types import Controls, Observation, State
 
 
 class NmfdPlant:
-    """The regional model as a plant (nmfd.types.Plant), in float64."""
+    """The regional model as a plant (nmfd.types.Plant), in float64.
+
+        >>> scenario = nmfd.load_scenario("economic_mpc")
+        >>> plant, network = nmfd.NmfdPlant(scenario), scenario.network
+        >>> state = plant.reset(0)
+        >>> state = plant.step(nmfd.Controls(perimeter=network.u_max * network.adjacency, splits=None))
+        >>> state.step, state.time
+        (1, 30.0)
+    """
 
     def __init__(self, scenario: Scenario):
         self._scenario = scenario

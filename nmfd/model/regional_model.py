@@ -125,6 +125,12 @@ def load_network(folder: Path | str) -> RegionalModel:
 
     Raises InputError for a missing file, an unknown key, a wrong type or range, an adjacency that is not symmetric
     or not connected, or an MFD that is none. The table [sumo] is left to the microsimulation.
+
+        >>> network = load_network("hexagon7")
+        >>> network.regions, network.u_min, network.u_max
+        (7, 0.1, 0.9)
+        >>> network.nominal_splits[2, :, 4]  # from west to east by the centre
+        array([0., 0., 0., 1., 0., 0., 0.])
     """
     folder = shipped.found(folder, shipped.NETWORK)
     path = folder / "network.toml"

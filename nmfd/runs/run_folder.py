@@ -43,6 +43,13 @@ def write_trajectory(path: Path, trajectory: Trajectory, record: Mapping[str, tu
 
     record: more variables (nmfd.quantities.variables). Not by way of xarray: after Ctrl-C in the middle of it, it waits
     for a lock of its own for ever.
+
+        >>> import tempfile
+        >>> run = nmfd.run("economic_mpc", "no-control", steps=2)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     nmfd.write_trajectory(Path(folder, "run.nc"), run)
+        ...     bool((nmfd.read_trajectory(Path(folder, "run.nc")).accumulation == run.accumulation).all())
+        True
     """
     content = {**trajectory.variables, **(record or {})}
     del content["decision_time"]
