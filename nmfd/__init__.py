@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from nmfd.model.regional_model import RegionalModel, load_network
     from nmfd.model.scenario import Scenario
     from nmfd.runs.run_folder import read_trajectory, write_trajectory
-    from nmfd.studies.benchmark import summary_table
+    from nmfd.studies.summary import Summary, summary_table
     from nmfd.types import Controller, Controls, Observation, Plant, State, Status, Trajectory
 
 _MODULES = {
@@ -31,11 +31,11 @@ _MODULES = {
     "metrics": ("summary", "total_time_spent"), "model.planning": ("PlanningModel",),
     "model.plant": ("AcyclicPlant", "NmfdPlant"), "model.regional_model": ("RegionalModel", "load_network"),
     "model.scenario": ("Scenario",), "runs.run_folder": ("read_trajectory", "write_trajectory"),
-    "studies.benchmark": ("summary_table",),
+    "studies.summary": ("Summary", "summary_table"),
     "types": ("Controller", "Controls", "Observation", "Plant", "State", "Status", "Trajectory")}
 __all__ = [
     "AcyclicPlant", "Controller", "Controls", "InputError", "NmfdPlant", "Observation", "Plant", "PlanningModel",
-    "RegionalModel", "Scenario", "State", "Status", "Trajectory", "benchmark", "controller", "load_network",
+    "RegionalModel", "Scenario", "State", "Status", "Summary", "Trajectory", "benchmark", "controller", "load_network",
     "load_scenario", "read_trajectory", "run", "summary", "summary_table", "total_time_spent", "train",
     "write_trajectory"]
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

@@ -71,6 +71,21 @@ def parse(name: str) -> Strategy:
     return Strategy(name=name, controller=controller, overrides=overrides)
 
 
+def ready(scenario: Scenario) -> tuple[str, ...]:
+    """The strategies of which a pattern such as dpc-* may speak: controllers that can be made for `scenario`, those
+    with options for which it has a policy or a table of their own, and signals alone."""
+    files = sorted(scenario.folder.glob("*+*.pt")) if scenario.folder else []
+    with_options = dict.fromkeys([*(file.stem for file in files), *scenario.controller_options])
+    return (*registry.ready(scenario), *filter(_is_variant, with_options), *SIGNALS[1:])
+
+
+def _is_variant(name: str) -> bool:
+    try:
+        return "+" in name and bool(parse(name))
+    except InputError:
+        return False
+
+
 def model_free(name: str) -> bool:
     """Whether runs of a strategy do not depend on the regional model; its controller need not be there any more."""
     first, _ = registry.split(name)

@@ -100,7 +100,7 @@ def _run(run: Finished) -> dict:
         run.scenario.name, configuration["steps"], configuration["step_s"], len(run.levels), rows)
     with Scratch("cosim-") as folder:
         if run.city is not None:
-            pictures.region_map(folder / "regions.png", run.scenario, run.city)
+            pictures.region_map(folder / "regions.png", run.scenario)
         if len(run.levels) > 1:
             pictures.demand_levels(folder / "demand.png", rows)
         shown = _pictures(folder, (("demand", caption), ("regions", REGIONS)))

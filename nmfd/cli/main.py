@@ -66,13 +66,14 @@ def benchmark(
       nmfd benchmark scenarios/economic_mpc --controllers no-control,dpc-pc \\
           --seeds 5 --plant acyclic --workers 2 --policy dpc-pc=mine.pt --out runs/mine
     """
-    names = controller_names(controllers)
+    names = controller_names(controllers, scenario, policies=policies)
     files = policy_files(policies, names)
 
     from nmfd.api import load_scenario  # heavy
     from nmfd.model.scenario import with_faults, with_time_limit
     from nmfd.runs import run_folder
-    from nmfd.studies.benchmark import run_all, summary_table
+    from nmfd.studies.benchmark import run_all
+    from nmfd.studies.summary import summary_table
 
     loaded = with_time_limit(with_faults(load_scenario(scenario), faults), own_time_limit)
     out = run_folder.default_folder(loaded.name) if out is None else out

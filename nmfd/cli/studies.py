@@ -44,7 +44,7 @@ def robustness(
     Example:
       nmfd robustness scenarios/economic_mpc --controllers pi-gating,dpc-pcrg,dpc-pcrg-robust --out runs/robust
     """
-    names = controller_names(controllers)
+    names = controller_names(controllers, scenario, policies=policies)
     files = policy_files(policies, names)
 
     from nmfd.api import load_scenario  # heavy
@@ -81,7 +81,7 @@ def adaptation(
       nmfd adaptation scenarios/economic_mpc
       nmfd adaptation scenarios/economic_mpc --controllers dpc-pc,dpc-pc-online,pi-gating --cases rain,more
     """
-    names = controller_names(controllers)
+    names = controller_names(controllers, scenario, policies=policies)
     files = policy_files(policies, names)
 
     from nmfd.api import load_scenario  # heavy
@@ -122,7 +122,7 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int, 
     from nmfd.studies import bound as method
 
     method.check(controller)
-    names = None if starts is None else controller_names(starts)
+    names = None if starts is None else controller_names(starts, scenario, where="--from")
     loaded = load_scenario(scenario)
     file = scenario / f"{controller}.npz" if out is None else out
     if not file.parent.is_dir():
@@ -162,7 +162,7 @@ def ablation(
       nmfd ablation training scenarios/economic_mpc --seeds 3 --out runs/alternating
       nmfd ablation horizon scenarios/economic_mpc --controllers mpc-pc --out runs/horizon
     """
-    names = controller_names(controllers)
+    names = controller_names(controllers, scenario)
 
     from nmfd.api import load_scenario  # heavy
     from nmfd.runs import run_folder
@@ -203,9 +203,9 @@ def scaling(
       nmfd scaling
       nmfd scaling --family hexagonal --load congested --controllers dpc-pcrg,mpc-pcrg --regions 7,19,37
     """
-    names = controller_names(controllers)
-
     from nmfd.studies import scaling as method  # heavy
+
+    names = controller_names(controllers, ready=lambda: method.CONTROLLERS)
 
     with resumable("scaling", out, "scaling.csv") as progress:
         rows = method.scaling(

@@ -102,6 +102,18 @@ def choice() -> tuple[str, ...]:
     return (*_ENTRIES, *(name for name in custom.entry_points() if name not in _ENTRIES))
 
 
+def ready(scenario: Scenario) -> tuple[str, ...]:
+    """Those of `choice` that `make` can make for `scenario`, as far as files go: what needs a policy or plan has it."""
+    def has_files(name: str) -> bool:
+        try:
+            policy_path(name, scenario)
+        except InputError:
+            return False
+        return True
+
+    return tuple(filter(has_files, choice()))
+
+
 def is_own(name: str) -> bool:
     """Whether `name`, which must be known, is a controller of the user's own."""
     return name not in _ENTRIES
