@@ -9,9 +9,12 @@ from nmfd.controllers import names, registry
 from nmfd.controllers.dpc import training
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario
-from nmfd.runs import run_folder
+from nmfd.runs import config, run_folder
 from nmfd.runs.progress import Progress, watched
+from nmfd.studies import measured
 from nmfd.studies.benchmark import PLANTS, run_all
+from nmfd.studies.measured import Identified
+from nmfd.studies.settings import Measured
 from nmfd.studies.summary import Summary
 from nmfd.types import Controller, Plant, Trajectory
 
@@ -115,6 +118,28 @@ def train(
         return training.train(
             _loaded(scenario), controller, seed=seed, out=Path(out), steps=steps, resume=resume, anyway=anyway,
             progress=show)
+
+
+def identify(
+    counts: Path | str, *, out: Path | str, detectors: Path | str | None = None, regions: Path | str | None = None,
+    about: Path | str | None = None, adjacency: Path | str | None = None, city: str | None = None,
+    skip_bad: bool = False, name: str | None = None, force: bool = False, **settings: float,
+) -> Identified:
+    """`nmfd identify`: measured counts and occupancies -> MFDs per region, and a network.toml in the folder `out`.
+
+        found = nmfd.identify("counts.csv", detectors="detectors.csv", regions="regions.csv", trip_length=1500.0,
+                              out="networks/mine")
+        print(found.text), found.network.mfds, found.to_frame()
+
+    counts, detectors, regions, about: tables as UTD19 has them (nmfd.model.detector_tables); adjacency: a table
+    region,neighbour or the network.toml of the same regions; settings: vehicle_length, trip_length [m], least_share [-]
+    of nmfd.studies.settings.Measured. Raises InputError.
+    """
+    given = {"detectors": detectors, "regions": regions, "about": about, "adjacency": adjacency}
+    return measured.identify(
+        measured.Sources(counts=Path(counts), city=city, skip_bad=skip_bad, **{
+            key: None if file is None else Path(file) for key, file in given.items()}),
+        config.checked(Measured, settings, "identify"), out=Path(out), name=name, force=force)
 
 
 def named(controller: str | Controller, scenario: Scenario, policy: Path | str | None) -> tuple[str, Controller]:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from cosim.evaluation import explain, fit_quality, statistics
+from cosim.evaluation import explain, statistics
 from cosim.evaluation.results import Finished, Level
 from cosim.plant.strategy import planning_of
 from cosim.report import pictures, summary_text
@@ -21,6 +21,7 @@ from nmfd.errors import InputError
 from nmfd.model import authority
 from nmfd.runs import files
 from nmfd.runs.scratch import Scratch
+from nmfd.studies import fit_quality
 
 PIXELS = 150.0  # per inch, of the pictures (nmfd.studies.plots.save)
 WORDS = (

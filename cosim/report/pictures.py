@@ -15,7 +15,7 @@ from cosim.sumo.net import City, edge_shapes, load_city
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
-from nmfd.studies import plots
+from nmfd.studies import mfd_bands, plots
 from nmfd.studies.benchmark import draw_accumulations
 
 MAPS = 4       # times of the maps
@@ -270,7 +270,7 @@ def outflows(path: Path, network: RegionalModel, results: dict[str, Result]) -> 
             [result.trajectory], [result.record], network.u_max, region, network.adjacency)
             for name, result in results.items()}
         samples.append({name: np.concatenate(list(parts.values())) for name, parts in clouds.items()})
-    model_validation.draw_mfds(path, network, samples)
+    mfd_bands.draw_mfds(path, network, samples)
 
 
 def decision_times(path: Path, rows: pd.DataFrame, step: float) -> None:

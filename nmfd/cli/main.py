@@ -6,7 +6,7 @@ import click
 
 from nmfd.cli.declared import declared
 from nmfd.cli.errors import Commands, Interrupted
-from nmfd.cli.exchange import export, new_controller
+from nmfd.cli.exchange import export, identify, new_controller
 from nmfd.cli.options import (
     ADAM_STEPS,
     FILE,
@@ -205,5 +205,5 @@ def _stamp(path: Path) -> int | None:
     return path.stat().st_mtime_ns if path.exists() else None
 
 
-for command in (bound, robustness, adaptation, ablation, scaling, new_controller, export):
+for command in (bound, robustness, adaptation, ablation, scaling, new_controller, export, identify):
     main.add_command(command)

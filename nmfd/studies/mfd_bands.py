@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
-from cosim.sumo.arrays import Points
+from nmfd.arrays import Points
 from nmfd.model.regional_model import RegionalModel
 from nmfd.studies import plots
 from nmfd.studies.benchmark import interval
@@ -67,5 +67,20 @@ def draw_production(path: Path, network: RegionalModel, records: Sequence[Mappin
         ax.set_xlim(left=0.0)
         ax.set_ylim(0.0, 1.1e-3 * max(cloud[:, 1].max() for run in runs for cloud in run.values() if len(cloud)))
         ax.spines[["top", "right"]].set_visible(False)
+    plots.legend_below(drawing, axes)
+    plots.save(drawing, path)
+
+
+def draw_mfds(
+    path: Path, network: RegionalModel, samples: Sequence[Mapping[str, Points]],
+    found: Sequence[Band] = (),
+) -> None:
+    """The MFD of every region over its outflow samples, as one picture. found: by region, a `band` to draw."""
+    drawing, axes = plots.panels(network.regions)
+    for region, ax in enumerate(axes):
+        plots.mfd(ax, network.mfds[region], samples[region])
+        if len(found):
+            draw_band(ax, found[region])
+        ax.set_title(f"{region} {network.region_names[region]}", fontsize="medium")
     plots.legend_below(drawing, axes)
     plots.save(drawing, path)
