@@ -1,10 +1,11 @@
 """Loops of SUMO as if they were those of a real city: tables as UTD19 has them, of a city whose truth is known.
 
-    python tests/sumo_loops.py FOLDER       # three days of grid7_peak; what `nmfd identify` makes of them, as a table
+    python tests/sumo_loops.py FOLDER SEED ...    # a day of grid7_peak per seed; what `nmfd identify` makes of them
 """
 
 import sys
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pandas as pd
 import nmfd
 from cosim.evaluation.run_metrics import regional_outflow
 from cosim.evaluation.simulate import drive
+from cosim.plant.settings import settings
 from cosim.plant.strategy import parse
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, edge_shapes, load_city
@@ -43,29 +45,37 @@ class Truth:
 
 
 def simulated(
-    scenario: Scenario, folder: Path, seeds: range, intervals: int,
+    scenario: Scenario, folder: Path, seeds: Sequence[int], intervals: int,
 ) -> tuple[pd.DataFrame, pd.DataFrame, Truth]:
     """(counts, detectors, the truth) of a day per seed without control; counts over so many control intervals.
 
-    Two loops on every lane: somewhere along it (MIDDLE, drawn by lot), and at the stop line.
+    Two loops on every lane: somewhere along it (MIDDLE, drawn by lot), and at the stop line. Days are kept in `folder`.
     """
     files = ensure_built(scenario.network)
     city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
     detectors, period = _detectors(city, np.random.default_rng(0)), intervals * scenario.step
     days, truths = [], []
     for seed in seeds:
+        kept = folder / f"day-{seed}.pkl"
+        if kept.exists():
+            counts, truth = pd.read_pickle(kept)
+            days.append(counts)
+            truths.append(truth)
+            continue
         additional, output = folder / f"loops-{seed}.add.xml", folder / f"loops-{seed}.xml"
         additional.write_text("<additional>\n" + "".join(
             f'  <inductionLoop id="{row.detid}" lane="{row.lane}" pos="{row.along:.2f}" period="{period:g}" '
             f'file="{output}"/>\n' for row in detectors.itertuples()) + "</additional>\n")
         strategy = parse("no-control")
-        strategy = replace(strategy, overrides={**strategy.overrides, "additional": (str(additional),)})
+        strategy = replace(strategy, overrides={
+            **strategy.overrides, "additional": (*settings(scenario).additional, str(additional))})
         result = drive(scenario, strategy, controller("no-control", scenario), seed=seed)
         days.append(_counts(output, f"2026-06-{seed + 1:02d}", scenario.steps // intervals * period))
         truths.append([np.asarray(values)[: scenario.steps // intervals * intervals].reshape(
             -1, intervals, city.regions).mean(axis=1) for values in (
                 result.record["mean_accumulation"], result.record["production"],
                 regional_outflow(result.record, scenario.step))])
+        pd.to_pickle((days[-1], truths[-1]), kept)
     region = np.array([city.region_of[edge] for edge in city.edges])
     lane_km = np.bincount(region, [city.length[edge] * city.lanes[edge] / 1000.0 for edge in city.edges], city.regions)
     accumulation, production, outflow = (np.stack(part) for part in zip(*truths, strict=True))
@@ -93,6 +103,7 @@ def _counts(output: Path, day: str, end: float) -> pd.DataFrame:
     """The output of the loops as UTD19 has it."""
     rows = [dict(element.attrib) for _, element in ElementTree.iterparse(output) if element.tag == "interval"]
     table = pd.DataFrame(rows).astype({name: float for name in ("begin", "end", "flow", "occupancy")})
+    table[["begin", "end"]] -= table["begin"].min()  # a city may begin at any time of the day
     table = table[table["end"] <= end]
     return pd.DataFrame({
         "day": day, "interval": table["begin"], "detid": table["id"], "flow": table["flow"],
@@ -147,13 +158,11 @@ def errors(found: nmfd.Identified, truth: Truth) -> dict[str, float]:
         "maximum": float(np.mean([abs(own.capacity / true.capacity - 1.0) for own, true, _ in pairs]))}
 
 
-def main(folder: Path) -> None:
-    """Three days of grid7_peak, counts every three minutes."""
+def main(folder: Path, *seeds: str) -> None:
+    """Days of grid7_peak, counts every three minutes."""
     folder.mkdir(parents=True, exist_ok=True)
-    kept = folder / "kept.pkl"
-    if not kept.exists():
-        pd.to_pickle(simulated(nmfd.load_scenario("scenarios/grid7_peak"), folder, range(3), 2), kept)
-    counts, detectors, truth = pd.read_pickle(kept)
+    counts, detectors, truth = simulated(
+        nmfd.load_scenario("scenarios/grid7_peak"), folder, [int(seed) for seed in seeds], 2)
     lines = []
     for place, share, told in (
             (MIDDLE, 1.0, True), (MIDDLE, 0.3, True), (MIDDLE, 0.1, True), (AT_STOP_LINE, 1.0, True),
@@ -165,4 +174,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), *sys.argv[2:])

@@ -3,6 +3,7 @@
 import io
 import re
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -92,8 +93,6 @@ def test_results_of_runs_are_tables_and_datasets(tmp_path):
 
 
 def test_html_is_escaped_and_says_units(tmp_path):
-    from dataclasses import replace
-
     trajectory = replace(nmfd.run(tiny.write(tmp_path), "no-control"), controller="<script>&")
     html = trajectory._repr_html_()
     assert "&lt;script&gt;&amp;" in html and "<script>" not in html and "time spent [veh s]" in html

@@ -1,6 +1,7 @@
 """Measured counts and occupancies become MFDs: the formulas, what is doubtful, what is wrong with tables; and SUMO's
 own loops, where the truth is known."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pandas as pd
 import pytest
 import sumo_loops
 import tiny
+import tiny_city
 from commands import error_line, good
 from commands import nmfd as command
 
@@ -93,7 +95,7 @@ def test_what_is_given_replaces_what_is_assumed(tmp_path, made):
     north, south = found.network.mfds
     assert north.critical == pytest.approx(4.0 * south.critical, rel=0.02)       # four times the streets
     assert north.capacity == pytest.approx(8.0 * south.capacity, rel=0.02)       # and trips half as long
-    assert found.fits[0].doubts == ("coverage 25 %",) and found.fits[1].doubts == ("coverage unknown",)
+    assert found.fits[0].doubts == ("low coverage 25 %",) and found.fits[1].doubts == ("coverage unknown",)
 
 
 @pytest.mark.usefixtures("without_pictures")
@@ -218,11 +220,11 @@ def test_bad_rows_and_silent_detectors_are_left_out_and_counted(tmp_path, made):
 
 @pytest.mark.slow
 def test_loops_of_sumo_tell_what_sumo_knows(tmp_path):
-    from dataclasses import replace
-
-    scenario = nmfd.load_scenario("scenarios/grid7_peak")
-    scenario = replace(scenario, steps=30, demand=scenario.demand[:30])
-    counts, detectors, truth = sumo_loops.simulated(scenario, tmp_path, range(1), 2)
+    scenario = nmfd.load_scenario(tiny_city.imported(tmp_path))
+    scenario = replace(scenario, demand=4.0 * scenario.demand, demand_factor=4.0 * scenario.demand_factor)
+    counts, detectors, truth = sumo_loops.simulated(scenario, tmp_path, range(2), 1)
     wrong = sumo_loops.errors(sumo_loops.case(tmp_path / "all", counts, detectors, truth), truth)
     assert abs(wrong["accumulation bias"]) < 0.25 and abs(wrong["production bias"]) < 0.1
-    assert wrong["curve RMSE"] < 0.25
+    assert wrong["curve RMSE"] < 0.2
+    half = sumo_loops.errors(sumo_loops.case(tmp_path / "half", counts, detectors, truth, share=0.5), truth)
+    assert half["accumulation RMSE"] > wrong["accumulation RMSE"]

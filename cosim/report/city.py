@@ -39,9 +39,7 @@ class City:
     def __init__(self, city: Path | str | Scenario | RegionalModel):
         """city: the folder of a network or a scenario, or what was loaded from one. InputError without a SUMO city."""
         if not isinstance(city, Scenario | RegionalModel):
-            folder = Path(city)
-            missing = not (folder / "scenario.toml").is_file() and any(folder.parent.glob("*/network.toml"))
-            city = load_network(folder) if missing or (folder / "network.toml").is_file() else load_scenario(city)
+            city = _loaded(city)
         self.scenario = city if isinstance(city, Scenario) else None
         self.network = city.network if isinstance(city, Scenario) else city
         self.name = city.name
@@ -128,3 +126,16 @@ class City:
         if self.scenario is not None:
             alone = {**alone, **dict.fromkeys(settings(self.scenario).leave_signals, "left alone by the scenario")}
         return quality.tables(self._streets, self._regions, self.network.region_names, self._city, None, alone)
+
+
+def _loaded(where: Path | str) -> Scenario | RegionalModel:
+    """The scenario or network in a folder, or of that name. InputError."""
+    folder = Path(where)
+    if (folder / "scenario.toml").is_file():
+        return load_scenario(where)
+    try:
+        return load_network(where)
+    except InputError:
+        if any(folder.parent.glob("*/network.toml")):  # meant, but misspelt or broken
+            raise
+    return load_scenario(where)

@@ -33,7 +33,7 @@ STOP_LINE = 0.03          # km before a junction: a loop here sees queues first
 FAR = 3.0                 # times the median distance between neighbouring detectors: no boundary lies between
 COVERAGE, BIASED, DAYS = 0.3, 0.5, 3  # shares of lane-kilometres; days: below, or above, it is doubtful
 UNKNOWN, SMALL, LOOPS, ASSUMED, SINGLE = (
-    "coverage unknown", "coverage", "loops at stop lines", "trip length assumed", "days")
+    "coverage unknown", "low coverage", "loops at stop lines", "trip length assumed", "days")
 MEANINGS = {
     fit_quality.FEW: f"fewer than {fit_quality.SAMPLES} intervals were measured",
     fit_quality.POOR: f"below {fit_quality.EXPLAINED:g} the curve explains hardly anything of the outflow: streets "
@@ -46,7 +46,7 @@ MEANINGS = {
     SMALL: f"detectors stand for less than {100 * COVERAGE:g} % of the lane-kilometres, usually the main roads, and "
            "are taken for all",
     LOOPS: f"most loops lie within {1000 * STOP_LINE:g} m of a junction, where queues stand: the density comes out too "
-           "high, before saturation most",
+           "high where a vehicle stands on them, too low between two",
     ASSUMED: "two thirds of the side of a square as large as the region: the outflow is as uncertain as that; give it "
              "with --trip-length or --about",
     SINGLE: f"fewer than {DAYS} days: how much the curve differs from day to day is unknown"}
@@ -303,7 +303,7 @@ def _told(rows: pd.DataFrame, left: Mapping[str, int], coverage: np.ndarray, tri
 def _write(out: Path, found: Identified, clouds: Sequence[Sequence[dict[str, Points]]], sources: Sources) -> None:
     out.mkdir(parents=True, exist_ok=True)
     bands = [mfd_bands.band([fit_quality.own_points(day) for day in days]) for days in clouds]
-    mfd_bands.draw_mfds(out / "mfd.png", found.network, found.samples, bands)
+    mfd_bands.draw_mfds(out / "mfd.png", found.network, found.samples, bands, "days")
     files.write_text(out / "samples.csv", found.intervals.to_csv(index=False, float_format="%.6g"))
     fit_quality.write_fits(out / "fit.csv", found.fits, None)
     files.write_text(out / "identify.txt", found.text + "\n")
