@@ -127,22 +127,28 @@ def test_in_a_notebook_the_bar_is_that_of_notebooks(monkeypatch):
     bars = []
 
     class Bar(io.StringIO):
-        n, total = 0, None
+        n = 0
 
         def set_postfix_str(self, note, refresh):
             pass
 
-        def reset(self, total):
-            self.total = total
-
         def update(self, more):
             self.n += more
 
-    monkeypatch.setattr(progress, "_notebook_bar", lambda label: bars.append(Bar(label)) or bars[0])
+    def bar(label, total):
+        bars.append(Bar(label))
+        bars[-1].total = total
+        return bars[-1]
+
+    monkeypatch.setattr(progress, "_notebook_bar", bar)
+    with progress.watched("run", None) as show:
+        show(3, 10)
+    assert not bars  # done soon
+    monkeypatch.setattr(progress, "SOON", 0.0)
     with progress.watched("run", None) as show:
         show(3, 10)
         show(10, 10, "done")
-    assert bars[0].n == bars[0].total == 10
+    assert bars[0].n == bars[0].total == 10 and bars[0].closed
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,10 @@
 """A bar of progress where somebody looks: in a notebook, or one line on stderr where that is a terminal."""
 
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any, Protocol, TextIO, runtime_checkable
 
 from tqdm.std import tqdm
@@ -47,8 +48,8 @@ def watched(label: str, progress: Progress) -> Iterator[Callable[..., None] | No
     elif progress is False:
         yield None
     elif in_notebook():
-        with _notebook_bar(label) as line:
-            yield _shown(line)
+        with ExitStack() as bars:
+            yield _late(label, bars)
     else:
         with progress_line(label) as show:
             yield show
@@ -60,11 +61,25 @@ def in_notebook() -> bool:
     return shell is not None and "IPKernelApp" in shell.config
 
 
-def _notebook_bar(label: str) -> Any:
+def _late(label: str, bars: ExitStack) -> Show:
+    """What makes a bar, which ends with `bars`, of work that is not done SOON."""
+    begin = time.monotonic()
+    shown: list[Show] = []
+
+    def show(done: int, total: int, note: str = "") -> None:
+        if not shown and time.monotonic() - begin >= SOON:
+            shown.append(_shown(bars.enter_context(_notebook_bar(label, total))))
+        if shown:
+            shown[0](done, total, note)
+
+    return show
+
+
+def _notebook_bar(label: str, total: int) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # without ipywidgets it is a line of text, and a warning
         from tqdm.autonotebook import tqdm as bar  # asks whether there are widgets
-    return bar(desc=label, leave=False, miniters=0, delay=SOON)
+    return bar(desc=label, total=total, leave=False, miniters=0)
 
 
 def _shown(line: Any) -> Show:
