@@ -172,6 +172,9 @@ MISTAKES = {
         lambda c, d: (c, d.drop(columns=["long", "lat"])), ("--trip-length", "900"), "give a table region,"),
     "no positions and no trip length": (lambda c, d: (c, d.drop(columns=["long", "lat"])), (), "give --trip-length"),
     "too few intervals": (lambda c, d: (c[: 20 * 5], d), (), "fewer than 10 intervals"),
+    "a name too long": (lambda c, d: (c, d), ("--name", 101 * "x"), "network.toml: name: expected text in quotes"),
+    "a region's name too long": (
+        lambda c, d: (c, d.assign(region=d["region"] + 100 * "x")), (), "regions[0].name: expected text in quotes"),
     "a trip length in km": (lambda c, d: (c, d), ("--trip-length", "1.2"), "'--trip-length'"),
 }
 

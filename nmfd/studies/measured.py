@@ -7,6 +7,7 @@ P [veh km/h]; the outflow of the regional model is P over the mean trip length w
 Daganzo, "Existence of urban-scale macroscopic fundamental diagrams", Transportation Research B 42, 2008).
 """
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -22,8 +23,9 @@ from nmfd.html import html_table
 from nmfd.model import detector_tables, mfd
 from nmfd.model.detector_tables import SPEEDS
 from nmfd.model.model_file import network_toml, schema_line
+from nmfd.model.network_file import NetworkTable
 from nmfd.model.regional_model import RegionalModel, load_network
-from nmfd.runs import files
+from nmfd.runs import config, files
 from nmfd.runs.tables import wrapped
 from nmfd.studies import fit_quality, mfd_bands
 from nmfd.studies.settings import Measured
@@ -301,11 +303,13 @@ def _told(rows: pd.DataFrame, left: Mapping[str, int], coverage: np.ndarray, tri
 
 
 def _write(out: Path, found: Identified, clouds: Sequence[Sequence[dict[str, Points]]], sources: Sources) -> None:
+    text = network_toml(
+        found.network, {}, f"Regional model: written by nmfd identify from {sources.counts.name}; see identify.txt.")
+    config.checked(NetworkTable, tomllib.loads(text), out / "network.toml")  # names, say, may be none
     out.mkdir(parents=True, exist_ok=True)
     bands = [mfd_bands.band([fit_quality.own_points(day) for day in days]) for days in clouds]
     mfd_bands.draw_mfds(out / "mfd.png", found.network, found.samples, bands, "days")
     files.write_text(out / "samples.csv", found.intervals.to_csv(index=False, float_format="%.6g"))
     fit_quality.write_fits(out / "fit.csv", found.fits, None)
     files.write_text(out / "identify.txt", found.text + "\n")
-    files.write_text(out / "network.toml", schema_line(out) + network_toml(
-        found.network, {}, f"Regional model: written by nmfd identify from {sources.counts.name}; see identify.txt."))
+    files.write_text(out / "network.toml", schema_line(out) + text)
