@@ -82,7 +82,7 @@ class City:
         if ax is None:
             from matplotlib import pyplot  # only where it is wanted: it brings global state
 
-            _, ax = pyplot.subplots(figsize=(6.5, 6.5), layout="constrained")
+            _, ax = pyplot.subplots(figsize=(6.5, 6.0), layout="constrained")
         atlas.region_map(ax, self._streets, self._regions, self.network.region_names, self._places)
         atlas.gateway_marks(ax, self._streets, self._tables)
         if flows and self.scenario is not None:

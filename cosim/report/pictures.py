@@ -257,7 +257,7 @@ def draw_more(out: Path, scenario: Scenario, folder: Path, rows: pd.DataFrame) -
 
 def region_map(path: Path, scenario: Scenario) -> None:
     """The regions and gateways of the city."""
-    drawing = plots.figure(6.2, 7.0)
+    drawing = plots.figure(6.2, 5.6)
     CityView(scenario).plot(drawing.subplots(), flows=False)
     plots.save(drawing, path)
 
