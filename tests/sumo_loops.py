@@ -69,11 +69,13 @@ def simulated(
         strategy = parse("no-control")
         strategy = replace(strategy, overrides={
             **strategy.overrides, "additional": (*settings(scenario).additional, str(additional))})
-        result = drive(scenario, strategy, controller("no-control", scenario), seed=seed)
+        edges = folder / f"edges-{seed}.xml"
+        result = drive(
+            scenario, strategy, controller("no-control", scenario), seed=seed, outputs={"edgedata": edges})
         days.append(_counts(output, f"2026-06-{seed + 1:02d}", scenario.steps // intervals * period))
         truths.append([np.asarray(values)[: scenario.steps // intervals * intervals].reshape(
             -1, intervals, city.regions).mean(axis=1) for values in (
-                result.record["mean_accumulation"], result.record["production"],
+                result.record["mean_accumulation"], _production(edges, city, scenario),
                 regional_outflow(result.record, scenario.step))])
         pd.to_pickle((days[-1], truths[-1]), kept)
     region = np.array([city.region_of[edge] for edge in city.edges])
@@ -97,6 +99,20 @@ def _detectors(city: City, random: np.random.Generator) -> pd.DataFrame:
                     "lanes": 1, "linkid": edge, "x": round(x, 1), "y": round(y, 1), "region": city.region_of[edge],
                     "place": place, "lane": lane, "along": along})
     return pd.DataFrame(rows)
+
+
+def _production(output: Path, city: City, scenario: Scenario) -> np.ndarray:
+    """(T, R) [veh m/s] of every control interval: what SUMO itself adds up of every vehicle (edgeData)."""
+    found: list[np.ndarray] = []
+    for event, element in ElementTree.iterparse(output, events=("start", "end")):
+        if event == "start" and element.tag == "interval":
+            found.append(np.zeros(city.regions))
+        elif event == "end" and element.tag == "edge" and element.get("id") in city.length:
+            found[-1][city.region_of[element.attrib["id"]]] += float(element.get("sampledSeconds", 0.0)) * float(
+                element.get("speed", 0.0)) / scenario.step
+    rows = np.zeros((scenario.steps, city.regions))
+    rows[: len(found)] = found[: scenario.steps]  # SUMO ends where nothing moves any more
+    return rows
 
 
 def _counts(output: Path, day: str, end: float) -> pd.DataFrame:
