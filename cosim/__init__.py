@@ -3,31 +3,34 @@
     import cosim
 
     result = cosim.run("grid7_peak", "dpc-pcrg", seed=1)
-    print(result.facts["mean_trip_time_s"], result.trajectory.to_frame())
+    print(result.facts["mean_trip_time_s"], result.to_frame())
 
 `run` is one closed loop in SUMO, `run_tasks` many with a run folder, `sweep` many more on processes or a cluster;
-`read_run` reads a run folder. Names here are imported when they are first used.
+`read_run` reads a run folder, `City` shows a city before anything runs. Names here are
+imported when they are first used.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cosim.api import run
-    from cosim.evaluation.experiment import experiment as run_tasks
-    from cosim.evaluation.experiment import overview, read_run
+    from cosim.api import read_run, run, run_tasks, sweep
+    from cosim.evaluation.experiment import overview
     from cosim.evaluation.simulate import Result, Task
-    from cosim.evaluation.sweeps import Sweep, sweep
+    from cosim.evaluation.sweeps import Sweep
     from cosim.plant.plant import SumoPlant
     from cosim.plant.settings import Settings, settings
+    from cosim.report.city import City
 
 __all__ = [
-    "Result", "Settings", "SumoPlant", "Sweep", "Task", "overview", "read_run", "run", "run_tasks", "settings", "sweep"]
+    "City", "Result", "Settings", "SumoPlant", "Sweep", "Task", "overview", "read_run", "run", "run_tasks", "settings",
+    "sweep"]
 _PLACES = {
-    "Result": "evaluation.simulate.Result", "Settings": "plant.settings.Settings", "SumoPlant": "plant.plant.SumoPlant",
+    "City": "report.city.City", "Result": "evaluation.simulate.Result", "Settings": "plant.settings.Settings",
+    "SumoPlant": "plant.plant.SumoPlant",
     "Task": "evaluation.simulate.Task", "overview": "evaluation.experiment.overview",
-    "read_run": "evaluation.experiment.read_run", "run": "api.run", "run_tasks": "evaluation.experiment.experiment",
-    "settings": "plant.settings.settings", "Sweep": "evaluation.sweeps.Sweep", "sweep": "evaluation.sweeps.sweep"}
+    "read_run": "api.read_run", "run": "api.run", "run_tasks": "api.run_tasks",
+    "settings": "plant.settings.settings", "Sweep": "evaluation.sweeps.Sweep", "sweep": "api.sweep"}
 
 
 def __getattr__(name: str) -> object:

@@ -1,23 +1,28 @@
-"""What `cosim run` does, as a function of a few arguments; exported by the package `cosim`."""
+"""What `cosim run` and `cosim sweep` do, as functions of a few arguments; exported by the package `cosim`."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from cosim.evaluation.simulate import Result, drive
+import pandas as pd
+
+from cosim.evaluation import dask_cluster, experiment, sweeps
+from cosim.evaluation.simulate import Result, Task, drive
+from cosim.evaluation.sweeps import Sweep
 from cosim.plant.strategy import ALONE, configured, parse, planning_of
 from cosim.sumo.outputs import check
 from nmfd.api import load_scenario, named
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
+from nmfd.runs.progress import Progress, watched
 from nmfd.types import Controller
 
 
 def run(
     scenario: Scenario | Path | str, controller: str | Controller, *, seed: int = 0, steps: int | None = None,
     demand_factor: float = 1.0, policy: Path | str | None = None, city: str = "",
-    sumo_output: Mapping[str, Path | str] | None = None, progress: Callable[[int, int], None] | None = None,
+    sumo_output: Mapping[str, Path | str] | None = None, progress: Progress = None,
 ) -> Result:
     """One closed loop in SUMO, in this process and without a run folder.
 
@@ -35,7 +40,8 @@ def run(
     policy: of a DPC controller by name, if not SCENARIO/NAME.pt
     city: what else the city does, with a controller that is an object: "max-pressure+rerouting-30"
     sumo_output: files of SUMO's own outputs: {"tripinfo": "trips.xml"}, also summary, edgedata, emission
-    progress: called as progress(done, steps) after every control interval
+    progress: None for a bar in a notebook or on a terminal, False for none, or your own, which is called as
+        progress(done, steps) after every control interval
 
     The result holds `trajectory` (nmfd.Trajectory), `record` (arrays, see cosim.plant.record.Record) and `facts` (the
     row of sumo.csv). The same seed gives the same result, but for wall times. Raises InputError, and RuntimeError while
@@ -62,4 +68,43 @@ def run(
             overrides={**strategy.overrides, "gateways_fixed": name != ALONE})
     outputs = {kind: Path(file) for kind, file in (sumo_output or {}).items()}
     check(outputs)
-    return drive(scenario, strategy, acting, seed=seed, progress=progress, outputs=outputs, planning=planning)
+    with watched(strategy.name, progress) as show:
+        return drive(scenario, strategy, acting, seed=seed, progress=show, outputs=outputs, planning=planning)
+
+
+def run_tasks(
+    tasks: Task | Sequence[Task], *, out: Path | str, workers: int = 1, progress: Progress = None,
+    tell: Callable[[str], None] | None = None,
+) -> pd.DataFrame:
+    """Closed loops in SUMO with a run folder: those that are not yet in `out`; returns a row for every run there.
+
+    Columns: those of summary.csv and sumo.csv, with units in their names; progress: as in `run`, and called as
+    progress(done, tasks, what); tell: takes one line where the runs of a controller do not count any more because it
+    changed, None: an InputError. Raises InputError, and nmfd.runs.workers.RunFailed at the end if runs failed.
+    """
+    with watched("cosim", progress) as show:
+        return experiment.experiment(
+            [tasks] if isinstance(tasks, Task) else list(tasks), out=Path(out), workers=workers, progress=show,
+            tell=tell)
+
+
+def sweep(
+    order: Sweep, *, workers: int = 1, scheduler: dask_cluster.Scheduler | str | None = None,
+    progress: Progress = None, tell: Callable[[str], None] | None = None,
+) -> pd.DataFrame:
+    """Controllers x seeds x demand levels x compliance in SUMO, as one table: cosim.evaluation.sweeps.sweep.
+
+    scheduler: a Dask scheduler or its address, instead of `workers` processes here; progress, tell: as in `run_tasks`.
+    """
+    with watched("sweep", progress) as show:
+        return sweeps.sweep(order, workers=workers, scheduler=scheduler, progress=show, tell=tell)
+
+
+def read_run(folder: Path | str, controller: str, seed: int) -> Result:
+    """A finished run of a run folder, with its row of sumo.csv as `facts`. Raises InputError."""
+    result, file = experiment.read_run(Path(folder), controller, seed), Path(folder) / "sumo.csv"
+    if not file.is_file():  # the files of the runs alone were copied
+        return result
+    rows = experiment.read_facts(file)
+    rows = rows[(rows["controller"] == controller) & (rows["seed"] == seed)]
+    return replace(result, facts=next(iter(rows.to_dict("records")), {}))

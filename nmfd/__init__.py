@@ -15,7 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from nmfd.api import benchmark, controller, load_scenario, run, train
+    from nmfd.api import benchmark, controller, identify, load_scenario, run, train
     from nmfd.errors import InputError
     from nmfd.metrics import summary, total_time_spent
     from nmfd.model.planning import PlanningModel
@@ -23,22 +23,23 @@ if TYPE_CHECKING:
     from nmfd.model.regional_model import RegionalModel, load_network
     from nmfd.model.scenario import Scenario
     from nmfd.runs.run_folder import read_trajectory, write_trajectory
-    from nmfd.studies.benchmark import summary_table
+    from nmfd.studies.measured import Identified
+    from nmfd.studies.summary import Summary, summary_table
     from nmfd.types import Controller, Controls, Observation, Plant, State, Status, Trajectory
 
 __version__ = "0.1.0"  # of the package perimeter-cosim, nmfd and cosim alike
 _MODULES = {
-    "api": ("benchmark", "controller", "load_scenario", "run", "train"), "errors": ("InputError",),
+    "api": ("benchmark", "controller", "identify", "load_scenario", "run", "train"), "errors": ("InputError",),
     "metrics": ("summary", "total_time_spent"), "model.planning": ("PlanningModel",),
     "model.plant": ("AcyclicPlant", "NmfdPlant"), "model.regional_model": ("RegionalModel", "load_network"),
     "model.scenario": ("Scenario",), "runs.run_folder": ("read_trajectory", "write_trajectory"),
-    "studies.benchmark": ("summary_table",),
+    "studies.measured": ("Identified",), "studies.summary": ("Summary", "summary_table"),
     "types": ("Controller", "Controls", "Observation", "Plant", "State", "Status", "Trajectory")}
 __all__ = [
-    "AcyclicPlant", "Controller", "Controls", "InputError", "NmfdPlant", "Observation", "Plant", "PlanningModel",
-    "RegionalModel", "Scenario", "State", "Status", "Trajectory", "benchmark", "controller", "load_network",
-    "load_scenario", "read_trajectory", "run", "summary", "summary_table", "total_time_spent", "train",
-    "write_trajectory"]
+    "AcyclicPlant", "Controller", "Controls", "Identified", "InputError", "NmfdPlant", "Observation", "Plant",
+    "PlanningModel", "RegionalModel", "Scenario", "State", "Status", "Summary", "Trajectory", "benchmark", "controller",
+    "identify", "load_network", "load_scenario", "read_trajectory", "run", "summary", "summary_table",
+    "total_time_spent", "train", "write_trajectory"]
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 

@@ -1,16 +1,21 @@
 """What the command line `nmfd` does, as functions of a few arguments; exported by the package `nmfd`."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from nmfd import closed_loop
-from nmfd.controllers import registry
+from nmfd.controllers import names, registry
 from nmfd.controllers.dpc import training
-from nmfd.errors import InputError
+from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario
-from nmfd.runs import run_folder
+from nmfd.runs import config, run_folder
+from nmfd.runs.progress import Progress, watched
+from nmfd.studies import measured
 from nmfd.studies.benchmark import PLANTS, run_all
+from nmfd.studies.measured import Identified
+from nmfd.studies.settings import Measured
+from nmfd.studies.summary import Summary
 from nmfd.types import Controller, Plant, Trajectory
 
 
@@ -42,7 +47,7 @@ def controller(name: str, scenario: Scenario | Path | str, *, policy: Path | str
 
 def run(
     scenario: Scenario | Path | str, controller: str | Controller, *, seed: int = 0, plant: str | Plant = "nmfd",
-    steps: int | None = None, policy: Path | str | None = None, progress: Callable[[int, int], None] | None = None,
+    steps: int | None = None, policy: Path | str | None = None, progress: Progress = None,
 ) -> Trajectory:
     """One closed loop on a regional model.
 
@@ -58,7 +63,8 @@ def run(
     plant: "nmfd", "acyclic", or an object with `reset`, `step`, `completed` and `close` (nmfd.Plant)
     steps: control intervals; the scenario's if None
     policy: as in `nmfd.controller`
-    progress: called as progress(done, steps) after every control interval
+    progress: None for a bar in a notebook or on a terminal, False for none, or your own, which is called as
+        progress(done, steps) after every control interval
 
     The same seed gives the same trajectory (but for wall times). Raises InputError.
     """
@@ -69,21 +75,27 @@ def run(
         steps = min(steps, scenario.steps)
         scenario = replace(scenario, steps=steps, demand=scenario.demand[:steps])
     if isinstance(plant, str) and plant not in PLANTS:
-        raise InputError(f"plant {plant!r} is unknown; choose from {', '.join(PLANTS)}, or give an object")
+        raise InputError(f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from "
+                         f"{', '.join(PLANTS)}, or give an object")
     name, acting = named(controller, scenario, policy)
     driven = PLANTS[plant](scenario) if isinstance(plant, str) else plant
-    trajectory = closed_loop.run(driven, acting, scenario, seed=seed, progress=progress)
+    with watched(name, progress) as show:
+        trajectory = closed_loop.run(driven, acting, scenario, seed=seed, progress=show)
     return run_folder.labelled(
         trajectory, controller=name, plant=plant if isinstance(plant, str) else type(plant).__name__)
 
 
 def benchmark(
-    scenario: Scenario | Path | str, controllers: Sequence[str], *, seeds: int | Sequence[int] = 1,
+    scenario: Scenario | Path | str, controllers: str | Sequence[str], *, seeds: int | Sequence[int] = 1,
     plant: str = "nmfd", out: Path | str | None = None, policies: Mapping[str, Path | str] | None = None,
-    workers: int = 1, progress: Callable[[int, int, str], None] | None = None,
-) -> list[dict]:
+    workers: int = 1, progress: Progress = None,
+) -> Summary:
     """`nmfd benchmark`: controllers x seeds with a run folder; returns the rows of its summary.csv.
 
+        rows = nmfd.benchmark("scenarios/economic_mpc", ["no-control", "dpc-*"])
+        print(rows), rows.to_frame(), rows.to_xarray()
+
+    controllers: a name, several, or patterns, which stand for the controllers that can be made for this scenario
     seeds: how many, from 0, or which
     out: the run folder, runs/<scenario>-<time> if None; finished runs in it are kept
     policies: controller -> file, if not SCENARIO/NAME.pt
@@ -92,28 +104,57 @@ def benchmark(
 
         >>> rows = nmfd.benchmark("economic_mpc", ["no-control", "pi-gating"], seeds=3)  # doctest: +SKIP
         >>> print(nmfd.summary_table(rows))  # doctest: +SKIP
+    progress: as in `nmfd.run`; your own is called as progress(done, steps, what)
 
     Raises InputError and nmfd.runs.workers.RunFailed.
     """
-    scenario = _loaded(scenario)
-    return run_all(
-        scenario, list(controllers), range(seeds) if isinstance(seeds, int) else list(seeds), plant,
-        out=run_folder.default_folder(scenario.name) if out is None else Path(out),
-        policies={name: Path(file) for name, file in (policies or {}).items()}, workers=workers, progress=progress)
+    scenario, files = _loaded(scenario), {name: Path(file) for name, file in (policies or {}).items()}
+    chosen = names.chosen(
+        controllers, registry.check, lambda: dict.fromkeys([*registry.ready(scenario), *files]))
+    if plant not in PLANTS:
+        raise InputError(f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from {', '.join(PLANTS)}")
+    with watched("benchmark", progress) as show:
+        return Summary(run_all(
+            scenario, chosen, range(seeds) if isinstance(seeds, int) else list(seeds), plant,
+            out=run_folder.default_folder(scenario.name) if out is None else Path(out), policies=files,
+            workers=workers, progress=show))
 
 
 def train(
     scenario: Scenario | Path | str, controller: str, *, out: Path | str, seed: int = 0, steps: int | None = None,
-    resume: bool = False, anyway: bool = False, progress: Callable[[int, int, str], None] | None = None,
+    resume: bool = False, anyway: bool = False, progress: Progress = None,
 ) -> Path:
     """`nmfd train` on the CPU: train the DPC policy `controller` and write it to the file `out`, which is returned.
 
     steps: Adam steps; what scenario.toml says, else 400, if None; anyway: even on placeholder MFDs, or where no gateway
-    can be controlled. Raises InputError.
+    can be controlled; progress: as in `benchmark`. Raises InputError.
     """
-    return training.train(
-        _loaded(scenario), controller, seed=seed, out=Path(out), steps=steps, resume=resume, anyway=anyway,
-        progress=progress)
+    with watched(controller, progress) as show:
+        return training.train(
+            _loaded(scenario), controller, seed=seed, out=Path(out), steps=steps, resume=resume, anyway=anyway,
+            progress=show)
+
+
+def identify(
+    counts: Path | str, *, out: Path | str, detectors: Path | str | None = None, regions: Path | str | None = None,
+    about: Path | str | None = None, adjacency: Path | str | None = None, city: str | None = None,
+    skip_bad: bool = False, name: str | None = None, force: bool = False, **settings: float,
+) -> Identified:
+    """`nmfd identify`: measured counts and occupancies -> MFDs per region, and a network.toml in the folder `out`.
+
+        found = nmfd.identify("counts.csv", detectors="detectors.csv", regions="regions.csv", trip_length=1500.0,
+                              out="networks/mine")
+        print(found.text), found.network.mfds, found.to_frame()
+
+    counts, detectors, regions, about: tables as UTD19 has them (nmfd.model.detector_tables); adjacency: a table
+    region,neighbour or the network.toml of the same regions; settings: vehicle_length, trip_length [m], least_share [-]
+    of nmfd.studies.settings.Measured. Raises InputError.
+    """
+    given = {"detectors": detectors, "regions": regions, "about": about, "adjacency": adjacency}
+    return measured.identify(
+        measured.Sources(counts=Path(counts), city=city, skip_bad=skip_bad, **{
+            key: None if file is None else Path(file) for key, file in given.items()}),
+        config.checked(Measured, settings, "identify"), out=Path(out), name=name, force=force)
 
 
 def named(controller: str | Controller, scenario: Scenario, policy: Path | str | None) -> tuple[str, Controller]:

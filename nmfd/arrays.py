@@ -21,3 +21,4 @@ Hops = Int[np.ndarray, "R R"]
 Intervals = Float[np.ndarray, " T"]
 Flags = Int[np.ndarray, " T"]
 Cumulative = Float[np.ndarray, " S"]
+Points = Float[np.ndarray, "_ 2"]  # of a line on the map [m], or samples of accumulation and outflow

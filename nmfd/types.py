@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 
 from nmfd.arrays import Cumulative, Flags, Intervals, PairsOverTime, PerPair, PerTurn, StatesOverTime, TurnsOverTime
+from nmfd.html import html_table
 from nmfd.quantities import quantity, variables
 
 if TYPE_CHECKING:
@@ -186,6 +187,21 @@ class Trajectory:
             "interval": ("interval", times[:-1], {"long_name": "beginning of the interval", "units": "s"}),
             **variables(Trajectory, vars(self))}
 
+    def _repr_html_(self) -> str:
+        """Its regions, for notebooks."""
+        present, names = self.accumulation + self.backlog + self.removed, [*range(self.accumulation.shape[1]), "all"]
+        inside, waiting, spending = (
+            np.column_stack([x.sum(axis=2), x.sum(axis=(1, 2))]).T for x in (self.accumulation, self.backlog, present))
+        lines = [
+            [name, f"{x.mean():,.0f}", f"{x.max():,.0f}", f"{x[-1]:,.0f}", f"{queue.max():,.0f}",
+             f"{self.step * spent[:-1].sum():.3e}"]
+            for name, x, queue, spent in zip(names, inside, waiting, spending, strict=True)]
+        return html_table(
+            ["region", "mean [veh]", "most [veh]", "end [veh]", "most waiting [veh]", "time spent [veh s]"], lines,
+            f"{self.controller}, plant {self.plant}, seed {self.seed}: {len(self.status)} control intervals of "
+            f"{self.step:g} s, {self.completed[-1]:,.0f} trips completed, {int((self.status != 0).sum())} decisions "
+            "not as they should be")
+
     @property
     def labels(self) -> dict[str, str | int | float]:
         """What run this is: controller, plant, seed, step [s] and estimated (0 or 1)."""
@@ -193,11 +209,13 @@ class Trajectory:
             "controller": self.controller, "plant": self.plant, "seed": self.seed, "step": self.step,
             "estimated": int(self.estimated)}
 
-    def to_dataset(self) -> "xarray.Dataset":
+    def to_xarray(self) -> "xarray.Dataset":
         """Everything but `wall_time`, with named dimensions, times in seconds, and units as attributes."""
         import xarray  # with the pandas under it half a second of the start-up, which few commands need
 
         return xarray.Dataset(self.variables, attrs=self.labels)
+
+    to_dataset = to_xarray  # its name before
 
     def to_frame(self) -> "pandas.DataFrame":
         """The states as a table: one row per time and pair of regions, (T+1) R R rows.
@@ -222,7 +240,7 @@ class Trajectory:
         return self._table({"interval": "time_s", "perimeter": "perimeter"})
 
     def _table(self, columns: dict[str, str]) -> "pandas.DataFrame":
-        data = self.to_dataset()
+        data = self.to_xarray()
         rows = data[[name for name in columns if name in data.data_vars]].to_dataframe().reset_index()
         for place, name in enumerate(("controller", "plant", "seed")):
             rows.insert(place, name, getattr(self, name))

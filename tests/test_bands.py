@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.evaluation.mfd_bands import BINS, band, draw_production, production_samples
 from nmfd.api import load_scenario
+from nmfd.studies.mfd_bands import BINS, band, draw_production, production_samples
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
 

@@ -9,7 +9,6 @@ import tiny
 import torch
 import trajectories
 
-from cosim.evaluation.fit_quality import fit_table, nearly_empty, region_fits
 from cosim.evaluation.identify import as_it_was, samples_of, static_model
 from cosim.evaluation.model_validation import errors, held_up, outflow_samples, predict, predict_next
 from cosim.evaluation.simulate import Result
@@ -19,6 +18,7 @@ from nmfd.model import dynamics, mfd
 from nmfd.model.identification import observed_split_ratios
 from nmfd.model.model_file import network_toml
 from nmfd.model.regional_model import load_network
+from nmfd.studies.fit_quality import fit_table, nearly_empty, region_fits
 
 ROOT = Path(__file__).parents[1]
 

@@ -8,8 +8,7 @@ import pytest
 import tiny
 from commands import error_line, good, nmfd
 
-from cosim.evaluation import fit_quality, model_validation, prediction_error
-from cosim.evaluation.fit_quality import MEANINGS, fit_table, prediction_table, region_fits, write_fits
+from cosim.evaluation import model_validation, prediction_error
 from cosim.report import html
 from nmfd.api import load_scenario, train
 from nmfd.errors import InputError
@@ -19,6 +18,8 @@ from nmfd.model.identification import Observed
 from nmfd.model.mfd import Mfd
 from nmfd.model.model_file import network_toml
 from nmfd.model.regional_model import load_network
+from nmfd.studies import fit_quality
+from nmfd.studies.fit_quality import MEANINGS, fit_table, prediction_table, region_fits, write_fits
 
 
 @pytest.fixture

@@ -180,7 +180,7 @@ def test_a_failure_leaves_the_old_page(evaluation, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name, arguments, expected", [
     ("none", (), "holds no finished runs; give a folder of `cosim run` or `cosim evaluate`"),
-    ("one", ("--reference", "mpc-pc"), "--reference: 'mpc-pc' is not in these runs; choose from dpc-pcrg"),
+    ("one", ("--reference", "mpc-pc"), "--reference: 'mpc-pc' is not in these runs; did you mean dpc-pcrg"),
     ("one", ("--scenario", made_up.SCENARIO.with_name("economic_mpc")), "the runs are of grid7_peak"),
     ("lost", (), "scenario_folder: there is no gone; give it with --scenario"),
     ("broken", (), "manifest.json: is no manifest of runs in SUMO"),

@@ -69,9 +69,9 @@ def evaluate(
       cosim evaluate grid7_peak --controllers no-control,pi-gating,dpc-pc --seeds 10
       cosim evaluate grid7_peak --controllers no-control,dpc-pc --demand 0.8,1.0,1.3 --out runs/levels
     """
-    from cosim.plant.strategy import parse  # heavy
+    from cosim.plant.strategy import parse, ready  # heavy
 
-    names = controller_names(controllers, parse)
+    names = controller_names(controllers, scenario, policies=policies, check=parse, ready=ready)
     files = policy_files(policies, names)
 
     from cosim.evaluation import evaluate, statistics  # heavy
@@ -124,9 +124,9 @@ def sweep(
       cosim sweep grid7_peak --controllers no-control,pi-gating --demand 0.8,1.0,1.2 \\
           --scheduler tcp://localhost:8786 --out runs/cluster
     """
-    from cosim.plant.strategy import parse  # heavy
+    from cosim.plant.strategy import parse, ready  # heavy
 
-    names = controller_names(controllers, parse)
+    names = controller_names(controllers, scenario, policies=policies, check=parse, ready=ready)
     files = policy_files(policies, names)
     cluster = chosen_scheduler(workers, scheduler, scheduler_ca, scheduler_cert, scheduler_key)
 

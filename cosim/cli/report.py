@@ -15,7 +15,7 @@ from cosim.cli.options import CONTROLLER, POLICY, REFERENCE
 from nmfd.cli.declared import declared
 from nmfd.cli.options import FILE, FOLDER, SCENARIO, SEED, STEPS
 from nmfd.cli.progress import progress_line
-from nmfd.errors import InputError
+from nmfd.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from cosim.evaluation.simulate import Task
@@ -49,7 +49,8 @@ def report(
     found = [results.read(folder, scenario) for folder in folders]
     known = {name for run in found for name in run.rows["controller"]}
     if reference is not None and reference not in known:
-        raise InputError(f"--reference: {reference!r} is not in these runs; choose from {', '.join(sorted(known))}")
+        raise InputError(f"--reference: {reference!r} is not in these runs{did_you_mean(reference, known)}; choose "
+                         f"from {', '.join(sorted(known))}")
     with progress_line("report") as progress:
         path = html.write_page(out or folders[0] / "report.html", found, reference, progress)
     click.echo(f"Written to {path}: open it in a browser")

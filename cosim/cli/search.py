@@ -96,9 +96,9 @@ def frontier(
     Example:
       cosim frontier grid7_peak --controllers max-pressure,pi-gating+guided+max-pressure --seeds 5
     """
-    from cosim.plant.strategy import parse  # heavy
+    from cosim.plant.strategy import parse, ready  # heavy
 
-    names = controller_names(controllers, parse)
+    names = controller_names(controllers, scenario, policies=policies, check=parse, ready=ready)
     files = policy_files(policies, names)
 
     from cosim.evaluation import evaluate  # heavy

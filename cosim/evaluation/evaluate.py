@@ -16,7 +16,7 @@ import pandas as pd
 from cosim.evaluation import experiment, explain, statistics
 from cosim.evaluation.simulate import Task
 from nmfd.api import load_scenario
-from nmfd.errors import InputError
+from nmfd.errors import InputError, did_you_mean
 from nmfd.runs import files
 from nmfd.runs.workers import ended
 
@@ -60,7 +60,8 @@ def evaluate(
     known = {*evaluation.controllers, *all_runs(evaluation)["controller"]}
     if evaluation.reference is not None and evaluation.reference not in known:
         raise InputError(
-            f"--reference: {evaluation.reference!r} is neither among --controllers nor in {out}; add it to them")
+            f"--reference: {evaluation.reference!r} is neither among --controllers nor in {out}"
+            f"{did_you_mean(evaluation.reference, known)}; add it to them")
     failures = experiment.perform(
         evaluation.plan(), workers=workers, fresh=True, progress=progress, tell=tell,
         kept=lambda: statistics.write_tables(out, all_runs(evaluation), None))

@@ -14,17 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.evaluation import experiment, mfd_bands, results, verdict
-from cosim.evaluation.fit_quality import (
-    fit_table,
-    nearly_empty,
-    own_points,
-    prediction_table,
-    predictions,
-    region_fits,
-    write_fits,
-)
-from cosim.evaluation.model_validation import draw_mfds, outflow_samples
+from cosim.evaluation import experiment, results, verdict
+from cosim.evaluation.model_validation import outflow_samples
 from cosim.evaluation.simulate import Result, Task
 from cosim.sumo.arrays import Points
 from cosim.sumo.build import network_folder
@@ -39,6 +30,16 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
 from nmfd.runs.tables import wrapped
 from nmfd.runs.workers import ended
+from nmfd.studies import mfd_bands
+from nmfd.studies.fit_quality import (
+    fit_table,
+    nearly_empty,
+    own_points,
+    prediction_table,
+    predictions,
+    region_fits,
+    write_fits,
+)
 
 PATHS = ("recipe", "net", "regions")  # keys of [sumo] in network.toml
 
@@ -142,7 +143,7 @@ def identify(
     text = "\n".join([text, *wrapped("\n".join(judged.sentences))])
     _write_samples(out / "samples.csv", samples)
     by_run = [[own_points(cloud) for cloud in samples_of(network, [result])] for result in found]
-    draw_mfds(out / "mfd.png", model, samples, [mfd_bands.band(runs) for runs in zip(*by_run, strict=True)])
+    mfd_bands.draw_mfds(out / "mfd.png", model, samples, [mfd_bands.band(runs) for runs in zip(*by_run, strict=True)])
     mfd_bands.draw_production(out / "production.png", model, [result.record for result in found])
     levels, seeds = ", ".join(f"{level:g}" for level in loading.levels), f"{min(loading.seeds)} to {max(loading.seeds)}"
     target.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
 """The microsimulation against what the regional model predicts, for the same demand and the recorded controls."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,18 +9,18 @@ import pandas as pd
 import torch
 from jaxtyping import Bool, Float
 
-from cosim.evaluation import mfd_bands, run_metrics
+from cosim.evaluation import run_metrics
 from cosim.evaluation.simulate import Result
 from cosim.sumo.arrays import Points, RegionCounts, Series
 from nmfd import closed_loop
 from nmfd.arrays import Adjacency
 from nmfd.model.dynamics import advance, parameters
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_columns
-from nmfd.studies import plots
+from nmfd.studies import mfd_bands, plots
+from nmfd.studies.fit_quality import SPILLBACK
 from nmfd.studies.traffic_states import model_outflow, remembered
 from nmfd.types import Controls, Observation, Trajectory
 
@@ -28,7 +28,6 @@ COLUMNS = (
     "region", "name", "critical_veh", "mean_veh", "rmse_veh", "rmse_share", "persistence_rmse_veh", "bias_veh",
     "next_interval_rmse_veh", "next_interval_rmse_share", "next_interval_persistence_rmse_veh")
 COLLAPSED = 0.7  # of the largest outflow so far
-SPILLBACK = "held up by a neighbour"
 CAPTION = (
     "RMSE, bias: of the accumulation that the regional model predicts for the whole run from its start [veh]; next "
     "interval: predicted one control interval ahead from every recorded state; if nothing changed: RMSE of the "
@@ -192,20 +191,5 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
         outflow_samples(
             [result.trajectory], [result.record], scenario.network.u_max, region, scenario.network.adjacency)
         for region in range(scenario.network.regions)]
-    draw_mfds(folder / f"compare-{name}-mfd.png", scenario.network, samples)
+    mfd_bands.draw_mfds(folder / f"compare-{name}-mfd.png", scenario.network, samples)
     return rows
-
-
-def draw_mfds(
-    path: Path, network: RegionalModel, samples: Sequence[Mapping[str, Points]],
-    found: Sequence[Float[np.ndarray, "_ 3"]] = (),
-) -> None:
-    """The MFD of every region over its outflow samples, as one picture. found: by region, a `bands.band` to draw."""
-    drawing, axes = plots.panels(network.regions)
-    for region, ax in enumerate(axes):
-        plots.mfd(ax, network.mfds[region], samples[region])
-        if len(found):
-            mfd_bands.draw_band(ax, found[region])
-        ax.set_title(f"{region} {network.region_names[region]}", fontsize="medium")
-    plots.legend_below(drawing, axes)
-    plots.save(drawing, path)

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from cosim.evaluation import experiment, fit_quality
+from cosim.evaluation import experiment
 from cosim.evaluation.identify import observed
 from cosim.evaluation.results import Finished
 from cosim.plant.strategy import planning_of
@@ -19,6 +19,7 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.tables import text_table
+from nmfd.studies import fit_quality
 
 COLUMNS = (
     "demand", "controller", "runs", "model", "region", "critical_veh", "most_share", "next_interval_rmse_share",

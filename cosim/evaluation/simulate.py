@@ -6,26 +6,36 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from cosim.evaluation import estimation_errors, run_metrics
 from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
 from cosim.plant.observer import Observer
 from cosim.plant.plant import SumoPlant
-from cosim.plant.record import settled
+from cosim.plant.record import Record, settled
 from cosim.plant.settings import settings
 from cosim.plant.strategy import Strategy, configured, parse, planning_of
 from cosim.sumo.outputs import check_whole
 from nmfd import closed_loop, metrics
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
+from nmfd.html import html_table
 from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import Scenario, with_faults
+from nmfd.quantities import variables
 from nmfd.runs import run_folder
 from nmfd.runs.files import atomic
 from nmfd.types import Controller, Trajectory
 
+if TYPE_CHECKING:
+    import xarray
+
+SHOWN = (  # of FACTS, in notebooks
+    "trips", "departed_veh", "final_backlog_veh", "removed_veh", "teleports", "mean_trip_time_s", "co2_kg",
+    "gateway_queue_mean_veh", "wall_time_s")
 # Columns of sumo.csv, beside those of summary.csv.
 FACTS = (
     "controller", "seed", "trips", "departed_veh", "final_backlog_veh", "total_backlog_veh_s", "teleports",
@@ -54,6 +64,10 @@ class Task:
     faults: tuple[str, ...] = ()
     time_limit: float | None = None
 
+    def __post_init__(self) -> None:
+        """A text will do for the scenario's folder."""
+        object.__setattr__(self, "scenario", Path(self.scenario))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
@@ -62,6 +76,24 @@ class Result:
     trajectory: Trajectory
     record: dict[str, np.ndarray]
     facts: dict[str, float | int | str]
+
+    def to_frame(self) -> pd.DataFrame:
+        """The states as a table (nmfd.Trajectory.to_frame)."""
+        return self.trajectory.to_frame()
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """Trajectory and record with named dimensions and units, facts as attributes."""
+        import xarray  # half a second of every worker's start
+
+        return xarray.Dataset(
+            {**self.trajectory.variables, **variables(Record, self.record)},
+            attrs={**self.facts, **self.trajectory.labels})
+
+    def _repr_html_(self) -> str:
+        """Regions and figures, for notebooks."""
+        return self.trajectory._repr_html_() + html_table(
+            ["sumo.csv", "value"], ([name, f"{value:.4g}" if isinstance(value, float) else value]
+                                    for name, value in self.facts.items() if name in SHOWN))
 
 
 def scenario_of(task: Task) -> Scenario:

@@ -15,9 +15,10 @@ from cosim.evaluation import dask_cluster, experiment
 from cosim.evaluation.evaluate import check_folder, level_folders
 from cosim.evaluation.simulate import Result, Task
 from cosim.plant.settings import settings
-from cosim.plant.strategy import parse
+from cosim.plant.strategy import parse, ready
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
+from nmfd.controllers.names import chosen
 from nmfd.errors import InputError
 from nmfd.runs.frames import write_parquet
 from nmfd.runs.tables import text_table
@@ -30,14 +31,15 @@ FIRST = ["strategy", "controller", "seed", "demand", "compliance", "status", "re
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """scenario: its folder; controllers: strategies; levels: multiples of the scenario's demand; compliance: shares of
-    the drivers' decisions that follow route guidance, the scenario's own where there is none or nobody guides;
+    """scenario: its folder; controllers: a strategy, several, or patterns (nmfd.controllers.names); levels: multiples
+    of the scenario's demand; compliance: shares of the drivers' decisions that follow route guidance, the scenario's
+    own where there is none or nobody guides;
     steps: control intervals, all if None; policies: controller -> file instead of the scenario's own; time_limit: of
     controllers of the user's own, instead of the scenario's; out: the folder.
     """
 
     scenario: Path
-    controllers: tuple[str, ...]
+    controllers: Sequence[str]
     seeds: Sequence[int]
     out: Path
     levels: tuple[float, ...] = (1.0,)
@@ -45,6 +47,13 @@ class Sweep:
     steps: int | None = None
     policies: Mapping[str, Path] = field(default_factory=dict)
     time_limit: float | None = None
+
+    def __post_init__(self) -> None:
+        """Texts will do for folders and for one strategy. InputError."""
+        for name in ("scenario", "out"):
+            object.__setattr__(self, name, Path(getattr(self, name)))
+        names = chosen(self.controllers, parse, lambda: ready(load_scenario(self.scenario)))
+        object.__setattr__(self, "controllers", tuple(names))
 
     def strategies(self) -> dict[str, str]:
         """Strategy with its compliance -> strategy as asked for; those that guide nobody once only. InputError."""

@@ -18,7 +18,6 @@ from cosim.importing.regions import positions
 from cosim.importing.streets import Streets, read_streets
 from cosim.importing.trials import Peaks, Trials, routed
 from cosim.sumo.net import City, load_city
-from cosim.sumo.signals import HELD
 from nmfd.errors import InputError
 from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel
@@ -165,12 +164,7 @@ def _traffic(case: SumoInput, streets: Streets, order: ImportOptions) -> Traffic
 
 def left_alone(streets: Streets, traffic: Traffic) -> dict[str, str]:
     """Signal -> why perimeter control leaves it alone: it holds back at programmes of HELD kinds that always run."""
-    found = {signal: "no programme" for signal in streets.link_signals if signal and signal not in streets.logics}
-    found |= {
-        signal: "switched off" if logics[-1].programme == "off" else f"{logics[-1].kind} signal"
-        for signal, logics in streets.logics.items() if logics[-1].kind not in HELD or logics[-1].programme == "off"}
-    found |= {signal: "programme follows a timetable" for signal in traffic.switched}
-    return found
+    return quality.left_alone(streets) | {signal: "programme follows a timetable" for signal in traffic.switched}
 
 
 def _check_free(order: ImportOptions) -> None:

@@ -13,7 +13,7 @@ from cosim.importing.regions import digraph
 from cosim.importing.streets import Streets, graph
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge
 from cosim.sumo.net import City
-from cosim.sumo.signals import FIXED
+from cosim.sumo.signals import FIXED, HELD
 from nmfd.arrays import PerRegion
 from nmfd.runs.tables import text_table
 
@@ -118,6 +118,14 @@ def _halves(streets: Streets, regions: EdgeNumbers, baseline: Baseline | None) -
     """The fewest edges that hold half of all vehicles, of every region and of all, when these have the most."""
     members = [streets.drivable & (regions == region) for region in range(int(regions.max()) + 1)]
     return [0 if baseline is None else baseline.concentration(edges)[0] for edges in (*members, streets.drivable)]
+
+
+def left_alone(streets: Streets) -> dict[str, str]:
+    """Signal -> why perimeter control, which holds back at programmes of HELD kinds, leaves it alone."""
+    found = {signal: "no programme" for signal in streets.link_signals if signal and signal not in streets.logics}
+    return found | {
+        signal: "switched off" if logics[-1].programme == "off" else f"{logics[-1].kind} signal"
+        for signal, logics in streets.logics.items() if logics[-1].kind not in HELD or logics[-1].programme == "off"}
 
 
 def kind(streets: Streets, signal: str | None) -> str:

@@ -93,6 +93,20 @@ def options() -> list[tuple[str, str]]:
     """Of every option, which is joined to a controller by +, what it does."""
     return [(f"+{name}", _TEXTS[name]) for name in OPTIONS]
 
+def ready(scenario: Scenario) -> tuple[str, ...]:
+    """The strategies of which a pattern such as dpc-* may speak: controllers that can be made for `scenario`, those
+    with options for which it has a policy or a table of their own, and signals alone."""
+    files = sorted(scenario.folder.glob("*+*.pt")) if scenario.folder else []
+    with_options = dict.fromkeys([*(file.stem for file in files), *scenario.controller_options])
+    return (*registry.ready(scenario), *filter(_is_variant, with_options), *SIGNALS[1:])
+
+
+def _is_variant(name: str) -> bool:
+    try:
+        return "+" in name and bool(parse(name))
+    except InputError:
+        return False
+
 
 def model_free(name: str) -> bool:
     """Whether runs of a strategy do not depend on the regional model; its controller need not be there any more."""

@@ -11,6 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 
 from cosim.sumo.arrays import EdgeNumbers, PerEdge, Points, Series
+from nmfd.arrays import PerPair, Positions
 from nmfd.studies import plots
 from nmfd.studies.benchmark import REFERENCE
 
@@ -19,6 +20,7 @@ DENSITIES = ScalarMappable(Normalize(0.0, JAM_DENSITY), LinearSegmentedColormap.
     "density", ["#d9d9d9", "#fecc5c", "#e31a1c", "#4d0010"]))
 ASIDE = 0.007  # of the map's width: how far the lines of the two directions of a street are drawn apart
 QUEUES = colormaps["YlOrRd"]
+LEAST_FLOW, WIDEST_FLOW = 0.05, 4.5  # of the largest one; points
 SATURATION = 0.5  # veh/s and lane
 COMMANDED, GREEN_SHOWN, FLOWED = "#333333", "#009e73", "#0059a8"
 
@@ -50,6 +52,22 @@ def _to_the_right(shape: Points, distance: float) -> Points:
     """The line moved sideways, as seen in its direction."""
     along = shape[-1] - shape[0]
     return shape + distance * np.array([along[1], -along[0]]) / max(np.hypot(*along), 1e-9)
+
+
+def flow_arrows(ax: Axes, places: Positions, trips: PerPair) -> Axes:
+    """The demand between regions on a map: arrows as wide as their trips.
+
+    places: (R, 2) [m]; trips: (R, R) [veh], those within a region and below LEAST_FLOW of the most are not drawn
+    """
+    between = trips * ~np.eye(len(trips), dtype=bool)
+    most = float(between.max(initial=0.0))
+    for i, j in np.argwhere((between > 0) & (between >= LEAST_FLOW * most)):
+        ax.annotate("", places[j], places[i], zorder=4, arrowprops={
+            "arrowstyle": "-|>", "connectionstyle": "arc3,rad=0.15", "color": "black", "alpha": 0.35, "shrinkA": 14,
+            "shrinkB": 14, "linewidth": WIDEST_FLOW * between[i, j] / most})
+    if most:
+        ax.set_title(f"demand between regions, widest arrow {most:,.0f} trips", fontsize="medium")
+    return ax
 
 
 def perimeter(ax: Axes, step: float, commanded: Series, green: Series, flow: Series) -> Axes:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from cosim.evaluation import explain, fit_quality, statistics
+from cosim.evaluation import explain, statistics
 from cosim.evaluation.results import Finished, Level
 from cosim.plant.strategy import planning_of
 from cosim.report import pictures, summary_text
@@ -21,6 +21,7 @@ from nmfd.errors import InputError
 from nmfd.model import authority
 from nmfd.runs import files
 from nmfd.runs.scratch import Scratch
+from nmfd.studies import fit_quality
 
 PIXELS = 150.0  # per inch, of the pictures (nmfd.studies.plots.save)
 WORDS = (
@@ -100,7 +101,7 @@ def _run(run: Finished) -> dict:
         run.scenario.name, configuration["steps"], configuration["step_s"], len(run.levels), rows)
     with Scratch("cosim-") as folder:
         if run.city is not None:
-            pictures.region_map(folder / "regions.png", run.scenario, run.city)
+            pictures.region_map(folder / "regions.png", run.scenario)
         if len(run.levels) > 1:
             pictures.demand_levels(folder / "demand.png", rows)
         shown = _pictures(folder, (("demand", caption), ("regions", REGIONS)))

@@ -8,17 +8,14 @@ import pandas as pd
 
 from cosim.evaluation import experiment, model_validation, run_metrics, statistics
 from cosim.evaluation.simulate import Result
-from cosim.importing import atlas
-from cosim.importing.quality import Tables
-from cosim.importing.streets import read_streets
-from cosim.plant.settings import settings
 from cosim.report import figures
+from cosim.report.city import City as CityView
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, edge_shapes, load_city
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
-from nmfd.studies import plots
+from nmfd.studies import mfd_bands, plots
 from nmfd.studies.benchmark import draw_accumulations
 
 MAPS = 4       # times of the maps
@@ -258,17 +255,11 @@ def draw_more(out: Path, scenario: Scenario, folder: Path, rows: pd.DataFrame) -
     decision_times(out / "decision_times.png", rows, scenario.step)
 
 
-def region_map(path: Path, scenario: Scenario, city: City) -> None:
+def region_map(path: Path, scenario: Scenario) -> None:
     """The regions and gateways of the city."""
-    streets = read_streets(city.net_file)
-    regions = np.array([city.region_of.get(edge, -1) for edge in streets.edges])
-    places = np.stack([streets.centre[streets.drivable & (regions == r)].mean(axis=0) for r in range(city.regions)])
-    left_alone = settings(scenario).leave_signals
-    static = {signal for signal, logics in streets.logics.items() if logics[-1].kind == "static"} - set(left_alone)
-    gateways = [{"from_edge": g.from_edge, "control": "controlled" if g.signal in static else "left alone"}
-                for g in city.gateways]
-    atlas.draw_map(path, streets, regions, scenario.network.region_names, places,
-                   Tables(quality=(), gateways=gateways), None)
+    drawing = plots.figure(6.2, 5.6)
+    CityView(scenario).plot(drawing.subplots(), flows=False)
+    plots.save(drawing, path)
 
 
 def outflows(path: Path, network: RegionalModel, results: dict[str, Result]) -> None:
@@ -279,7 +270,7 @@ def outflows(path: Path, network: RegionalModel, results: dict[str, Result]) -> 
             [result.trajectory], [result.record], network.u_max, region, network.adjacency)
             for name, result in results.items()}
         samples.append({name: np.concatenate(list(parts.values())) for name, parts in clouds.items()})
-    model_validation.draw_mfds(path, network, samples)
+    mfd_bands.draw_mfds(path, network, samples)
 
 
 def decision_times(path: Path, rows: pd.DataFrame, step: float) -> None:

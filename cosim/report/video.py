@@ -14,7 +14,7 @@ from cosim.evaluation.results import Finished, Level
 from cosim.evaluation.simulate import Result
 from cosim.report import figures, pictures
 from cosim.sumo.net import City, edge_shapes
-from nmfd.errors import InputError
+from nmfd.errors import InputError, did_you_mean
 from nmfd.runs.files import atomic, file_name
 from nmfd.studies import plots
 
@@ -36,7 +36,8 @@ def choose(finished: Finished, level: Level, controller: str | None, against: st
         names.append(against)
     for name in names:
         if name not in set(rows["controller"]):
-            raise InputError(f"{option}: {level.folder} has no runs of {name!r}; choose from "
+            raise InputError(f"{option}: {level.folder} has no runs of {name!r}"
+                             f"{did_you_mean(name, rows['controller'])}; choose from "
                              f"{', '.join(dict.fromkeys(rows['controller']))}")
         option = "--against"
     common = set.intersection(*(set(rows.loc[rows["controller"] == name, "seed"]) for name in names))

@@ -7,6 +7,8 @@ Checked while testing (tests/conftest.py).
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real
 
+from nmfd.arrays import Points as Points  # as there
+
 PerEdge = Float[np.ndarray, " E"]
 EdgeMask = Bool[np.ndarray, " E"]
 EdgeNumbers = Int[np.ndarray, " E"]
@@ -14,7 +16,6 @@ PerGateway = Float[np.ndarray, " G"]
 GatewayMask = Bool[np.ndarray, " G"]
 PerTrip = Float[np.ndarray, " N"]
 TripNumbers = Int[np.ndarray, " N"]
-Points = Float[np.ndarray, "_ 2"]  # of a line on the map [m], or samples of accumulation and outflow
 Series = Real[np.ndarray, " T"]
 RegionCounts = Real[np.ndarray, "T R"]
 PairCounts = Real[np.ndarray, "T R R"]

@@ -6,7 +6,7 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 from cosim.sumo.xml_files import BROKEN, opened
-from nmfd.errors import InputError, RunFailed
+from nmfd.errors import InputError, RunFailed, did_you_mean
 from nmfd.runs.run_folder import run_name
 
 # Kind -> ending of its file. The emissions of every vehicle in every step are gigabytes, unless compressed.
@@ -18,7 +18,7 @@ TAIL = 200  # bytes that are sure to hold the end tag of the root
 
 def parse(text: str) -> tuple[str, ...]:
     """Kinds separated by commas. InputError for one that there is not."""
-    kinds = tuple(dict.fromkeys(kind.strip() for kind in text.split(",")))
+    kinds = tuple(dict.fromkeys(kind.strip() for kind in text.removesuffix(",").split(",")))
     check(kinds)
     return kinds
 
@@ -27,7 +27,8 @@ def check(kinds: Iterable[str]) -> None:
     """InputError for a kind that there is not."""
     for kind in kinds:
         if kind not in KINDS:
-            raise InputError(f"--sumo-output: {kind!r} is unknown; choose from {', '.join(KINDS)}, separated by commas")
+            raise InputError(f"--sumo-output: {kind!r} is unknown{did_you_mean(kind, KINDS)}; choose from "
+                             f"{', '.join(KINDS)}, separated by commas")
 
 
 def paths(kinds: tuple[str, ...], folder: Path, controller: str, seed: int) -> tuple[tuple[str, Path], ...]:

@@ -60,7 +60,7 @@ class Declared(click.Option):
         from nmfd.runs import config  # pydantic
 
         try:
-            words = [part.strip() for part in value.split(",")] if self._is_list else value
+            words = [part.strip() for part in value.removesuffix(",").split(",")] if self._is_list else value
             return config.parsed(self._kind, str(self.name), words)
         except ValueError:
             raise click.BadParameter(config.got(self._allowed, value), ctx=ctx, param=self) from None

@@ -7,7 +7,7 @@ import click
 from nmfd.cli.about import about, listing
 from nmfd.cli.declared import declared
 from nmfd.cli.errors import Commands, Interrupted
-from nmfd.cli.exchange import export, new_controller
+from nmfd.cli.exchange import export, identify, new_controller
 from nmfd.cli.options import (
     ADAM_STEPS,
     FILE,
@@ -67,13 +67,14 @@ def benchmark(
       nmfd benchmark economic_mpc --controllers no-control,dpc-pc \\
           --seeds 5 --plant acyclic --workers 2 --policy dpc-pc=mine.pt --out runs/mine
     """
-    names = controller_names(controllers)
+    names = controller_names(controllers, scenario, policies=policies)
     files = policy_files(policies, names)
 
     from nmfd.api import load_scenario  # heavy
     from nmfd.model.scenario import with_faults, with_time_limit
     from nmfd.runs import run_folder
-    from nmfd.studies.benchmark import run_all, summary_table
+    from nmfd.studies.benchmark import run_all
+    from nmfd.studies.summary import summary_table
 
     loaded = with_time_limit(with_faults(load_scenario(scenario), faults), own_time_limit)
     out = run_folder.default_folder(loaded.name) if out is None else out
@@ -207,5 +208,6 @@ def _stamp(path: Path) -> int | None:
     return path.stat().st_mtime_ns if path.exists() else None
 
 
-for command in (listing(), bound, robustness, adaptation, ablation, scaling, new_controller, export):
+for command in (
+        listing(), bound, robustness, adaptation, ablation, scaling, new_controller, export, identify):
     main.add_command(command)

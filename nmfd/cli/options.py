@@ -1,13 +1,13 @@
 """Command-line values that several commands of `nmfd` share."""
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import click
 
 from nmfd.cli.declared import Declared, declared
-from nmfd.errors import InputError
+from nmfd.errors import InputError, did_you_mean
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -29,7 +29,7 @@ PARQUET = click.option("--parquet", is_flag=True, help="Write the tables as Parq
 def controllers_option(text: str, default: str | None = None) -> Callable[[Callable], Callable]:
     """--controllers, which is required without a default."""
     more = {"required": True} if default is None else {"default": default, "show_default": True}
-    return click.option("--controllers", metavar="A,B,...", help=text, **more)
+    return click.option("--controllers", metavar="A,B,...", help=f"{text} In quotes also patterns: 'dpc-*'.", **more)
 
 
 def out_option(kind: str = "<time>", text: str = "The run folder.") -> Callable[[Callable], Callable]:
@@ -47,19 +47,26 @@ def fault_option(more: str = "") -> Callable[[Callable], Callable]:
              "May be repeated; what is done instead is in the status of every decision.")
 
 
-def controller_names(controllers: str, check: Callable[[str], object] | None = None) -> list[str]:
-    """The controllers in a list separated by commas. InputError for an unknown, repeated or empty name.
+def controller_names(
+    controllers: str, scenario: Path | None = None, *, policies: Sequence[str] = (),
+    check: Callable[[str], object] | None = None, ready: Callable[..., Iterable[str]] | None = None,
+    where: str = "--controllers",
+) -> list[str]:
+    """The controllers in a list separated by commas, patterns replaced (nmfd.controllers.names). InputError.
 
-    check: raises InputError for an unknown name; that of the regional controllers if None
+    scenario: of whose controllers a pattern speaks, besides those with a file in `policies`, NAME=FILE
+    check: raises InputError for an unknown name; ready: the names for a scenario, or without one where that is None;
+    those of the regional controllers if None
     """
-    from nmfd.controllers import registry  # heavy
+    from nmfd.controllers import names, registry  # heavy
 
-    names = [name.strip() for name in controllers.split(",")]
-    for name in names:
-        (check or registry.check)(name)
-    if repeated := [name for n, name in enumerate(names) if name in names[:n]]:
-        raise InputError(f"--controllers: {repeated[0]} is there twice; name every controller once")
-    return names
+    def there() -> list[str]:
+        from nmfd.api import load_scenario
+
+        known = (ready or registry.ready)(*([] if scenario is None else [load_scenario(scenario)]))
+        return list(dict.fromkeys([*known, *(option.partition("=")[0] for option in policies)]))
+
+    return names.chosen(controllers, check or registry.check, there, where)
 
 
 def policy_files(options: tuple[str, ...], names: list[str]) -> dict[str, Path]:
@@ -70,7 +77,8 @@ def policy_files(options: tuple[str, ...], names: list[str]) -> dict[str, Path]:
         if not equals or not file:
             raise InputError(f"--policy: expected NAME=FILE, such as dpc-pc=mine.pt, got {option!r} instead")
         if name not in names:
-            raise InputError(f"--policy: {name!r} is not among --controllers {','.join(names)}; add it there")
+            raise InputError(f"--policy: {name!r} is not among --controllers {','.join(names)}"
+                             f"{did_you_mean(name, names)}; add it there")
         if name in files:
             raise InputError(f"--policy: {name} is there twice; give one file for each controller")
         files[name] = Path(file)

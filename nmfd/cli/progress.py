@@ -1,43 +1,14 @@
-"""One line of progress on stderr, where that is a terminal; silence elsewhere."""
+"""Progress of commands, and how those end that are interrupted."""
 
 import shlex
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol, TextIO
-
-from tqdm.std import tqdm
 
 from nmfd.cli.errors import Interrupted
+from nmfd.runs.progress import Show, progress_line
 
-LINE = "{desc}  [{bar:24}]  {n_fmt}/{total_fmt}  {remaining} left{postfix}"
-
-
-class Show(Protocol):
-    """A callback as `closed_loop.run` and the studies want it."""
-
-    def __call__(self, done: int, total: int, note: str = "") -> None: ...
-
-
-@contextmanager
-def progress_line(label: str, stream: TextIO | None = None) -> Iterator[Show | None]:
-    """What shows progress on a line that is wiped at the end; None if `stream` (default stderr) is no terminal."""
-    stream = sys.stderr if stream is None else stream
-    if not stream.isatty():
-        yield None
-        return
-    # a new note is shown even if nothing more is done: miniters 0
-    with tqdm(
-        desc=label, file=stream, leave=False, dynamic_ncols=True, ascii=".#", miniters=0, bar_format=LINE,
-    ) as line:
-        def show(done: int, total: int, note: str = "") -> None:
-            line.set_postfix_str(note, refresh=False)
-            if total != line.total:
-                line.reset(total)
-            line.update(done - line.n)
-
-        yield show
+__all__ = ["progress_line", "resumable"]
 
 
 @contextmanager

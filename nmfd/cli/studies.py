@@ -44,7 +44,7 @@ def robustness(
     Example:
       nmfd robustness economic_mpc --controllers pi-gating,dpc-pcrg,dpc-pcrg-robust --out runs/robust
     """
-    names = controller_names(controllers)
+    names = controller_names(controllers, scenario, policies=policies)
     files = policy_files(policies, names)
 
     from nmfd.api import load_scenario  # heavy
@@ -81,7 +81,7 @@ def adaptation(
       nmfd adaptation economic_mpc
       nmfd adaptation economic_mpc --controllers dpc-pc,dpc-pc-online,pi-gating --cases rain,more
     """
-    names = controller_names(controllers)
+    names = controller_names(controllers, scenario, policies=policies)
     files = policy_files(policies, names)
 
     from nmfd.api import load_scenario  # heavy
@@ -123,7 +123,7 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int, 
     from nmfd.studies import bound as method
 
     method.check(controller)
-    names = None if starts is None else controller_names(starts)
+    names = None if starts is None else controller_names(starts, scenario, where="--from")
     loaded = load_scenario(scenario)
     file = out or shipped.beside(
         shipped.found(scenario, shipped.SCENARIO), f"{controller}.npz", "--out FILE", scenario=True)
@@ -164,7 +164,7 @@ def ablation(
       nmfd ablation training economic_mpc --seeds 3 --out runs/alternating
       nmfd ablation horizon economic_mpc --controllers mpc-pc --out runs/horizon
     """
-    names = controller_names(controllers)
+    names = controller_names(controllers, scenario)
 
     from nmfd.api import load_scenario  # heavy
     from nmfd.runs import run_folder
@@ -205,9 +205,9 @@ def scaling(
       nmfd scaling
       nmfd scaling --family hexagonal --load congested --controllers dpc-pcrg,mpc-pcrg --regions 7,19,37
     """
-    names = controller_names(controllers)
-
     from nmfd.studies import scaling as method  # heavy
+
+    names = controller_names(controllers, ready=lambda: method.CONTROLLERS)
 
     with resumable("scaling", out, "scaling.csv") as progress:
         rows = method.scaling(

@@ -130,6 +130,17 @@ def texts() -> dict[str, str]:
     return {name: _ENTRIES[name].text if name in _ENTRIES else f"installed: {custom.entry_points()[name].value}"
             for name in choice()}
 
+def ready(scenario: Scenario) -> tuple[str, ...]:
+    """Those of `choice` that `make` can make for `scenario`, as far as files go: what needs a policy or plan has it."""
+    def has_files(name: str) -> bool:
+        try:
+            policy_path(name, scenario)
+        except InputError:
+            return False
+        return True
+
+    return tuple(filter(has_files, choice()))
+
 
 def is_own(name: str) -> bool:
     """Whether `name`, which must be known, is a controller of the user's own."""

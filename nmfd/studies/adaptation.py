@@ -15,7 +15,7 @@ import numpy as np
 
 from nmfd import closed_loop
 from nmfd.controllers import registry
-from nmfd.errors import InputError
+from nmfd.errors import InputError, did_you_mean
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
@@ -91,7 +91,7 @@ def adaptation(
     policies = policies or {}
     for case in cases:
         if case not in CASES:
-            raise InputError(f"--cases: {case!r} is unknown; choose from {', '.join(CASES)}")
+            raise InputError(f"--cases: {case!r} is unknown{did_you_mean(case, CASES)}; choose from {', '.join(CASES)}")
     for name in controllers:
         registry.verify(name, scenario, policy=policies.get(name))
     common, settings = configuration(scenario, controllers, plant, policies)

@@ -10,11 +10,9 @@ from scipy.special import stdtrit
 
 from nmfd import closed_loop, faults
 from nmfd.controllers import registry
-from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
-from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, Worker, attempt, ended, outcomes
 from nmfd.studies import plots
 from nmfd.studies.traffic_states import OutflowOf, model_outflow, remembered
@@ -22,12 +20,6 @@ from nmfd.types import Plant, Trajectory
 
 PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
-CAPTION = (
-    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against {against}; control: time of all "
-    "decisions of a run; step: median / longest decision; decisions of all seeds: " + "; ".join(
-        f"{heading}: {what}" for heading, what in COUNTED.values()))
-BOUND_CAPTION = (
-    "; above bound: TTS against the bound with the same controls, perimeter alone (PC) or with routes (PCRG)")
 
 
 def compared_with(controllers: Iterable[str]) -> str:
@@ -208,48 +200,3 @@ def interval(values: Sequence[float]) -> float:
     if len(values) < 2 or any(map(math.isnan, values)):
         return math.nan
     return float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
-
-
-def summary_table(rows: Sequence[Mapping]) -> str:
-    """The rows of summary.csv as text: one line per controller, means over seeds, TTS with its 95 % interval."""
-    groups: dict[str, list[Mapping]] = {}
-    for row in rows:
-        groups.setdefault(row["controller"], []).append(row)
-    tts = {name: [row["total_time_spent_veh_s"] for row in group] for name, group in groups.items()}
-    against = compared_with(tts) if tts else REFERENCE
-    with_bound = any(name in tts for name in ("bound-pc", "bound-pcrg"))
-    lines = []
-    for name, group in groups.items():
-        def mean(column: str, group: Sequence[Mapping] = group) -> float:
-            return statistics.fmean(row[column] for row in group)
-
-        spread = interval(tts[name])
-        change = _percent(tts[name], tts[against]) if name != against else ""
-        bound = "bound-pcrg" if "-pcrg" in name else "bound-pc"
-        above = _percent(tts[name], tts[bound]) if bound in tts and name != bound else ""
-        lines.append({
-            "controller": name, "seeds": len(group),
-            "TTS [veh s]": _scientific(statistics.fmean(tts[name])) + (
-                "" if math.isnan(spread) else f" ± {_scientific(spread, 1)}"),
-            "change": change, **({"above bound": above} if with_bound else {}),
-            "final [veh]": f"{mean('final_accumulation_veh'):,.0f}",
-            "max [veh]": f"{mean('max_accumulation_veh'):,.0f}",
-            "completed [veh]": f"{mean('completed_veh'):,.0f}", "control [s]": f"{mean('evaluation_time_s'):.3g}",
-            "step [ms]": f"{mean('control_step_ms_median'):.3g} / "
-                         f"{max(row['control_step_ms_max'] for row in group):.3g}",
-            **{heading: sum(row[column] for row in group) for column, (heading, _) in COUNTED.items()}})
-    return text_table(lines, CAPTION.format(against=against) + BOUND_CAPTION * with_bound)
-
-
-def _percent(values: Sequence[float], reference: Sequence[float]) -> str:
-    """How far the mean of `values` is above that of `reference`, like +1.7 %; - where that is 0."""
-    change = percent_change(statistics.fmean(values), statistics.fmean(reference))
-    return "-" if math.isnan(change) else f"{change:+.1f} %"
-
-
-def _scientific(value: float, digits: int = 4) -> str:
-    """Like 1.7730e8."""
-    if value == 0:
-        return "0"
-    mantissa, exponent = f"{value:.{digits}e}".split("e")
-    return f"{mantissa}e{int(exponent)}"

@@ -139,7 +139,7 @@ def region_accumulation(
     top = 1.06 * max(highest, 1.25 * mfd.critical)
     ax.set_ylim(0.0, top / left)
     ax.set_yticks([tick for tick in ax.get_yticks() if 0.0 <= tick <= top])  # none beside the strips
-    ax.set_title(_region_title(network, region), fontsize="medium")
+    ax.set_title(region_title(network, region), fontsize="medium")
     return ax
 
 
@@ -266,7 +266,7 @@ def demand(ax: Axes, scenario: Scenario) -> Axes:
     if len(used):
         rates = np.concatenate([arriving[used, :end], arriving[used, end - 1:end]], axis=1)
         ax.stackplot(
-            time, rates, step="post", labels=[f"to {_region_title(scenario.network, j)}" for j in used],
+            time, rates, step="post", labels=[f"to {region_title(scenario.network, j)}" for j in used],
             colors=_tones(len(used)), linewidth=0)
     ax.set_ylabel("demand [veh/s]")
     ax.set_ylim(bottom=0.0)
@@ -330,6 +330,7 @@ def _pairs(adjacency: Adjacency) -> Int[np.ndarray, "N 2"]:
     return np.argwhere(np.triu(adjacency | adjacency.T))
 
 
-def _region_title(network: RegionalModel, region: int) -> str:
+def region_title(network: RegionalModel, region: int) -> str:
+    """Number and name, or the number alone where that is the name."""
     name = network.region_names[region]
     return f"region {region}" if name == str(region) else f"{region} {name}"

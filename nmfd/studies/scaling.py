@@ -21,7 +21,7 @@ import torch
 from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy
 from nmfd.controllers.mpc import edge_model
 from nmfd.controllers.mpc.controller import EconomicMpc
-from nmfd.errors import InputError
+from nmfd.errors import InputError, did_you_mean
 from nmfd.model.mfd import Mfd
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
@@ -202,7 +202,8 @@ def _case(row: Mapping) -> Case:
 def _check(controllers: Sequence[str], family: str, load: str, regions: Sequence[int]) -> None:
     for name in controllers:
         if name not in CONTROLLERS:
-            raise InputError(f"--controllers: {name!r} is not measured; choose from {', '.join(CONTROLLERS)}")
+            raise InputError(f"--controllers: {name!r} is not measured{did_you_mean(name, CONTROLLERS)}; choose from "
+                             f"{', '.join(CONTROLLERS)}")
     if family not in REGIONS:
         raise InputError(f"--family: expected one of {', '.join(REGIONS)}, got {family!r} instead")
     if load not in LOADS:

@@ -60,6 +60,18 @@ class Scaling(Study):
     time_limit: float = setting("that a case may take", 600.0, unit="s", gt=0.0, le=1e6)
 
 
+class Measured(Settings):
+    """Of MFDs from real detectors."""
+
+    vehicle_length: float = setting(
+        "of a vehicle and a loop together: the density is the occupancy over it", 6.5, unit="m", gt=1.0, le=50.0)
+    trip_length: float | None = setting(
+        "mean length of trips within a region: the outflow is the production over it", None, unit="m", ge=10.0, le=1e5)
+    least_share: float = setting(
+        "of a region's detectors, by lane-kilometres, that must report for an interval to count", 0.5, unit="-", ge=0.0,
+        le=1.0)
+
+
 class Bound(Settings):
     """Of the best plan for demand that is known."""
 

@@ -8,15 +8,14 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from cosim.evaluation.model_validation import SPILLBACK
-from cosim.sumo.arrays import Points
-from nmfd.arrays import StatesOverTime
+from nmfd.arrays import Points, StatesOverTime
 from nmfd.model import identification
 from nmfd.model.identification import Observed
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files
 from nmfd.runs.tables import text_table, wrapped
 
+SPILLBACK = "held up by a neighbour"  # label of samples that the region's own MFD does not explain
 SAMPLES = 10     # of a region: with fewer it is as good as empty, and keeps the MFD that it has
 BINS = 12        # of accumulation, for the hysteresis
 EXPLAINED = 0.3  # R2: below, the curve says hardly more than the mean outflow
@@ -40,7 +39,8 @@ class RegionFit:
     """How well the model of one region explains what was seen there.
 
     critical_veh, jam_veh, storage_veh, max_outflow_veh_s: of the model; samples: of the outflow; r2, hysteresis [-]:
-    NaN where unknown; most_share: the largest accumulation in any run, as a share of the critical one; doubts: each
+    NaN where unknown; spread [-]: standard deviation of the samples round the curve, as a share of its maximum;
+    most_share: the largest accumulation in any run, as a share of the critical one; doubts: each
     begins as one of MEANINGS
     """
 
@@ -52,6 +52,7 @@ class RegionFit:
     max_outflow_veh_s: float
     samples: int
     r2: float
+    spread: float
     hysteresis: float
     most_share: float
     doubts: tuple[str, ...]
@@ -68,10 +69,10 @@ def region_fits(
     found = []
     for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
         points = own_points(cloud)
+        residuals = points[:, 1] - curve.outflow(points[:, 0])
         explained, share = float("nan"), float(most[region] / curve.critical)
         if len(points) >= SAMPLES and points[:, 1].var() > 0:
-            explained = float(
-                1.0 - ((points[:, 1] - curve.outflow(points[:, 0])) ** 2).mean() / points[:, 1].var())
+            explained = float(1.0 - (residuals**2).mean() / points[:, 1].var())
         doubts = []
         if len(points) < SAMPLES:
             doubts.append(f"{FEW} ({len(points)})")
@@ -86,8 +87,9 @@ def region_fits(
         found.append(RegionFit(
             region=region, name=network.region_names[region], critical_veh=curve.critical, jam_veh=curve.jam,
             storage_veh=float("inf") if network.storage is None else float(network.storage[region]),
-            max_outflow_veh_s=curve.capacity, samples=len(points), r2=explained, hysteresis=hysteresis(cloud),
-            most_share=share, doubts=tuple(doubts)))
+            max_outflow_veh_s=curve.capacity, samples=len(points), r2=explained,
+            spread=float(np.sqrt((residuals**2).mean()) / curve.capacity) if len(points) else float("nan"),
+            hysteresis=hysteresis(cloud), most_share=share, doubts=tuple(doubts)))
     return found
 
 
@@ -123,26 +125,31 @@ def hysteresis(cloud: Mapping[str, Points]) -> float:
     return float((both[0] - both[1]).sum() / both.mean(axis=0).sum()) if both.size else float("nan")
 
 
-def fit_table(network: RegionalModel, samples: Sequence[dict], fits: Sequence[RegionFit] | None = None) -> str:
+def fit_table(
+    network: RegionalModel, samples: Sequence[dict], fits: Sequence[RegionFit] | None = None,
+    known: Mapping[str, str] = MEANINGS,
+) -> str:
     """Per region: the curve of the MFD, how well it explains the samples, their hysteresis, and what is doubtful; then
-    what the doubts mean."""
+    what the doubts mean, as far as `known`."""
     fits = region_fits(network, samples) if fits is None else fits
     table = text_table([{
         "region": f"{fit.region} {fit.name}", "critical [veh]": f"{fit.critical_veh:.0f}",
-        "jam [veh]": f"{fit.jam_veh:.0f}", "storage [veh]": f"{fit.storage_veh:.0f}",
+        "jam [veh]": f"{fit.jam_veh:.0f}",
+        **({} if network.storage is None else {"storage [veh]": f"{fit.storage_veh:.0f}"}),
         "max outflow [veh/s]": f"{fit.max_outflow_veh_s:.3f}", "samples": fit.samples, "R2": f"{fit.r2:.2f}",
+        "spread": f"{100 * fit.spread:.0f} %",
         "hysteresis": "-" if np.isnan(fit.hysteresis) else f"{100 * fit.hysteresis:.0f} %",
         "most / critical": f"{fit.most_share:.2f}", "WARNINGS": "; ".join(fit.doubts) or "none"} for fit in fits])
-    lines = [table, *wrapped("\n".join(meanings([doubt for fit in fits for doubt in fit.doubts])))]
+    lines = [table, *wrapped("\n".join(meanings([doubt for fit in fits for doubt in fit.doubts], known)))]
     if empty := nearly_empty(samples):
         left = ", ".join(f"{region} {network.region_names[region]}" for region in empty)
         lines.append(f"nearly empty in all loading runs: {left}; the MFD stays as it was there")
     return "\n".join(lines)
 
 
-def meanings(doubts: Sequence[str]) -> list[str]:
+def meanings(doubts: Sequence[str], known: Mapping[str, str] = MEANINGS) -> list[str]:
     """What these doubts mean, each kind once."""
-    return [f"WARNING, {kind}: {what}" for kind, what in MEANINGS.items()
+    return [f"WARNING, {kind}: {what}" for kind, what in known.items()
             if any(doubt.startswith(kind) for doubt in doubts)]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
-from cosim.sumo.arrays import Points
+from nmfd.arrays import Points
 from nmfd.model.regional_model import RegionalModel
 from nmfd.studies import plots
 from nmfd.studies.benchmark import interval
@@ -35,11 +35,11 @@ def band(runs: Sequence[Points]) -> Band:
     return np.array(rows).reshape(-1, 3)
 
 
-def draw_band(ax: Axes, found: Band) -> Axes:
-    """A shaded band and its middle; found: (n, 3) as `band` gives it."""
+def draw_band(ax: Axes, found: Band, over: str = "runs") -> Axes:
+    """A shaded band and its middle; found: (n, 3) as `band` gives it, over runs or days."""
     x, mean, half = found.T
     ax.fill_between(x, mean - half, mean + half, color="tab:blue", alpha=0.25, linewidth=0, zorder=3,
-                    label="mean over runs, 95 % interval")
+                    label=f"mean over {over}, 95 % interval")
     ax.plot(x, mean, color="tab:blue", linewidth=1.2, zorder=3)
     return ax
 
@@ -61,11 +61,27 @@ def draw_production(path: Path, network: RegionalModel, records: Sequence[Mappin
             cloud = np.concatenate([run[label] for run in runs])
             ax.scatter(cloud[:, 0], cloud[:, 1] / 1000.0, s=7, alpha=0.5, linewidths=0, color=tone, label=label)
         draw_band(ax, band([np.concatenate(list(run.values())) for run in runs]) / [1.0, 1000.0, 1000.0])
-        ax.set_title(f"{region} {network.region_names[region]}", fontsize="medium")
+        ax.set_title(plots.region_title(network, region), fontsize="medium")
         ax.set_xlabel("accumulation [veh]")
         ax.set_ylabel("production [veh km/s]")
         ax.set_xlim(left=0.0)
         ax.set_ylim(0.0, 1.1e-3 * max(cloud[:, 1].max() for run in runs for cloud in run.values() if len(cloud)))
         ax.spines[["top", "right"]].set_visible(False)
+    plots.legend_below(drawing, axes)
+    plots.save(drawing, path)
+
+
+def draw_mfds(
+    path: Path, network: RegionalModel, samples: Sequence[Mapping[str, Points]],
+    found: Sequence[Band] = (), over: str = "runs",
+) -> None:
+    """The MFD of every region over its outflow samples, as one picture. found: by region, a `band` to draw, over runs
+    or days."""
+    drawing, axes = plots.panels(network.regions)
+    for region, ax in enumerate(axes):
+        plots.mfd(ax, network.mfds[region], samples[region])
+        if len(found):
+            draw_band(ax, found[region], over)
+        ax.set_title(plots.region_title(network, region), fontsize="medium")
     plots.legend_below(drawing, axes)
     plots.save(drawing, path)

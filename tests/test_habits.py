@@ -1,0 +1,194 @@
+"""What users of notebooks and shells expect: one name or many, patterns, tables, progress, a look at a city."""
+
+import io
+import re
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+import tiny
+from commands import error_line, good
+from commands import nmfd as command
+
+import cosim
+import nmfd
+from cosim.evaluation.simulate import Result
+from cosim.plant import strategy
+from cosim.plant.record import Record
+from nmfd.controllers import registry
+from nmfd.controllers.names import chosen
+from nmfd.quantities import quantities
+from nmfd.runs import progress
+
+NAMES = ("no-control", "dpc-pc", "dpc-pcrg", "pi-gating")
+
+
+def listed(given):
+    return chosen(given, registry.check, lambda: NAMES)
+
+
+@pytest.mark.parametrize("given, expected", [
+    ("no-control", ["no-control"]), (["no-control"], ["no-control"]), ("no-control, pi-gating,", [NAMES[0], NAMES[3]]),
+    ("dpc-*", ["dpc-pc", "dpc-pcrg"]), ("dpc-*,dpc-pc", ["dpc-pcrg", "dpc-pc"]),
+    (["mpc-pc", "*-p[ci]", "dpc-??"], ["mpc-pc", "dpc-pc"]), ("*", list(NAMES)),
+], ids=str)
+def test_one_name_many_and_patterns(given, expected):
+    assert listed(given) == expected
+
+
+@pytest.mark.parametrize("given, expected", [
+    ("dcp-*", "controllers: no controller here matches 'dcp-*'; there are no-control, dpc-pc,"),
+    ("pi-gating,,no-control", "expected a name between commas"), ("", "at least one controller"),
+    ([], "at least one controller"), ("dpc-pc,dpc-pc", "dpc-pc is there twice"), ("dpc-prcg", "did you mean dpc-pcrg?"),
+], ids=str)
+def test_lists_that_are_none(given, expected):
+    with pytest.raises(nmfd.InputError, match=re.escape(expected)):
+        listed(given)
+
+
+def test_a_pattern_stands_for_what_has_a_policy(tmp_path, monkeypatch):
+    monkeypatch.setattr("nmfd.studies.benchmark.draw", lambda *given: None)
+    folder = tiny.write(tmp_path)
+    scenario = nmfd.load_scenario(folder)
+    assert "mpc-pc" in registry.ready(scenario) and not any(name.startswith("dpc") for name in registry.ready(scenario))
+    table = good(command("benchmark", folder, "--controllers", "no-*,pi-gating,", "--out", tmp_path / "out"))
+    assert re.findall("^(no-control|pi-gating) ", table, re.MULTILINE) == ["no-control", "pi-gating"]
+    assert "matches 'dpc-*'" in error_line(command("benchmark", folder, "--controllers", "dpc-*"), "nmfd")
+    for name in ("dpc-pc.pt", "dpc-pc+max-pressure.pt", "dpc-pc+nonsense.pt"):
+        (folder / name).touch()
+    names = strategy.ready(nmfd.load_scenario(folder))
+    assert {"dpc-pc", "dpc-pc-guarded", "dpc-pc+max-pressure", "actuated"} <= set(names)
+    assert not {"dpc-pcrg", "dpc-pc+nonsense"} & set(names)
+    order = cosim.Sweep(scenario=str(folder), controllers="dpc-pc*max*", seeds=[0], out="runs/x")
+    assert order.controllers == ("dpc-pc+max-pressure",) and order.out.name == "x"
+
+
+def test_a_benchmark_of_one_name_is_a_table_in_every_form(tmp_path, monkeypatch):
+    monkeypatch.setattr("nmfd.studies.benchmark.draw", lambda *given: None)
+    rows = nmfd.benchmark(tiny.write(tmp_path), "no-control", seeds=2, out=tmp_path / "out")
+    assert isinstance(rows, list) and str(rows) == nmfd.summary_table(rows)
+    pd.testing.assert_frame_equal(rows.to_frame(), pd.DataFrame(list(rows)))
+    data = rows.to_xarray()
+    assert data.sizes == {"controller": 1, "seed": 2}
+    assert data.total_time_spent_veh_s.attrs["units"] == "veh s" and data.control_step_ms_max.attrs["units"] == "ms"
+    assert data.completed_veh.sel(seed=1).item() == rows[1]["completed_veh"]
+    assert re.search("<td>no-control *</td>", rows._repr_html_()) and "TTS [veh s]" in rows._repr_html_()
+    with pytest.raises(nmfd.InputError, match="did you mean acyclic?"):
+        nmfd.benchmark(tmp_path / "scenario", "no-control", plant="acylic", out=tmp_path / "other")
+
+
+def test_results_of_runs_are_tables_and_datasets(tmp_path):
+    trajectory = nmfd.run(tiny.write(tmp_path), "pi-gating", steps=3)
+    record = {name: np.ones([{"interval": 3, "region": 2, "destination": 2, "next_region": 2}.get(axis, 4)
+                             for axis in about["dimensions"]]) for name, about in quantities(Record).items()}
+    result = Result(trajectory=trajectory, record=record, facts={"trips": 12, "co2_kg": 3.25, "notes": "a & b"})
+    assert result.to_frame().equals(trajectory.to_frame())
+    data = result.to_xarray()
+    assert data.gateway_queue.sizes == {"interval": 3, "gateway": 4} and data.gateway_queue.attrs["units"] == "veh"
+    assert data.attrs["co2_kg"] == 3.25 and data.accumulation.equals(trajectory.to_xarray().accumulation)
+    assert "co2_kg" in result._repr_html_() and "a & b" not in result._repr_html_()
+
+
+def test_html_is_escaped_and_says_units(tmp_path):
+    trajectory = replace(nmfd.run(tiny.write(tmp_path), "no-control"), controller="<script>&")
+    html = trajectory._repr_html_()
+    assert "&lt;script&gt;&amp;" in html and "<script>" not in html and "time spent [veh s]" in html
+    total = nmfd.total_time_spent(trajectory)
+    assert re.search(r"<td>all *</td>.*" + re.escape(f"{total:.3e}"), html)
+    rows = nmfd.Summary([{**nmfd.summary(trajectory)}])
+    assert "<script>" not in rows._repr_html_()
+
+
+def test_progress_is_shown_on_a_terminal_and_in_notebooks_only(monkeypatch, capsys, tmp_path):
+    folder, calls = tiny.write(tmp_path), []
+    nmfd.run(folder, "no-control", progress=lambda done, steps: calls.append((done, steps)))
+    assert calls[-1] == (20, 20)
+    nmfd.run(folder, "no-control")
+    assert capsys.readouterr().err == ""  # no terminal
+
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr(sys, "stderr", shown := Terminal())
+    nmfd.run(folder, "no-control")
+    assert "no-control" in shown.getvalue() and "0/20" in shown.getvalue()
+    monkeypatch.setattr(sys, "stderr", silent := Terminal())
+    nmfd.run(folder, "no-control", progress=False)
+    assert silent.getvalue() == "" and not progress.in_notebook()
+
+
+def test_in_a_notebook_the_bar_is_that_of_notebooks(monkeypatch):
+    shell = SimpleNamespace(config={"IPKernelApp": {}})
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    bars = []
+
+    class Bar(io.StringIO):
+        n = 0
+
+        def set_postfix_str(self, note, refresh):
+            pass
+
+        def update(self, more):
+            self.n += more
+
+    def bar(label, total):
+        bars.append(Bar(label))
+        bars[-1].total = total
+        return bars[-1]
+
+    monkeypatch.setattr(progress, "_notebook_bar", bar)
+    with progress.watched("run", None) as show:
+        show(3, 10)
+    assert not bars  # done soon
+    monkeypatch.setattr(progress, "SOON", 0.0)
+    with progress.watched("run", None) as show:
+        show(3, 10)
+        show(10, 10, "done")
+    assert bars[0].n == bars[0].total == 10 and bars[0].closed
+
+
+@pytest.fixture(scope="module")
+def city():
+    return cosim.City("scenarios/grid7_peak")
+
+
+def test_a_city_without_a_run(city):
+    regions, gateways, flows = city.regions, city.gateways, city.flows
+    assert len(regions) == 7 and regions["lane_km"].between(10, 30).all()
+    assert regions["critical_veh"].tolist() == [mfd.critical for mfd in city.network.mfds]
+    joined = {(g.source, g.target) for g in gateways.itertuples()}
+    assert joined == {(i, h) for i, h in np.argwhere(city.network.adjacency)}
+    assert set(gateways["control"]) == {"controlled"}
+    scenario = city.scenario
+    assert flows["trips_veh"].sum() == pytest.approx(scenario.step * scenario.demand.sum())
+    assert "3 centre" in city._repr_html_() and "max outflow [veh/s]" in city._repr_html_()
+
+
+def test_the_map_is_drawn_into_the_axes_it_is_given(city):
+    from matplotlib.figure import Figure
+
+    ax = Figure().subplots()
+    assert city.plot(ax) is ax
+    arrows = [text for text in ax.texts if getattr(text, "arrow_patch", None)]
+    assert len(ax.collections[0].get_paths()) == city.regions["edges"].sum() and len(arrows) > 10
+    ax = Figure().subplots()
+    assert not [text for text in cosim.City("networks/grid7").plot(ax).texts if getattr(text, "arrow_patch", None)]
+
+
+@pytest.mark.parametrize("folder, expected", [
+    ("networks/hexagon7", "networks/hexagon7/network.toml: sumo: missing"),
+    ("networks/grid", "networks/grid/network.toml: no such file; did you mean grid7?"),
+    ("scenarios/grid7_peek", "scenarios/grid7_peek/scenario.toml: no such file; did you mean grid7_peak?"),
+])
+def test_no_city(folder, expected):
+    with pytest.raises(nmfd.InputError, match=re.escape(expected)):
+        cosim.City(folder)
+
+
+def test_a_network_has_no_flows():
+    with pytest.raises(nmfd.InputError, match="give the folder of a scenario"):
+        _ = cosim.City("networks/grid7").flows

@@ -1,0 +1,233 @@
+"""Measured counts and occupancies become MFDs: the formulas, what is doubtful, what is wrong with tables; and SUMO's
+own loops, where the truth is known."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import sumo_loops
+import tiny
+import tiny_city
+from commands import error_line, good
+from commands import nmfd as command
+
+import nmfd
+from nmfd.model.mfd import Mfd
+
+CURVE = Mfd(a=4e-9, b=-8e-6, c=0.004, jam=1000.0)  # of every region, which holds 10 km of lanes
+LANE_KM, TRIP, VEHICLE = 10.0, 1200.0, 6.5
+REGIONS = ("north", "south")
+
+
+def tables(folder: Path, *, days: int = 3, most: float = 900.0) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """(counts, detectors) of two regions with ten links each, all of which follow CURVE exactly."""
+    random, rows = np.random.default_rng(0), []
+    detectors = pd.DataFrame([
+        {"detid": f"{region}{n}", "length": 0.25 + 0.05 * n, "lanes": 2, "pos": 0.1, "linkid": f"{region}-{n}",
+         "long": 8.5 + 0.01 * (n % 5), "lat": 47.4 - 0.03 * r - 0.01 * (n // 5), "region": region}
+        for r, region in enumerate(REGIONS) for n in range(10)])
+    detectors["length"] *= LANE_KM / 2.0 / 4.75
+    for day in range(days):
+        load = most * np.sin(np.linspace(0.05, np.pi - 0.05, 40)) * random.uniform(0.9, 1.0)
+        for k, n in enumerate(load):
+            flow = CURVE.outflow(n) * TRIP * 3.6 / LANE_KM  # veh/h of a lane
+            spread = random.uniform(0.7, 1.3, len(detectors))
+            for region in REGIONS:  # links differ, regions keep their mean
+                own = (detectors["region"] == region).to_numpy()
+                spread[own] /= np.average(spread[own], weights=detectors["length"][own])
+            rows.append(pd.DataFrame({
+                "day": f"2019-05-{day + 1:02d}", "interval": 300 * k, "detid": detectors["detid"],
+                "flow": flow * spread, "occ": n / LANE_KM / 1000.0 * VEHICLE * spread, "error": 0, "city": "made up",
+                "speed": np.nan}))
+    return pd.concat(rows, ignore_index=True), detectors
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("measured")
+    return tables(folder)
+
+
+@pytest.fixture
+def without_pictures(monkeypatch):
+    monkeypatch.setattr("nmfd.studies.mfd_bands.draw_mfds", lambda *given: None)
+
+
+def written(folder: Path, counts: pd.DataFrame, detectors: pd.DataFrame) -> dict[str, Path]:
+    files = {"counts": folder / "counts.csv", "detectors": folder / "detectors.csv"}
+    counts.to_csv(files["counts"], index=False)
+    detectors.to_csv(files["detectors"], index=False)
+    return files
+
+
+def test_the_curve_that_made_the_tables_comes_back(tmp_path, made):
+    found = nmfd.identify(**written(tmp_path, *made), trip_length=TRIP, out=tmp_path / "city")
+    for fit, curve in zip(found.fits, found.network.mfds, strict=True):
+        x = np.linspace(10.0, 840.0, 50)
+        assert np.abs(curve.outflow(x) - CURVE.outflow(x)).max() < 0.01 * CURVE.capacity
+        assert fit.r2 > 0.99 and fit.spread < 0.02 and fit.critical_veh == pytest.approx(CURVE.critical, rel=0.03)
+        assert fit.doubts == ("coverage unknown",)
+    frame = found.to_frame()
+    assert len(frame) == 2 * 3 * 40 and frame["reporting"].between(0.999, 1.001).all()
+    assert frame["production_veh_km_h"].to_numpy() == pytest.approx(
+        3.6 * TRIP * CURVE.outflow(frame["accumulation_veh"].to_numpy()), rel=1e-6)
+    again = nmfd.load_network(tmp_path / "city")
+    assert again.region_names == REGIONS and again.adjacency.tolist() == [[False, True], [True, False]]
+    assert again.doubts == found.network.doubts and not again.placeholder
+    assert np.hypot(*(again.positions[0] - again.positions[1])) == pytest.approx(3336.0, rel=0.01)  # 0.03 degrees
+    files = {path.name for path in (tmp_path / "city").iterdir()}
+    assert files == {"network.toml", "mfd.png", "samples.csv", "fit.csv", "identify.txt"}
+    assert "do not say" in found.text and "&#x27;" not in found._repr_html_() and "north" in found._repr_html_()
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_what_is_given_replaces_what_is_assumed(tmp_path, made):
+    counts, detectors = made
+    files = written(tmp_path, counts, detectors.drop(columns="region"))
+    detectors[["detid", "region"]].to_csv(tmp_path / "regions.csv", index=False)
+    (tmp_path / "about.csv").write_text("region,lane_km,trip_length\nnorth,40,600\nsouth,,1200\n")
+    (tmp_path / "adjacency.csv").write_text("region,neighbour\nnorth,south\n")
+    found = nmfd.identify(
+        **files, regions=tmp_path / "regions.csv", about=tmp_path / "about.csv", adjacency=tmp_path / "adjacency.csv",
+        out=tmp_path / "city")
+    north, south = found.network.mfds
+    assert north.critical == pytest.approx(4.0 * south.critical, rel=0.02)       # four times the streets
+    assert north.capacity == pytest.approx(8.0 * south.capacity, rel=0.02)       # and trips half as long
+    assert found.fits[0].doubts == ("low coverage 25 %",) and found.fits[1].doubts == ("coverage unknown",)
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_regions_and_adjacency_of_another_network(tmp_path, made):
+    counts, detectors = made
+    tiny.write(tmp_path, network=tiny.row_network(2))
+    files = written(tmp_path, counts, detectors.assign(region=detectors["region"].map({"north": 1, "south": 0})))
+    found = nmfd.identify(
+        **files, adjacency=tmp_path / "network" / "network.toml", out=tmp_path / "city", trip_length=TRIP)
+    base = nmfd.load_network(tmp_path / "network")
+    assert found.network.region_names == base.region_names and (found.network.positions == base.positions).all()
+    assert found.network.mfds != base.mfds
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_doubts_of_few_days_free_flow_and_loops_at_stop_lines(tmp_path):
+    counts, detectors = tables(tmp_path, days=1, most=200.0)
+    files = written(tmp_path, counts, detectors.assign(pos=0.01))
+    found = nmfd.identify(**files, out=tmp_path / "city")
+    text = " ".join(found.fits[0].doubts)
+    for doubt in (
+            "no falling branch", "coverage unknown", "loops at stop lines (100 %)", "trip length assumed", "days: 1"):
+        assert doubt in text and f"WARNING, {doubt.split(' (')[0].split(':')[0]}" in found.text, doubt
+    assert found.network.mfds[0].outflow(800.0) == pytest.approx(found.network.mfds[0].capacity, rel=0.06)
+
+
+@pytest.mark.slow
+def test_it_benchmarks_and_trains_like_any_other(tmp_path, made):
+    files = written(tmp_path, *made)
+    told = good(command("identify", files["counts"], "--detectors", files["detectors"], "--trip-length", TRIP, "--out",
+                        tmp_path / "network"))
+    assert "R2" in told and "What such data do not say" in told
+    (tmp_path / "scenario").mkdir()
+    (tmp_path / "scenario" / "scenario.toml").write_text(tiny.SCENARIO)
+    rows = nmfd.benchmark(tmp_path / "scenario", ["no-control", "pi-gating"], out=tmp_path / "out")
+    assert rows[0]["completed_veh"] > 50.0
+    policy = nmfd.train(tmp_path / "scenario", "dpc-pc", out=tmp_path / "dpc-pc.pt", steps=1)
+    assert policy.is_file()
+
+
+def changed(**columns):
+    """A change of the first row of the counts, whose values are texts then."""
+    def change(counts, detectors):
+        counts = counts.astype(object)
+        for name, value in columns.items():
+            counts.loc[3, name] = value
+        return counts, detectors
+
+    return change
+
+
+MISTAKES = {
+    "a column is missing": (lambda c, d: (c.drop(columns="occ").rename(columns={"speed": "occc"}), d), (),
+                            "counts.csv: column occ is missing; did you mean occc?"),
+    "nan": (changed(flow=np.nan), (), "line 5: flow: expected vehicles per hour and lane, from 0 to 3600, got nothing"),
+    "negative": (changed(flow=-3.0), (), "line 5: flow: expected"),
+    "a word": (changed(occ="much"), (), "line 5: occ: expected a share of the time, from 0 to 1, got 'much' instead"),
+    "percent": (changed(occ=12.5), (), "got '12.5' instead (1 such rows); is it percent?; correct it, or leave"),
+    "a time after midnight": (changed(interval=90000), (), "line 5: interval: expected seconds since midnight"),
+    "no day": (changed(day=np.nan), (), "line 5: day is missing"),
+    "minutes": (lambda c, d: (c.assign(interval=c["interval"] / 60), d), (), "0, 5, ... instead; is it minutes"),
+    "per interval": (lambda c, d: (c.assign(flow=c["flow"] / 60), d), (), "m/s, with 6.5 m for a vehicle over a loop"),
+    "all percent": (lambda c, d: (c.assign(occ=c["occ"] * 100), d), ("--skip-bad",), "occ a share?"),
+    "twice": (lambda c, d: (pd.concat([c, c[:1]]), d), (), "has two rows of 2019-05-01, 0 s"),
+    "two cities": (changed(city="elsewhere"), (), "holds 2 of them; choose one with --city: elsewhere, made up"),
+    "no such city": (lambda c, d: (c, d), ("--city", "madeup"), "did you mean made up?"),
+    "a detector without a row": (lambda c, d: (c, d[1:]), (), "detector north0, which"),
+    "a detector without a region": (
+        lambda c, d: (c, d.assign(region=d["region"].where(d["detid"] != "north4"))), (), "north4, which"),
+    "no regions": (lambda c, d: (c, d.drop(columns="region")), (), "has no column region"),
+    "metres": (lambda c, d: (c, d.assign(length=1000 * d["length"])), (), "km of its link, from 0.001 to 30, got"),
+    "a detector twice": (lambda c, d: (c, pd.concat([d, d[:1]])), (), "detid north0 is there twice"),
+    "no positions": (
+        lambda c, d: (c, d.drop(columns=["long", "lat"])), ("--trip-length", "900"), "give a table region,"),
+    "no positions and no trip length": (lambda c, d: (c, d.drop(columns=["long", "lat"])), (), "give --trip-length"),
+    "too few intervals": (lambda c, d: (c[: 20 * 5], d), (), "fewer than 10 intervals"),
+    "a name too long": (lambda c, d: (c, d), ("--name", 101 * "x"), "network.toml: name: expected text in quotes"),
+    "a region's name too long": (
+        lambda c, d: (c, d.assign(region=d["region"] + 100 * "x")), (), "regions[0].name: expected text in quotes"),
+    "a trip length in km": (lambda c, d: (c, d), ("--trip-length", "1.2"), "'--trip-length'"),
+}
+
+
+@pytest.mark.parametrize("change, options, expected", MISTAKES.values(), ids=MISTAKES)
+def test_malformed_tables_end_in_one_line(tmp_path, made, change, options, expected):
+    files = written(tmp_path, *change(*made))
+    line = error_line(command(
+        "identify", files["counts"], "--detectors", files["detectors"], "--out", tmp_path / "city", *options), "nmfd")
+    assert expected in line and not (tmp_path / "city").exists()
+
+
+@pytest.mark.parametrize("name, text, expected", [
+    ("about", "region,lane_km\nnorth,2\n", "lane_km: 2 is less than the 10 km that its detectors stand for"),
+    ("about", "region,lane_km\nnorht,20\n", "region 'norht' has no detector; did you mean north?"),
+    ("about", "region,trip_length\nnorth,1.5\n", "line 2: trip_length: expected m, from 10"),
+    ("adjacency", "region,neighbour\nnorth,north\n", "line 2: region 'north' is no neighbour of itself"),
+    ("adjacency", "region,neighbour\nnorth,west\n", "line 2: region 'west' has no detector"),
+    ("adjacency", "region,neighbour\n", "region south cannot be reached from north"),
+    ("adjacency", "a,b\n", "column region is missing"), ("about", "", "is empty"),
+    ("regions", "detid,region\n", "has a column region already"),
+], ids=str)
+def test_other_tables_end_in_one_line(tmp_path, made, name, text, expected):
+    files = {**written(tmp_path, *made), name: tmp_path / f"{name}.csv"}
+    files[name].write_text(text)
+    with pytest.raises(nmfd.InputError, match="^[^\n]*$") as caught:
+        nmfd.identify(**files, trip_length=TRIP, out=tmp_path / "city")
+    assert expected in str(caught.value) and not (tmp_path / "city").exists()
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_bad_rows_and_silent_detectors_are_left_out_and_counted(tmp_path, made):
+    counts, detectors = made
+    counts = counts.copy()
+    counts.loc[[3, 7], "flow"] = np.nan
+    counts.loc[[30, 31], "error"] = 1
+    counts = counts[~((counts["interval"] == 900) & counts["detid"].str.startswith("north") & (counts.index % 10 < 7))]
+    options = {**written(tmp_path, counts, detectors), "trip_length": TRIP, "skip_bad": True, "out": tmp_path / "city"}
+    found = nmfd.identify(**options)
+    assert "2 rows marked as errors, 2 rows with a missing or impossible number" in found.text
+    frame = found.to_frame()
+    assert not ((frame["region"] == "north") & (frame["interval"] == 900)).any() and frame["reporting"].min() >= 0.5
+    with pytest.raises(nmfd.InputError, match="is there already"):
+        nmfd.identify(**options)
+
+
+@pytest.mark.slow
+def test_loops_of_sumo_tell_what_sumo_knows(tmp_path):
+    scenario = nmfd.load_scenario(tiny_city.imported(tmp_path))
+    scenario = replace(scenario, demand=4.0 * scenario.demand, demand_factor=4.0 * scenario.demand_factor)
+    counts, detectors, truth = sumo_loops.simulated(scenario, tmp_path, range(2), 1)
+    wrong = sumo_loops.errors(sumo_loops.case(tmp_path / "all", counts, detectors, truth), truth)
+    assert abs(wrong["accumulation bias"]) < 0.25 and abs(wrong["production bias"]) < 0.1
+    assert wrong["curve RMSE"] < 0.2
+    half = sumo_loops.errors(sumo_loops.case(tmp_path / "half", counts, detectors, truth, share=0.5), truth)
+    assert half["accumulation RMSE"] > wrong["accumulation RMSE"]
