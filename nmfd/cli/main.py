@@ -151,8 +151,7 @@ def train(
         with progress_line(controller) as line:
             def progress(done: int, total: int, note: str) -> None:
                 notes.append(note)
-                if line:
-                    line(done, total, note)
+                line(done, total, note)
 
             training.train(
                 loaded, controller, seed=seed, out=file, steps=steps, resume=resume, device=device, compiled=compiled,

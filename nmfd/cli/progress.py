@@ -1,9 +1,11 @@
-"""One line of progress on stderr, where that is a terminal; silence elsewhere."""
+"""Progress on stderr: one line that moves where that is a terminal, elsewhere a plain line every half minute."""
 
+import os
 import shlex
 import sys
+import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Protocol, TextIO
 
@@ -12,6 +14,9 @@ from tqdm.std import tqdm
 from nmfd.cli.errors import Interrupted
 
 LINE = "{desc}  [{bar:24}]  {n_fmt}/{total_fmt}  {remaining} left{postfix}"
+PLAIN = "{desc}: {n_fmt}/{total_fmt} after {elapsed}, {remaining} left{postfix}"
+BEAT = 1.0    # s, between two looks of the moving line at the clock
+EVERY = 30.0  # s, between two plain lines
 
 
 class Show(Protocol):
@@ -21,27 +26,45 @@ class Show(Protocol):
 
 
 @contextmanager
-def progress_line(label: str, stream: TextIO | None = None) -> Iterator[Show | None]:
-    """What shows progress on a line that is wiped at the end; None if `stream` (default stderr) is no terminal."""
+def progress_line(label: str, stream: TextIO | None = None) -> Iterator[Show]:
+    """What shows progress on `stream` (default stderr): on a terminal in a line that is wiped at the end.
+
+    The remaining time is what is left at the mean rate since the line, or another total, began.
+    """
     stream = sys.stderr if stream is None else stream
-    if not stream.isatty():
-        yield None
-        return
-    # a new note is shown even if nothing more is done: miniters 0
-    with tqdm(
-        desc=label, file=stream, leave=False, dynamic_ncols=True, ascii=".#", miniters=0, bar_format=LINE,
-    ) as line:
+    over, moving = threading.Event(), stream.isatty()
+    with ExitStack() as stack:
+        shown = stream if moving else stack.enter_context(open(os.devnull, "w"))
+        # a new note is shown even if nothing more is done: miniters 0; jams change the rate, not for long: smoothing 0
+        line = stack.enter_context(tqdm(
+            desc=label, file=shown, leave=False, dynamic_ncols=True, ascii=".#", miniters=0, smoothing=0.0,
+            bar_format=LINE if moving else PLAIN))
+
+        def beat() -> None:
+            while not over.wait(BEAT if moving else EVERY):
+                if moving:
+                    line.refresh()
+                else:
+                    print(line, file=stream, flush=True)
+
         def show(done: int, total: int, note: str = "") -> None:
             line.set_postfix_str(note, refresh=False)
-            if total != line.total:
+            if total != line.total or done < line.n:
                 line.reset(total)
+                line.initial = line.n = done  # what was there before says nothing of the rate
             line.update(done - line.n)
 
-        yield show
+        thread = threading.Thread(target=beat, daemon=True)
+        thread.start()
+        try:
+            yield show
+        finally:
+            over.set()
+            thread.join()
 
 
 @contextmanager
-def resumable(label: str, out: Path, results: str = "") -> Iterator[Show | None]:
+def resumable(label: str, out: Path, results: str = "") -> Iterator[Show]:
     """`progress_line` of a command that keeps what is finished in the folder `out`; Ctrl-C says how to go on.
 
     results: the file there that holds what is finished; without it nothing is kept

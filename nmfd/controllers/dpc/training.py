@@ -27,6 +27,7 @@ from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import atomic, locked, sweep
+from nmfd.runs.workers import reached
 from nmfd.threads import one_thread
 
 VALIDATE_EVERY = 20  # Adam steps
@@ -154,6 +155,7 @@ def train(
                             policy, planning.network, {**configuration, "validation_veh_s": best}, states), out)
                     if not last:
                         _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
+                reached((step + 1) / chosen.steps)
                 if progress:
                     progress(step + 1, chosen.steps, f"best {best:.4g} veh s")
             if not math.isfinite(best):
