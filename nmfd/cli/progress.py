@@ -50,6 +50,7 @@ def progress_line(label: str, stream: TextIO | None = None) -> Iterator[Show]:
         def show(done: int, total: int, note: str = "") -> None:
             line.set_postfix_str(note, refresh=False)
             if total != line.total or done < line.n:
+                line.initial = 0
                 line.reset(total)
                 line.initial = line.n = done  # what was there before says nothing of the rate
             line.update(done - line.n)

@@ -86,14 +86,14 @@ def available(device: str) -> str:
 def train(
     scenario: Scenario, controller: str, *, seed: int, out: Path, steps: int | None = None, resume: bool = False,
     device: str = "cpu", compiled: bool = False, anyway: bool = False,
-    progress: Callable[[int, int, str], None] | None = None, log: Callable[[int, float], None] | None = None,
+    progress: Callable[[int, int, str], None] | None = None, log: Callable[[int, float, float], object] | None = None,
 ) -> Path:
     """Train `controller`, one that `settings` knows, on the regional model and write the policy to `out`.
 
     `out` holds the best policy so far after every validation; `out`.resume beside it holds what `resume` needs and
-    goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done, TTS)` after
-    every validation. `compiled` makes a step about twice as fast, after up to a minute or two of compilation; the
-    weights differ by rounding. `anyway`: even where `check` refuses.
+    goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done,
+    TTS in training, TTS in validation)` [veh s] after every validation, also for those from before `resume`. `compiled`
+    makes a step about twice as fast, after up to a minute or two of compilation; the weights differ by rounding. `anyway`: even where `check` refuses.
     """
     with one_thread():
         chosen = settings(scenario, controller, steps)
@@ -123,6 +123,8 @@ def train(
             sweep(out.parent, {out.stem, state_file.stem})
             if resume:
                 first, best, history = _restore(state_file, configuration, policy, optimizer, generator)
+                for row in history if log else ():
+                    log(int(row[0]), *row[1:])
             for step in range(first, chosen.steps):
                 for group in optimizer.param_groups:
                     cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
@@ -147,7 +149,7 @@ def train(
                     score = validate(policy, rollout, seed, chosen)
                     history.append([step + 1, math.exp(loss.item()), score])
                     if log:
-                        log(step + 1, score)
+                        log(step + 1, history[-1][1], score)
                     if score < best:
                         best = score
                         states = fallback.statistics(visited(policy, rollout, chosen, seed))
