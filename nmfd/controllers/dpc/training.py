@@ -93,7 +93,8 @@ def train(
     `out` holds the best policy so far after every validation; `out`.resume beside it holds what `resume` needs and
     goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done,
     TTS in training, TTS in validation)` [veh s] after every validation, also for those from before `resume`. `compiled`
-    makes a step about twice as fast, after up to a minute or two of compilation; the weights differ by rounding. `anyway`: even where `check` refuses.
+    makes a step about twice as fast, after up to a minute or two of compilation; the weights differ by rounding.
+    `anyway`: even where `check` refuses.
     """
     with one_thread():
         chosen = settings(scenario, controller, steps)
