@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from nmfd.arrays import PerPair, PerRegion, Positions
@@ -13,7 +14,7 @@ from nmfd.arrays import PerPair, PerRegion, Positions
 SIZE, DPI = (6.4, 4.8), 100
 OVER = 2.0         # critical accumulations: the dark end of the scale
 JAM = 1000.0 / 7.5  # veh/km and lane
-COLOURS = "YlOrRd"
+COLOURS = LinearSegmentedColormap.from_list("load", ("#c3cbd2", "#f2c14e", "#e2711d", "#a3123a", "#2d0a2e"))
 ASIDE = 0.06       # of the way between two regions: how far the arrows of the two directions are apart
 
 
