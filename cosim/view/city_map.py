@@ -39,7 +39,7 @@ class Encoded(list, Serializable):
     def to_serializable(self, serializer: Serializer) -> AnyRep:
         """What Bokeh asks for."""
         if not hasattr(self, "_rep"):
-            alone = Serializer()
+            alone = Serializer(deferred=False)
             self._rep = [alone.encode(item) for item in self]
         return self._rep
 
@@ -72,6 +72,7 @@ class CityMap:
         self.streets = self._streets(plot)
         self.arrows = self._guidance(plot)
         self.gates = self._gateways(plot)
+        plot.add_tools(TapTool(renderers=self._clicked))  # one for all of them: of several only one is active
         _numbers(plot, picture)
         plot.add_layout(ScaleBar(
             range=plot.x_range, unit="m", location="bottom_left", bar_length=0.15, background_fill_alpha=0.0,
@@ -114,7 +115,7 @@ class CityMap:
         drawn = plot.patches(
             "xs", "ys", source=source, fill_color="fill", line_color="line", line_width="width",
             nonselection_fill_alpha=1.0, nonselection_line_alpha=1.0)
-        plot.add_tools(TapTool(renderers=[drawn]))
+        self._clicked = [drawn]
         return source
 
     def _streets(self, plot: Plot) -> ColumnDataSource:
@@ -130,9 +131,8 @@ class CityMap:
         self._drawn = plot.multi_line(
             "xs", "ys", source=source, line_width="width", line_cap="round", nonselection_line_alpha=1.0,
             line_color={"field": "value", "transform": self._bars[DENSITY].color_mapper})
-        plot.add_tools(
-            TapTool(renderers=[self._drawn]),
-            HoverTool(renderers=[self._drawn], tooltips=[("street", "@edge"), ("value", "@value{0.00}")]))
+        self._clicked.append(self._drawn)
+        plot.add_tools(HoverTool(renderers=[self._drawn], tooltips=[("street", "@edge"), ("value", "@value{0.00}")]))
         for bar in self._bars.values():
             plot.add_layout(bar, "below")
         return source
@@ -156,11 +156,10 @@ class CityMap:
                              line_width="rim_width", nonselection_alpha=1.0)
         plot.wedge("x", "y", radius="radius", radius_units="screen", start_angle=np.pi / 2, end_angle="end",
                    direction="clock", source=source, color=colours.GREEN, line_color=None, nonselection_alpha=1.0)
-        plot.add_tools(
-            TapTool(renderers=[discs]),
-            HoverTool(renderers=[discs], tooltips=[
-                ("gateway", "@way"), ("green, share of the original", "@green"),
-                ("halting before it [veh]", "@queue{0.0}")]))
+        self._clicked.append(discs)
+        plot.add_tools(HoverTool(renderers=[discs], tooltips=[
+            ("gateway", "@way"), ("green, share of the original", "@green"),
+            ("halting before it [veh]", "@queue{0.0}")]))
         return source
 
     def _show_gates(self, frame: Frame, held: frozenset[tuple[int, int]]) -> None:
