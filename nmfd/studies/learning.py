@@ -17,7 +17,8 @@ class Curve:
         if board:
             need("--log tensorboard", "tensorboard", "tensorboard")
         self.rows: list[tuple[int, float, float]] = []
-        self._board, self._writer = board, None
+        self._board = board
+        self._writer: Any = None
 
     def log(self, step: int, trained: float, validated: float) -> None:
         """After a validation."""

@@ -124,8 +124,9 @@ def train(
             sweep(out.parent, {out.stem, state_file.stem})
             if resume:
                 first, best, history = _restore(state_file, configuration, policy, optimizer, generator)
-                for row in history if log else ():
-                    log(int(row[0]), *row[1:])
+                for done, trained, score in history:
+                    if log:
+                        log(int(done), trained, score)
             for step in range(first, chosen.steps):
                 for group in optimizer.param_groups:
                     cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
