@@ -92,18 +92,14 @@ def benchmark(
 ) -> Summary:
     """`nmfd benchmark`: controllers x seeds with a run folder; returns the rows of its summary.csv.
 
-        rows = nmfd.benchmark("scenarios/economic_mpc", ["no-control", "dpc-*"])
-        print(rows), rows.to_frame(), rows.to_xarray()
+        >>> rows = nmfd.benchmark("economic_mpc", ["no-control", "dpc-*"])  # doctest: +SKIP
+        >>> print(rows), rows.to_frame(), rows.to_xarray()  # doctest: +SKIP
 
     controllers: a name, several, or patterns, which stand for the controllers that can be made for this scenario
     seeds: how many, from 0, or which
     out: the run folder, runs/<scenario>-<time> if None; finished runs in it are kept
     policies: controller -> file, if not SCENARIO/NAME.pt
 
-    `nmfd.summary_table(rows)` gives the text that the command prints.
-
-        >>> rows = nmfd.benchmark("economic_mpc", ["no-control", "pi-gating"], seeds=3)  # doctest: +SKIP
-        >>> print(nmfd.summary_table(rows))  # doctest: +SKIP
     progress: as in `nmfd.run`; your own is called as progress(done, steps, what)
 
     Raises InputError and nmfd.runs.workers.RunFailed.

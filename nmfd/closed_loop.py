@@ -9,6 +9,7 @@ import numpy as np
 from nmfd import faults
 from nmfd.arrays import PerPair
 from nmfd.model.scenario import Scenario
+from nmfd.runs import workers
 from nmfd.threads import one_thread
 from nmfd.types import Controller, Controls, Observation, Plant, State, Status, Trajectory
 
@@ -49,6 +50,7 @@ def run(
         controls.append(_booked(decided, Status.PLANT_FAULT, fault) if fault else decided)
         observed, problem = sensors.observe(states[-1], plant.observe())
         observations.append(observed)
+        workers.reached((k + 1) / scenario.steps)
         if progress:
             progress(k + 1, scenario.steps)
     return Trajectory(

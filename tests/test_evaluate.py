@@ -39,7 +39,7 @@ def ran(monkeypatch):
     """SUMO is not started: the tasks that would be run, and which of them fail."""
     tasks, failing = [], set()
 
-    def outcomes(function, todo, workers, *, fresh, group=None):
+    def outcomes(function, todo, workers, *, fresh, group=None, look=None):
         assert fresh
         for task in todo:
             tasks.append((task.controller, task.seed, task.demand_factor))

@@ -39,9 +39,20 @@ def gymnasium_check(env):
     from gymnasium.utils.env_checker import check_env
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # unbounded observations, no render mode: as they should be
-        check_env(env)
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", ".*not within.*|.*recommend.*")
+        check_env(env, skip_render_check=True)  # which wants to make another one beside it
+    assert np.isfinite(env.observation_space.low).all() and np.isfinite(env.observation_space.high).all()
+    assert drawn(env).shape == drawn(env).shape
     env.close()
+
+
+def drawn(env):
+    """What it renders, which is a picture of something."""
+    picture = env.render()
+    assert picture.dtype == np.uint8 and picture.shape[2] == 3 and min(picture.shape[:2]) > 300
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+    return picture
 
 
 def pettingzoo_check(env, cycles):
@@ -53,8 +64,8 @@ def pettingzoo_check(env, cycles):
 
 @pytest.mark.parametrize("guidance", [False, True])
 def test_gymnasium_and_pettingzoo_accept_the_regional_plants(scenario, hexagon, guidance):
-    gymnasium_check(rl.RegionalEnv(scenario, guidance=guidance))
-    gymnasium_check(rl.RegionalEnv(hexagon, AcyclicPlant(hexagon), guidance=guidance))
+    gymnasium_check(rl.RegionalEnv(scenario, guidance=guidance, render_mode="rgb_array"))
+    gymnasium_check(rl.RegionalEnv(hexagon, AcyclicPlant(hexagon), guidance=guidance, render_mode="rgb_array"))
     pettingzoo_check(rl.RegionsEnv(scenario, guidance=guidance), 50)
     pettingzoo_check(rl.RegionsEnv(hexagon, guidance=guidance, cooperative=False), 10)
 
@@ -62,8 +73,36 @@ def test_gymnasium_and_pettingzoo_accept_the_regional_plants(scenario, hexagon, 
 def test_gymnasium_and_pettingzoo_accept_sumo(peak):
     from cosim.plant.env import gymnasium_env, pettingzoo_env
 
-    gymnasium_check(gymnasium_env(peak, steps=2, guidance=True))
+    gymnasium_check(gymnasium_env(peak, steps=2, guidance=True, render_mode="rgb_array"))
     pettingzoo_check(pettingzoo_env(peak, steps=2, city="actuated"), 3)
+
+
+def test_environments_have_names(scenario, tmp_path):
+    env = gymnasium.make("nmfd/Hexagon7-v0", guidance=True, render_mode="rgb_array")
+    assert env.reset(seed=1)[0] in env.observation_space and env.unwrapped.interface.action_size > 24
+    empty = drawn(env)
+    for _ in range(30):
+        seen, *_ = env.step(env.action_space.sample())
+        assert seen in env.observation_space
+    assert (drawn(env) != empty).any()
+    env.close()
+    own = gymnasium.make("nmfd/Scenario-v0", scenario=str(scenario.folder))
+    assert own.reset(seed=0)[0] in own.observation_space and own.render() is None
+    other = rl.RegionsEnv(scenario.folder, render_mode="rgb_array")
+    other.reset(seed=0)
+    drawn(other)
+
+
+def test_the_city_has_a_name(peak):
+    import cosim.plant.env as city
+
+    assert city.gymnasium_env.__name__ in gymnasium.spec("cosim/Grid7-v0").entry_point
+    env = gymnasium.make("cosim/Scenario-v0", scenario=peak, steps=2, render_mode="rgb_array")
+    env.reset(seed=1)
+    empty = drawn(env)
+    env.step(env.action_space.sample())
+    assert (drawn(env) != empty).any()
+    env.close()
 
 
 @pytest.mark.parametrize("guidance", [False, True])

@@ -19,10 +19,12 @@ from trajectories import trajectory
 
 from cosim.plant.record import Record
 from nmfd import quantities
+from nmfd.cli import progress
 from nmfd.cli.progress import progress_line
 from nmfd.errors import InputError
 from nmfd.runs import files, provenance, run_folder, workers
 from nmfd.runs.tables import markdown_table
+from nmfd.runs.tally import Tally
 from nmfd.types import Trajectory
 
 ROOT = Path(__file__).parents[1]
@@ -226,9 +228,19 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.usefixtures("unchecked")  # a StringIO is no typing.TextIO
-def test_progress_is_shown_on_a_terminal_only_and_wiped():
-    with progress_line("x", io.StringIO()) as show:
-        assert show is None
+def test_progress_is_a_line_that_is_wiped_on_a_terminal_and_plain_ones_elsewhere(monkeypatch):
+    stream = io.StringIO()
+    with progress_line("x", stream) as show:
+        show(1, 4)
+    assert stream.getvalue() == ""  # for what is over in a moment
+    monkeypatch.setattr(progress, "EVERY", 0.2)
+    with progress_line("cosim", stream) as show:
+        show(1, 4, "0/2 runs")
+        time.sleep(0.1)
+        show(2, 4, "1/2 runs; seed 1: 17 of 70 min")
+        time.sleep(0.4)
+    first, *_ = stream.getvalue().splitlines()
+    assert first.startswith("cosim: 2/4 after 00:00, 00:0") and first.endswith("left, 1/2 runs; seed 1: 17 of 70 min")
     stream = Terminal()
     with progress_line("training", stream) as show:
         show(0, 4, "best 3")
@@ -255,6 +267,26 @@ def test_progress_begins_again_with_another_total():
         show(3, 4)
         show(0, 100, "fitting")
     assert "0/100  ? left, fitting" in stream.getvalue().split("\r")[-3]
+
+
+def half_way(task):
+    workers.reached(0.5)
+    time.sleep(1.5 * workers.LOOK)
+    return task
+
+
+def test_who_waits_for_workers_sees_how_far_they_are():
+    seen, told = [], []
+    tally = Tally(lambda *what: told.append(what), [1, 2], steps=lambda run: 10 * run, label=lambda run: f"run {run}",
+                  at=lambda run, share: f" at {share:.0%}")
+    for task, _ in workers.outcomes(half_way, [1, 2], workers=2, look=lambda running: (
+            seen.append(list(running)), tally.look(running))):
+        tally.end(task, failed=task == 2)
+    assert [(1, 0.5), (2, 0.5)] in seen
+    assert told[0] == (0, 30, "0/2 runs") and (15, 30, "0/2 runs; run 1 at 50%; run 2 at 50%") in told
+    assert [what[0] for what in told] == sorted(what[0] for what in told) and told[-1][:2] == (30, 30)
+    assert told[-1][2].startswith("2/2 runs; ")
+    workers.reached(0.7)  # in this process, which is no worker: nothing
 
 
 def test_a_look_at_the_checkout_does_not_write_to_it(tmp_path):

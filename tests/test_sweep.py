@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from commands import killed
 
 from cosim.cli.main import main
-from cosim.evaluation import dask_cluster, dask_worker, sweeps
+from cosim.evaluation import dask_cluster, dask_worker, experiment, sweeps
 from cosim.evaluation.simulate import FACTS, Result, Task
 from nmfd.errors import InputError
 from nmfd.runs.run_folder import read_summary
@@ -44,12 +44,12 @@ def ran(monkeypatch):
     """SUMO is not started: the tasks that would be run, and which of them fail."""
     tasks, failing = [], set()
 
-    def outcomes(todo, *, workers):
+    def outcomes(function, todo, workers, *, fresh, group=None, look=None):
         for task in todo:
             tasks.append((task.controller, task.seed, task.demand_factor))
             yield task, Failure("SUMO fell over") if (task.controller, task.seed) in failing else made_up(task)
 
-    monkeypatch.setattr(sweeps, "_local", outcomes)
+    monkeypatch.setattr(experiment, "outcomes", outcomes)
     return tasks, failing
 
 
@@ -91,13 +91,13 @@ def test_more_is_added_and_an_interruption_keeps_what_is_there(peak, tmp_path, r
     out = tmp_path / "out"
     done = sweep(peak, "--controllers", "no-control", "--out", out)
     assert done.exit_code == 1 and "seed 0: SUMO fell over" in done.stderr  # all there was
-    plain = sweeps._local
+    plain = experiment.outcomes
 
-    def interrupted(todo, *, workers):
-        yield from list(plain(todo, workers=workers))[:1]
+    def interrupted(*arguments, **options):
+        yield from list(plain(*arguments, **options))[:1]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sweeps, "_local", interrupted)
+    monkeypatch.setattr(experiment, "outcomes", interrupted)
     done = sweep(peak, "--controllers", "pi-gating,max-pressure", "--out", out)
     assert done.exit_code == 130 and "the same command with --out" in done.stderr
     rows = pd.read_parquet(out / "sweep.parquet")

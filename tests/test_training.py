@@ -273,8 +273,9 @@ def test_the_best_validation_is_kept_and_told(tmp_path, scenario, monkeypatch):
     options = {"batch": 2, "width": 4}
     out = training.train(
         replace(scenario, controller_options={"dpc-pc": options}), "dpc-pc", seed=3, out=tmp_path / "p.pt", steps=5,
-        log=lambda done, score: logged.append((done, score)), progress=lambda *note: notes.append(note))
-    assert logged == [(2, 7.0), (4, 5.0), (5, 6.0)]
+        log=lambda done, loss, score: logged.append((done, score, loss > 0.0)),
+        progress=lambda *note: notes.append(note))
+    assert logged == [(2, 7.0, True), (4, 5.0, True), (5, 6.0, True)]
     assert notes == [(1, 5, "best inf veh s"), (2, 5, "best 7 veh s"), (3, 5, "best 7 veh s"), (4, 5, "best 5 veh s"),
                      (5, 5, "best 5 veh s")]
     configuration = torch.load(out, weights_only=True)["configuration"]

@@ -53,7 +53,7 @@ def runs(monkeypatch):
     """The tasks that are run; their total time spent is lowest at set point 300 and kp 2."""
     tasks, failing = [], set()
 
-    def outcomes(function, todo, workers, *, fresh, group=None):
+    def outcomes(function, todo, workers, *, fresh, group=None, look=None):
         for task in todo:
             tasks.append(task)
             options = dict(task.options)
@@ -129,13 +129,14 @@ def test_one_line_for_what_cannot_be_tuned(city, tmp_path, arguments, expected):
 def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_path, monkeypatch):
     seen = []
 
-    def outcomes(function, todo, workers, *, fresh, group=None):
+    def outcomes(function, todo, workers, *, fresh, group=None, look=None):
         for task in todo:
             seen.append(task.policy)
             yield task, result(task, 1e6 * dict(task.options)["mfd_scale"])
 
     monkeypatch.setattr(experiment, "outcomes", outcomes)
-    monkeypatch.setattr(tuning, "outcomes", lambda function, todo, workers: [(task, function(task)) for task in todo])
+    monkeypatch.setattr(tuning, "outcomes", lambda function, todo, workers, look: [
+        (task, function(task)) for task in todo])
     asked = tuning.Tuning(
         scenario=city, controller="dpc-pcrg", candidates=2, seeds=(1000,), out=tmp_path / "out", population=2,
         knobs=(tuning.knob("mfd_scale=0.6:1"), tuning.knob("steps=1:1.4")))
@@ -153,7 +154,7 @@ SERVED = {  # demand -> of four seeds, how many serve all trips
 def demanded(monkeypatch):
     tasks = []
 
-    def outcomes(function, todo, workers, *, fresh, group=None):
+    def outcomes(function, todo, workers, *, fresh, group=None, look=None):
         for task in todo:
             tasks.append((task.controller, task.demand_factor))
             served = task.seed - 1000 < SERVED[task.controller][task.demand_factor]

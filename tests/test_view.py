@@ -21,6 +21,8 @@ from cosim.evaluation.simulate import Task, scenario_of, simulate
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import load_city
 from cosim.view import city_map, picture, replay, run
+from cosim.view import server as server_module
+from cosim.view.budget import SAVED, SHARE, Budget
 from cosim.view.page import Page, numbers
 from cosim.view.picture import CityPicture, Frame
 from cosim.view.run import Pace, Switch, Switched
@@ -210,6 +212,13 @@ def test_a_page_shows_every_street_and_trusts_no_name(task, city, seen):
     np.testing.assert_array_equal(page.maps[0].streets.data["value"], speed)
     ends = page.maps[0].gates.data["end"]
     assert len(ends) == len(drawn.gates) and (page.maps[0].gates.data["rim_width"] == 3.0).any()
+    busiest = int(np.argmax(whole[-1].density))
+    page.choose_street(busiest)
+    page.trace([whole, whole[:2]], whole[-1].time)
+    seen_there = page.curves.lines[0].data["density"]
+    np.testing.assert_array_equal(seen_there, np.array([frame.density[busiest] for frame in whole], np.float32))
+    assert city.edges[busiest] in page.curves.street.title.text
+    assert list(page.maps[1].chosen.data["xs"][0]) == list(page.maps[0].streets.data["xs"][busiest])
     assert len(page.curves.lines[0].data["time"]) == STEPS + 1 and len(page.curves.lines[1].data["time"]) == 2
     html = file_html(document, CDN, title=document.title, template=document.template,
                      template_variables=document.template_variables)
@@ -337,10 +346,34 @@ def test_the_guard_stands_before_everything():
         signed = re.search(rb'"token":"([^"]+)"', page)[1].decode()
         assert ask("/ws", **{**upgrade, "Sec_WebSocket_Protocol": f"bokeh, {signed}x"})[0] == 403
         assert ask("/ws", **{**upgrade, "Sec_WebSocket_Protocol": f"bokeh, {signed}"})[0] == 101
+        given = [ask("/") for _ in range(server_module.MOST_VIEWERS + 2)]
+        assert {status for status, _ in given} == {200, 503} and box[0].viewers <= server_module.MOST_VIEWERS
+        assert given[-1][0] == 503 and b"asks again" in given[-1][1] and len(given[-1][1]) < 500
+        assert ask("/static/js/bokeh.min.js")[0] == 200  # of those who are in
     finally:
         stop.set()
         thread.join(10.0)
     assert not thread.is_alive()
+
+
+def test_the_processor_time_of_viewers_is_limited():
+    now, spent = [0.0], [0.0]
+    budget = Budget(clock=lambda: now[0], spent=lambda: spent[0])
+    made = 0
+    while now[0] < 100.0:  # ever more ask for pages of half a second each
+        if budget.left():
+            made, spent[0] = made + 1, spent[0] + 0.5
+        now[0] += 0.1
+    assert made == pytest.approx((100 * SHARE + SAVED) / 0.5, abs=1.5)
+    assert budget.slower() > 1.0
+    for _ in range(100):  # forty viewers, 10 ms for a picture
+        period = 0.25 * budget.slower()
+        now[0], spent[0] = now[0] + period, spent[0] + 40 * 0.01
+    assert 40 * 0.01 / period == pytest.approx(SHARE, rel=0.3)
+    for _ in range(100):  # one
+        now[0], spent[0] = now[0] + 0.25, spent[0] + 0.01
+        budget.slower()
+    assert budget.slower() == 1.0
 
 
 def test_a_port_that_is_taken_and_a_host_that_is_elsewhere():

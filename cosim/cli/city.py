@@ -144,6 +144,6 @@ def import_(
         begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"), routes=routes, od=od,
         zones=zones, effort=Effort(iterations=iterations, gap=gap), seeds=seeds)
     with progress_line("import") as progress:
-        report = import_city(order, (lambda stage: progress(0, 1, stage)) if progress else lambda stage: None)
+        report = import_city(order, lambda stage, share=0.0: progress(round(100 * share), 100, stage))
     click.echo(report)
     click.echo(f"Written to {order.out} (see map.png, quality.csv, gateways.csv) and {order.scenario}")

@@ -33,13 +33,14 @@ from nmfd.quantities import quantities, variables
 from nmfd.runs import run_folder
 from nmfd.runs.files import check_file, file_hash, write_text
 from nmfd.runs.tables import text_table
+from nmfd.runs.tally import Progress, Tally
 from nmfd.runs.workers import Failure, attempt, ended, outcomes
 from nmfd.studies.benchmark import REFERENCE, compared_with, draw_accumulations, interval
 from nmfd.studies.traffic_states import OutflowOf, RegionalOutflow
 from nmfd.types import Trajectory
 
-Progress = Callable[[int, int, str], None]  # takes what is done, what there is to do, and what is running
 Outcomes = Iterator[tuple[Task, Result | Failure]]
+MINUTE = 60.0
 # Of loading runs: whether they guide routes, and so depend on the drivers' own split ratios.
 LOADING = {"probing-pc": False, "probing-pcrg": True, "route-guidance": True}
 CAPTION = (
@@ -108,8 +109,10 @@ def perform(
         there = {path: folder.finished for path, folder in folders.items()}
         todo = [task for task in where if (task.controller, task.seed) not in there[where[task]] or not all(
             file.is_file() for _, file in task.sumo_output)]
-        found = _outcomes(todo, workers, fresh, progress) if source is None else _reported(source, todo, progress)
+        tally = _tally(todo, progress)
+        found = _outcomes(todo, workers, fresh, tally) if source is None else source(todo) if todo else ()
         for task, outcome in found:
+            tally.end(task, failed=isinstance(outcome, Failure))
             if isinstance(outcome, Failure):
                 failures.append((task, outcome))
                 if failed:
@@ -197,35 +200,36 @@ def _plain(chosen: Settings, scenario: Scenario) -> dict:
     return {**found, **hashes}
 
 
-def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, progress: Progress | None) -> Outcomes:
-    """(task, Result or Failure); in this process, which reports every control interval, if one run is all there is, and
-    not of a controller of the user's own."""
+def _tally(todo: Sequence[Task], progress: Progress | None) -> Tally:
+    """What tells of the tasks, in control intervals."""
+    runs = todo if progress else ()
+    scenarios = {key: scenario_of(Task(scenario=key[0], controller=REFERENCE, seed=0, steps=key[1]))
+                 for key in {(task.scenario, task.steps) for task in runs}}
+
+    def of(task: Task) -> Scenario:
+        return scenarios[task.scenario, task.steps]
+
+    def at(task: Task, share: float) -> str:
+        length = of(task).steps * of(task).step / MINUTE
+        return f": {share * length:.0f} of {length:.0f} min"
+
+    return Tally(progress, runs, steps=lambda task: of(task).steps, at=at,
+                 label=lambda task: label(task).removeprefix("controller "))
+
+
+def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, tally: Tally) -> Outcomes:
+    """(task, Result or Failure); in this process if one run is all there is, and not of a controller of the user's
+    own."""
     if len(todo) != 1 or fresh or _apart(todo[0]):
-        yield from _reported(
-            lambda tasks: outcomes(simulate, tasks, workers, fresh=fresh, group=_apart), todo, progress)
+        yield from outcomes(simulate, todo, workers, fresh=fresh, group=_apart, look=tally.look)
         return
-
-    def tick(k: int, steps: int) -> None:
-        if progress:
-            progress(k, steps, f"{todo[0].controller}, seed {todo[0].seed}")
-
-    yield todo[0], attempt(lambda task: simulate(task, tick), todo[0])
+    task = todo[0]
+    yield task, attempt(lambda task: simulate(task, lambda k, steps: tally.look([(task, k / steps)])), task)
 
 
 def _apart(task: Task) -> str:
     """The controller of the user's own, which has a process to itself, "" for others."""
     return task.controller if registry.runs_apart(task.controller) else ""
-
-
-def _reported(
-    source: Callable[[Sequence[Task]], Outcomes], todo: Sequence[Task], progress: Progress | None,
-) -> Outcomes:
-    """What comes from `source`, with a word to `progress` of each."""
-    report = progress or (lambda done, total, note: None)
-    report(0, len(todo), "")
-    for done, (task, outcome) in enumerate(source(todo) if todo else (), start=1):
-        report(done, len(todo), f"{'failed' if isinstance(outcome, Failure) else 'last'} {label(task)}")
-        yield task, outcome
 
 
 def read_run(folder: Path, controller: str, seed: int) -> Result:

@@ -107,10 +107,10 @@ def identify(
         raise InputError(f"--network: {there} is no folder that can be written to; choose another")
     first, second = loading.stages
     more = [run for folder in loading.runs for run in _finished(folder, scenario)]
-    found = _load(scenario, loading, first, {}, out, workers, progress)
+    found = _load(scenario, loading, first, {}, out, workers, _named(progress, "1 of 2"))
     network = static_model(loaded, found, guided=loading.guided)
     set_point = tuple(network.mfds[region].critical for region in loaded.protected)
-    found += _load(scenario, loading, second, {"set_point": set_point}, out, workers, progress)
+    found += _load(scenario, loading, second, {"set_point": set_point}, out, workers, _named(progress, "2 of 2"))
     held_out = [result for result in found if len(loading.seeds) > 1 and result.trajectory.seed == loading.seeds[-1]]
     found += more
     scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
@@ -153,6 +153,11 @@ def identify(
         f"{first} and\n# {second}, demand times {levels}, seeds {seeds}{_and_runs(more)}."))
     verdict.write_verdict(target, judged)
     return text
+
+
+def _named(progress: experiment.Progress | None, what: str) -> experiment.Progress | None:
+    """That of one part of the loading runs."""
+    return progress and (lambda done, total, note: progress(done, total, f"loading runs, {what}; {note}"))
 
 
 def _load(

@@ -4,7 +4,7 @@
     <folder>/demand-<level>/    the run folder of a demand level (cosim.evaluation.experiment), as of an evaluation
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ import pandas as pd
 
 from cosim.evaluation import dask_cluster, experiment
 from cosim.evaluation.evaluate import check_folder, level_folders
-from cosim.evaluation.simulate import Result, Task
+from cosim.evaluation.simulate import Task
 from cosim.plant.settings import settings
 from cosim.plant.strategy import parse, ready
 from nmfd.api import load_scenario
@@ -22,7 +22,7 @@ from nmfd.controllers.names import chosen
 from nmfd.errors import InputError
 from nmfd.runs.frames import write_parquet
 from nmfd.runs.tables import text_table
-from nmfd.runs.workers import Failure, ended, outcomes
+from nmfd.runs.workers import ended
 
 OK, FAILED = "ok", "failed"
 KEYS = ["strategy", "seed", "demand"]
@@ -105,16 +105,12 @@ def sweep(
 
     cluster = None if scheduler is None else dask_cluster.checked(scheduler, tell)
     failed_now = experiment.perform(
-        plan, workers=workers, progress=progress, tell=tell, kept=write, failed=failed,
-        source=partial(_local, workers=workers) if cluster is None else partial(dask_cluster.outcomes, cluster))
+        plan, workers=workers, fresh=True, progress=progress, tell=tell, kept=write, failed=failed,
+        source=None if cluster is None else partial(dask_cluster.outcomes, cluster))
     rows = write()
     if failed_now and (rows["status"] == FAILED).all():
         raise ended([(experiment.label(task), failure) for task, failure in failed_now[:1]])
     return rows
-
-
-def _local(tasks: Sequence[Task], *, workers: int) -> Iterator[tuple[Task, Result | Failure]]:
-    return outcomes(experiment.simulate, tasks, workers, fresh=True)
 
 
 def _finished(out: Path) -> pd.DataFrame:

@@ -273,14 +273,16 @@ def _scored(
 ) -> list[dict[str, object]]:
     """Run the candidates `begin`, `begin` + 1, ... at `points`; their rows of tune.csv."""
     options = {begin + n: order.options(point) for n, point in enumerate(points)}
-    if order.trains:
-        _train(order, options, workers)
     plan = [entry for candidate, chosen in options.items() for entry in order.plan(candidate, chosen)]
+    each = len(plan) // len(points) * scenario_of(plan[0][1]).steps  # intervals of a candidate
 
     def report(done: int, total: int, note: str) -> None:
-        if progress:
-            progress(done, total, f"candidates {begin} to {max(options)} of {order.candidates}, {note}")
+        if progress:  # of what is kept nothing is to do: total counts the rest
+            progress((begin + len(points)) * each - total + done, order.candidates * each,
+                     f"candidates {begin} to {max(options)} of {order.candidates}; {note}")
 
+    if order.trains:
+        _train(order, options, workers, lambda note: report(0, len(points) * each, note))
     failures = experiment.perform(
         plan, workers=workers, fresh=True, progress=report, tell=tell,
         source=None if cluster is None else partial(dask_cluster.outcomes, cluster))
@@ -322,11 +324,17 @@ def _column(level: float, seed: int) -> str:
     return f"tts_{level:g}_{seed}_veh_s"
 
 
-def _train(order: Tuning, options: Mapping[int, tuple[tuple[str, object], ...]], workers: int) -> None:
+def _train(
+    order: Tuning, options: Mapping[int, tuple[tuple[str, object], ...]], workers: int, tell: Callable[[str], object],
+) -> None:
     """The policies that are not there yet, several at a time. RunFailed if one cannot be trained."""
     todo = [(order, candidate, chosen) for candidate, chosen in options.items()
             if not (order.folder(candidate) / "trained").is_file()]
-    for (_, candidate, _), outcome in outcomes(train_policy, todo, workers):
+
+    def look(running: Sequence[tuple[tuple, float]]) -> None:
+        tell("training " + ", ".join(f"{task[1]}: {share:.0%}" for task, share in running))
+
+    for (_, candidate, _), outcome in outcomes(train_policy, todo, workers, look=look):
         if isinstance(outcome, Failure):
             raise ended([(f"policy of candidate {candidate}", outcome)])
 

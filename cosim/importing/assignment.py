@@ -17,7 +17,7 @@ import os
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +25,7 @@ import numpy as np
 import psutil
 import sumo
 
-from cosim.importing.baseline import run_sumo
+from cosim.importing.baseline import Tell, run_sumo
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.errors import InputError
 from nmfd.runs.scratch import Scratch
@@ -85,7 +85,7 @@ class Assigned:
 def assign(
     net: Path, elements: Sequence[ElementTree.Element], *, begin: float, end: float, seed: int, effort: Effort,
     mesoscopic: bool = True, options: Sequence[str] = (), additional: Sequence[Path] = (),
-    tell: Callable[[str], None] = lambda line: None,
+    tell: Tell = lambda stage, share=0.0: None,
 ) -> Assigned:
     """Find routes for vehicles that have some already.
 
@@ -105,8 +105,8 @@ def assign(
         for model, most in [(True, effort.iterations), *([] if mesoscopic else [(False, effort.car_following)])]:
             gaps: list[float] = []
             for n in range(len(found), len(found) + most):
-                tell(f"assignment {n + 1}{'' if model else ', car-following'}"
-                     + (f", gap {100 * found[-1].gap:.0f} %" if found else ""))
+                tell(f"assignment{'' if model else ', car-following'}, at most {most} iterations"
+                     + (f", gap {100 * found[-1].gap:.0f} %" if found else ""), len(gaps) / most)
                 _iterate(folder, n, [
                     "--net-file", file_list([net]), "--begin", f"{begin:g}", "--end", f"{end:g}", *options,
                     *(["--mesosim", "--meso-junctioncontrol"] if model else []),

@@ -1,11 +1,13 @@
 """No-control runs of the imported city by SUMO's own program: densities of its streets, and who crossed what."""
 
+import re
 import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import sumo
@@ -19,7 +21,14 @@ from nmfd.errors import InputError
 from nmfd.runs.scratch import Scratch
 
 INTERVAL = 300.0  # s, of the densities
+STEP = re.compile(r"Step #([\d.]+)")
 PEAK = 3          # such intervals, one after the other: those with the most vehicles count for the partition
+
+
+class Tell(Protocol):
+    """Is called with what is going on, and the share of it [-] that is done."""
+
+    def __call__(self, stage: str, share: float = 0.0) -> None: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,10 +127,10 @@ def holding_half(held: Float[np.ndarray, " E"]) -> int:
 def run_baseline(
     streets: Streets, *, routes: Sequence[Path], additional: Sequence[Path], begin: float, end: float,
     vehicles: Collection[str] = (), options: Sequence[str] = (), seed: int = 0,
-    look: Callable[[Path], None] = lambda edges: None,
+    look: Callable[[Path], None] = lambda edges: None, reached: Callable[[float], None] = lambda time: None,
 ) -> Baseline:
-    """Simulate without control; vehicles: ids of the demand; look: is called with SUMO's edgeData, which goes then.
-    Raises InputError with SUMO's own words if it refuses."""
+    """Simulate without control; vehicles: ids of the demand; look: is called with SUMO's edgeData, which goes then;
+    reached: now and then with SUMO's time [s]. Raises InputError with SUMO's own words if it refuses."""
     # A vehicle that a rerouter gives another route makes SUMO fail when it writes the times of the edges it has left.
     rerouted = any(next(read_xml(path).iter("routeProbReroute"), None) is not None for path in additional)
     with Scratch("cosim-") as folder:
@@ -132,12 +141,12 @@ def run_baseline(
         run_sumo(
             "sumo", "--net-file", file_list([streets.path]), "--route-files", file_list(routes),
             "--additional-files", file_list([*additional, folder / "measure.add.xml"]), "--begin", str(begin),
-            "--end", str(end), "--seed", str(seed), "--no-step-log", "true", "--no-warnings", "true",
+            "--end", str(end), "--seed", str(seed), "--step-log.period", "10", "--no-warnings", "true",
             "--ignore-route-errors", "true", "--vehroute-output", str(folder / "ways.xml"),
             "--vehroute-output.exit-times", str(not rerouted).lower(), "--vehroute-output.last-route", "true",
             "--vehroute-output.write-unfinished", "true", "--statistic-output", str(folder / "statistic.xml"),
             "--duration-log.statistics", "true",
-            *options, where=str(streets.path))
+            *options, where=str(streets.path), reached=reached)
         statistic = ElementTree.parse(folder / "statistic.xml").getroot()
         counts, trips = child(statistic, "vehicles"), child(statistic, "vehicleTripStatistics")
         waiting = int(attribute(counts, "waiting"))
@@ -152,12 +161,27 @@ def run_baseline(
             + waiting * max(float(attribute(trips, "departDelayWaiting")), 0.0))
 
 
-def run_sumo(program: str, *arguments: str, where: str) -> None:
-    """Run one of SUMO's programs. Raises InputError with the first line of its complaint."""
-    done = subprocess.run(
-        [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments], capture_output=True, text=True, check=False)
-    if done.returncode:
-        lines = [line for line in (done.stderr + done.stdout).splitlines() if "rror" in line] or ["no reason given"]
+def run_sumo(
+    program: str, *arguments: str, where: str, reached: Callable[[float], None] = lambda time: None,
+) -> None:
+    """Run one of SUMO's programs. reached: is called with the times of its step log [s], if it writes one. Raises
+    InputError with the first line of its complaint."""
+    said = []
+    with subprocess.Popen(
+            [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments], stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True) as process:
+        assert process.stdout is not None  # it is a pipe
+        try:
+            for line in process.stdout:  # universal newlines: the step log ends its lines with \r
+                if step := STEP.match(line):
+                    reached(float(step[1]))
+                else:
+                    said.append(line)
+        except BaseException:
+            process.kill()
+            raise
+    if process.returncode:
+        lines = [line for line in said if "rror" in line] or ["no reason given"]
         raise InputError(f"{where}: {program} cannot run it: {' '.join(lines[0].split())}; correct the input")
 
 

@@ -1,7 +1,7 @@
 """`cosim import`: from a sumocfg to networks/NAME and scenarios/NAME."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +10,7 @@ import numpy as np
 
 from cosim.importing import level, model, quality, verdict, written
 from cosim.importing.assignment import Assigned, Effort, relative_gap
-from cosim.importing.baseline import Baseline
+from cosim.importing.baseline import Baseline, Tell
 from cosim.importing.case import SumoInput, read_sumo_input, seconds
 from cosim.importing.demand import Traffic, read_traffic
 from cosim.importing.partition import Clustered, Drawn, alternatives, partition
@@ -63,9 +63,9 @@ class ImportOptions:
     seeds: int = 3
 
 
-def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage: None) -> str:
+def import_city(order: ImportOptions, tell: Tell = lambda stage, share=0.0: None) -> str:
     """Write the network and the scenario; returns what was found, for the terminal. Raises InputError, before anything
-    is written. tell: called with what is going on."""
+    is written. tell: called with what is going on, and the share of it [-] that is done."""
     _check_free(order)
     tell("reading")
     case = _windowed(read_sumo_input(order.source), order)
@@ -82,7 +82,7 @@ def import_city(order: ImportOptions, tell: Callable[[str], None] = lambda stage
     times, congests = order.level or 1.0, True
     if order.level is None:
         times, congests = level.congesting(
-            _probe(order, case, streets, traffic, peaks, scale), mesoscopic=mesoscopic, tell=tell)
+            _probe(order, case, streets, traffic, peaks, scale, tell), mesoscopic=mesoscopic, tell=tell)
     factor, assigned = scale * times, None
     if order.peak:
         factor, (traffic, assigned) = 1.0, peaks.at(times)
@@ -217,6 +217,7 @@ def _folders(order: ImportOptions) -> Iterator[tuple[Path, Path]]:
 
 def _probe(
     order: ImportOptions, case: SumoInput, streets: Streets, traffic: Traffic, peaks: Peaks, scale: float,
+    tell: Tell,
 ) -> level.Probe:
     """Runs of other levels, seen by provisional regions: the user's own, or as many of similar size."""
     if isinstance(order.cut, Drawn):
@@ -229,7 +230,9 @@ def _probe(
         with Scratch("cosim-") as folder:
             files = written.write_traffic(folder, vehicles)
             trials = Trials(streets, case, model.clock(case, streets, vehicles), folder, files)
-            return level.loaded(trials.run(factor, mesoscopic), streets, regions)
+            run = trials.run(
+                factor, mesoscopic, reached=lambda share: tell(f"simulating demand times {times:g}", share))
+            return level.loaded(run, streets, regions)
 
     return probe
 

@@ -7,7 +7,7 @@ from xml.etree.ElementTree import Element, ElementTree
 
 from cosim.importing import model
 from cosim.importing.assignment import Assigned, Effort, assign
-from cosim.importing.baseline import Baseline, averaged, run_baseline
+from cosim.importing.baseline import Baseline, Tell, averaged, run_baseline
 from cosim.importing.case import SumoInput
 from cosim.importing.demand import Traffic, wrapped
 from cosim.importing.generated import morning_peak
@@ -15,6 +15,7 @@ from cosim.importing.streets import Streets
 from cosim.sumo.recorded_trips import MESOSCOPIC, read_recorded_trips, write_recorded_trips
 from nmfd.runs.scratch import Scratch
 
+MINUTE = 60.0
 JITTER = 10.0  # s: what seeds differ in, as in the scenario that is written
 TYPES = ("vType", "vTypeDistribution")
 
@@ -38,25 +39,34 @@ class Trials:
 
     def run(
         self, factor: float, mesoscopic: bool, seed: int = 0, look: Callable[[Path], None] = lambda edges: None,
+        reached: Callable[[float], None] = lambda share: None,
     ) -> Baseline:
-        """With the demand times `factor`. Of seed 0 everybody departs when they wish to. look: as of run_baseline."""
+        """With the demand times `factor`. Of seed 0 everybody departs when they wish to. look: as of run_baseline;
+        reached: is called now and then with the share that is done [-]."""
+        begin, length = self._clock.begin, self._clock.end - self._clock.begin
         if (key := (factor, mesoscopic, seed)) not in self._known:
             with Scratch("cosim-") as folder:
                 routes, vehicles = self._vehicles(folder, factor, seed)
                 self._known[key] = run_baseline(
                     self._streets, routes=[*routes, *self._background], additional=self._additional,
                     begin=self._clock.begin, end=self._clock.end, vehicles=vehicles, seed=seed, look=look,
+                    reached=lambda time: reached(min((time - begin) / length, 1.0)),
                     options=[*self._options, *(MESOSCOPIC if mesoscopic else ())])
         return self._known[key]
 
     def averaged(
-        self, factor: float, mesoscopic: bool, seeds: int, tell: Callable[[str], None], look: Callable[[Path], None],
+        self, factor: float, mesoscopic: bool, seeds: int, tell: Tell, look: Callable[[Path], None],
     ) -> Baseline:
         """Of seeds 0 to seeds - 1. look: as of run_baseline, for the first."""
         runs = []
         for seed in range(seeds):
-            tell(f"simulating without control, {seed + 1} of {seeds}")
-            runs.append(self.run(factor, mesoscopic, seed, look if seed == 0 else lambda edges: None))
+            def reached(share: float, seed: int = seed) -> None:
+                length = (self._clock.end - self._clock.begin) / MINUTE
+                tell(f"simulating without control, {seed + 1} of {seeds}: {share * length:.0f} of {length:.0f} min",
+                     (seed + share) / seeds)
+
+            reached(0.0)
+            runs.append(self.run(factor, mesoscopic, seed, look if seed == 0 else lambda edges: None, reached))
         return averaged(runs)
 
     def _vehicles(self, folder: Path, factor: float, seed: int) -> tuple[list[Path], list[str]]:
@@ -73,7 +83,7 @@ class Peaks:
     """Generated peaks at any level, their routes assigned; each level is made once."""
 
     def __init__(self, streets: Streets, case: SumoInput, beside: Traffic, *, seed: int, effort: Effort,
-                 mesoscopic: bool, tell: Callable[[str], None]):
+                 mesoscopic: bool, tell: Tell):
         """beside: what else the city's files hold; effort, mesoscopic: of the assignment."""
         self._streets, self._case, self._beside, self._seed, self._effort, self._mesoscopic, self._tell = (
             streets, case, beside, seed, effort, mesoscopic, tell)

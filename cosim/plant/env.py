@@ -1,5 +1,8 @@
 """The SUMO city as an environment for reinforcement learning (nmfd.rl; needs the extra `rl`).
 
+Importing this module, as gymnasium has it, registers cosim/Grid7-v0 and cosim/Scenario-v0 (scenario="FOLDER") for
+gymnasium.make.
+
 One simulation per process: close an environment before the next is reset, and use processes for several
 (gymnasium.vector.AsyncVectorEnv, Stable-Baselines3's SubprocVecEnv).
 """
@@ -13,6 +16,7 @@ from cosim.plant.settings import settings
 from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
 from nmfd.model.scenario import Scenario
+from nmfd.rl import register
 
 if TYPE_CHECKING:
     from nmfd.rl import RegionalEnv, RegionsEnv
@@ -20,26 +24,28 @@ if TYPE_CHECKING:
 
 def gymnasium_env(
     scenario: Scenario | Path | str, *, guidance: bool = False, metering: bool = False, steps: int | None = None,
-    city: str = "",
+    city: str = "", render_mode: str | None = None,
 ) -> "RegionalEnv":
     """One agent for all regions (nmfd.rl.RegionalEnv) in SUMO.
 
     guidance, metering: as of nmfd.rl.Interface; steps: control intervals of an episode, the scenario's if None
-    city: what else the city does, such as "max-pressure+rerouting-30". Raises InputError.
+    city: what else the city does, such as "max-pressure+rerouting-30"; render_mode: "rgb_array" for the map. Raises
+    InputError.
     """
     from nmfd.rl import RegionalEnv  # of an extra: not there for everybody
 
-    return RegionalEnv(*_city(scenario, steps, city), guidance=guidance, metering=metering)
+    return RegionalEnv(*_city(scenario, steps, city), guidance=guidance, metering=metering, render_mode=render_mode)
 
 
 def pettingzoo_env(
     scenario: Scenario | Path | str, *, guidance: bool = False, cooperative: bool = True, steps: int | None = None,
-    city: str = "",
+    city: str = "", render_mode: str | None = None,
 ) -> "RegionsEnv":
     """One agent per region (nmfd.rl.RegionsEnv) in SUMO; the other arguments as of `gymnasium_env`."""
     from nmfd.rl import RegionsEnv  # of an extra: not there for everybody
 
-    return RegionsEnv(*_city(scenario, steps, city), guidance=guidance, cooperative=cooperative)
+    return RegionsEnv(
+        *_city(scenario, steps, city), guidance=guidance, cooperative=cooperative, render_mode=render_mode)
 
 
 def _city(scenario: Scenario | Path | str, steps: int | None, city: str) -> tuple[Scenario, SumoPlant]:
@@ -48,3 +54,6 @@ def _city(scenario: Scenario | Path | str, steps: int | None, city: str) -> tupl
         loaded = replace(loaded, steps=min(steps, loaded.steps), demand=loaded.demand[:steps])
     overrides = {**(parse(city).overrides if city else {}), "gateways_fixed": True}
     return loaded, SumoPlant(loaded, overrides=settings(loaded).changed(**overrides))
+
+
+register("cosim", "cosim.plant.env:gymnasium_env", {"Grid7": "grid7_peak"})

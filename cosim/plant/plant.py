@@ -18,11 +18,12 @@ from cosim.plant.record import Record, Recorder
 from cosim.plant.sensing import Estimation, Sensing
 from cosim.plant.settings import ESTIMATE, PRESSURES, Settings, settings
 from cosim.plant.standstill import Standstill
+from cosim.sumo.arrays import PerEdge, Points
 from cosim.sumo.build import ensure_built
-from cosim.sumo.net import City, Gateway, check_adjacency, load_city
+from cosim.sumo.net import City, Gateway, check_adjacency, edge_shapes, load_city
 from cosim.sumo.session import Session, Window
 from cosim.sumo.tripinfo import TripFacts, TripReader
-from nmfd.arrays import PerTurn
+from nmfd.arrays import PerTurn, Positions
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
@@ -136,6 +137,18 @@ class SumoPlant:
             self._recorder.close()
             self._facts = self._with_standstill(self._trips.facts, *emitted)
         return self._facts
+
+    def map(self) -> tuple[Positions, list[Points]]:
+        """Where the regions are (R, 2), and the streets, E lines (n, 2) [m]."""
+        shapes = edge_shapes(self.city)
+        middles = np.array([shape.mean(axis=0) for shape in shapes])
+        region = np.array([self.city.region_of[edge] for edge in self.city.edges])
+        return np.stack([middles[region == r].mean(axis=0) for r in range(self.city.regions)]), shapes
+
+    def density(self) -> PerEdge:
+        """(E,) [veh/km and lane] on average over the control interval that has ended; 0 before."""
+        lane_km = np.array([self.city.length[edge] * self.city.lanes[edge] for edge in self.city.edges]) / 1000.0
+        return self._recorder.last["edge_vehicles"] / lane_km if self._k else np.zeros(len(lane_km))
 
     @property
     def sumo_time(self) -> float:

@@ -1,6 +1,9 @@
 """The map of a city: streets in the colour of what they do, regions with their numbers, gateways with their green."""
 
+from functools import lru_cache
+
 import numpy as np
+from bokeh.core.serialization import AnyRep, Serializable, Serializer
 from bokeh.models import (
     ColorBar,
     ColumnDataSource,
@@ -30,6 +33,26 @@ WIDEST = 9.0    # pixels, of an arrow
 NOTHING = -1.0  # where a street has no value
 
 
+class Encoded(list, Serializable):
+    """A column that is the same in all documents, encoded once: else that is most of what a page costs."""
+
+    def to_serializable(self, serializer: Serializer) -> AnyRep:
+        """What Bokeh asks for."""
+        if not hasattr(self, "_rep"):
+            alone = Serializer(deferred=False)
+            self._rep = [alone.encode(item) for item in self]
+        return self._rep
+
+
+@lru_cache(maxsize=4)
+def street_columns(picture: CityPicture) -> dict[str, Encoded]:
+    """The lines of the streets, each to the right of its middle, and their names."""
+    apart = SIDE * float(np.ptp(np.concatenate(picture.shapes)[:, 0]))
+    lines = [_to_the_right(shape, apart) for shape in picture.shapes]
+    return {"xs": Encoded(_floats(line[:, 0]) for line in lines), "ys": Encoded(_floats(line[:, 1]) for line in lines),
+            "edge": Encoded(picture.edges)}
+
+
 class CityMap:
     """One run on the map. `show` sets it to a frame; what it needs for that are the sources, and no server."""
 
@@ -49,6 +72,7 @@ class CityMap:
         self.streets = self._streets(plot)
         self.arrows = self._guidance(plot)
         self.gates = self._gateways(plot)
+        plot.add_tools(TapTool(renderers=self._clicked))  # one for all of them: of several only one is active
         _numbers(plot, picture)
         plot.add_layout(ScaleBar(
             range=plot.x_range, unit="m", location="bottom_left", bar_length=0.15, background_fill_alpha=0.0,
@@ -75,6 +99,11 @@ class CityMap:
             "line": [(slice(len(of)), [colours.CHOSEN if r == region else colours.FAINT for r in of])],
             "fill": [(slice(len(of)), [colours.CHOSEN_LAND if r == region else colours.LAND for r in of])]})
 
+    def choose_street(self, street: int) -> None:
+        """Mark a street."""
+        columns = street_columns(self._picture)
+        self.chosen.data = {name: [columns[name][street]] for name in ("xs", "ys")}
+
     def _regions(self, plot: Plot) -> ColumnDataSource:
         picture = self._picture
         rings = [(r, ring) for r, found in enumerate(picture.outlines) for ring in found]
@@ -86,22 +115,23 @@ class CityMap:
         drawn = plot.patches(
             "xs", "ys", source=source, fill_color="fill", line_color="line", line_width="width",
             nonselection_fill_alpha=1.0, nonselection_line_alpha=1.0)
-        plot.add_tools(TapTool(renderers=[drawn]))
+        self._clicked = [drawn]
         return source
 
     def _streets(self, plot: Plot) -> ColumnDataSource:
         picture = self._picture
-        apart = SIDE * float(np.ptp(np.concatenate(picture.shapes)[:, 0]))
-        lines = [_to_the_right(shape, apart) for shape in picture.shapes]
-        many = len(lines) > 2000
+        many = len(picture.edges) > 2000
         source = ColumnDataSource({
-            "xs": [_floats(line[:, 0]) for line in lines], "ys": [_floats(line[:, 1]) for line in lines],
-            "edge": list(picture.edges), "value": np.zeros(len(lines), np.float32),
+            **street_columns(picture), "value": np.zeros(len(picture.edges), np.float32),
             "width": ((0.8 if many else 1.6) + (0.4 if many else 0.9) * picture.lanes).astype(np.float32)})
         self._bars = {by: _bar(by) for by in LABELS}
+        self.chosen = ColumnDataSource({"xs": [], "ys": []})
+        plot.multi_line("xs", "ys", source=self.chosen, line_width=12, color=colours.CHOSEN, alpha=0.5,
+                        line_cap="round")
         self._drawn = plot.multi_line(
-            "xs", "ys", source=source, line_width="width", line_cap="round",
+            "xs", "ys", source=source, line_width="width", line_cap="round", nonselection_line_alpha=1.0,
             line_color={"field": "value", "transform": self._bars[DENSITY].color_mapper})
+        self._clicked.append(self._drawn)
         plot.add_tools(HoverTool(renderers=[self._drawn], tooltips=[("street", "@edge"), ("value", "@value{0.00}")]))
         for bar in self._bars.values():
             plot.add_layout(bar, "below")
@@ -126,11 +156,10 @@ class CityMap:
                              line_width="rim_width", nonselection_alpha=1.0)
         plot.wedge("x", "y", radius="radius", radius_units="screen", start_angle=np.pi / 2, end_angle="end",
                    direction="clock", source=source, color=colours.GREEN, line_color=None, nonselection_alpha=1.0)
-        plot.add_tools(
-            TapTool(renderers=[discs]),
-            HoverTool(renderers=[discs], tooltips=[
-                ("gateway", "@way"), ("green, share of the original", "@green"),
-                ("halting before it [veh]", "@queue{0.0}")]))
+        self._clicked.append(discs)
+        plot.add_tools(HoverTool(renderers=[discs], tooltips=[
+            ("gateway", "@way"), ("green, share of the original", "@green"),
+            ("halting before it [veh]", "@queue{0.0}")]))
         return source
 
     def _show_gates(self, frame: Frame, held: frozenset[tuple[int, int]]) -> None:

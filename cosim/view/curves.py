@@ -3,7 +3,17 @@
 from collections.abc import Sequence
 
 import numpy as np
-from bokeh.models import ColorBar, ColumnDataSource, FixedTicker, HoverTool, LinearColorMapper, Plot, Span
+from bokeh.models import (
+    ColorBar,
+    ColumnDataSource,
+    FixedTicker,
+    HoverTool,
+    LinearAxis,
+    LinearColorMapper,
+    Plot,
+    Range1d,
+    Span,
+)
 from bokeh.plotting import figure
 
 from cosim.view import colours
@@ -63,7 +73,12 @@ class Curves:
         self.gate = _figure("", "time [min]", "share [-]")
         self.trips = _figure("Completed trips", "time [min]", "trips [veh]")
         self.spent = _figure("Total time spent so far", "time [min]", "time spent [veh h]")
-        overtime = (self.region, self.gate, self.trips, self.spent)
+        self.street = _figure("", "time [min]", "density [veh/km and lane]")
+        self.street.extra_y_ranges = {"speed": Range1d(0.0, 1.1)}
+        self.street.add_layout(LinearAxis(
+            y_range_name="speed", axis_label="speed, share of what is allowed [-]", axis_label_text_font_style="normal",
+            axis_label_text_color=colours.FAINT, major_label_text_color=colours.FAINT), "right")
+        overtime = (self.region, self.gate, self.trips, self.spent, self.street)
         self.lines, self.points, self.trails = [], [], []
         for plot in overtime:
             plot.x_range.start, plot.x_range.end = 0.0, horizon
@@ -76,7 +91,7 @@ class Curves:
         for n, name in enumerate(names):
             colour, dash = colours.RUNS[n]
             empty: dict[str, list[float]] = {key: [] for key in (
-                "time", "accumulation", "outflow", "u", "green", "completed", "spent")}
+                "time", "accumulation", "outflow", "u", "green", "completed", "spent", "density", "speed")}
             line = ColumnDataSource(empty)
             for plot, key in ((self.region, "accumulation"), (self.trips, "completed"), (self.spent, "spent")):
                 plot.line("time", key, source=line, color=colour, line_dash=dash, line_width=2, legend_label=name)
@@ -84,6 +99,10 @@ class Curves:
                            legend_label=f"u commanded, {name}")
             self.gate.scatter("time", "green", source=line, size=5, marker=("circle", "square")[n], line_color=colour,
                               fill_color=colours.PAPER, legend_label=f"green / original, {name}")
+            self.street.line("time", "density", source=line, color=colour, line_dash=dash, line_width=2,
+                             legend_label=f"density, {name}")
+            self.street.scatter("time", "speed", source=line, y_range_name="speed", size=5, line_color=colour,
+                                marker=("circle", "square")[n], fill_color=colours.PAPER, legend_label=f"speed, {name}")
             trail, point = ColumnDataSource({"x": [], "y": []}), ColumnDataSource({"x": [], "y": []})
             self.plane.line("x", "y", source=trail, color=colour, line_dash=dash, alpha=0.5, line_width=1.5)
             self.plane.scatter("x", "y", source=trail, color=colour, alpha=0.35, size=4)
@@ -94,9 +113,11 @@ class Curves:
             self.points.append(point)
         for plot in (*overtime, self.plane):
             _legend(plot)
-        legend = self.gate.legend[0]  # values are at the top and at the bottom: below them
-        legend.update(location="left", ncols=2, margin=0)
-        self.gate.add_layout(legend, "below")
+        for plot in (self.gate, self.street):  # values are at the top and at the bottom: below them
+            legend = plot.legend[0]
+            legend.update(location="left", ncols=2, margin=0)
+            plot.add_layout(legend, "below")
+        self.choose_street(None)
         self.now = [_now(plot) for plot in overtime]
 
     def choose(self, region: int, gate: tuple[int, int] | None) -> None:
@@ -113,6 +134,12 @@ class Curves:
                                "y": [float(picture.critical[region])] * 2}
         self.curve.data = {"x": curve[:, 0].astype(np.float32), "y": curve[:, 1].astype(np.float32)}
 
+    def choose_street(self, street: int | None) -> None:
+        """The street whose curves are shown."""
+        self._street = street
+        self.street.title.text = "Click a street of the map" if street is None else (
+            f"Street {self._picture.edges[street]}: density and speed")
+
     def show(self, runs: Sequence[Sequence[Frame]], time: float) -> None:
         """runs: the whole frames of every run so far; time: [s], that is looked at"""
         for n, whole in enumerate(runs):
@@ -125,7 +152,9 @@ class Curves:
                 "u": np.array([u for u, _ in shares], np.float32),
                 "green": np.array([green for _, green in shares], np.float32),
                 "completed": np.array([frame.completed for frame in whole], np.float32),
-                "spent": np.array([frame.time_spent / HOUR for frame in whole], np.float32)}
+                "spent": np.array([frame.time_spent / HOUR for frame in whole], np.float32),
+                **{name: np.array([np.nan if self._street is None else getattr(frame, name)[self._street]
+                                   for frame in whole], np.float32) for name in ("density", "speed")}}
             past = [frame for frame in later if frame.time <= time][-TRAIL:]
             x, y = (np.array(values, np.float32) for values in (
                 [frame.accumulation[self._region] for frame in past], [frame.outflow[self._region] for frame in past]))

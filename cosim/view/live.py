@@ -4,25 +4,26 @@ import time
 from functools import partial
 
 from bokeh.document import Document
-from bokeh.models import Button, RadioButtonGroup, Select, Slider
+from bokeh.models import Button, RadioButtonGroup, Select, Slider, TextInput
 
+from cosim.view.budget import Budget
 from cosim.view.city_map import DENSITY, SPEED
 from cosim.view.curves import MINUTE
 from cosim.view.page import Page
 from cosim.view.show import Show
 
 EVERY = 250  # ms of wall time between two pictures: 4 Hz
-SHARE = 0.2  # of a core, for the pictures of all viewers: with many of them, everybody's come more seldom
 
 
 class Viewer:
-    """A document of the server: it looks at `show` a few times a second."""
+    """A document of the server: it looks at `show` a few times a second, more seldom if `budget` says so."""
 
-    def __init__(self, show: Show, document: Document):
-        """show: whose picture is there"""
+    def __init__(self, show: Show, document: Document, budget: Budget):
+        """show: whose picture is there; budget: of all viewers"""
         assert show.picture is not None
         self._show, picture = show, show.picture
         self._page = Page(picture, [seen.name for seen in show.runs])
+        self._numbers = {edge: n for n, edge in enumerate(picture.edges)}
         self._at: float | None = None  # the time that is looked back at [s], None for the present
         self._by = DENSITY
         self._drawn: tuple[object, ...] = ()
@@ -32,24 +33,20 @@ class Viewer:
         for n, one in enumerate(self._page.maps):
             one.regions.selected.on_change("indices", partial(self._region_clicked, n))
             one.gates.selected.on_change("indices", partial(self._gate_clicked, n))
+            one.streets.selected.on_change("indices", partial(self._street_clicked, n))
         self._page.place(
             document, f"{len(picture.edges):,} streets, {picture.regions} regions, control interval "
-            f"{picture.step:g} s, {picture.steps} intervals", bar, choices)
-        self._next = 0.0
+            f"{picture.step:g} s, {picture.steps} intervals", bar, choices, streets=True)
+        self._next, self._budget = 0.0, budget
         self.refresh()
-        show.viewers += 1
-        document.on_session_destroyed(self._leave)
         document.add_periodic_callback(self._look, EVERY)
 
-    def _leave(self, _: object) -> None:
-        self._show.viewers -= 1
-
     def _look(self) -> None:
-        """Draw, if this viewer's share of the time allows it."""
-        begin = time.perf_counter()
-        if begin >= self._next:
+        """Draw, if the last picture is long enough ago."""
+        now = time.monotonic()
+        if now >= self._next:
             self.refresh()
-            self._next = begin + self._show.viewers * (time.perf_counter() - begin) / SHARE
+            self._next = now + (self._budget.slower() - 0.5) * EVERY / 1000.0
 
     def refresh(self) -> None:
         """Draw what has changed."""
@@ -60,7 +57,7 @@ class Viewer:
             (i, h): share for _, i, h, share in seen.switched}.items() if share is not None) for seen in show.runs]
         drawn = (now, self._by, *held, *(None if frame is None else (frame.time, frame.whole) for frame in frames))
         whole = [[frame for frame in seen.whole if frame.time <= show.now] for seen in show.runs]
-        traced = (self._page.region, self._page.gate, self._at, *(len(frames) for frames in whole))
+        traced = (self._page.region, self._page.gate, self._page.street, self._at, *(len(frames) for frames in whole))
         if drawn != self._drawn:
             self._page.show(frames, now, self._by, held)
             self._drawn = drawn
@@ -101,6 +98,8 @@ class Viewer:
         self._gates.on_change("value", lambda _, __, new: self._choose(self._page.region, _pair(new)))
         self._whose = Select(title="of the run", name="whose", value="0", width=200, options=[
             (str(n), seen.name) for n, seen in enumerate(self._show.runs)])
+        self._street = TextInput(title="Street", name="street", placeholder="its name, or click it", width=170)
+        self._street.on_change("value", lambda _, __, new: self._choose_street(new))
         buttons: list[Button] = []
         for label, name, share in (
                 ("Close gate", "close", 0.0), ("Open gate", "open", 1.0), ("Let go", "release", None)):
@@ -108,7 +107,7 @@ class Viewer:
             button.on_click(partial(self._switch, share))
             buttons.append(button)
         self._running += buttons
-        return [colour, self._regions, self._gates, self._whose, *buttons]
+        return [colour, self._regions, self._street, self._gates, self._whose, *buttons]
 
     def _do(self, command: object) -> None:
         command()  # type: ignore[operator]
@@ -145,6 +144,17 @@ class Viewer:
             self._whose.value = str(n)
             if gate.signal:
                 self._choose(gate.target, (gate.source, gate.target))
+
+    def _street_clicked(self, n: int, _: str, __: list[int], new: list[int]) -> None:
+        if new:
+            self._page.maps[n].streets.selected.indices = []
+            self._street.value = self._page.picture.edges[new[0]]
+
+    def _choose_street(self, name: str) -> None:
+        """Nothing for a name that no street has."""
+        if (name := name.strip()) in self._numbers:
+            self._page.choose_street(self._numbers[name])
+            self.refresh()
 
     def _choose(self, region: int, gate: tuple[int, int] | None) -> None:
         """gate: None for the region's first one"""

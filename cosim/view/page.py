@@ -27,6 +27,7 @@ class Page:
         self.curves = Curves(picture, names)
         self.numbers = Div(text="", sizing_mode="stretch_width")
         ends = [region for gate in picture.gates for region in (gate.source, gate.target)]
+        self.street: int | None = None
         self.region = max(range(picture.regions), key=ends.count)
         self.gate = self.gate_of(self.region)
         self.choose(self.region, self.gate)
@@ -43,6 +44,13 @@ class Page:
         for one in self.maps:
             one.choose(region)
         self.curves.choose(region, gate)
+
+    def choose_street(self, street: int) -> None:
+        """The street whose curves are shown, from the next `curves` on."""
+        self.street = street
+        for one in self.maps:
+            one.choose_street(street)
+        self.curves.choose_street(street)
 
     def show(
         self, frames: Sequence[Frame | None], time: float, by: str = DENSITY,
@@ -64,15 +72,18 @@ class Page:
             load.show(whole)
         self.curves.show(runs, time)
 
-    def place(self, document: Document, subtitle: str, bar: Sequence[Model], choices: Sequence[Model]) -> None:
-        """Put it into a document. bar, choices: what one can press, with names."""
-        curves = self.curves
+    def place(
+        self, document: Document, subtitle: str, bar: Sequence[Model], choices: Sequence[Model], *,
+        streets: bool = False,
+    ) -> None:
+        """Put it into a document. bar, choices: what one can press, with names; streets: whether one can be chosen"""
+        curves, street = self.curves, {"street_curve": self.curves.street} if streets else {}
         roots = {
             "numbers": self.numbers,
             **{f"map{n}": one.plot for n, one in enumerate(self.maps)},
             **{f"load{n}": one.plot for n, one in enumerate(self.loads)},
             "region_curve": curves.region, "plane": curves.plane, "gate_curve": curves.gate, "trips": curves.trips,
-            "spent": curves.spent, **{str(model.name): model for model in (*bar, *choices)}}
+            "spent": curves.spent, **street, **{str(model.name): model for model in (*bar, *choices)}}
         with document.models.freeze():  # else all models are looked through anew with every root
             for name, model in roots.items():
                 model.name = name
@@ -84,7 +95,7 @@ class Page:
             bar=[model.name for model in bar], choices=[model.name for model in choices],
             maps=[name for name in roots if name.startswith("map")],
             loads=[name for name in roots if name.startswith("load")],
-            curves=["region_curve", "plane", "gate_curve", "trips", "spent"])
+            curves=["region_curve", "plane", "gate_curve", *street, "trips", "spent"])
 
 
 def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -> str:

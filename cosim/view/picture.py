@@ -37,9 +37,9 @@ class Gate:
     signal: bool
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CityPicture:
-    """What does not change during a run.
+    """What does not change during a run. The same only as itself.
 
     name: of the scenario; region_names: R; edges: E ids
     shapes: E lines (n, 2) [m]; lane_km (E,) [km]: length times lanes; limit (E,) [m/s]; lanes, region: (E,)

@@ -23,12 +23,14 @@ from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPServerRequest
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.netutil import bind_sockets
-from tornado.web import ErrorHandler
+from tornado.web import ErrorHandler, RequestHandler
 
+from cosim.view.budget import Budget
 from nmfd.errors import InputError
 
 LOOPBACK = "127.0.0.1"
-MOST_VIEWERS = 12    # at a time: a page takes half a second of processor time to make
+MOST_VIEWERS = 12    # at a time
+RETRY = 5            # s, until somebody for whom there is no room asks again
 LARGEST = 1_000_000  # bytes of a message to the server
 LEFT = 5.0           # s without a viewer, after which nobody is looking
 
@@ -36,19 +38,26 @@ LEFT = 5.0           # s without a viewer, after which nobody is looking
 class Guarded(BokehTornado):
     """Bokeh's server behind a guard. token: what the page's address needs, "" on this machine alone."""
 
-    def __init__(self, application: Application, names: frozenset[str], token: str):
-        """names: of this machine, as a Host may have them, besides addresses where there is a token"""
-        self._names, self._token = names, token
+    def __init__(self, application: Application, names: frozenset[str], token: str, budget: Budget):
+        """names: of this machine, as a Host may have them, besides addresses where there is a token; budget: of pages
+        and pictures"""
+        self._names, self._token, self._budget = names, token, budget
         super().__init__(
             application, extra_websocket_origins=["*"], sign_sessions=True, secret_key=secrets.token_bytes(32),
             websocket_max_message_size_bytes=LARGEST, unused_session_lifetime_milliseconds=int(1000 * LEFT),
             check_unused_sessions_milliseconds=1000, keep_alive_milliseconds=10_000, use_index=False)
 
     def find_handler(self, request: HTTPServerRequest, **more: object) -> object:
-        """403 instead of an answer, unless all is well."""
-        if self.allowed(request):
-            return super().find_handler(request, **more)
-        return self.get_handler_delegate(request, ErrorHandler, {"status_code": 403})
+        """403 instead of an answer, unless all is well; a page that asks again where too many look."""
+        if not self.allowed(request):
+            return self.get_handler_delegate(request, ErrorHandler, {"status_code": 403})
+        if not _free(request.path) and not self.room():
+            return self.get_handler_delegate(request, Waiting)
+        return super().find_handler(request, **more)
+
+    def room(self) -> bool:
+        """Whether a page may be made now."""
+        return len(self.get_sessions("/")) < MOST_VIEWERS and self._budget.left()
 
     def allowed(self, request: HTTPServerRequest) -> bool:
         """Whether a request may have an answer."""
@@ -58,15 +67,12 @@ class Guarded(BokehTornado):
         origins = request.headers.get_list("Origin")
         if any(origin.lower() != f"http://{host[0].lower()}" for origin in origins):
             return False
-        path = request.path.rstrip("/")
-        if path == "/ws":
+        if request.path.rstrip("/") == "/ws":
             return self._signed(request.headers.get("Sec-WebSocket-Protocol", ""))
-        if path.startswith("/static/") or path == "/favicon.ico":
+        if _free(request.path):
             return True
         given = parse_qs(request.query).get("token", [""])[-1]
-        if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
-            return False
-        return len(self.get_sessions("/")) < MOST_VIEWERS
+        return not self._token or hmac.compare_digest(given.encode(), self._token.encode())
 
     def _signed(self, protocol: str) -> bool:
         """Whether a websocket is of a page that this server gave out: "bokeh, TOKEN"."""
@@ -82,11 +88,26 @@ class Guarded(BokehTornado):
         return bool(self._token) and _is_address(name)
 
 
+class Waiting(RequestHandler):
+    """What costs next to nothing, for those for whom there is no room now."""
+
+    def get(self) -> None:
+        """A page that asks again."""
+        self.set_status(503)
+        self.set_header("Retry-After", str(RETRY))
+        self.finish(
+            f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta http-equiv="refresh" content="{RETRY}">'
+            "<title>One moment</title><p>Many are watching, and the runs go first. This page asks again in "
+            f"{RETRY} s.")
+
+
 class Server:
     """Shows `page` to whoever opens `address`, in the thread that calls `serve`."""
 
-    def __init__(self, page: Callable[[Document], object], *, host: str = LOOPBACK, port: int = 0):
-        """port: 0 for any that is free. Raises InputError for one that is not, and a host that is not this machine's"""
+    def __init__(self, page: Callable[[Document], object], *, host: str = LOOPBACK, port: int = 0,
+                 budget: Budget | None = None):
+        """port: 0 for any that is free; budget: of what pages and pictures cost. Raises InputError for a port that is
+        not free, and a host that is not this machine's"""
         try:
             sockets = bind_sockets(port, host)
         except (OSError, UnicodeError) as error:
@@ -102,7 +123,7 @@ class Server:
             names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
         application = Application(FunctionHandler(page))
         self._loop = IOLoop.current()
-        self._tornado = Guarded(application, frozenset(names), self._token)
+        self._tornado = Guarded(application, frozenset(names), self._token, budget or Budget())
         http = HTTPServer(
             self._tornado, max_buffer_size=10 * LARGEST, max_body_size=LARGEST, idle_connection_timeout=60)
         http.add_sockets(sockets)
@@ -131,6 +152,12 @@ class Server:
             asking.stop()
             self._server.stop()
             self._server.unlisten()
+
+
+def _free(path: str) -> bool:
+    """Whether it costs next to nothing."""
+    path = path.rstrip("/")
+    return path.startswith("/static/") or path in ("/favicon.ico", "/ws")
 
 
 def _name(host: str) -> str:

@@ -58,7 +58,6 @@ class Show:
         self.picture: CityPicture | None = None
         self.pace = Pace(delay=delay)
         self.changed = threading.Event()  # something was shown or has ended
-        self.viewers = 0
         self._progress, self._lock = progress, threading.Lock()
         self._workers: list[Worker] = []
         self._pipes: list[Connection] = []

@@ -9,6 +9,7 @@ from contextlib import suppress
 import psutil
 
 from cosim.evaluation.simulate import Task
+from cosim.view.budget import Budget
 from cosim.view.live import Viewer
 from cosim.view.server import LOOPBACK, Server
 from cosim.view.show import Seen, Show
@@ -41,7 +42,8 @@ def watch(
             return True
         return server.viewers == 0 and time.monotonic() - over_at > PATIENCE
 
-    server = Server(lambda document: Viewer(show, document), host=host, port=port)
+    budget = Budget()
+    server = Server(lambda document: Viewer(show, document, budget), host=host, port=port, budget=budget)
     show = Show(tasks, delay=delay, progress=progress)
     try:
         while show.picture is None and not show.over:

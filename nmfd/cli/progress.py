@@ -12,7 +12,7 @@ __all__ = ["progress_line", "resumable"]
 
 
 @contextmanager
-def resumable(label: str, out: Path, results: str = "") -> Iterator[Show | None]:
+def resumable(label: str, out: Path, results: str = "") -> Iterator[Show]:
     """`progress_line` of a command that keeps what is finished in the folder `out`; Ctrl-C says how to go on.
 
     results: the file there that holds what is finished; without it nothing is kept

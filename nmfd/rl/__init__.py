@@ -6,13 +6,15 @@
     Sb3VecEnv           the same as Stable-Baselines3 wants it
     Interface           observations and actions as numbers; turns the actions of a trained agent into controls
 
-Names are imported when they are first used. scenarios/economic_mpc/ppo.py is an example with PPO.
+Importing this module, as gymnasium has it, registers nmfd/Hexagon7-v0 and nmfd/Scenario-v0 (scenario="FOLDER") for
+gymnasium.make. Names are imported when they are first used. scenarios/economic_mpc/ppo.py is an example with PPO.
 """
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nmfd.extras import need
+from nmfd.extras import need, there
 
 if TYPE_CHECKING:
     from nmfd.rl.agents import RegionsEnv
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from nmfd.rl.vector import NmfdVectorEnv
 
 __all__ = ["Interface", "NmfdVectorEnv", "RegionalEnv", "RegionsEnv", "Sb3VecEnv"]
+_SCENARIOS = {"Hexagon7": "economic_mpc"}  # of the ids: a scenario of the package; Scenario takes scenario=FOLDER
 _PLACES = {  # name -> its module, and the libraries that it needs
     "Interface": ("interface",), "NmfdVectorEnv": ("vector", "gymnasium"), "RegionalEnv": ("env", "gymnasium"),
     "RegionsEnv": ("agents", "gymnasium", "pettingzoo"), "Sb3VecEnv": ("sb3", "gymnasium", "stable_baselines3")}
@@ -33,3 +36,19 @@ def __getattr__(name: str) -> Any:
     module, *libraries = _PLACES[name]
     need(f"nmfd.rl.{name}", "rl", *libraries)
     return getattr(import_module(f"nmfd.rl.{module}"), name)
+
+
+def register(namespace: str, entry_point: str, scenarios: dict[str, str]) -> None:
+    """Ids for gymnasium.make, if that is there: NAMESPACE/NAME-v0 of scenarios that come with the package, and
+    NAMESPACE/Scenario-v0 for any other."""
+    if there("gymnasium"):
+        import gymnasium  # of an extra: not there for everybody
+
+        gymnasium.register(id=f"{namespace}/Scenario-v0", entry_point=entry_point)
+        for name, folder in scenarios.items():
+            gymnasium.register(
+                id=f"{namespace}/{name}-v0", entry_point=entry_point,
+                kwargs={"scenario": str(Path(__file__).parents[2] / "scenarios" / folder)})
+
+
+register("nmfd", "nmfd.rl.env:RegionalEnv", _SCENARIOS)

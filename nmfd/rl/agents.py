@@ -1,10 +1,11 @@
 """A scenario as a PettingZoo environment: one agent per region, all act at once."""
 
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 from pettingzoo import ParallelEnv
 
-from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.rl.interface import Episode, Interface, combined
 from nmfd.types import Plant
@@ -18,14 +19,15 @@ class RegionsEnv(ParallelEnv):
     is little sense of what it does to its neighbours. `state()` is the observation of RegionalEnv.
     """
 
-    metadata = {"name": "nmfd_regions_v0", "render_modes": [], "is_parallelizable": True}
-    render_mode = None
+    metadata = {"name": "nmfd_regions_v0", "render_modes": ["rgb_array"], "render_fps": 10, "is_parallelizable": True}
 
     def __init__(
-        self, scenario: Scenario, plant: Plant | None = None, *, guidance: bool = False, cooperative: bool = True,
+        self, scenario: Scenario | Path | str, plant: Plant | None = None, *, guidance: bool = False,
+        cooperative: bool = True, render_mode: str | None = None,
     ):
-        network = scenario.network
-        self._episode = Episode(scenario, NmfdPlant(scenario) if plant is None else plant)
+        self._episode, self.render_mode = Episode(scenario, plant), render_mode
+        loaded = self._episode.scenario
+        network = loaded.network
         self._cooperative = cooperative
         self.possible_agents = [f"region_{region}" for region in range(network.regions)]
         self.agents: list[str] = []
@@ -35,7 +37,7 @@ class RegionsEnv(ParallelEnv):
             for region, agent in enumerate(self.possible_agents)}
         self._whole, self._random = Interface(network, guidance=guidance), np.random.default_rng()
         self.observation_spaces = {
-            agent: gymnasium.spaces.Box(-np.inf, np.inf, (interface.observation_size,), np.float32)
+            agent: gymnasium.spaces.Box(*interface.bounds(loaded), dtype=np.float32)
             for agent, interface in self.interfaces.items()}
         self.action_spaces = {
             agent: gymnasium.spaces.Box(-1.0, 1.0, (interface.action_size,), np.float32)
@@ -74,14 +76,16 @@ class RegionsEnv(ParallelEnv):
         """The observation of all regions together."""
         return self._whole.observed(self._seen)
 
-    def render(self) -> None:
-        pass
+    def render(self) -> np.ndarray | None:
+        """As of RegionalEnv."""
+        return self._episode.picture() if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
         self._episode.close()
 
     def _observations(self) -> dict:
-        return {agent: self.interfaces[agent].observed(self._seen) for agent in self.agents}
+        return {agent: np.clip(self.interfaces[agent].observed(self._seen), space.low, space.high)
+                for agent, space in self.observation_spaces.items() if agent in self.agents}
 
     def _infos(self) -> dict:
         return {agent: {"time_s": self._seen.time} for agent in self.agents}

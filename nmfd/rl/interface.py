@@ -1,19 +1,23 @@
 """What an agent sees and does, as vectors of numbers."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from nmfd.arrays import PerRegion
 from nmfd.closed_loop import noise_of, noisy
+from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import RegionalModel
-from nmfd.model.scenario import Scenario
+from nmfd.model.scenario import Scenario, read_scenario
+from nmfd.rl.drawing import CityDrawing
 from nmfd.types import Controls, Observation, Plant
 
 Pairs = Float[np.ndarray, "*#B R R"]  # of some states or controls, or of one
 Actions = Float[np.ndarray, "*B A"]
 
+NOISE = 10.0  # standard deviations of the measurement noise that an observation may be off by
 LOGITS = 5.0  # actions in [-1, 1] times this are the logits of the split ratios: up to e^10 between two ways
 
 
@@ -65,6 +69,13 @@ class Interface:
         """(observation_size,) of what a controller sees."""
         return self.observation(observation.accumulation, observation.backlog)
 
+    def bounds(self, scenario: Scenario) -> tuple[Float[np.ndarray, " O"], Float[np.ndarray, " O"]]:
+        """The lowest and the highest observation (observation_size,): of nobody, and of twice all vehicles of the
+        scenario besides full regions at every place, give and take the noise."""
+        trips = 2.0 * scenario.step * scenario.demand.sum() + sum(mfd.jam for mfd in scenario.network.mfds)
+        off, nobody = NOISE * scenario.measurement_std, np.zeros_like(self._open)
+        return self.observation(nobody - off, nobody), self.observation(nobody + trips + off, nobody + trips)
+
     def perimeter(self, action: Actions) -> Pairs:
         """(..., R, R) [-] of actions (..., action_size); u_max at the boundaries of other regions."""
         network = self._network
@@ -103,23 +114,42 @@ def combined(parts: dict[int, Controls], network: RegionalModel) -> Controls:
 class Episode:
     """A closed loop that is stepped from outside, with the noise and states of nmfd.closed_loop.run of one seed."""
 
-    def __init__(self, scenario: Scenario, plant: Plant):
-        self.scenario, self._plant, self._closed = scenario, plant, False
-        self.unit = sum(mfd.critical for mfd in scenario.network.mfds)  # [veh]
+    def __init__(self, scenario: Scenario | Path | str, plant: Plant | None):
+        """scenario: or its folder; plant: the NMFD if None"""
+        self.scenario = scenario if isinstance(scenario, Scenario) else read_scenario(Path(scenario))
+        self._plant, self._closed = NmfdPlant(self.scenario) if plant is None else plant, False
+        self._drawing: CityDrawing | None = None
+        # Only cities have streets.
+        self._shown, self._density = (getattr(plant, name, None) for name in ("map", "density"))
+        self.unit = sum(mfd.critical for mfd in self.scenario.network.mfds)  # [veh]
 
     def reset(self, seed: int) -> Observation:
         """What the agent sees at the beginning."""
         self._random = noise_of(seed)
         self._state, self.steps = self._plant.reset(seed), 0
+        self._perimeter = np.where(self.scenario.network.adjacency, self.scenario.network.u_max, 0.0)
         return self._seen()
 
     def step(self, controls: Controls) -> tuple[Observation, PerRegion, bool]:
         """What the agent sees next; vehicles (R,) [veh] in and before each region, and removed there, when the interval
         began; the end."""
         spent = self._state.unfinished.sum(axis=1)
-        self._state = self._plant.step(controls)
+        self._state, self._perimeter = self._plant.step(controls), controls.perimeter
         self.steps += 1
         return self._seen(), spent, self.steps >= self.scenario.steps
+
+    def picture(self) -> UInt8[np.ndarray, "H W 3"]:
+        """What the city is in."""
+        if self._drawing is None:
+            network = self.scenario.network
+            critical = np.array([mfd.critical for mfd in network.mfds])
+            places, streets = self._shown() if self._shown else (network.positions, ())
+            self._drawing = CityDrawing(places, network.adjacency, critical, streets)
+        state = self._state
+        return self._drawing.draw(
+            f"{self.scenario.name}, {state.time / 60:.0f} min: {state.accumulation.sum():,.0f} vehicles inside, "
+            f"{state.completed:,.0f} trips completed", state.accumulation.sum(axis=1), self._perimeter,
+            self._density() if self._density else None)
 
     @property
     def completed(self) -> float:

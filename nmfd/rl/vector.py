@@ -36,8 +36,7 @@ class NmfdVectorEnv(VectorEnv):
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
         self.interface = Interface(scenario.network, guidance=guidance, metering=metering)
         self.unit = sum(mfd.critical for mfd in scenario.network.mfds)
-        self.single_observation_space = gymnasium.spaces.Box(
-            -np.inf, np.inf, (self.interface.observation_size,), np.float32)
+        self.single_observation_space = gymnasium.spaces.Box(*self.interface.bounds(scenario), dtype=np.float32)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.interface.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -89,7 +88,8 @@ class NmfdVectorEnv(VectorEnv):
     def _observations(self) -> Observations:
         shape = self._x.shape[1:]
         noise = np.stack([random.standard_normal(shape) for random in self._random])
-        return self.interface.observation(self._x.numpy() + self.scenario.measurement_std * noise, self._backlog)
+        seen = self.interface.observation(self._x.numpy() + self.scenario.measurement_std * noise, self._backlog)
+        return np.clip(seen, self.single_observation_space.low, self.single_observation_space.high)
 
     def _info(self) -> dict:
         every = np.ones(self.num_envs, dtype=bool)

@@ -1,6 +1,8 @@
-"""A bar of progress where somebody looks: in a notebook, or one line on stderr where that is a terminal."""
+"""Progress: a bar in a notebook, a line that moves on a terminal, elsewhere a plain line every half minute."""
 
+import os
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -10,6 +12,9 @@ from typing import Any, Protocol, TextIO, runtime_checkable
 from tqdm.std import tqdm
 
 LINE = "{desc}  [{bar:24}]  {n_fmt}/{total_fmt}  {remaining} left{postfix}"
+PLAIN = "{desc}: {n_fmt}/{total_fmt} after {elapsed}, {remaining} left{postfix}"
+BEAT = 1.0    # s, between two looks of the moving line at the clock
+EVERY = 30.0  # s, between two plain lines
 SOON = 1.0  # s: what is done sooner shows nothing in a notebook
 
 
@@ -24,17 +29,34 @@ Progress = Callable[..., None] | bool | None
 
 
 @contextmanager
-def progress_line(label: str, stream: TextIO | None = None) -> Iterator[Show | None]:
-    """What shows progress on a line that is wiped at the end; None if `stream` (default stderr) is no terminal."""
+def progress_line(label: str, stream: TextIO | None = None) -> Iterator[Show]:
+    """What shows progress on `stream` (default stderr): on a terminal in a line that is wiped at the end.
+
+    The remaining time is what is left at the mean rate since the line, or another total, began.
+    """
     stream = sys.stderr if stream is None else stream
-    if not stream.isatty():
-        yield None
-        return
-    # a new note is shown even if nothing more is done: miniters 0
-    with tqdm(
-        desc=label, file=stream, leave=False, dynamic_ncols=True, ascii=".#", miniters=0, bar_format=LINE,
-    ) as line:
-        yield _shown(line)
+    over, moving = threading.Event(), stream.isatty()
+    with ExitStack() as stack:
+        shown = stream if moving else stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
+        # a new note is shown even if nothing more is done: miniters 0; jams change the rate, not for long: smoothing 0
+        line = stack.enter_context(tqdm(
+            desc=label, file=shown, leave=False, dynamic_ncols=True, ascii=".#", miniters=0, smoothing=0.0,
+            bar_format=LINE if moving else PLAIN))
+
+        def beat() -> None:
+            while not over.wait(BEAT if moving else EVERY):
+                if moving:
+                    line.refresh()
+                else:
+                    print(line, file=stream, flush=True)
+
+        thread = threading.Thread(target=beat, daemon=True)
+        thread.start()
+        try:
+            yield _shown(line)
+        finally:
+            over.set()
+            thread.join()
 
 
 @contextmanager
@@ -50,9 +72,11 @@ def watched(label: str, progress: Progress) -> Iterator[Callable[..., None] | No
     elif in_notebook():
         with ExitStack() as bars:
             yield _late(label, bars)
-    else:
+    elif sys.stderr.isatty():
         with progress_line(label) as show:
             yield show
+    else:
+        yield None
 
 
 def in_notebook() -> bool:
@@ -85,8 +109,10 @@ def _notebook_bar(label: str, total: int) -> Any:
 def _shown(line: Any) -> Show:
     def show(done: int, total: int, note: str = "") -> None:
         line.set_postfix_str(note, refresh=False)
-        if total != line.total:
+        if total != line.total or done < line.n:
+            line.initial = 0
             line.reset(total)
+            line.initial = line.n = done  # what was there before says nothing of the rate
         line.update(done - line.n)
 
     return show

@@ -73,11 +73,21 @@ class Ended(BaseException):
 
 
 class Watch:
-    """What a worker is at, and until when [s, time.monotonic], in memory that it shares with its parent."""
+    """What a worker is at, and until when [s, time.monotonic], in memory that it shares with its parent; and how much
+    of its task [-] is done."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._until, self._doing = context.RawValue("d", 0.0), context.RawArray("c", SAID)
+        self._share = context.RawValue("d", 0.0)
+
+    @property
+    def share(self) -> float:
+        return self._share.value
+
+    @share.setter
+    def share(self, share: float) -> None:
+        self._share.value = share
 
     def set(self, doing: str, until: float = 0.0) -> None:
         """From now on; until: 0 for no limit."""
@@ -99,6 +109,12 @@ _here: Watch | None = None  # of this process, if it is a worker
 def inside() -> bool:
     """Whether this process is a worker."""
     return _here is not None
+
+
+def reached(share: float) -> None:
+    """So much [-] of the task of this process is done, if it is a worker."""
+    if _here:
+        _here.share = share
 
 
 @contextmanager
@@ -153,7 +169,7 @@ class Worker:
 
     def hand(self, task: Any) -> None:
         """Have it do `task`."""
-        self.task = task
+        self.task, self._watch.share = task, 0.0
         with suppress(OSError):  # a process that has just died is noticed by `receive`
             self.connection.send(task)
 
@@ -169,6 +185,11 @@ class Worker:
             doing = self._watch.doing
             reason = f"its process died (status {self._process.exitcode})"
             return Failure(f"{doing}: {reason}" if doing else reason, mistake=bool(doing))
+
+    @property
+    def share(self) -> float:
+        """How much of its task [-] is done, as that has said (`reached`)."""
+        return self._watch.share
 
     @property
     def overdue(self) -> bool:
@@ -208,11 +229,13 @@ class Worker:
 def outcomes(
     function: Callable, tasks: Sequence, workers: int, *, fresh: bool = False,
     group: Callable[[Any], str] = lambda task: "", seconds: float | None = None,
+    look: Callable[[Sequence[tuple[Any, float]]], object] | None = None,
 ) -> Iterator[tuple]:
     """(task, `attempt(function, task)`) for every task, as they finish, from `workers` processes.
 
     fresh: every task in a process of its own; group: of a task, which shares no process with those of other groups
     seconds: wall time after which a task is ended; it needs `fresh`
+    look: called now and then with the tasks under way, and how much [-] of each is done
 
     The processes are spawned, so `function` and the tasks must be picklable. A process that dies (out of memory, a
     crash in a library) is the Failure of the task it was at. Closing the iterator ends the processes at once, and so
@@ -227,6 +250,8 @@ def outcomes(
                 worker.hand(todo.pop())
             first = min(deadlines.values()) - time.monotonic()
             ready = wait([worker.connection for worker in deadlines], max(min(first, LOOK), 0.0))
+            if look:
+                look([(worker.task, worker.share) for worker in deadlines])
             for worker in list(deadlines):
                 task = worker.task
                 if worker.connection in ready:

@@ -42,7 +42,7 @@ def train_one(
     changed = replace(scenario, controller_options={**scenario.controller_options, controller: table})
     curve: list[dict] = []
 
-    def log(step: int, total: float) -> None:
+    def log(step: int, _: float, total: float) -> None:
         curve.append(dict(zip(VALIDATION_COLUMNS, (method, seed, step, total), strict=True)))
 
     with Scratch("nmfd-") as folder:

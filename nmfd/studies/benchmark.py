@@ -13,6 +13,7 @@ from nmfd.controllers import registry
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
+from nmfd.runs.tally import Tally
 from nmfd.runs.workers import Failure, Worker, attempt, ended, outcomes
 from nmfd.studies import plots
 from nmfd.studies.traffic_states import OutflowOf, model_outflow, remembered
@@ -106,28 +107,28 @@ def results(
     work(run), or work(run, progress=...) in this process, is one closed loop of `steps` control intervals; progress
     as in `benchmark`, with the `label` of the run.
     """
-    report = progress or (lambda done, total, note: None)
-    total = steps * len(todo)
+    tally = Tally(progress, todo, steps=lambda run: steps, label=label)
     if workers > 1:
-        found = outcomes(work, todo, min(workers, len(todo)), group=_apart)
-        for done, (run, outcome) in enumerate(found, start=1):
-            report(done * steps, total, f"{done}/{len(todo)} runs, last {label(run)}")
+        for run, outcome in outcomes(work, todo, min(workers, len(todo)), group=_apart, look=tally.look):
+            tally.end(run, failed=isinstance(outcome, Failure))
             yield run, outcome
         return
     apart: dict[str, Worker] = {}
     try:
-        for done, run in enumerate(todo):
-            def tick(k: int, _: int, before: int = done * steps, run: tuple = run) -> None:
-                report(before + k, total, label(run))
+        for run in todo:
+            def tick(k: int, _: int, run: tuple = run) -> None:
+                tally.look([(run, k / steps)])
 
             if name := _apart(run):
                 tick(0, steps)
                 if name not in apart or not apart[name].alive:
                     apart[name] = Worker(work)
                 apart[name].hand(run)
-                yield run, apart[name].receive()
+                outcome = apart[name].receive()
             else:
-                yield run, attempt(partial(work, progress=tick), run)
+                outcome = attempt(partial(work, progress=tick), run)
+            tally.end(run, failed=isinstance(outcome, Failure))
+            yield run, outcome
     finally:
         for worker in apart.values():
             worker.terminate()

@@ -65,6 +65,28 @@ def training_curves(ax: Axes, rows: Sequence[Mapping]) -> Axes:
     return ax
 
 
+def learning_curve(ax: Axes, controller: str, rows: Sequence[tuple[int, float, float]]) -> Axes:
+    """Total time spent [veh s] against Adam steps: of the training's own rollouts, and in validation, the best marked.
+
+    rows: steps, training, validation
+    """
+    steps, trained, validated = np.array(rows, dtype=float).T
+    colour, best = plots.colour(controller), int(np.nanargmin(validated))
+    ax.plot(steps, trained, color=colour, alpha=0.4, linewidth=1.2, label="training: random starts and demand")
+    ax.plot(steps, validated, color=colour, linewidth=1.8, marker=".", label="validation: the scenario itself")
+    ax.plot(steps[best], validated[best], "o", color=colour, markersize=9, fillstyle="none",
+            label=f"kept: {validated[best]:.4g} veh s after {steps[best]:.0f} steps")
+    if (np.concatenate([trained, validated]) > 0.0).all():
+        ax.set_yscale("log")
+        ax.yaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(2.0, 0.5)))
+    ax.set_title(f"Training of {controller}", loc="left", fontsize="medium")
+    ax.set_xlabel("Adam steps")
+    ax.set_ylabel("total time spent [veh s]")
+    ax.legend(frameon=False, fontsize="small")
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
 def trained(ax: Axes, rows: Sequence[Mapping]) -> Axes:
     """Total time spent [veh s] of every finished policy on the plant, one column per method, with the mean over seeds.
 

@@ -27,6 +27,7 @@ from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import atomic, locked, sweep
+from nmfd.runs.workers import reached
 from nmfd.threads import one_thread
 
 VALIDATE_EVERY = 20  # Adam steps
@@ -85,14 +86,15 @@ def available(device: str) -> str:
 def train(
     scenario: Scenario, controller: str, *, seed: int, out: Path, steps: int | None = None, resume: bool = False,
     device: str = "cpu", compiled: bool = False, anyway: bool = False,
-    progress: Callable[[int, int, str], None] | None = None, log: Callable[[int, float], None] | None = None,
+    progress: Callable[[int, int, str], None] | None = None, log: Callable[[int, float, float], object] | None = None,
 ) -> Path:
     """Train `controller`, one that `settings` knows, on the regional model and write the policy to `out`.
 
     `out` holds the best policy so far after every validation; `out`.resume beside it holds what `resume` needs and
-    goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done, TTS)` after
-    every validation. `compiled` makes a step about twice as fast, after up to a minute or two of compilation; the
-    weights differ by rounding. `anyway`: even where `check` refuses.
+    goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done,
+    TTS in training, TTS in validation)` [veh s] after every validation, also for those from before `resume`. `compiled`
+    makes a step about twice as fast, after up to a minute or two of compilation; the weights differ by rounding.
+    `anyway`: even where `check` refuses.
     """
     with one_thread():
         chosen = settings(scenario, controller, steps)
@@ -122,6 +124,9 @@ def train(
             sweep(out.parent, {out.stem, state_file.stem})
             if resume:
                 first, best, history = _restore(state_file, configuration, policy, optimizer, generator)
+                for done, trained, score in history:
+                    if log:
+                        log(int(done), trained, score)
             for step in range(first, chosen.steps):
                 for group in optimizer.param_groups:
                     cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
@@ -146,7 +151,7 @@ def train(
                     score = validate(policy, rollout, seed, chosen)
                     history.append([step + 1, math.exp(loss.item()), score])
                     if log:
-                        log(step + 1, score)
+                        log(step + 1, history[-1][1], score)
                     if score < best:
                         best = score
                         states = fallback.statistics(visited(policy, rollout, chosen, seed))
@@ -154,6 +159,7 @@ def train(
                             policy, planning.network, {**configuration, "validation_veh_s": best}, states), out)
                     if not last:
                         _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
+                reached((step + 1) / chosen.steps)
                 if progress:
                     progress(step + 1, chosen.steps, f"best {best:.4g} veh s")
             if not math.isfinite(best):
