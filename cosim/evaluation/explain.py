@@ -112,6 +112,31 @@ def at(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame) -
     return _city(network, found, leaking, shown), lines
 
 
+def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame, name: str) -> str:
+    """Why the strategy `name` does better or not than what all are compared with, in one sentence for everybody; other
+    arguments as of `at`."""
+    shown = statistics.compared_with(rows)
+    before, after = (_runs(folder, one, [int(seed) for seed in rows.loc[rows["controller"] == one, "seed"]])
+                     for one in (shown, name))
+    found, done = load(network, *before), deeds(network, *after)
+    gained = statistics.paired(
+        statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, shown)).percent < 0
+    if not gained or not len(found.critical):
+        leaking = float(rows.loc[rows["controller"] == shown, "leaking_share"].mean())
+        return f"{name} {verdict(rows, level, name, found, leaking, done, network)}."
+    region = int(np.argmax(found.beyond))
+    then = load(network, after[0], ())
+    acts = [text for text, there in (
+        ("signals at the boundaries let vehicles in only as fast as it can serve them", done.held >= HARDLY),
+        ("drivers were guided to other routes", done.guided > 0)) if there and not model_free(name)]
+    means = f": {' and '.join(acts)}" if acts else ""
+    return (
+        f"{statistics.than(shown).capitalize()}, {network.region_names[region]} (region {region}) was fuller than serves "
+        f"most for {_share(found.beyond[region])} of the time, up to {found.most[region]:.1f} times that full, and its "
+        f"streets blocked one another; with {name} for {_share(then.beyond[region])}, up to {then.most[region]:.1f} "
+        f"times{means}.")
+
+
 def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Trajectory], Iterable[Mapping]]:
     """Trajectories and records of one controller."""
     return ([run_folder.read_trajectory(run_folder.run_path(folder, name, seed)) for seed in seeds],

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from bokeh.core.templates import get_env
 from bokeh.document import Document
 from bokeh.models import Div, Model
+from jinja2 import Environment, PackageLoader
 
 from cosim.view import colours
 from cosim.view.city_map import DENSITY, CityMap
@@ -14,6 +14,8 @@ from cosim.view.curves import HOUR, MINUTE, Curves, Load
 from cosim.view.picture import CityPicture, Frame
 
 HERE = Path(__file__).parent
+TEMPLATES = Environment(
+    loader=PackageLoader("cosim.view", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
 
 
 class Page:
@@ -64,8 +66,9 @@ class Page:
             load.show(whole)
         self.curves.show(runs, time)
 
-    def place(self, document: Document, subtitle: str, bar: Sequence[Model], choices: Sequence[Model]) -> None:
-        """Put it into a document. bar, choices: what one can press, with names."""
+    def layout(self, bar: Sequence[Model], choices: Sequence[Model]) -> tuple[dict[str, Model], dict[str, list[str]]]:
+        """What stands on the page: models by name, and which of them is where (`body.html.j2`). bar, choices: what one
+        can press, with names."""
         curves = self.curves
         roots = {
             "numbers": self.numbers,
@@ -73,19 +76,29 @@ class Page:
             **{f"load{n}": one.plot for n, one in enumerate(self.loads)},
             "region_curve": curves.region, "plane": curves.plane, "gate_curve": curves.gate, "trips": curves.trips,
             "spent": curves.spent, **{str(model.name): model for model in (*bar, *choices)}}
+        for name, model in roots.items():
+            model.name = name
+        return roots, {
+            "bar": [str(model.name) for model in bar], "choices": [str(model.name) for model in choices],
+            "maps": [name for name in roots if name.startswith("map")],
+            "loads": [name for name in roots if name.startswith("load")],
+            "curves": ["region_curve", "plane", "gate_curve", "trips", "spent"]}
+
+    def place(self, document: Document, subtitle: str, bar: Sequence[Model], choices: Sequence[Model]) -> None:
+        """Put it into a document; arguments as in `layout`."""
+        roots, places = self.layout(bar, choices)
         with document.models.freeze():  # else all models are looked through anew with every root
-            for name, model in roots.items():
-                model.name = name
+            for model in roots.values():
                 document.add_root(model)
         document.title = f"{self.picture.name}: {' against '.join(self.names)}"
-        document.template = get_env().from_string((HERE / "page.html.j2").read_text(encoding="utf-8"))
+        document.template = TEMPLATES.get_template("page.html.j2")
         document.template_variables.update(
-            heading=document.title, subtitle=subtitle, css=(HERE / "page.css").read_text(encoding="utf-8"),
-            bar=[model.name for model in bar], choices=[model.name for model in choices],
-            maps=[name for name in roots if name.startswith("map")],
-            loads=[name for name in roots if name.startswith("load")],
-            curves=["region_curve", "plane", "gate_curve", "trips", "spent"])
+            heading=document.title, subtitle=subtitle, css=style("page.css", "runs.css"), **places)
 
+
+def style(*names: str) -> str:
+    """Style sheets of the page, one after the other."""
+    return "\n".join((HERE / name).read_text(encoding="utf-8") for name in names)
 
 def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -> str:
     """What has come of the runs so far, in HTML."""
