@@ -1,5 +1,6 @@
 """The command demo of `cosim`; what brings numpy, torch or libsumo is imported inside, as in the other commands."""
 
+import webbrowser
 from pathlib import Path
 
 import click
@@ -18,7 +19,7 @@ NAMES = ("no-control", "pi-gating")
 @click.option("--open/--no-open", "browse", default=None,
               help="Open the page in this machine's browser. [default: where there is a screen and a terminal]")
 def demo(seed: int, out: Path, browse: bool | None) -> None:
-    """See what a gate does: a small city that locks, and the same with signals that hold vehicles back around its centre.
+    """See what gates do: a small city that locks, and the same with signals that hold vehicles back around its centre.
 
     Both run in SUMO at the same time, on the same trips, in about half a minute. What came of it is one page: four
     figures, and both runs side by side on the map, with a slider over their time.
@@ -43,4 +44,4 @@ def demo(seed: int, out: Path, browse: bool | None) -> None:
     page = html.write_page(out / "report.html", [results.read(out, SCENARIO)], seed=seed)
     click.echo(f"Both side by side: {page.resolve()}")
     if has_screen() if browse is None else browse:
-        click.launch(page.resolve().as_uri())
+        webbrowser.open(page.resolve().as_uri())

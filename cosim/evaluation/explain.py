@@ -113,9 +113,11 @@ def at(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame) -
 
 
 def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame, name: str) -> str:
-    """Why the strategy `name` does better or not than what all are compared with, in one sentence for everybody; other
-    arguments as of `at`."""
+    """Why the strategy `name` does better or not than what all are compared with, in one sentence for everybody, none
+    of that itself; other arguments as of `at`."""
     shown = statistics.compared_with(rows)
+    if name == shown:
+        return ""
     before, after = (_runs(folder, one, [int(seed) for seed in rows.loc[rows["controller"] == one, "seed"]])
                      for one in (shown, name))
     found, done = load(network, *before), deeds(network, *after)
@@ -130,11 +132,12 @@ def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.Dat
         ("signals at the boundaries let vehicles in only as fast as it can serve them", done.held >= HARDLY),
         ("drivers were guided to other routes", done.guided > 0)) if there and not model_free(name)]
     means = f": {' and '.join(acts)}" if acts else ""
+    first, name_of = statistics.than(shown), network.region_names[region]
     return (
-        f"{statistics.than(shown).capitalize()}, {network.region_names[region]} (region {region}) was fuller than serves "
-        f"most for {_share(found.beyond[region])} of the time, up to {found.most[region]:.1f} times that full, and its "
-        f"streets blocked one another; with {name} for {_share(then.beyond[region])}, up to {then.most[region]:.1f} "
-        f"times{means}.")
+        f"{first[0].upper()}{first[1:]}, {name_of} (region {region}) was fuller than serves most for "
+        f"{_share(found.beyond[region])} of the time, up to {found.most[region]:.1f} times that full, and its streets "
+        f"blocked one another; with {name} for {_share(then.beyond[region])}, up to {then.most[region]:.1f} times"
+        f"{means}.")
 
 
 def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Trajectory], Iterable[Mapping]]:

@@ -46,7 +46,8 @@ FACTS = {
     "overhead_share": "of it, the share outside SUMO", "setup_time_s": "before the first interval",
     "signals_left_alone": "signals that keep their own programmes",
     "booked_intervals": "of a standstill that was not simulated any more",
-    "removed_veh": "taken out before the end of their trips", "removed_waiting_veh": "of these, before they could enter",
+    "removed_veh": "taken out before the end of their trips",
+    "removed_waiting_veh": "of these, before they could enter",
     "jumps": "vehicles that came into another region where no gateway leads there", **PRESSURE_FACTS}
 
 

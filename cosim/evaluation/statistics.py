@@ -26,8 +26,8 @@ MEANS = (  # columns of summary.csv and sumo.csv of which an evaluation shows th
 COLUMNS = {  # heading of a table, without its unit -> what it says
     "controller": "the strategy for signals and routes", "seeds": "how many runs, each with other trips",
     "TTS": "total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval",
-    "change": "of TTS against no-control, or against the controller that the heading names, paired by seed, mean of the "
-              "percentages ± 95 % interval, * if that excludes zero",
+    "change": "of TTS against no-control, or against the controller that the heading names, paired by seed, mean of "
+              "the percentages ± 95 % interval, * if that excludes zero",
     "completed": "trips that ended on the last edge of their route",
     "removed": "by whatever else takes vehicles out of SUMO, in TTS as if they were there to the end",
     "backlog": "not inserted at the end, and its time integral", "teleports": "all seeds",

@@ -29,8 +29,9 @@ class Figure:
 
 
 def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
-    """A heading, the figures of the best strategy of one demand level, and its name; over the seeds that it has in common with
-    what all are compared with; of what was run, if that is alone. rows: as in cosim.evaluation.statistics."""
+    """A heading, the figures of the best strategy of one demand level, and its name; over the seeds that it has in
+    common with what all are compared with; of what was run, if that is alone. rows: as in
+    cosim.evaluation.statistics."""
     against, level = statistics.compared_with(rows), rows["demand"].iloc[0]
     others = [name for name in ranked(rows) if name != against]
     name = others[0] if others else against
@@ -45,8 +46,8 @@ def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
     figures = [
         _figure(part, name, against, label, column, what, show, good)
         for label, column, what, show, good in (
-            ("Time per trip", "minutes", "mean of all trips, from the wanted departure to the arrival, or to the end of "
-             "the run for those who have not arrived", lambda x: f"{x:.1f} min", -1),
+            ("Time per trip", "minutes", "mean of all trips, from the wanted departure to the arrival, or to the end "
+             "of the run for those who have not arrived", lambda x: f"{x:.1f} min", -1),
             ("Trips served", "completed_veh", f"of {part['trips'].mean():,.0f} that were due; mean over seeds",
              lambda x: f"{x:,.0f}", 1),
             ("CO2", "tonnes", "of all vehicles while the run lasted, by SUMO's HBEFA4 petrol car; vehicles that stand "
@@ -64,9 +65,10 @@ def _figure(
     if name == against:
         return Figure(label=label, value=show(now), before="", change="", better=None, what=what)
     pair = _pair(rows, name, against, column)
+    change = f"{pair.percent:+.0f} %{_half(pair.percent_half, pair.seeds, '.0f')}"
     return Figure(
         label=label, value=show(now), before=f"{show(before)} {statistics.than(against)}",
-        change="" if math.isnan(pair.percent) else f"{pair.percent:+.0f} %{_half(pair.percent_half, pair.seeds, '.0f')}",
+        change="" if math.isnan(pair.percent) else change,
         better=_better(pair.percent, pair.percent_half, good), what=what)
 
 
