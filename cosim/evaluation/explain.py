@@ -127,17 +127,16 @@ def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.Dat
         leaking = float(rows.loc[rows["controller"] == shown, "leaking_share"].mean())
         return f"{name} {verdict(rows, level, name, found, leaking, done, network)}."
     region = int(np.argmax(found.beyond))
-    then = load(network, after[0], ())
     acts = [text for text, there in (
-        ("signals at the boundaries let vehicles in only as fast as it can serve them", done.held >= HARDLY),
+        ("signals at the boundaries held vehicles back", done.held >= HARDLY),
         ("drivers were guided to other routes", done.guided > 0)) if there and not model_free(name)]
-    means = f": {' and '.join(acts)}" if acts else ""
-    first, name_of = statistics.than(shown), network.region_names[region]
+    means = f", because {' and '.join(acts)}" if acts else ""
+    first, then = statistics.than(shown), load(network, after[0], ())
     return (
-        f"{first[0].upper()}{first[1:]}, {name_of} (region {region}) was fuller than serves most for "
-        f"{_share(found.beyond[region])} of the time, up to {found.most[region]:.1f} times that full, and its streets "
-        f"blocked one another; with {name} for {_share(then.beyond[region])}, up to {then.most[region]:.1f} times"
-        f"{means}.")
+        f"{first[0].upper()}{first[1:]}, the region {network.region_names[region]} held more vehicles than it serves "
+        f"best with for {_share(found.beyond[region])} of the time, up to {found.most[region]:.1f} times as many, and "
+        f"served fewer of them; with {name} for {_share(then.beyond[region])}, up to {then.most[region]:.1f} times as "
+        f"many{means}.")
 
 
 def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Trajectory], Iterable[Mapping]]:

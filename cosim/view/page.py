@@ -109,14 +109,14 @@ def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -
             ("completed trips [veh]", frame.completed), ("time spent [veh h]", frame.time_spent / HOUR),
             ("removed [veh]", frame.removed))
         cells = "".join(
-            f"<div style='flex:0 0 138px'><div style='font-size:19px;font-variant-numeric:tabular-nums'>{value:,.0f}"
+            f"<div style='flex:0 0 126px'><div style='font-size:19px;font-variant-numeric:tabular-nums'>{value:,.0f}"
             f"</div><div style='font-size:12px;color:{colours.FAINT}'>{text}</div></div>" for text, value in told)
         note = "" if frame is None or not frame.note else (
             f"<div style='flex-basis:100%;font-size:13px;color:{colours.QUEUE}'>{escape(frame.note[:200])}</div>")
         colour, dash = colours.RUNS[n]
         lines.append(
             f"<div style='display:flex;flex-wrap:wrap;gap:2px 10px;align-items:center;border-left:4px {dash} {colour};"
-            f"padding-left:12px;margin:5px 0'><div style='flex:0 0 230px;font-weight:650;color:{colour}'>{escape(name)}"
+            f"padding-left:12px;margin:5px 0'><div style='flex:1 1 110px;font-weight:650;color:{colour}'>{escape(name)}"
             f"</div>{cells}{note}</div>")
     return (
         "<div style='display:flex;flex-wrap:wrap;gap:4px 36px;align-items:center'>"
