@@ -120,18 +120,18 @@ def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.Dat
         return ""
     before, after = (_runs(folder, one, [int(seed) for seed in rows.loc[rows["controller"] == one, "seed"]])
                      for one in (shown, name))
-    found, done = load(network, *before), deeds(network, *after)
+    found, then, done = load(network, *before), load(network, after[0], ()), deeds(network, *after)
     gained = statistics.paired(
         statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, shown)).percent < 0
-    if not gained or not len(found.critical):
+    region = int(np.argmax(found.beyond))
+    if not gained or not len(found.critical) or then.beyond[region] >= found.beyond[region]:
         leaking = float(rows.loc[rows["controller"] == shown, "leaking_share"].mean())
         return f"{name} {verdict(rows, level, name, found, leaking, done, network)}."
-    region = int(np.argmax(found.beyond))
     acts = [text for text, there in (
         ("signals at the boundaries held vehicles back", done.held >= HARDLY),
         ("drivers were guided to other routes", done.guided > 0)) if there and not model_free(name)]
     means = f", because {' and '.join(acts)}" if acts else ""
-    first, then = statistics.than(shown), load(network, after[0], ())
+    first = statistics.than(shown)
     return (
         f"{first[0].upper()}{first[1:]}, the region {network.region_names[region]} held more vehicles than it serves "
         f"best with for {_share(found.beyond[region])} of the time, up to {found.most[region]:.1f} times as many, and "
