@@ -88,7 +88,7 @@ def test_the_page_is_valid_and_needs_nothing_else(content):
     assert content.startswith("<!DOCTYPE html>") and read.tags.count("html") == read.tags.count("main") == 1
     assert len(read.ids) == len(set(read.ids))
     pictures = [link for link in read.links if link.startswith("data:image/png;base64,")]
-    assert len(pictures) == 1 + 6
+    assert len(pictures) == 1 + 5
     assert all(base64.b64decode(link.partition(",")[2]).startswith(b"\x89PNG") for link in pictures)
     for link in set(read.links) - set(pictures):
         assert link == "data:," or (link.startswith("#") and link[1:] in read.ids)

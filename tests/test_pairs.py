@@ -63,7 +63,7 @@ def test_the_page_speaks_of_the_first(folder, monkeypatch):
 def test_pictures_show_both(folder, monkeypatch):
     seen = {}
     monkeypatch.setattr(pictures, "outflows", lambda path, network, pair: seen.update(mfd=list(pair)))
-    for name in ("perimeter", "splits", "draw_accumulations", "decision_times"):
+    for name in ("perimeter", "splits", "draw_accumulations"):
         monkeypatch.setattr(pictures, name, lambda *_, **__: None)
     level = results.read(folder).level(1.0)
     pictures.draw(level.folder, results.read(folder).scenario, results.read(folder).city, level.rows)

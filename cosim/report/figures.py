@@ -131,22 +131,3 @@ def over_demand(
     ax.set_ylim(bottom=0.0)
     ax.spines[["top", "right"]].set_visible(False)
     return ax
-
-
-def decision_times(ax: Axes, median: Mapping[str, float], longest: Mapping[str, float], step: float) -> Axes:
-    """Wall time per decision [ms], controller -> median and longest, on a scale that ends at the control interval
-    `step` [s]."""
-    tones = plots.colours(list(median))
-    for row, name in enumerate(median):
-        ax.plot([median[name], longest[name]], [row, row], color=tones[name], linewidth=2.0)
-        ax.plot(median[name], row, "o", color=tones[name], markersize=7)
-        ax.plot(longest[name], row, "|", color=tones[name], markersize=13, markeredgewidth=2.0)
-    ax.axvline(1000.0 * step, color=plots.RED, linestyle="--", linewidth=1.2)
-    ax.text(1000.0 * step, -0.75, "control interval ", color=plots.RED, ha="right", va="center", fontsize="small")
-    ax.set_xscale("log")
-    ax.set_xlim(right=1500.0 * step)
-    ax.set_yticks(range(len(median)), list(median))
-    ax.set_ylim(len(median) - 0.5, -1.2)
-    ax.set_xlabel("time per decision [ms]: median (dot) and longest (bar)")
-    ax.spines[["top", "right"]].set_visible(False)
-    return ax

@@ -20,8 +20,8 @@ from nmfd.studies.benchmark import draw_accumulations
 PANELS = 11    # boundaries, or pairs of region and destination, that are shown one by one
 NAMED = 2      # controllers with the most teleports in a title
 WINDOW = 3     # control intervals over which realised shares are taken
-DRAWN = (      # what pictures of streets and gateways need of a record
-    "edge_vehicles", "gateway_queue", "gateway_flow", "gateway_green", "gateway_original_green", "crossings", "guided")
+DRAWN = (  # what pictures of gateways and guidance need of a record
+    "gateway_flow", "gateway_green", "gateway_original_green", "crossings", "guided")
 
 
 def draw(
@@ -29,7 +29,7 @@ def draw(
 ) -> None:
     """All pictures of one demand level into `out`, or into its run folder; `rows` of this level, as in statistics.
 
-    Those of streets and gateways need the `city`, and records that hold DRAWN.
+    Those of gateways and guidance need the `city`, and records that hold DRAWN.
     """
     out = folder if out is None else out
     names = ranked(rows)
@@ -194,13 +194,12 @@ def draw_all(out: Path, folders: Mapping[float, Path], scenario: Scenario, rows:
 
 
 def draw_more(out: Path, scenario: Scenario, folder: Path, rows: pd.DataFrame) -> None:
-    """Beside `draw`, for a page, of one demand level: MFDs and decision times; arguments as there."""
+    """Beside `draw`, for a page, the MFDs of one demand level; arguments as there."""
     results = recorded(folder, rows, shown_seed(rows))
     against = statistics.compared_with(rows)
     best = next((name for name in results if name != against), None)
     outflows(out / "mfd.png", scenario.network, {
         name: results[name] for name in (against, best) if name in results})
-    decision_times(out / "decision_times.png", rows, scenario.step)
 
 
 def outflows(path: Path, network: RegionalModel, results: dict[str, Result]) -> None:
@@ -212,12 +211,3 @@ def outflows(path: Path, network: RegionalModel, results: dict[str, Result]) -> 
             for name, result in results.items()}
         samples.append({name: np.concatenate(list(parts.values())) for name, parts in clouds.items()})
     model_validation.draw_mfds(path, network, samples)
-
-
-def decision_times(path: Path, rows: pd.DataFrame, step: float) -> None:
-    """Wall time per decision of every controller, all seeds."""
-    groups = rows.groupby("controller", sort=False)
-    median, longest = groups["control_step_ms_median"].median(), groups["control_step_ms_max"].max()
-    drawing = plots.figure(8.0, 1.4 + 0.32 * len(median))
-    figures.decision_times(drawing.subplots(), median.to_dict(), longest.to_dict(), step)
-    plots.save(drawing, path)
