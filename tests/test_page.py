@@ -123,7 +123,7 @@ def test_the_card_has_the_figures_of_the_best_strategy(evaluation):
     assert trip.change == "-50 % ± 2 over 2 seeds"
     assert served.value == "500" and served.better is None
     tts = rows.groupby("controller")["total_time_spent_veh_s"].mean() / 3600
-    assert saved.label == "Hours of delay saved in the city" and saved.better
+    assert saved.label == "Hours of delay saved" and saved.better
     assert saved.value == f"{tts['no-control'] - tts['dpc-pcrg']:,.0f} h"
     alone = card.card(rows[rows["controller"] == "no-control"])
     assert alone[0] == "no-control" and all(figure.change == "" for figure in alone[1])

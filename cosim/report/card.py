@@ -74,8 +74,8 @@ def _figure(
 
 def _saved(rows: pd.DataFrame, name: str, against: str) -> Figure:
     """The hours of all drivers that are saved, of total time spent."""
-    what = ("of all drivers together in one run, on the road and waiting to enter (total time spent), until the end of "
-            "the run")
+    what = ("in the city, of all drivers together in one run, on the road and waiting to enter (total time spent), "
+            "until the end of the run")
     if name == against:
         spent = rows.loc[rows["controller"] == name, "hours"].mean()
         return Figure(label="Hours spent in traffic", value=f"{spent:,.0f} h", before="", change="", better=None,
@@ -84,7 +84,7 @@ def _saved(rows: pd.DataFrame, name: str, against: str) -> Figure:
     saved = -pair.difference
     before = rows.loc[rows["controller"] == against, "hours"].mean()
     return Figure(
-        label=f"Hours of delay {'saved' if saved >= 0 else 'added'} in the city", value=f"{abs(saved):,.0f} h",
+        label=f"Hours of delay {'saved' if saved >= 0 else 'added'}", value=f"{abs(saved):,.0f} h",
         before=f"of {before:,.0f} h {statistics.than(against)}",
         change=f"{abs(saved):,.0f} h{_half(pair.difference_half, pair.seeds, ',.0f')}",
         better=_better(pair.difference, pair.difference_half, -1), what=what)

@@ -14,6 +14,7 @@ from cosim.view.curves import HOUR, MINUTE, Curves, Load
 from cosim.view.picture import CityPicture, Frame
 
 HERE = Path(__file__).parent
+WIDE = ".bk-clearfix { display: block !important; }"  # of a Div, which else is no wider than its words
 TEMPLATES = Environment(
     loader=PackageLoader("cosim.view", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
 
@@ -27,7 +28,7 @@ class Page:
         self.maps = [CityMap(picture, name) for name in names]
         self.loads = [Load(picture, f"{name}: how full the regions are") for name in names]
         self.curves = Curves(picture, names)
-        self.numbers = Div(text="", sizing_mode="stretch_width")
+        self.numbers = Div(text="", sizing_mode="stretch_width", stylesheets=[WIDE])
         ends = [region for gate in picture.gates for region in (gate.source, gate.target)]
         self.region = max(range(picture.regions), key=ends.count)
         self.gate = self.gate_of(self.region)
@@ -109,14 +110,14 @@ def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -
             ("completed trips [veh]", frame.completed), ("time spent [veh h]", frame.time_spent / HOUR),
             ("removed [veh]", frame.removed))
         cells = "".join(
-            f"<div style='flex:0 0 126px'><div style='font-size:19px;font-variant-numeric:tabular-nums'>{value:,.0f}"
+            f"<div style='flex:0 0 138px'><div style='font-size:19px;font-variant-numeric:tabular-nums'>{value:,.0f}"
             f"</div><div style='font-size:12px;color:{colours.FAINT}'>{text}</div></div>" for text, value in told)
         note = "" if frame is None or not frame.note else (
             f"<div style='flex-basis:100%;font-size:13px;color:{colours.QUEUE}'>{escape(frame.note[:200])}</div>")
         colour, dash = colours.RUNS[n]
         lines.append(
             f"<div style='display:flex;flex-wrap:wrap;gap:2px 10px;align-items:center;border-left:4px {dash} {colour};"
-            f"padding-left:12px;margin:5px 0'><div style='flex:1 1 110px;font-weight:650;color:{colour}'>{escape(name)}"
+            f"padding-left:12px;margin:5px 0'><div style='flex:1 1 140px;font-weight:650;color:{colour}'>{escape(name)}"
             f"</div>{cells}{note}</div>")
     return (
         "<div style='display:flex;flex-wrap:wrap;gap:4px 36px;align-items:center'>"
