@@ -16,6 +16,20 @@ COUNTED = {
     "plant_faults": ("plant", "intervals in which the city could not do what was commanded"),
 }
 
+# Columns of summary.csv: type, and what they say.
+SUMMARY: dict[str, tuple[type, str]] = {
+    "controller": (str, "the strategy"), "seed": (int, "of trips, drivers and guidance"),
+    "plant": (str, "what was driven: a regional model, or the city in SUMO"),
+    "total_time_spent_veh_s": (float, "running, waiting to enter, and as long as it could be of those removed"),
+    "final_accumulation_veh": (float, "inside at the end"),
+    "max_accumulation_veh": (float, "inside at the end of an interval, the most"),
+    "completed_veh": (float, "trips that reached their end"),
+    "evaluation_time_s": (float, "wall time of all decisions"),
+    "control_step_ms_median": (float, "wall time of a decision"),
+    "control_step_ms_max": (float, "of the longest decision"),
+    **{column: (int, text) for column, (_, text) in COUNTED.items()},
+}
+
 
 def total_time_spent(trajectory: Trajectory) -> float:
     """dt * sum over k = 0 .. T-1 of all vehicles, running, waiting to enter, and removed before that [veh s].

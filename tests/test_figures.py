@@ -37,13 +37,6 @@ def test_link_map_colours_by_density_and_parts_the_directions(ax):
     assert there < 0 < back  # each to the right of its direction
 
 
-def test_gateway_queues_name_each_boundary_once(ax):
-    queue = np.array([[1.0, 0.0, 5.0], [2.0, 0.0, 6.0]])
-    figures.gateway_queues(ax, 90.0, queue, ["0 > 1", "0 > 1", "2 > 1"], most=6.0)
-    assert [text.get_text() for text in ax.texts] == ["0 > 1", "2 > 1"]
-    np.testing.assert_allclose(np.ma.filled(ax.collections[0].get_array(), 0.0), queue.T)
-
-
 def test_demand_figure_has_the_levels_as_ticks(ax):
     figures.over_demand(ax, {"dpc-pc": {0.8: (0.9, 0.1), 1.3: (0.5, np.nan)}, "pi-gating": {0.8: (0.7, 0.1)}})
     assert [tick.get_text() for tick in ax.get_xticklabels()] == ["0.8", "1.3"]

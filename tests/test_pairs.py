@@ -48,8 +48,9 @@ def test_reasons_are_told_against_the_first(folder):
 
 
 def test_the_page_speaks_of_the_first(folder, monkeypatch):
-    for name in ("draw", "draw_more", "region_map"):
+    for name in ("draw", "draw_more"):
         monkeypatch.setattr(html.pictures, name, lambda *_: None)
+    monkeypatch.setattr(html, "_replay", lambda *_: (None, ""))
     good(cosim("report", folder))
     page = (folder / "report.html").read_text()
     plain = re.sub(r"base64,[\w+/=]+", "", page)
@@ -61,15 +62,13 @@ def test_the_page_speaks_of_the_first(folder, monkeypatch):
 
 def test_pictures_show_both(folder, monkeypatch):
     seen = {}
-    for name in ("link_maps", "gateway_queues"):
-        monkeypatch.setattr(pictures, name, lambda path, city, pair, note, name=name: seen.update({name: list(pair)}))
     monkeypatch.setattr(pictures, "outflows", lambda path, network, pair: seen.update(mfd=list(pair)))
-    for name in ("perimeter", "splits", "draw_accumulations", "decision_times"):
+    for name in ("perimeter", "splits", "draw_accumulations"):
         monkeypatch.setattr(pictures, name, lambda *_, **__: None)
     level = results.read(folder).level(1.0)
     pictures.draw(level.folder, results.read(folder).scenario, results.read(folder).city, level.rows)
     pictures.draw_more(folder, results.read(folder).scenario, level.folder, level.rows)
-    assert seen == dict.fromkeys(("link_maps", "gateway_queues", "mfd"), list(PAIR))
+    assert seen == {"mfd": list(PAIR)}
     pictures.demand_levels(folder / "demand.png", results.read(folder).rows)
     assert (folder / "demand.png").stat().st_size > 5000
     ax = figures.over_demand(plots.figure(4, 3).subplots(), {"dpc-pcrg": {1.0: (0.8, 0.1)}}, "pi-gating")

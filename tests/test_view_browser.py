@@ -8,7 +8,7 @@ import sys
 
 import pytest
 import tiny_city
-from commands import call
+from commands import call, good
 
 from cosim.evaluation.simulate import Task, scenario_of
 from cosim.sumo.build import ensure_built
@@ -53,28 +53,35 @@ def browser():
         found.close()
 
 
-def test_the_slider_of_a_report_moves_both_maps(scenario, browser, tmp_path):
-    out = tmp_path / "run"
+@pytest.fixture(scope="module")
+def report(scenario, tmp_path_factory):
+    """The page of two runs."""
+    out = tmp_path_factory.mktemp("report") / "run"
     for command in (("run", scenario, "--controller", "no-control+guided", "--against", "no-control", "--seed", 3,
-                     "--steps", 6, "--out", out), ("report", out, "--replay")):
-        result = call("cosim", *command)
-        assert result.exit_code == 0, result.output
-    assert str(out / "replay.html") in result.stdout and (out / "report.html").is_file()
-    page, wrong = browser.new_page(viewport={"width": 1200, "height": 900}), []
+                     "--steps", 6, "--out", out), ("report", out)):
+        good(call("cosim", *command))
+    return out / "report.html"
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_page_of_finished_runs(report, browser, width):
+    page, wrong = browser.new_page(viewport={"width": width, "height": 900}), []
     page.on("console", lambda said: said.type in ("error", "warning") and wrong.append(said.text))
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.on("dialog", lambda dialog: wrong.append(dialog.message))
     page.on("request", lambda asked: asked.url.startswith(("file:", "data:", "blob:")) or wrong.append(asked.url))
-    page.goto((out / "replay.html").as_uri())
-    page.wait_for_function("() => window.Bokeh && Bokeh.documents.length && document.querySelector('h1')")
+    page.goto(report.as_uri())
+    page.wait_for_function("() => window.Bokeh && Bokeh.documents.length")
+    assert page.locator("h1").inner_text() == f"Traffic control in SUMO: {EVIL}"
 
     def shown():
         return page.evaluate("""() => [0, 1].map(n => Array.from(Bokeh.documents[0].get_model_by_name(`map${n}`)
             .renderers.map(one => one.data_source.data).find(data => data.edge).value))""")
 
-    page.locator(".noUi-handle").wait_for()
-    at_the_end = shown()
     page.locator(".noUi-handle").focus()
+    page.keyboard.press("End")
+    page.wait_for_timeout(300)
+    at_the_end = shown()
     for _ in range(3):
         page.keyboard.press("ArrowLeft")
     page.wait_for_timeout(500)
@@ -85,7 +92,21 @@ def test_the_slider_of_a_report_moves_both_maps(scenario, browser, tmp_path):
     assert page.evaluate("() => Bokeh.documents[0].get_model_by_name('plane').title.text").startswith("Region 1")
     page.get_by_role("button", name="Play").click()
     page.wait_for_timeout(2000)
-    assert shown() == at_the_end and wrong == []
+    assert shown() == at_the_end
+
+    table = page.get_by_role("region", name="What came of it, demand times 1")
+    heading = table.locator("thead th", has_text="TTS")
+
+    def times():
+        return [float(row.split()[0]) for row in table.locator("tbody td:nth-child(3)").all_inner_texts()]
+
+    heading.get_by_role("button").click()
+    assert times() == sorted(times()) and heading.get_attribute("aria-sort") == "ascending"
+    page.keyboard.press("Enter")
+    assert times() == sorted(times(), reverse=True) and times()[0] > times()[1]
+    assert heading.get_attribute("aria-sort") == "descending"
+    assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
+    assert page.evaluate("() => [...document.images].every(one => one.naturalWidth > 100)") and wrong == []
 
 
 @pytest.mark.parametrize("width", [1400, 390])

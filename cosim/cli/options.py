@@ -1,5 +1,7 @@
 """Options that commands of `cosim` share."""
 
+import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -79,3 +81,9 @@ def parsed_level(text: str, no_run: bool) -> float | None:
 def tell(line: str) -> None:
     """Print a line about the work, apart from its results."""
     click.echo(f"cosim: {line}", err=True)
+
+
+def has_screen() -> bool:
+    """Whether a browser of this machine may be opened: somebody sits there, as far as one can tell."""
+    screen = not sys.platform.startswith("linux") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    return screen and sys.stdout.isatty()

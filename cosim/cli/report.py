@@ -4,14 +4,12 @@ What brings numpy, pandas, torch or libsumo is imported inside the commands, so 
 instead of 3 s.
 """
 
-import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from cosim.cli.options import CONTROLLER, POLICY, REFERENCE
+from cosim.cli.options import CONTROLLER, POLICY, REFERENCE, has_screen
 from nmfd.cli.declared import declared
 from nmfd.cli.options import FILE, FOLDER, SCENARIO, SEED, STEPS
 from nmfd.cli.progress import progress_line
@@ -27,21 +25,21 @@ if TYPE_CHECKING:
 @click.option("--out", type=FILE, metavar="FILE", help="The page. [default: report.html in the first RUN]")
 @REFERENCE
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="The runs' scenario, if it is no longer where it was.")
-@click.option("--replay", is_flag=True,
-              help="Write replay.html beside the page, too: the best run of the first RUN and what it is compared "
-                   "with, on the map of the city, with a slider over their time.")
+@click.option("--seed", type=SEED, help="Of the runs on the map. [default: the first that both have]")
 def report(
-    folders: tuple[Path, ...], out: Path | None, reference: str | None, scenario: Path | None, replay: bool,
+    folders: tuple[Path, ...], out: Path | None, reference: str | None, scenario: Path | None, seed: int | None,
 ) -> None:
-    """Write one self-contained HTML page about finished runs: what came of them, in words, tables and pictures.
+    """Write one self-contained HTML page about finished runs: what came of them, in four figures, on a map, in pictures
+    and tables.
 
-    RUN is a folder of `cosim run` or `cosim evaluate`; several come on one page. The page works without a network.
+    RUN is a folder of `cosim run` or `cosim evaluate`; several come on one page. The map has the best run of the first
+    RUN beside what it is compared with, and a slider over their time. The page works without a network.
 
     \b
     Examples:
       cosim report runs/grid7_peak-evaluate
       cosim report runs/monday runs/tuesday --out both.html
-      cosim report runs/gating --replay
+      cosim report runs/gating --seed 3
     """
     from cosim.evaluation import results  # heavy
     from cosim.report import html
@@ -52,12 +50,8 @@ def report(
         raise InputError(f"--reference: {reference!r} is not in these runs{did_you_mean(reference, known)}; choose "
                          f"from {', '.join(sorted(known))}")
     with progress_line("report") as progress:
-        path = html.write_page(out or folders[0] / "report.html", found, reference, progress)
+        path = html.write_page(out or folders[0] / "report.html", found, reference, progress, seed=seed)
     click.echo(f"Written to {path}: open it in a browser")
-    if replay:
-        from cosim.report.replay import write_replay  # heavy
-
-        click.echo(f"Written to {write_replay(path.with_name('replay.html'), found[0], reference)}: the runs over time")
 
 
 @click.command()
@@ -151,7 +145,7 @@ def watch(
     with progress_line("watch") as progress:
         runs = watch(
             tasks, host=host or LOOPBACK, port=port or 0, delay=(delay or 0.0) / 1000.0,
-            browse=_has_screen() if browse is None else browse, tell=lambda line: click.echo(line), progress=progress)
+            browse=has_screen() if browse is None else browse, tell=lambda line: click.echo(line), progress=progress)
     for seen in runs:
         if isinstance(seen.outcome, Result):
             _tell(seen.name, seed, seen.outcome.trajectory)
@@ -182,8 +176,3 @@ def _tell(controller: str, seed: int, trajectory: "Trajectory") -> None:
                f"{row['completed_veh']:,.0f} trips completed"
                + (f", {removed:,.0f} vehicles removed" if (removed := trajectory.removed[-1].sum()) else ""))
 
-
-def _has_screen() -> bool:
-    """Whether a browser of this machine may be opened: somebody sits there, as far as one can tell."""
-    screen = not sys.platform.startswith("linux") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
-    return screen and sys.stdout.isatty()

@@ -255,9 +255,9 @@ def measured_outflow(folder: Path) -> OutflowOf:
 
 def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
     path = folder.path / "sumo.csv"
-    rows = read_facts(path) if path.is_file() else pd.DataFrame(columns=FACTS)
+    rows = read_facts(path) if path.is_file() else pd.DataFrame(columns=[*FACTS])
     same = (rows["controller"] == result.facts["controller"]) & (rows["seed"] == result.facts["seed"])
-    rows = pd.DataFrame([*rows[~same].to_dict("records"), result.facts], columns=FACTS)
+    rows = pd.DataFrame([*rows[~same].to_dict("records"), result.facts], columns=[*FACTS])
     write_text(path, rows.to_csv(index=False))
 
 

@@ -112,6 +112,33 @@ def at(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame) -
     return _city(network, found, leaking, shown), lines
 
 
+def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame, name: str) -> str:
+    """Why the strategy `name` does better or not than what all are compared with, in one sentence for everybody, none
+    of that itself; other arguments as of `at`."""
+    shown = statistics.compared_with(rows)
+    if name == shown:
+        return ""
+    before, after = (_runs(folder, one, [int(seed) for seed in rows.loc[rows["controller"] == one, "seed"]])
+                     for one in (shown, name))
+    found, then, done = load(network, *before), load(network, after[0], ()), deeds(network, *after)
+    gained = statistics.paired(
+        statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, shown)).percent < 0
+    region = int(np.argmax(found.beyond))
+    if not gained or not len(found.critical) or then.beyond[region] >= found.beyond[region]:
+        leaking = float(rows.loc[rows["controller"] == shown, "leaking_share"].mean())
+        return f"{name} {verdict(rows, level, name, found, leaking, done, network)}."
+    acts = [text for text, there in (
+        ("signals at the boundaries held vehicles back", done.held >= HARDLY),
+        ("drivers were guided to other routes", done.guided > 0)) if there and not model_free(name)]
+    means = f", because {' and '.join(acts)}" if acts else ""
+    first = statistics.than(shown)
+    return (
+        f"{first[0].upper()}{first[1:]}, the region {network.region_names[region]} held more vehicles than it serves "
+        f"best with for {_share(found.beyond[region])} of the time, up to {found.most[region]:.1f} times as many, and "
+        f"served fewer of them; with {name} for {_share(then.beyond[region])}, up to {then.most[region]:.1f} times as "
+        f"many{means}.")
+
+
 def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Trajectory], Iterable[Mapping]]:
     """Trajectories and records of one controller."""
     return ([run_folder.read_trajectory(run_folder.run_path(folder, name, seed)) for seed in seeds],

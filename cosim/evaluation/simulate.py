@@ -36,13 +36,29 @@ if TYPE_CHECKING:
 SHOWN = (  # of FACTS, in notebooks
     "trips", "departed_veh", "final_backlog_veh", "removed_veh", "teleports", "mean_trip_time_s", "co2_kg",
     "gateway_queue_mean_veh", "wall_time_s")
-# Columns of sumo.csv, beside those of summary.csv.
-FACTS = (
-    "controller", "seed", "trips", "departed_veh", "final_backlog_veh", "total_backlog_veh_s", "teleports",
-    "mean_trip_time_s", "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh",
-    "gateway_queue_max_veh", "gateway_full_share", "notes", "outside_training", "leaking_share",
-    "estimate_rmse_share", "estimate_cell_rmse_veh", "wall_time_s", "sumo_time_s", "overhead_share", "setup_time_s",
-    "signals_left_alone", "booked_intervals", "removed_veh", "removed_waiting_veh", "jumps", *PRESSURE_FACTS)
+# Columns of sumo.csv, beside those of summary.csv, and what they say.
+FACTS = {
+    "controller": "the strategy", "seed": "of trips, drivers and guidance", "trips": "that were due",
+    "departed_veh": "trips that could enter", "final_backlog_veh": "waiting to enter at the end",
+    "total_backlog_veh_s": "time integral of those who wait to enter", "teleports": "out of jams, by SUMO",
+    "mean_trip_time_s": "on the road, of all trips, unfinished ones with what they had spent at the end",
+    "mean_departure_delay_s": "between the wanted and the real departure, of all trips",
+    "co2_kg": "of all vehicles, by SUMO's HBEFA4 petrol car", "fuel_kg": "of all vehicles, by the same model",
+    "gateway_queue_mean_veh": "halting on the edges before gateways, mean over edges and time",
+    "gateway_queue_max_veh": "the longest of these queues",
+    "gateway_full_share": "share of these edges and intervals that were full",
+    "notes": "what was said most often of decisions that were not as they should be",
+    "outside_training": "where this is beyond what the policy was trained for",
+    "leaking_share": "share of the flow over the boundaries that passes no signal under control",
+    "estimate_rmse_share": "error of estimated accumulations, as a share of the critical ones",
+    "estimate_cell_rmse_veh": "error of estimated accumulations by destination",
+    "wall_time_s": "of the run", "sumo_time_s": "of it, SUMO's own steps",
+    "overhead_share": "of it, the share outside SUMO", "setup_time_s": "before the first interval",
+    "signals_left_alone": "signals that keep their own programmes",
+    "booked_intervals": "of a standstill that was not simulated any more",
+    "removed_veh": "taken out before the end of their trips",
+    "removed_waiting_veh": "of these, before they could enter",
+    "jumps": "vehicles that came into another region where no gateway leads there", **PRESSURE_FACTS}
 
 
 @dataclass(frozen=True, kw_only=True)

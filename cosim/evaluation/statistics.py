@@ -23,15 +23,33 @@ MEANS = (  # columns of summary.csv and sumo.csv of which an evaluation shows th
     "completed_veh", "removed_veh", "trips", "final_backlog_veh", "total_backlog_veh_s", "mean_trip_time_s",
     "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh", "gateway_full_share",
     "control_step_ms_median", "overhead_share", "wall_time_s")
-CAPTION = (
-    "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; change: of TTS "
-    "against no-control, or against the controller that the heading names, paired by seed, mean of the percentages "
-    "± 95 % interval, * if that excludes zero; completed: on the last edge of their route; removed: by whatever else "
-    "takes vehicles out of SUMO, in TTS as if they were there to the end; backlog: not inserted at the end, and its "
-    "time integral; teleports: all seeds; trip, delay: mean time on the road, and between the wanted and the real "
-    "departure, of all trips, unfinished ones with what they had spent at the end; queue: halting on the "
-    "edges before gateways, mean / longest; full: share of these edges and intervals that were full; decision: median "
-    "/ longest; " + "; ".join(f"{heading}: {what}" for heading, what in COUNTED.values()))
+COLUMNS = {  # heading of a table, without its unit -> what it says
+    "controller": "the strategy for signals and routes", "seeds": "how many runs, each with other trips",
+    "TTS": "total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval",
+    "change": "of TTS against no-control, or against the controller that the heading names, paired by seed, mean of "
+              "the percentages ± 95 % interval, * if that excludes zero",
+    "completed": "trips that ended on the last edge of their route",
+    "removed": "by whatever else takes vehicles out of SUMO, in TTS as if they were there to the end",
+    "backlog": "not inserted at the end, and its time integral", "teleports": "all seeds",
+    "trip": "mean time on the road of all trips, unfinished ones with what they had spent at the end",
+    "delay": "mean time between the wanted and the real departure, of the same trips",
+    "CO2": "of all vehicles, by SUMO's HBEFA4 petrol car",
+    "queue": "halting on the edges before gateways, mean / longest",
+    "full": "share of these edges and intervals that were full", "decision": "median / longest",
+    **dict(COUNTED.values()), "outside SUMO": "share of the wall time that was not SUMO's"}
+PAIRS = {  # columns of pairs.csv
+    "demand": "multiple of the scenario's", "controller": "the strategy", "against": "what it is paired with",
+    "seeds": "that both have", "change_percent": "of total time spent, mean over these seeds",
+    "half_interval_percent": "half of the 95 % interval of that change",
+    "difference_veh_s": "of total time spent, mean over these seeds",
+    "half_interval_veh_s": "half of the 95 % interval of that difference",
+    "excludes_zero": "whether the interval of the change does: more than the chance of the seeds"}
+CAPTION = "; ".join(f"{heading}: {text}" for heading, text in COLUMNS.items() if heading not in ("controller", "seeds"))
+
+
+def meaning(heading: str) -> str:
+    """What the column says that a table of `shown` has under this heading."""
+    return COLUMNS["change" if heading.startswith("against ") else heading.partition(" [")[0]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,9 +149,7 @@ def pairs(rows: pd.DataFrame) -> pd.DataFrame:
                     "change_percent": pair.percent, "half_interval_percent": pair.percent_half,
                     "difference_veh_s": pair.difference, "half_interval_veh_s": pair.difference_half,
                     "excludes_zero": pair.excludes_zero})
-    columns = ["demand", "controller", "against", "seeds", "change_percent", "half_interval_percent",
-               "difference_veh_s", "half_interval_veh_s", "excludes_zero"]
-    return pd.DataFrame(out, columns=columns)
+    return pd.DataFrame(out, columns=[*PAIRS])
 
 
 def shown(table: pd.DataFrame, reference: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame]:

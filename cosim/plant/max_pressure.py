@@ -35,7 +35,11 @@ from cosim.sumo.signals import GREEN, Link, Signal, is_stage, lane_id
 from nmfd.arrays import PerPair
 
 LEVELS = "rgG"    # from nothing to the right of way
-FACTS = ("signal_lanes", "split_lanes", "never_whole_lanes", "intergreen_share", "programmed_intergreen_share")
+FACTS = {  # columns of sumo.csv
+    "signal_lanes": "lanes before signals under max-pressure", "split_lanes": "those that a stage serves in part",
+    "never_whole_lanes": "those that no stage serves whole",
+    "intergreen_share": "share of the time between two stages under max-pressure",
+    "programmed_intergreen_share": "the same in the original programmes"}
 EVERY = 5.0       # s between two decisions: about two vehicles per lane
 SOON = 10.0       # s; about two minimum greens
 SHORT = 15.0      # m, two vehicles

@@ -19,7 +19,6 @@ JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
 DENSITIES = ScalarMappable(Normalize(0.0, JAM_DENSITY), LinearSegmentedColormap.from_list(
     "density", ["#d9d9d9", "#fecc5c", "#e31a1c", "#4d0010"]))
 ASIDE = 0.007  # of the map's width: how far the lines of the two directions of a street are drawn apart
-QUEUES = colormaps["YlOrRd"]
 LEAST_FLOW, WIDEST_FLOW = 0.05, 4.5  # of the largest one; points
 SATURATION = 0.5  # veh/s and lane
 COMMANDED, GREEN_SHOWN, FLOWED = "#333333", "#009e73", "#0059a8"
@@ -130,41 +129,6 @@ def split_totals(
     return ax
 
 
-def gateway_queues(
-    ax: Axes, step: float, queue: Real[np.ndarray, "T N"], labels: Sequence[str], *, most: float,
-) -> Axes:
-    """Vehicles halting before gateways over time: queue (T, N) [veh], one row per edge, white where there is none.
-
-    labels: N, such as "2 > 3"; neighbours with the same label are one group. most: [veh], end of the scale.
-    """
-    time = plots.time_axis(ax, step * np.arange(len(queue) + 1))
-    rows = np.arange(queue.shape[1] + 1)
-    mesh = ax.pcolormesh(time, rows, np.where(queue.T > 0, queue.T, np.nan), cmap=QUEUES, vmin=0.0, vmax=most)
-    mesh.set_rasterized(True)
-    begins = [n for n, label in enumerate(labels) if n == 0 or labels[n - 1] != label]
-    for begin, end in zip(begins, [*begins[1:], len(labels)], strict=True):
-        ax.axhline(begin, color="#dddddd", linewidth=0.5)
-        ax.text(-0.01, (begin + end) / 2, labels[begin], transform=ax.get_yaxis_transform(), fontsize=6, ha="right",
-                va="center")
-    ax.set_yticks([])
-    ax.set_ylim(len(labels), 0)
-    return ax
-
-
-def time_full(ax: Axes, hours: Mapping[str, np.ndarray]) -> Axes:
-    """How long the edges before each gateway row were full [min]: controller -> (N,), rows as in gateway_queues."""
-    tones = plots.colours(list(hours))
-    for n, (controller, values) in enumerate(hours.items()):
-        rows = np.arange(len(values)) + (n + 0.5) / len(hours)
-        ax.barh(rows, values, height=1.0 / len(hours), color=tones[controller], label=controller)
-    ax.set_yticks([])
-    ax.set_ylim(max(map(len, hours.values())), 0)
-    ax.set_xlim(0.0, max(1.0, 1.05 * max(values.max() for values in hours.values())))
-    ax.set_xlabel("time full [min]")
-    ax.spines[["top", "right"]].set_visible(False)
-    return ax
-
-
 def over_demand(
     ax: Axes, ratios: Mapping[str, Mapping[float, tuple[float, float]]], against: str = REFERENCE,
 ) -> Axes:
@@ -183,24 +147,5 @@ def over_demand(
     ax.set_xlabel("demand, multiple of the scenario's")
     ax.set_ylabel(f"total time spent / that of {against} [-]")
     ax.set_ylim(bottom=0.0)
-    ax.spines[["top", "right"]].set_visible(False)
-    return ax
-
-
-def decision_times(ax: Axes, median: Mapping[str, float], longest: Mapping[str, float], step: float) -> Axes:
-    """Wall time per decision [ms], controller -> median and longest, on a scale that ends at the control interval
-    `step` [s]."""
-    tones = plots.colours(list(median))
-    for row, name in enumerate(median):
-        ax.plot([median[name], longest[name]], [row, row], color=tones[name], linewidth=2.0)
-        ax.plot(median[name], row, "o", color=tones[name], markersize=7)
-        ax.plot(longest[name], row, "|", color=tones[name], markersize=13, markeredgewidth=2.0)
-    ax.axvline(1000.0 * step, color=plots.RED, linestyle="--", linewidth=1.2)
-    ax.text(1000.0 * step, -0.75, "control interval ", color=plots.RED, ha="right", va="center", fontsize="small")
-    ax.set_xscale("log")
-    ax.set_xlim(right=1500.0 * step)
-    ax.set_yticks(range(len(median)), list(median))
-    ax.set_ylim(len(median) - 0.5, -1.2)
-    ax.set_xlabel("time per decision [ms]: median (dot) and longest (bar)")
     ax.spines[["top", "right"]].set_visible(False)
     return ax

@@ -1,6 +1,7 @@
 """The report: one HTML file with everything in it, from the finished runs of one or several folders."""
 
 import base64
+import hashlib
 import json
 import math
 import os
@@ -11,13 +12,17 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+import pandas as pd
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from cosim.evaluation import explain, statistics
 from cosim.evaluation.results import Finished, Level
+from cosim.evaluation.simulate import FACTS
 from cosim.plant.strategy import planning_of
-from cosim.report import pictures, summary_text
+from cosim.report import card, pictures, replay, summary_text
+from cosim.view.page import style
 from nmfd.errors import InputError
+from nmfd.metrics import SUMMARY
 from nmfd.model import authority
 from nmfd.runs import files
 from nmfd.runs.scratch import Scratch
@@ -39,22 +44,15 @@ PICTURES = (  # heading, its pictures with captions
          "any vehicle leaves."),
         ("mfd", "Macroscopic fundamental diagram of each region: vehicles inside [veh] against vehicles that leave or "
          "arrive [veh/s]. Dots: one per control interval; line: the regional model; hatched: beyond all dots."))),
-    ("Streets", (
-        ("link_densities", "Density of every street [vehicles per km and lane] at four times, mean of the control "
-         "interval; 133 is a standing queue. The two directions of a street are drawn apart."),)),
     ("Signals and routes", (
         ("perimeter", "Perimeter control: the commanded share u [-] of each boundary (from > to) that was closed most, "
          "the green that its signals showed and the flow, both as shares of those of the original programme."),
         ("splits", "Route guidance: the commanded shares θ [-] by which the vehicles of a region should leave by each "
-         "neighbour, and the shares that did."))),
-    ("Queues before gateways", (
-        ("gateway_queues", "Vehicles halting on the edges before region boundaries [veh] over time, and how long these "
-         "edges were full [min]: held vehicles block other traffic there."),)),
-    ("Decision times", (
-        ("decision_times", "Wall time of one decision [ms], median and longest over all runs, against the control "
-         "interval in which it has to be taken."),)))
-REGIONS = (
-    "Streets in the colour of their region. Dots: gateways; black ones have a signal that perimeter control can use.")
+         "neighbour, and the shares that did."))))
+RUNS = {**{name: text for name, (_, text) in SUMMARY.items()}, **FACTS, "demand": "multiple of the scenario's"}
+SETTINGS = {"key": "of the configuration", "value": "as it was"}
+DEPENDS = {"strategy": "for signals and routes", "depends on": "if that changes, its runs have to be made again"}
+HERE = Path(__file__).parent
 DEMAND = "Total time spent as a share of that {than}, over the demand, with 95 % intervals."
 
 
@@ -69,9 +67,11 @@ class Picture:
 
 def write_page(
     path: Path, found: Sequence[Finished], reference: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None, *, seed: int | None = None,
 ) -> Path:
-    """The page of the runs, atomically. reference: a strategy to pair with, besides what all are compared with."""
+    """The page of the runs, atomically; the first folder has its map with a slider over time. reference: a strategy to
+    pair with, besides what all are compared with; seed: of the runs on the map, the first one that is there if None.
+    InputError for another seed."""
     total, done, runs = sum(len(run.levels) for run in found), 0, []
     for number, run in enumerate(found):
         levels = []
@@ -81,16 +81,47 @@ def write_page(
             if progress:
                 progress(done, total)
         runs.append({**_run(run), "anchor": f"run-{number}", "levels": levels})
+    shown, missing = _replay(found[0], reference, seed)
+    scripts = [*(shown.replay.scripts if shown else ()), (HERE / "sort.js").read_text(encoding="utf-8")]
     environment = Environment(
-        loader=PackageLoader("cosim.report", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True,
-        undefined=StrictUndefined)
+        loader=ChoiceLoader([PackageLoader("cosim.report", "."), PackageLoader("cosim.view", ".")]), autoescape=True,
+        trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
     environment.filters |= {"cell": cell, "typeset": typeset}
-    files.write_text(path, environment.get_template("page.html.j2").render(
-        runs=runs, words=WORDS, caption=statistics.CAPTION,
+    files.write_text(path, environment.get_template("report.html.j2").render(
+        runs=runs, words=WORDS, caption=statistics.CAPTION, shown=shown, without_replay=missing, scripts=scripts,
+        allowed=" ".join(f"'{_digest(script)}'" for script in scripts), style=style("runs.css"),
         names=", ".join(dict.fromkeys(run.scenario.name for run in found)),
         paths=", ".join(str(run.path) for run in found),
         version=found[-1].levels[-1].manifest["sessions"][-1].get("versions", {}).get("perimeter-cosim", "")))
     return path
+
+
+def _replay(run: Finished, reference: str | None, seed: int | None) -> tuple[replay.Shown | None, str]:
+    """The map with a slider, or why there is none."""
+    try:
+        return replay.chosen(run, reference, seed), ""
+    except InputError as error:
+        if seed is not None:
+            raise
+        return None, f"There is no map with a slider: {error}."
+
+
+def _digest(script: str) -> str:
+    """By which the page lets the browser run this script and no other, whatever a name in it may be."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
+
+
+def _table(
+    label: str, columns: Sequence[str], rows: Sequence[Sequence[object]], meaning: Callable[[str], str],
+    words: bool = False,
+) -> dict:
+    """A table of the page. meaning: what a column says; words: of text that wraps, not of numbers"""
+    told = [text[:1].upper() + text[1:] for text in map(meaning, columns)]
+    return {"label": label, "columns": list(zip(columns, told, strict=True)), "rows": rows, "words": words}
+
+
+def _frame(label: str, frame: pd.DataFrame, meaning: Callable[[str], str]) -> dict:
+    return _table(label, list(frame), frame.to_dict("split")["data"], meaning)
 
 
 def _run(run: Finished) -> dict:
@@ -100,17 +131,22 @@ def _run(run: Finished) -> dict:
     first = summary_text.opening(
         run.scenario.name, configuration["steps"], configuration["step_s"], len(run.levels), rows)
     with Scratch("cosim-") as folder:
-        if run.city is not None:
-            pictures.region_map(folder / "regions.png", run.scenario)
         if len(run.levels) > 1:
             pictures.demand_levels(folder / "demand.png", rows)
-        shown = _pictures(folder, (("demand", caption), ("regions", REGIONS)))
+        shown = _pictures(folder, (("demand", caption),))
+    level = run.level(None)
+    heading, figures, name = card.card(level.rows)
     return {
-        "name": run.name, "story": [first, *(_at(run, level) + summary_text.head(level.rows) for level in run.levels)],
-        "models": _models(run), "pictures": shown, "configuration": _configuration(run),
-        "strategies": list({
+        "name": run.name, "card": {
+            "heading": heading, "figures": figures, "where": _at(run, level),
+            "why": explain.at_a_glance(level.demand, level.folder, run.scenario.network, level.rows, name)},
+        "story": [first, *(_at(run, level) + summary_text.head(level.rows) for level in run.levels)],
+        "models": _models(run), "pictures": shown,
+        "configuration": _table("configuration", [*SETTINGS], _configuration(run), SETTINGS.__getitem__, words=True),
+        "strategies": _table("strategies", [*DEPENDS], list({
             name: (name, _plain(depends) or "nothing of its own") for level in run.levels
-            for name, depends in level.manifest.get("controllers", {}).items()}.values())}
+            for name, depends in level.manifest.get("controllers", {}).items()}.values()), DEPENDS.__getitem__,
+            words=True)}
 
 
 def _models(run: Finished) -> list[str]:
@@ -163,8 +199,11 @@ def _level(run: Finished, level: Level, reference: str | None) -> dict:
     return {
         "title": title, "details": summary_text.details(rows), "signals": signals, "reasons": reasons,
         "shown": f"Pictures of single runs show seed {pictures.shown_seed(rows)}{both}.",
-        "outcome": outcome, "how": how, "pairs": statistics.pairs(rows).drop(columns="demand"),
-        "runs": rows[["controller", *(name for name in rows.columns if name != "controller")]],
+        "tables": [_frame(f"What came of it, {title.lower()}", outcome, statistics.meaning),
+                   _frame(f"How, {title.lower()}", how, statistics.meaning)],
+        "pairs": _frame("pairs", statistics.pairs(rows).drop(columns="demand"), statistics.PAIRS.__getitem__),
+        "runs": _frame("runs", rows[["controller", *(name for name in rows.columns if name != "controller")]],
+                       lambda name: RUNS.get(name, "")),
         "pictures": [(heading, there) for heading, there in drawn if there],
         "missing": f"Without pictures of {missing}: {why}." if missing else ""}
 

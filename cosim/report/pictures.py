@@ -6,24 +6,22 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cosim.evaluation import experiment, model_validation, run_metrics, statistics
+from cosim.evaluation import experiment, model_validation, statistics
 from cosim.evaluation.simulate import Result
 from cosim.report import figures
-from cosim.report.city import City as CityView
 from cosim.sumo.build import ensure_built
-from cosim.sumo.net import City, edge_shapes, load_city
+from cosim.sumo.net import City, load_city
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
 from nmfd.studies import mfd_bands, plots
 from nmfd.studies.benchmark import draw_accumulations
 
-MAPS = 4       # times of the maps
 PANELS = 11    # boundaries, or pairs of region and destination, that are shown one by one
 NAMED = 2      # controllers with the most teleports in a title
 WINDOW = 3     # control intervals over which realised shares are taken
-DRAWN = (      # what pictures of streets and gateways need of a record
-    "edge_vehicles", "gateway_queue", "gateway_flow", "gateway_green", "gateway_original_green", "crossings", "guided")
+DRAWN = (  # what pictures of gateways and guidance need of a record
+    "gateway_flow", "gateway_green", "gateway_original_green", "crossings", "guided")
 
 
 def draw(
@@ -31,7 +29,7 @@ def draw(
 ) -> None:
     """All pictures of one demand level into `out`, or into its run folder; `rows` of this level, as in statistics.
 
-    Those of streets and gateways need the `city`, and records that hold DRAWN.
+    Those of gateways and guidance need the `city`, and records that hold DRAWN.
     """
     out = folder if out is None else out
     names = ranked(rows)
@@ -47,12 +45,6 @@ def draw(
         return
     results = {
         name: result for name, result in recorded(folder, rows, seed).items() if set(DRAWN) <= set(result.record)}
-    against = statistics.compared_with(rows)
-    best = next((name for name in names if name != against and name in results), None)
-    pair = {name: results[name] for name in (against, best) if name in results}
-    if pair:
-        link_maps(out / "link_densities.png", city, pair, f"seed {seed}; {note}")
-        gateway_queues(out / "gateway_queues.png", city, pair, f"seed {seed}; {note}")
     gating = next((name for name in names if name in results and acts(results[name], scenario.network)), None)
     if gating:
         perimeter(out / "perimeter.png", city, scenario.network, results[gating], note)
@@ -100,50 +92,6 @@ def teleports(rows: pd.DataFrame) -> str:
         return "no teleport in any run"
     named = [f"{name} {count:.0f}" for name, count in counts.iloc[:NAMED].items()]
     return "teleports: " + ", ".join(named + ["others fewer"] * (len(counts) > NAMED))
-
-
-def link_maps(path: Path, city: City, results: dict[str, Result], note: str) -> None:
-    """Maps of the link densities at MAPS times, one row per controller."""
-    shapes, lanes = edge_shapes(city), np.array([city.lanes[edge] for edge in city.edges])
-    km = np.array([city.length[edge] for edge in city.edges]) / 1000.0
-    region = np.array([city.region_of[edge] for edge in city.edges])
-    width, height = np.ptp(np.concatenate(shapes), axis=0)
-    drawing = plots.figure(3.6 * MAPS + 1.0, 0.6 + (0.3 + 3.6 * height / width) * len(results))
-    grid = drawing.subplots(len(results), MAPS, squeeze=False)
-    for line, (name, result) in zip(grid, results.items(), strict=True):
-        loads = result.record["edge_vehicles"].astype(float)
-        for ax, k in zip(line, np.linspace(0, len(loads) - 1, MAPS + 1).round().astype(int)[1:], strict=True):
-            figures.link_densities(ax, shapes, loads[k] / km / lanes, lanes, region)
-            ax.set_title(f"{name}, {(k + 1) * result.trajectory.step / 60:.0f} min", fontsize="medium")
-    drawing.suptitle(note, fontsize="medium")
-    bar = drawing.colorbar(figures.DENSITIES, ax=grid, shrink=0.8, aspect=30)
-    bar.set_label("vehicles per km and lane,\nmean of the control interval")
-    plots.save(drawing, path)
-
-
-def gateway_queues(path: Path, city: City, results: dict[str, Result], note: str) -> None:
-    """Queues before gateways over time for each of `results`, and how long the edges were full."""
-    upstream = run_metrics.upstream_gateways(city)
-    labels = [f"{city.gateways[n].source} > {city.gateways[n].target}" for n in upstream]
-    queues = {name: result.record["gateway_queue"][:, upstream] for name, result in results.items()}
-    most = max(max(queue.max() for queue in queues.values()), 1.0)
-    drawing = plots.figure(4.2 * len(results) + 3.6, 8.4)
-    axes = drawing.subplots(1, len(results) + 1, width_ratios=[*[1.0] * len(results), 0.6])
-    full = {}
-    for ax, (name, queue) in zip(axes, queues.items(), strict=False):
-        step = results[name].trajectory.step
-        figures.gateway_queues(ax, step, queue, labels, most=most)
-        ax.set_title(name, fontsize="medium")
-        full[name] = step / 60 * run_metrics.gateway_full(
-            results[name].record["edge_vehicles"], city)[:, upstream].sum(axis=0)
-        mesh = ax.collections[0]
-    figures.time_full(axes[-1], full)
-    axes[-1].set_title("edge full", fontsize="medium")
-    drawing.suptitle(note, fontsize="medium")
-    bar = drawing.colorbar(mesh, ax=axes[:-1], location="bottom", shrink=0.5, aspect=40)
-    bar.set_label("vehicles halting on the edge before the boundary (from > to) [veh]")
-    plots.legend_below(drawing, [axes[-1]])
-    plots.save(drawing, path)
 
 
 def perimeter(path: Path, city: City, network: RegionalModel, result: Result, note: str) -> None:
@@ -246,20 +194,12 @@ def draw_all(out: Path, folders: Mapping[float, Path], scenario: Scenario, rows:
 
 
 def draw_more(out: Path, scenario: Scenario, folder: Path, rows: pd.DataFrame) -> None:
-    """Beside `draw`, for a page, of one demand level: MFDs and decision times; arguments as there."""
+    """Beside `draw`, for a page, the MFDs of one demand level; arguments as there."""
     results = recorded(folder, rows, shown_seed(rows))
     against = statistics.compared_with(rows)
     best = next((name for name in results if name != against), None)
     outflows(out / "mfd.png", scenario.network, {
         name: results[name] for name in (against, best) if name in results})
-    decision_times(out / "decision_times.png", rows, scenario.step)
-
-
-def region_map(path: Path, scenario: Scenario) -> None:
-    """The regions and gateways of the city."""
-    drawing = plots.figure(6.2, 5.6)
-    CityView(scenario).plot(drawing.subplots(), flows=False)
-    plots.save(drawing, path)
 
 
 def outflows(path: Path, network: RegionalModel, results: dict[str, Result]) -> None:
@@ -271,12 +211,3 @@ def outflows(path: Path, network: RegionalModel, results: dict[str, Result]) -> 
             for name, result in results.items()}
         samples.append({name: np.concatenate(list(parts.values())) for name, parts in clouds.items()})
     mfd_bands.draw_mfds(path, network, samples)
-
-
-def decision_times(path: Path, rows: pd.DataFrame, step: float) -> None:
-    """Wall time per decision of every controller, all seeds."""
-    groups = rows.groupby("controller", sort=False)
-    median, longest = groups["control_step_ms_median"].median(), groups["control_step_ms_max"].max()
-    drawing = plots.figure(8.0, 1.4 + 0.32 * len(median))
-    figures.decision_times(drawing.subplots(), median.to_dict(), longest.to_dict(), step)
-    plots.save(drawing, path)

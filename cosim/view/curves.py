@@ -96,9 +96,9 @@ class Curves:
             for plot, key in ((self.region, "accumulation"), (self.trips, "completed"), (self.spent, "spent")):
                 plot.line("time", key, source=line, color=colour, line_dash=dash, line_width=2, legend_label=name)
             self.gate.step("time", "u", source=line, color=colour, line_dash=dash, line_width=2, mode="before",
-                           legend_label=f"u commanded, {name}")
+                           legend_label=f"u, {name}")
             self.gate.scatter("time", "green", source=line, size=5, marker=("circle", "square")[n], line_color=colour,
-                              fill_color=colours.PAPER, legend_label=f"green / original, {name}")
+                              fill_color=colours.PAPER, legend_label=f"green, {name}")
             self.street.line("time", "density", source=line, color=colour, line_dash=dash, line_width=2,
                              legend_label=f"density, {name}")
             self.street.scatter("time", "speed", source=line, y_range_name="speed", size=5, line_color=colour,

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from bokeh.core.templates import get_env
 from bokeh.document import Document
 from bokeh.models import Div, Model
+from jinja2 import Environment, PackageLoader
 
 from cosim.view import colours
 from cosim.view.city_map import DENSITY, CityMap
@@ -14,6 +14,9 @@ from cosim.view.curves import HOUR, MINUTE, Curves, Load
 from cosim.view.picture import CityPicture, Frame
 
 HERE = Path(__file__).parent
+WIDE = ".bk-clearfix { display: block !important; }"  # of a Div, which else is no wider than its words
+TEMPLATES = Environment(
+    loader=PackageLoader("cosim.view", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
 
 
 class Page:
@@ -25,7 +28,7 @@ class Page:
         self.maps = [CityMap(picture, name) for name in names]
         self.loads = [Load(picture, f"{name}: how full the regions are") for name in names]
         self.curves = Curves(picture, names)
-        self.numbers = Div(text="", sizing_mode="stretch_width")
+        self.numbers = Div(text="", sizing_mode="stretch_width", stylesheets=[WIDE])
         ends = [region for gate in picture.gates for region in (gate.source, gate.target)]
         self.street: int | None = None
         self.region = max(range(picture.regions), key=ends.count)
@@ -72,11 +75,11 @@ class Page:
             load.show(whole)
         self.curves.show(runs, time)
 
-    def place(
-        self, document: Document, subtitle: str, bar: Sequence[Model], choices: Sequence[Model], *,
-        streets: bool = False,
-    ) -> None:
-        """Put it into a document. bar, choices: what one can press, with names; streets: whether one can be chosen"""
+    def layout(
+        self, bar: Sequence[Model], choices: Sequence[Model], *, streets: bool = False,
+    ) -> tuple[dict[str, Model], dict[str, list[str]]]:
+        """What stands on the page: models by name, and which of them is where (`body.html.j2`). bar, choices: what one
+        can press, with names; streets: whether one can be chosen."""
         curves, street = self.curves, {"street_curve": self.curves.street} if streets else {}
         roots = {
             "numbers": self.numbers,
@@ -84,18 +87,32 @@ class Page:
             **{f"load{n}": one.plot for n, one in enumerate(self.loads)},
             "region_curve": curves.region, "plane": curves.plane, "gate_curve": curves.gate, "trips": curves.trips,
             "spent": curves.spent, **street, **{str(model.name): model for model in (*bar, *choices)}}
+        for name, model in roots.items():
+            model.name = name
+        return roots, {
+            "bar": [str(model.name) for model in bar], "choices": [str(model.name) for model in choices],
+            "maps": [name for name in roots if name.startswith("map")],
+            "loads": [name for name in roots if name.startswith("load")],
+            "curves": ["region_curve", "plane", "gate_curve", *street, "trips", "spent"]}
+
+    def place(
+        self, document: Document, subtitle: str, bar: Sequence[Model], choices: Sequence[Model], *,
+        streets: bool = False,
+    ) -> None:
+        """Put it into a document; arguments as in `layout`."""
+        roots, places = self.layout(bar, choices, streets=streets)
         with document.models.freeze():  # else all models are looked through anew with every root
-            for name, model in roots.items():
-                model.name = name
+            for model in roots.values():
                 document.add_root(model)
         document.title = f"{self.picture.name}: {' against '.join(self.names)}"
-        document.template = get_env().from_string((HERE / "page.html.j2").read_text(encoding="utf-8"))
+        document.template = TEMPLATES.get_template("page.html.j2")
         document.template_variables.update(
-            heading=document.title, subtitle=subtitle, css=(HERE / "page.css").read_text(encoding="utf-8"),
-            bar=[model.name for model in bar], choices=[model.name for model in choices],
-            maps=[name for name in roots if name.startswith("map")],
-            loads=[name for name in roots if name.startswith("load")],
-            curves=["region_curve", "plane", "gate_curve", *street, "trips", "spent"])
+            heading=document.title, subtitle=subtitle, css=style("page.css", "runs.css"), **places)
+
+
+def style(*names: str) -> str:
+    """Style sheets of the page, one after the other."""
+    return "\n".join((HERE / name).read_text(encoding="utf-8") for name in names)
 
 
 def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -> str:
@@ -114,7 +131,7 @@ def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -
         colour, dash = colours.RUNS[n]
         lines.append(
             f"<div style='display:flex;flex-wrap:wrap;gap:2px 10px;align-items:center;border-left:4px {dash} {colour};"
-            f"padding-left:12px;margin:5px 0'><div style='flex:0 0 230px;font-weight:650;color:{colour}'>{escape(name)}"
+            f"padding-left:12px;margin:5px 0'><div style='flex:1 1 140px;font-weight:650;color:{colour}'>{escape(name)}"
             f"</div>{cells}{note}</div>")
     return (
         "<div style='display:flex;flex-wrap:wrap;gap:4px 36px;align-items:center'>"

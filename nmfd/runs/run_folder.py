@@ -21,18 +21,13 @@ import netCDF4
 import numpy as np
 
 from nmfd.errors import InputError
-from nmfd.metrics import summary
+from nmfd.metrics import SUMMARY, summary
 from nmfd.quantities import quantities
 from nmfd.runs import files
 from nmfd.runs.provenance import provenance
 from nmfd.types import Trajectory
 
-COLUMNS = {
-    "controller": str, "seed": int, "plant": str, "total_time_spent_veh_s": float, "final_accumulation_veh": float,
-    "max_accumulation_veh": float, "completed_veh": float, "evaluation_time_s": float,
-    "control_step_ms_median": float, "control_step_ms_max": float, "solver_failures": int, "fallbacks": int,
-    "late_decisions": int, "sensor_faults": int, "plant_faults": int,
-}
+COLUMNS = {name: kind for name, (kind, _) in SUMMARY.items()}
 LOCK = ".lock"  # of a run folder
 # What reading raises for a file that is no netCDF, cut off, changed, or without a variable that it should have.
 DAMAGED = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError, MemoryError)

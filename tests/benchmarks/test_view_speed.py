@@ -1,6 +1,7 @@
 """The live view of a city as large as Luxembourg, 5,747 streets: pytest -n0 tests/benchmarks --benchmark-only"""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from bokeh.embed import file_html
 from bokeh.resources import INLINE
 
 from cosim.importing.layers import rings_round
+from cosim.view import replay
 from cosim.view.page import Page
 from cosim.view.picture import CityPicture, Frame, Gate, between
 
@@ -83,3 +85,14 @@ def test_the_size_of_the_page(benchmark, city):
         file_html, (document, INLINE), {"template": document.template, "template_variables": (
             document.template_variables)}, rounds=1)
     assert len(html) < 15e6
+
+
+def test_the_size_of_a_report(benchmark, city, frame):
+    """One hour of two runs, an interval a minute, on the map with a slider; pictures and tables take 1 to 2 MB more."""
+    random = np.random.default_rng(1)
+    runs = {name: [
+        replace(frame, time=60.0 * k, intervals=k, density=random.uniform(0.0, 133.0, EDGES).astype(np.float16),
+                green=random.uniform(size=GATES), queue=random.uniform(0.0, 30.0, GATES))
+        for k in range(61)] for name in ("one", "other")}
+    made = benchmark.pedantic(replay.embedded, (city, runs), rounds=1)
+    assert sum(map(len, (*made.scripts, *made.roots.values()))) < 13e6
