@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from cosim.cli.city import identify, import_
+from cosim.cli.get import get
 from cosim.cli.options import CONTROLLER_HELP, REFERENCE, chosen_scheduler, scheduler_options, tell
 from cosim.cli.reference import reference
 from cosim.cli.report import report, video, watch
@@ -146,5 +147,5 @@ def sweep(
         tell(f"{failed} of {len(rows)} runs failed, see the column reason; the same command tries them again")
 
 
-for command in (run, compare, report, video, watch, identify, import_, reference, tune, frontier):
+for command in (run, compare, report, video, watch, identify, import_, get, reference, tune, frontier):
     main.add_command(command)
