@@ -78,8 +78,8 @@ def test_import_makes_a_scenario_and_names_the_licence(tmp_path):
     with gzip.open(tmp_path / "city.osm.gz", "wb") as stream:
         stream.write(street_map())
     net, scenario = tmp_path / "networks" / "mycity", tmp_path / "scenarios" / "mycity"
-    good(cosim("import", tmp_path / "city.osm.gz", "--regions", 2, "--demand", "peak", "--level", 0.1, "--iterations", 1,
-               "--seeds", 1, "--out", net))
+    good(cosim("import", tmp_path / "city.osm.gz", "--regions", 2, "--demand", "peak", "--level", 0.1,
+               "--iterations", 1, "--seeds", 1, "--out", net))
     assert "OpenStreetMap contributors" in (net / "NOTICE.txt").read_text()
     assert "4 signals that cars see" in (net / "import.txt").read_text()
     good(cosim("run", scenario, "--controller", "pi-gating", "--steps", 3, "--out", tmp_path / "run"))

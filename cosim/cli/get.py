@@ -15,8 +15,8 @@ def get(name: str | None, out: Path | None) -> None:
     """Fetch a city of others from where it is published; without NAME, list them.
 
     Its licence is named and kept beside it, and its content is checked: against the hash that its publisher names,
-    or, where none is published, against that of the first download (SHA256SUMS beside the folders). Bologna and
-    Luxembourg need no fetching: they are scenarios here.
+    or, where none is published, against that of the first download (SHA256SUMS beside the folders). Bologna needs no
+    fetching: it is a scenario here.
 
     \b
     Examples:

@@ -117,10 +117,10 @@ def _members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
                     with packed.open(entry) as stream:
                         yield entry.filename, stream
         return
-    with tarfile.open(archive) as packed:
-        for member in packed:
-            if member.isfile() and (stream := packed.extractfile(member)):
-                yield member.name, stream
+    with tarfile.open(archive) as tape:
+        for member in tape:
+            if member.isfile() and (content := tape.extractfile(member)):
+                yield member.name, content
 
 
 def listed() -> str:
