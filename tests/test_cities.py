@@ -3,13 +3,14 @@
 Each must give a network and a scenario that run, or one clear line.
 """
 
+import gzip
 import os
 from pathlib import Path
 
 import pandas as pd
 import pytest
 import sumo
-from commands import cosim
+from commands import cosim, good
 from tiny_city import driven
 
 from cosim.evaluation.simulate import Task, simulate
@@ -18,10 +19,12 @@ from cosim.importing.streets import read_streets
 from nmfd.api import load_scenario
 from nmfd.metrics import total_time_spent
 
+ROOT = Path(__file__).parents[1]
 GAMES = Path(sumo.SUMO_HOME) / "tools" / "game"
 CITIES = Path(os.environ.get("CITIES", Path(__file__).parents[2] / "shared" / "cities"))
 REAL = {"bologna": ("bologna/run.sumocfg", 4), "ingolstadt": ("ingolstadt21/ingolstadt21.sumocfg", 3),
         "luxembourg": ("luxembourg/luxembourg.net.xml.gz", 6)}
+COMMITTED = sorted(notice.parent.name for notice in (ROOT / "networks").glob("*/NOTICE.txt"))
 
 
 def check(folder: Path, name: str, intervals: int) -> None:
@@ -86,3 +89,27 @@ def test_max_pressure_takes_no_longer_than_fixed_time(tmp_path, name, level):
         spent[signals] = total_time_spent(run.trajectory)
         assert run.trajectory.completed[-1] == run.facts["trips"], signals
     assert max(spent, key=spent.get) == "no-control", spent
+
+
+@pytest.mark.parametrize("name", COMMITTED)
+def test_committed_cities_are_small_and_need_nothing_else(name):
+    load_scenario(ROOT / "scenarios" / name)
+    assert "SPDX" in (ROOT / "networks" / name / "NOTICE.txt").read_text()
+    size = 0
+    for folder in (ROOT / "networks" / name, ROOT / "scenarios" / name):
+        assert (folder / "NOTICE.txt").is_file()
+        for file in (file for file in folder.rglob("*") if file.is_file() and "reference" not in file.parts):
+            content = gzip.decompress(file.read_bytes()) if file.suffix == ".gz" else file.read_bytes()
+            assert b"/work/" not in content and b"shared/cities" not in content, file
+            size += file.stat().st_size
+    assert size < 5e6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMITTED)
+def test_committed_cities_run_under_their_policies(tmp_path, name):
+    policies = sorted((ROOT / "scenarios" / name).glob("*.pt"))
+    assert policies
+    for policy in policies:
+        good(cosim("run", ROOT / "scenarios" / name, "--controller", policy.stem, "--steps", 2, "--out",
+                   tmp_path / policy.stem))

@@ -82,7 +82,10 @@ def identify(
 
 
 @click.command(name="import")
-@click.argument("source", type=FILE, metavar="SUMOCFG|NET")
+@click.argument("source", type=FILE, required=False, metavar="SUMOCFG|NET|OSM")
+@click.option("--bbox", metavar="W,S,E,N",
+              help="A box of OpenStreetMap, in degrees, fetched from a public server, instead of a file.")
+@click.option("--left-hand", is_flag=True, help="Of OpenStreetMap: a city that drives on the left.")
 @declared("cosim.importing.settings:Import", "regions", instead="those of --edges, --taz or --polygons")
 @click.option("--out", type=FOLDER, required=True, metavar="DIR", help="The network's folder, such as networks/mycity.")
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="[default: scenarios/<name>, beside the networks]")
@@ -109,14 +112,16 @@ def identify(
 @click.option("--no-run", is_flag=True, help="Do not simulate the city first: no densities and no flows.")
 @click.option("--force", is_flag=True, help="Replace a network and scenario that are there.")
 def import_(
-    source: Path, regions: int | None, out: Path, scenario: Path | None, method: Literal["density", "geometric"],
-    edges: Path | None, taz: Path | None, polygons: Path | None, routes: tuple[Path, ...], od: tuple[Path, ...],
-    zones: tuple[Path, ...], demand: str | None, iterations: int, gap: float, level: str, seeds: int, mesoscopic: bool,
-    begin: str | None, end: str | None, seed: int, no_run: bool, force: bool,
+    source: Path | None, bbox: str | None, left_hand: bool, regions: int | None, out: Path, scenario: Path | None,
+    method: Literal["density", "geometric"], edges: Path | None, taz: Path | None, polygons: Path | None,
+    routes: tuple[Path, ...], od: tuple[Path, ...], zones: tuple[Path, ...], demand: str | None, iterations: int,
+    gap: float, level: str, seeds: int, mesoscopic: bool, begin: str | None, end: str | None, seed: int, no_run: bool,
+    force: bool,
 ) -> None:
     """Turn any SUMO city into a network and a scenario: regions, gateways, demand by pair of regions, map.
 
     Its own vehicles stay as they are: routes, departures, types. The city is simulated without control first.
+    A file of OpenStreetMap (.osm, .osm.xml or .osm.gz) becomes a network by SUMO's netconvert.
 
     \b
     Examples:
@@ -124,11 +129,17 @@ def import_(
       cosim import city.net.xml.gz --routes cars.rou.xml --regions 5 --out networks/mycity
       cosim import city.net.xml.gz --regions 6 --demand peak --out networks/mycity
       cosim import city.sumocfg --taz districts.taz.xml --out networks/mycity --begin 7:00:00 --end 9:00:00
+      cosim import city.osm.gz --regions 5 --demand peak --out networks/mycity
+      cosim import --bbox 11.32,44.48,11.36,44.50 --regions 4 --demand peak --out networks/mycity
     """
     from cosim.importing.assignment import Effort
     from cosim.importing.importer import ImportOptions, import_city, parse_time  # heavy
+    from cosim.importing.osm import parse_box
     from cosim.importing.partition import Clustered, Drawn
 
+    given = parse_box(bbox) if bbox is not None else source
+    if given is None or (source is not None and bbox is not None):
+        raise InputError("cosim import: give a sumocfg, a net or a file of OpenStreetMap, or else --bbox")
     cuts: list[Clustered | Drawn] = [] if regions is None else [Clustered(method=method, regions=regions)]
     cuts += [Drawn(method="edges", file=edges)] if edges else []
     cuts += [Drawn(method="taz", file=taz)] if taz else []
@@ -138,7 +149,7 @@ def import_(
     if no_run and cuts[0].method == "density":
         raise InputError("--no-run: the densities come from that run; add --method geometric")
     order = ImportOptions(
-        source=source, out=out, cut=cuts[0], seed=seed, run=not no_run, force=force,
+        source=given, left_hand=left_hand, out=out, cut=cuts[0], seed=seed, run=not no_run, force=force,
         peak=demand is not None, level=parsed_level(level, no_run), mesoscopic=mesoscopic,
         scenario=scenario or out.parent.parent / "scenarios" / out.name,
         begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"), routes=routes, od=od,

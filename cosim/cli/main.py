@@ -10,6 +10,7 @@ import click
 
 from cosim.cli.city import identify, import_
 from cosim.cli.demo import demo
+from cosim.cli.get import get
 from cosim.cli.options import CONTROLLER_HELP, REFERENCE, chosen_scheduler, scheduler_options, tell
 from cosim.cli.reference import reference
 from cosim.cli.report import report, video, watch
@@ -149,6 +150,6 @@ def sweep(
 
 
 for command in (
-        demo, listing("cosim.plant.strategy:options"), run, compare, report, video, watch, identify, import_, reference,
-        tune, frontier):
+        demo, listing("cosim.plant.strategy:options"), run, compare, report, video, watch, identify, import_, get,
+        reference, tune, frontier):
     main.add_command(command)

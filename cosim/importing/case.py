@@ -31,6 +31,7 @@ class SumoInput:
     source: the file that was given; net; routes and additional in SUMO's order
     begin, end: [s]; end is None where it is open
     options: all other options of the sumocfg
+    notice: what the licence of its data wants to be said; "" where nothing is known
     """
 
     source: Path
@@ -40,6 +41,7 @@ class SumoInput:
     begin: float = 0.0
     end: float | None = None
     options: Mapping[str, str] = field(default_factory=dict)
+    notice: str = ""
 
     @property
     def scale(self) -> float:
@@ -83,7 +85,8 @@ def read_sumo_input(path: Path) -> SumoInput:
     if root.tag == "net":
         return SumoInput(source=path, net=path)
     if root.tag not in ("configuration", "sumoConfiguration"):
-        raise InputError(f"{path}: expected a sumocfg or a net.xml, got a file of <{root.tag}> instead")
+        raise InputError(f"{path}: expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of "
+                         f"<{root.tag}> instead")
     given = {}
     for element in read_xml(path).iter():
         value = element.get("value", element.get("v"))

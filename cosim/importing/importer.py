@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.importing import level, model, quality, verdict, written
+from cosim.importing import level, model, osm, quality, verdict, written
 from cosim.importing.assignment import Assigned, Effort, relative_gap
 from cosim.importing.baseline import Baseline, Tell
-from cosim.importing.case import SumoInput, read_sumo_input, seconds
+from cosim.importing.case import SumoInput, seconds
 from cosim.importing.demand import Traffic, read_traffic
 from cosim.importing.partition import Clustered, Drawn, alternatives, partition
 from cosim.importing.regions import positions
@@ -33,6 +33,8 @@ LITTLE = 0.3  # of the flow over the boundaries passes no signal under control: 
 class ImportOptions:
     """What the user asked for.
 
+    source: a sumocfg, a net, a file of OpenStreetMap, or a box of it (cosim.importing.osm)
+    left_hand: where it drives, which OpenStreetMap does not say of single streets
     cut: how to come by regions
     run: simulate the city without control first
     peak: generate a morning peak, instead of route files
@@ -44,7 +46,8 @@ class ImportOptions:
     seeds: runs without control whose densities are averaged
     """
 
-    source: Path
+    source: Path | osm.Box
+    left_hand: bool = False
     out: Path
     scenario: Path
     cut: Clustered | Drawn
@@ -68,7 +71,11 @@ def import_city(order: ImportOptions, tell: Tell = lambda stage, share=0.0: None
     is written. tell: called with what is going on, and the share of it [-] that is done."""
     _check_free(order)
     tell("reading")
-    case = _windowed(read_sumo_input(order.source), order)
+    with osm.sumo_input(order.source, tell, left_hand=order.left_hand) as case:
+        return _import(_windowed(case, order), order, tell)
+
+
+def _import(case: SumoInput, order: ImportOptions, tell: Tell) -> str:
     case = replace(case, routes=(*case.routes, *order.routes))
     streets = read_streets(case.net, case.additional)
     order = replace(order, mesoscopic=order.mesoscopic or case.mesoscopic)
@@ -114,8 +121,10 @@ def import_city(order: ImportOptions, tell: Tell = lambda stage, share=0.0: None
         judged = verdict.of_import(network, found.gateways, regions, baseline)
         network = replace(network, controllable=judged.boundaries.shares)
         verdict.write_verdict(net_folder, judged)
+        if case.notice:
+            (net_folder / "NOTICE.txt").write_text(case.notice)
         tell("writing")
-        written.write_network(net_folder, streets, regions, network, found, baseline, order.source.name)
+        written.write_network(net_folder, streets, regions, network, found, baseline, case.source.name)
         demand = model.region_demand(traffic, regions, clock)
         written.write_demand(folder / "demand.csv", demand)
         (folder / "scenario.toml").write_text(model.scenario_text(
@@ -152,12 +161,12 @@ def _traffic(case: SumoInput, streets: Streets, order: ImportOptions) -> Traffic
     if not order.peak:
         if not len(traffic.depart):
             raise InputError(
-                f"{order.source}: names no vehicles for the streets of cars{_notes(traffic)}; give a sumocfg with "
+                f"{case.source}: names no vehicles for the streets of cars{_notes(traffic)}; give a sumocfg with "
                 "route-files, or add --routes FILE, --od FILE or --demand peak")
         return traffic
     if len(traffic.depart):
         raise InputError(
-            f"--demand: {order.source} has {len(traffic.depart):,} vehicles of its own; omit --demand, or give "
+            f"--demand: {case.source} has {len(traffic.depart):,} vehicles of its own; omit --demand, or give "
             "the network alone")
     return traffic
 

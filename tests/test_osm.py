@@ -1,0 +1,106 @@
+"""cosim import of OpenStreetMap: a file, and a box of it from a server of our own."""
+
+import gzip
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+from commands import cosim, error_line, good
+
+from cosim.importing import osm
+from cosim.importing.streets import read_streets
+
+SIDE = 4  # junctions along a side
+
+
+def street_map() -> bytes:
+    """A grid of streets, both ways: the third of either direction is a main street, its inner junctions have signals;
+    and a footway, a railway and a street that is cut off from the rest."""
+    lines = ["<?xml version='1.0' encoding='UTF-8'?>", "<osm version='0.6'>"]
+    for y in range(SIDE):
+        for x in range(SIDE):
+            signal = "<tag k='highway' v='traffic_signals'/>" if {x, y} <= {1, 2} else ""
+            place = f"lat='{44.49 + 0.0018 * y}' lon='{11.33 + 0.0025 * x}'"
+            lines.append(f"<node id='{10 * y + x}' {place}>{signal}</node>")
+    lines += ["<node id='98' lat='44.52' lon='11.33'/>", "<node id='99' lat='44.52' lon='11.331'/>"]
+    ways = [([10 * y + x for x in range(SIDE)], "primary" if y == 2 else "residential") for y in range(SIDE)]
+    ways += [([10 * y + x for y in range(SIDE)], "primary" if x == 2 else "residential") for x in range(SIDE)]
+    ways += [([0, 11], "footway"), ([98, 99], "residential")]
+    for n, (nodes, kind) in enumerate(ways, start=1):
+        lines.append(f"<way id='{n}'>{''.join(f'<nd ref={chr(39)}{node}{chr(39)}/>' for node in nodes)}"
+                     f"<tag k='highway' v='{kind}'/></way>")
+    return "\n".join([*lines, "</osm>"]).encode()
+
+
+def test_streets_and_signals_of_a_file(tmp_path):
+    (tmp_path / "city.osm").write_bytes(street_map())
+    written = []
+    for left_hand in (False, False, True):
+        with osm.sumo_input(tmp_path / "city.osm", lambda stage: None, left_hand=left_hand) as case:
+            streets = read_streets(case.net, ())
+            written.append(case.net.read_bytes())
+            assert streets.left_hand == left_hand
+            # 24 streets, both ways; a corner is no junction: its two streets are one
+            assert len(streets.edges) == 2 * 24 - 2 * 4
+            assert streets.drivable.all()
+            assert set(streets.logics) == {"11", "12", "21", "22"}
+            assert {logics[-1].kind for logics in streets.logics.values()} == {"actuated"}
+            assert "ODbL-1.0" in case.notice
+        assert not case.net.exists()
+    assert written[0] == written[1] and b"osm.net.xml" not in written[0]
+
+
+def test_a_box_is_asked_of_a_server(tmp_path, monkeypatch):
+    asked = []
+
+    class Overpass(BaseHTTPRequestHandler):
+        def do_POST(self):
+            asked.append(self.rfile.read(int(self.headers["Content-Length"])).decode())
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(street_map())
+
+        def log_message(self, *arguments):
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Overpass) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        monkeypatch.setattr(osm, "SERVERS", f"http://127.0.0.1:{server.server_port}/")
+        file = osm.fetched((-0.5, 44.48, 11.34, 44.5), tmp_path)
+        server.shutdown()
+    assert 'w="-0.5"' in asked[0] and 'n="44.5"' in asked[0]
+    with gzip.open(file) as stream:
+        assert b"<way id='1'>" in stream.read()
+
+
+@pytest.mark.slow
+def test_import_makes_a_scenario_and_names_the_licence(tmp_path):
+    with gzip.open(tmp_path / "city.osm.gz", "wb") as stream:
+        stream.write(street_map())
+    net, scenario = tmp_path / "networks" / "mycity", tmp_path / "scenarios" / "mycity"
+    good(cosim("import", tmp_path / "city.osm.gz", "--regions", 2, "--demand", "peak", "--level", 0.1,
+               "--iterations", 1, "--seeds", 1, "--out", net))
+    assert "OpenStreetMap contributors" in (net / "NOTICE.txt").read_text()
+    assert "4 signals that cars see" in (net / "import.txt").read_text()
+    good(cosim("run", scenario, "--controller", "pi-gating", "--steps", 3, "--out", tmp_path / "run"))
+
+
+@pytest.mark.parametrize(("arguments", "expected"), [
+    (("--bbox", "11.3,44.4,11.4,44.5"), "osmGet.py got nothing from OpenStreetMap (urllib.error.URLError"),
+    (("--bbox", "11.3,44.4,11.4"), "expected west,south,east,north in degrees"),
+    (("--bbox", "11.4,44.4,11.3,44.5"), "expected west,south,east,north in degrees"),
+    ((), "or else --bbox"),
+    (("empty.osm", "--bbox", "11.3,44.4,11.4,44.5"), "or else --bbox"),
+    (("empty.osm",), "netconvert cannot run it: Error: No nodes loaded"),
+    (("city.osm.pbf",), "osmium cat city.osm.pbf -o city.osm"),
+    (("city.net.xml", "--left-hand"), "says itself where it drives"),
+    (("other.xml",), "expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of <html>"),
+])
+def test_one_line(tmp_path, monkeypatch, arguments, expected):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(osm, "SERVERS", "http://127.0.0.1:1/")
+    for name, content in (("empty.osm", "<osm/>"), ("city.osm.pbf", ""), ("city.net.xml", "<net/>"),
+                          ("other.xml", "<html/>")):
+        (tmp_path / name).write_text(content)
+    assert expected in error_line(cosim("import", *arguments, "--regions", 2, "--out", "networks/x"))
+    assert not (tmp_path / "networks" / "x").exists() and not (tmp_path / "scenarios").exists()
