@@ -120,7 +120,7 @@ def test_the_card_has_the_figures_of_the_best_strategy(evaluation):
     assert heading == "dpc-pcrg instead of no control" and name == "dpc-pcrg"
     trip, served, saved = figures  # CO2 was not recorded
     assert (trip.value, trip.before, trip.better) == ("5.0 min", "10.0 min without control", True)
-    assert trip.change == "-50 % ± 2 over 2 seeds"
+    assert trip.change == "-50 % ± 2 (95 %, 2 seeds)"
     assert served.value == "500" and served.better is None
     tts = rows.groupby("controller")["total_time_spent_veh_s"].mean() / 3600
     assert saved.label == "Hours of delay saved" and saved.better

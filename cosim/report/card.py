@@ -96,7 +96,7 @@ def _pair(rows: pd.DataFrame, name: str, against: str, column: str) -> statistic
 
 
 def _half(half: float, seeds: int, form: str) -> str:
-    return " on one seed" if math.isnan(half) else f" ± {half:{form}} over {seeds} seeds"
+    return " on one seed" if math.isnan(half) else f" ± {half:{form}} (95 %, {seeds} seeds)"
 
 
 def _better(change: float, half: float, good: int) -> bool | None:
