@@ -153,7 +153,8 @@ class Curves:
                 "green": np.array([green for _, green in shares], np.float32),
                 "completed": np.array([frame.completed for frame in whole], np.float32),
                 "spent": np.array([frame.time_spent / HOUR for frame in whole], np.float32),
-                **{name: np.array([np.nan if self._street is None else getattr(frame, name)[self._street]
+                # Zero where no street is chosen: of nothing at all Bokeh finds no range.
+                **{name: np.array([0.0 if self._street is None else getattr(frame, name)[self._street]
                                    for frame in whole], np.float32) for name in ("density", "speed")}}
             past = [frame for frame in later if frame.time <= time][-TRAIL:]
             x, y = (np.array(values, np.float32) for values in (

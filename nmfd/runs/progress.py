@@ -47,7 +47,7 @@ def progress_line(label: str, stream: TextIO | None = None) -> Iterator[Show]:
             while not over.wait(BEAT if moving else EVERY):
                 if moving:
                     line.refresh()
-                else:
+                elif line.total is None or line.n < line.total:  # else somebody looks at what has ended
                     print(line, file=stream, flush=True)
 
         thread = threading.Thread(target=beat, daemon=True)
