@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from nmfd.runs import files
+
 ROOT = Path(__file__).parents[1]
 RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|.*[. ]", re.IGNORECASE)  # on Windows
 
@@ -53,3 +55,13 @@ def test_every_system_takes_the_names_of_all_files():
         RESERVED.fullmatch(part) for part in path.split("/"))]
     assert paths and not bad
     assert len({path.lower() for path in paths}) == len(paths), "names that differ in case only"
+
+
+def test_where_no_way_leads_from_one_folder_to_another(monkeypatch):
+    assert files.relative(ROOT / "networks" / "grid7", ROOT / "scenarios" / "mine") == "../../networks/grid7"
+
+    def two_drives(path, start):
+        raise ValueError("path is on mount 'C:', start on mount 'D:'")
+
+    monkeypatch.setattr("os.path.relpath", two_drives)
+    assert files.relative(ROOT / "networks", ROOT / "scenarios") == (ROOT / "networks").as_posix()
