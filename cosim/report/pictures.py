@@ -161,7 +161,7 @@ def splits(path: Path, network: RegionalModel, result: Result, note: str) -> Non
 
 def _moving_sum(values: np.ndarray) -> np.ndarray:
     """(T, H): sums over WINDOW rows around each."""
-    kernel = np.ones(WINDOW)
+    kernel = np.ones(min(WINDOW, len(values)))  # a longer one would make more rows
     return np.stack([np.convolve(column, kernel, mode="same") for column in values.T], axis=1)
 
 
