@@ -76,8 +76,9 @@ class Curves:
         self.street = _figure("", "time [min]", "density [veh/km and lane]")
         self.street.extra_y_ranges = {"speed": Range1d(0.0, 1.1)}
         self.street.add_layout(LinearAxis(
-            y_range_name="speed", axis_label="speed, share of what is allowed [-]", axis_label_text_font_style="normal",
-            axis_label_text_color=colours.FAINT, major_label_text_color=colours.FAINT), "right")
+            y_range_name="speed", axis_label="speed / allowed [-]", axis_label_text_font_style="normal",
+            axis_label_text_color=colours.FAINT, major_label_text_color=colours.FAINT, minor_tick_line_color=None,
+            axis_line_color=colours.LINE, major_tick_line_color=colours.LINE), "right")
         overtime = (self.region, self.gate, self.trips, self.spent, self.street)
         self.lines, self.points, self.trails = [], [], []
         for plot in overtime:

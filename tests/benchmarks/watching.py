@@ -16,6 +16,7 @@ import statistics
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -23,7 +24,7 @@ from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
 CLIENTS = 40
-IDLE = 15.0  # s without processor time: the run has ended
+IDLE = 5.0  # s without processor time: the run has ended (too little where it is starved of it)
 PULL = [json.dumps(part) for part in ({"msgid": "1", "msgtype": "PULL-DOC-REQ"}, {}, {})]
 THERE = """() => { try { return Bokeh.documents[0].is_idle && !!Bokeh.documents[0].get_model_by_name("map0") }
 catch { return false } }"""
@@ -66,14 +67,16 @@ def watched(chosen: argparse.Namespace, visitors) -> dict:
     other = visitors and context.Process(target=visitors, args=(address, told), daemon=True)
     if other:
         other.start()
-    cpu, end, spent = before, begin, made
+    cpu, end, spent, seen = before, begin, made, dict[str, float]()
     while time.perf_counter() - end < IDLE:  # the process waits for another task when the run has ended
         time.sleep(0.05)
-        if (now := sum(run.cpu_times()[:2])) > cpu:
-            cpu, end, spent = now, time.perf_counter(), sum(server.cpu_times()[:2])
-    found = {"wall_s": round(end - begin, 2), "cpu_s": round(cpu - before, 2), "server_cpu_s": round(spent - made, 2)}
-    while other and not told.empty():
-        found |= told.get()
+        with suppress(psutil.NoSuchProcess):  # without a viewer it ends soon
+            if (now := sum(run.cpu_times()[:2])) > cpu:
+                cpu, end, spent = now, time.perf_counter(), sum(server.cpu_times()[:2])
+                while other and not told.empty():
+                    seen |= told.get()
+    found = {"wall_s": round(end - begin, 2), "cpu_s": round(cpu - before, 2),
+             "server_cpu_s": round(spent - made, 2), **seen}
     if other:
         for child in (*psutil.Process(other.pid).children(recursive=True), psutil.Process(other.pid)):
             child.kill()
