@@ -270,7 +270,7 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
     (lambda folder: (folder / "buses.rou.xml").unlink(), "route-files: no such file"),
     (lambda folder: (folder / "city.net.xml").write_text("<net><edge"), "is not a"),
     (lambda folder: (folder / "city.net.xml").write_text("<net></net>"), "has no edge that cars may use"),
-    (lambda folder: (folder / "city.sumocfg").write_text("<routes/>"), "expected a sumocfg, a net.xml or a file of OpenStreetMap"),
+    (lambda folder: (folder / "city.sumocfg").write_text("<routes/>"), "a net.xml or a file of OpenStreetMap"),
     (lambda folder: (folder / "city.sumocfg").write_text(
         '<configuration><net-file value="city.net.xml"/></configuration>'), "or add --routes FILE, --od FILE or --d"),
 ])

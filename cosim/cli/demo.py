@@ -9,7 +9,6 @@ from cosim.cli.options import has_screen, tell
 from nmfd.cli.options import FOLDER, SEED
 from nmfd.cli.progress import resumable
 
-SCENARIO = Path(__file__).parents[2] / "scenarios" / "demo"
 NAMES = ("no-control", "pi-gating")
 
 
@@ -32,8 +31,10 @@ def demo(seed: int, out: Path, browse: bool | None) -> None:
     from cosim.evaluation import experiment, results  # heavy
     from cosim.evaluation.simulate import Task
     from cosim.report import html
+    from nmfd.runs import shipped
 
-    tasks = [Task(scenario=SCENARIO, controller=name, seed=seed) for name in NAMES]
+    scenario = shipped.root() / "scenarios" / "demo"  # whatever folder here may have that name
+    tasks = [Task(scenario=scenario, controller=name, seed=seed) for name in NAMES]
     with resumable("demo", out, "summary.csv") as progress:
         rows = experiment.experiment(tasks, out=out, workers=2, progress=progress, tell=tell)
     for name in NAMES:
@@ -41,7 +42,7 @@ def demo(seed: int, out: Path, browse: bool | None) -> None:
         minutes = (row["mean_trip_time_s"] + row["mean_departure_delay_s"]) / 60.0
         click.echo(f"{name + ':':12} {row['completed_veh']:,.0f} of {row['trips']:,.0f} trips served, "
                    f"{minutes:.1f} minutes per trip")
-    page = html.write_page(out / "report.html", [results.read(out, SCENARIO)], seed=seed)
+    page = html.write_page(out / "report.html", [results.read(out, scenario)], seed=seed)
     click.echo(f"Both side by side: {page.resolve()}")
     if has_screen() if browse is None else browse:
         webbrowser.open(page.resolve().as_uri())

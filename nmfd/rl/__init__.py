@@ -48,7 +48,7 @@ def register(namespace: str, entry_point: str, scenarios: dict[str, str]) -> Non
         for name, folder in scenarios.items():
             gymnasium.register(
                 id=f"{namespace}/{name}-v0", entry_point=entry_point,
-                kwargs={"scenario": str(Path(__file__).parents[2] / "scenarios" / folder)})
+                kwargs={"scenario": folder})
 
 
 register("nmfd", "nmfd.rl.env:RegionalEnv", _SCENARIOS)
