@@ -9,6 +9,7 @@ from cosim.cli.options import has_screen, tell
 from nmfd.cli.options import FOLDER, SEED
 from nmfd.cli.progress import resumable
 
+SCENARIO = "demo"  # of those that come with the package, whatever folder here may have that name
 NAMES = ("no-control", "pi-gating")
 
 
@@ -33,7 +34,7 @@ def demo(seed: int, out: Path, browse: bool | None) -> None:
     from cosim.report import html
     from nmfd.runs import shipped
 
-    scenario = shipped.root() / "scenarios" / "demo"  # whatever folder here may have that name
+    scenario = shipped.root() / "scenarios" / SCENARIO
     tasks = [Task(scenario=scenario, controller=name, seed=seed) for name in NAMES]
     with resumable("demo", out, "summary.csv") as progress:
         rows = experiment.experiment(tasks, out=out, workers=2, progress=progress, tell=tell)

@@ -11,7 +11,6 @@ gymnasium.make. Names are imported when they are first used. scenarios/economic_
 """
 
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nmfd.extras import need, there
