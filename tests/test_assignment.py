@@ -47,13 +47,14 @@ def test_routes_spread_until_nobody_gains(fork):
     net, vehicles = fork
     told = []
     effort = Effort(iterations=2, gap=0.05)
-    found = assign(net, vehicles, begin=0.0, end=1800.0, seed=3, effort=effort, mesoscopic=False, tell=told.append)
+    found = assign(net, vehicles, begin=0.0, end=1800.0, seed=3, effort=effort, mesoscopic=False, 
+                   tell=lambda stage, share=0.0: told.append(stage))
     ways = {tuple(route) for route in found.routes.values()}
     assert ways == {("ab", "bm", "md", "de"), ("ab", "bc", "cd", "de")} and len(found.routes) == 600
     queue, followed = ([one.gap for one in found.iterations if one.mesoscopic == kind] for kind in (True, False))
     assert queue[0] > 0.5 and queue[-1] < 0.05 and len(followed) == 1
     assert found.gap == min(followed) and found.reached == (min(followed) <= 0.05)
-    assert len(told) == len(found.iterations) and told[0] == "assignment 1" and "car-following" in told[-1]
+    assert len(told) == len(found.iterations) and told[0] == "assignment, at most 2 iterations" and "car-following" in told[-1]
     again = assign(net, vehicles, begin=0.0, end=1800.0, seed=3, effort=effort)
     assert again.iterations == found.iterations[:len(queue)]
 

@@ -431,7 +431,7 @@ LINES = {
     "nmfd": """
         benchmark {s} --controllers no-control --seeds 0|-1|1.5|nan|x|99999999999
         benchmark {s} --controllers no-control --workers 0|-1|all
-        benchmark {s} --controllers ,|no-control,,|none|no-control,no-control|no-control;pi-gating|*
+        benchmark {s} --controllers ,|no-control,,|none|no-control,no-control|no-control;pi-gating|x*
         benchmark {s} --controllers no-control --plant x
         benchmark {s} --controllers no-control --plant
         benchmark {s} --controllers dpc-pc

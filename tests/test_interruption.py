@@ -155,7 +155,8 @@ def test_training_killed_and_resumed_is_the_uninterrupted_one(tmp_path, monkeypa
     whole, mine = (torch.load(file, weights_only=True) for file in (tmp_path / "whole.pt", out))
     assert all(torch.equal(whole["weights"][key], mine["weights"][key]) for key in whole["weights"])
     assert out.read_bytes() == (tmp_path / "whole.pt").read_bytes()
-    assert {path.name for path in tmp_path.iterdir()} == {"network", "scenario", "whole.pt", "mine.pt"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "network", "scenario", "whole.pt", "mine.pt", "whole-training.png", "mine-training.png"}
 
 
 @pytest.mark.parametrize("content", [b"", b"x", {"configuration": {}}, {"configuration": 5}, [1], "cut"])

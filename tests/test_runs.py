@@ -19,10 +19,9 @@ from trajectories import trajectory
 
 from cosim.plant.record import Record
 from nmfd import quantities
-from nmfd.cli import progress
 from nmfd.cli.progress import progress_line
 from nmfd.errors import InputError
-from nmfd.runs import files, provenance, run_folder, workers
+from nmfd.runs import files, progress, provenance, run_folder, workers
 from nmfd.runs.tables import markdown_table
 from nmfd.runs.tally import Tally
 from nmfd.types import Trajectory

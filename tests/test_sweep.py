@@ -176,7 +176,7 @@ def test_a_process_that_dies_is_a_failure(monkeypatch, tmp_path):
 def test_remote_gives_the_reason(tmp_path):
     task = Task(scenario=Path("nowhere"), controller="no-control", seed=0)
     outcome = dask_worker.run(task, str(tmp_path))
-    assert "nowhere/scenario.toml: no such file" in outcome.reason and "\n" not in outcome.reason
+    assert "nowhere: no such folder here" in outcome.reason and "\n" not in outcome.reason
 
 
 def test_no_scheduler_answers(peak, tmp_path, monkeypatch):
