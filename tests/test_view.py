@@ -251,9 +251,8 @@ def test_finished_runs_on_one_page_with_a_slider(task, city, plain, switched):
     inside = [np.array([frame.accumulation.sum() for frame in frames]) for frames in runs.values()]
     most = int(np.argmax(np.abs(inside[0] - inside[1])))
     assert models["time"].value == pytest.approx(most * drawn.step / 60)
-    np.testing.assert_array_equal(
-        next(
-            one.data_source.data["value"] for one in models["map1"].renderers if "value" in one.data_source.data), film["streets1.value"][most])
+    [value] = (one.data_source.data["value"] for one in models["map1"].renderers if "value" in one.data_source.data)
+    np.testing.assert_array_equal(value, film["streets1.value"][most])
 
 
 # The server.
