@@ -107,14 +107,31 @@ class Session:
         # Asked so often that a Python call around them would cost as much as SUMO's answer:
         # road(vehicle), the edge it is on, normal or internal; route(vehicle), its edges.
         self.road, self.route = sumo.vehicle.getRoadID, sumo.vehicle.getRoute
-        # Edges: the vehicles on one and their number, mean speed [m/s] (the limit if empty), vehicles under 0.1 m/s.
+        # Edges: the vehicles on one, their number, and of these under 0.1 m/s.
         self.vehicles_on, self.vehicle_count = sumo.edge.getLastStepVehicleIDs, sumo.edge.getLastStepVehicleNumber
-        self.mean_speed, self.halting = sumo.edge.getLastStepMeanSpeed, sumo.edge.getLastStepHaltingNumber
+        self.halting = sumo.edge.getLastStepHaltingNumber
+        self._lanes_of: dict[str, tuple[str, ...]] = {}  # of edges that were asked for
         # Lanes: the same, for max-pressure control, which asks for a thousand of them every few seconds.
         self.lane_vehicles = sumo.lane.getLastStepVehicleNumber
         self.lane_halting = sumo.lane.getLastStepHaltingNumber
         # Loop detectors: the share of the last step in which a vehicle was on one [%].
         self.loop_occupancy = sumo.inductionloop.getLastStepOccupancy
+
+    def mean_speed(self, edge: str) -> float:
+        """Mean speed [m/s] of the vehicles on an edge, its speed limit where there are none.
+
+        Not SUMO's own of several lanes: that counts every empty lane as one vehicle at the limit.
+        """
+        lanes = self._lanes_of.get(edge)
+        if lanes is None:
+            lanes = tuple(f"{edge}_{n}" for n in range(self._sumo.edge.getLaneNumber(edge)))
+            self._lanes_of[edge] = lanes
+        if len(lanes) > 1:
+            counts = [self._sumo.lane.getLastStepVehicleNumber(lane) for lane in lanes]
+            if total := sum(counts):  # the mesoscopic model knows no lanes, and counts none
+                speed = self._sumo.lane.getLastStepMeanSpeed
+                return sum(n * speed(lane) for n, lane in zip(counts, lanes, strict=True) if n) / total
+        return self._sumo.edge.getLastStepMeanSpeed(edge)
 
     def close(self) -> None:
         """End the simulation, which completes SUMO's own outputs; a second time it does nothing."""
