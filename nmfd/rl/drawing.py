@@ -9,7 +9,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from nmfd.arrays import PerPair, PerRegion, Positions
+from nmfd.arrays import Adjacency, PerPair, PerRegion, Positions
 
 SIZE, DPI = (6.4, 4.8), 100
 OVER = 2.0         # critical accumulations: the dark end of the scale
@@ -23,8 +23,8 @@ class CityDrawing:
     beneath them streets, where there are any, coloured by density."""
 
     def __init__(
-        self, places: Positions, adjacency: PerPair, critical: PerRegion,
-        streets: Sequence[Float[np.ndarray, "n 2"]] = (),
+        self, places: Positions, adjacency: Adjacency, critical: PerRegion,
+        streets: Sequence[Float[np.ndarray, "_ 2"]] = (),
     ):
         """places: (R, 2), of the regions; streets: E lines, in the same coordinates"""
         self._critical, self._pairs = critical, np.argwhere(adjacency)

@@ -1,7 +1,7 @@
 """How a training goes: what it tells after every validation, as a picture and for TensorBoard."""
 
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from nmfd.extras import need
 from nmfd.studies import plots, plots_studies
@@ -34,7 +34,7 @@ class Curve:
         plots_studies.learning_curve(drawing.subplots(), controller, self.rows)
         return plots.save(drawing, path)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Curve":
         return self
 
     def __exit__(self, *_: object) -> None:
