@@ -19,7 +19,7 @@ NOT_RUN = {  # what takes long or needs more, and where it is tested
     "cosim watch": "test_watch.py", "cosim video": "test_video.py", "cosim tune": "test_tuning.py",
     "cosim frontier": "test_tuning.py", "nmfd bound": "test_bound.py", "nmfd robustness": "test_robustness.py",
     "nmfd scaling": "test_scaling.py", "nmfd ablation": "test_ablation.py", "nmfd adaptation": "test_adaptation.py",
-    "cosim get": "test_get.py", "nmfd identify": "test_measured.py"}
+    "cosim get": "test_get.py", "cosim demo": "test_demo.py", "nmfd identify": "test_measured.py"}
 LONG = ("scenarios/grid7_peak", "networks/grid7")  # whose loading runs and training take minutes: of mycity they do not
 
 
