@@ -74,9 +74,8 @@ def run(
             raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
         steps = min(steps, scenario.steps)
         scenario = replace(scenario, steps=steps, demand=scenario.demand[:steps])
-    if isinstance(plant, str) and plant not in PLANTS:
-        raise InputError(f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from "
-                         f"{', '.join(PLANTS)}, or give an object")
+    if isinstance(plant, str):
+        _check_plant(plant, ", or give an object")
     name, acting = named(controller, scenario, policy)
     driven = PLANTS[plant](scenario) if isinstance(plant, str) else plant
     with watched(name, progress) as show:
@@ -107,8 +106,7 @@ def benchmark(
     scenario, files = _loaded(scenario), {name: Path(file) for name, file in (policies or {}).items()}
     chosen = names.chosen(
         controllers, registry.check, lambda: dict.fromkeys([*registry.ready(scenario), *files]))
-    if plant not in PLANTS:
-        raise InputError(f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from {', '.join(PLANTS)}")
+    _check_plant(plant)
     with watched("benchmark", progress) as show:
         return Summary(run_all(
             scenario, chosen, range(seeds) if isinstance(seeds, int) else list(seeds), plant,
@@ -151,6 +149,13 @@ def identify(
         measured.Sources(counts=Path(counts), city=city, skip_bad=skip_bad, **{
             key: None if file is None else Path(file) for key, file in given.items()}),
         config.checked(Measured, settings, "identify"), out=Path(out), name=name, force=force)
+
+
+def _check_plant(plant: str, more: str = "") -> None:
+    """InputError for an unknown name; more: what else is allowed."""
+    if plant not in PLANTS:
+        raise InputError(
+            f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from {', '.join(PLANTS)}{more}")
 
 
 def named(controller: str | Controller, scenario: Scenario, policy: Path | str | None) -> tuple[str, Controller]:
