@@ -31,7 +31,7 @@ def demo(seed: int, out: Path, browse: bool | None) -> None:
     """
     from cosim.evaluation import experiment, results  # heavy
     from cosim.evaluation.simulate import Task
-    from cosim.report import html
+    from cosim.report import card, html
     from nmfd.runs import shipped
 
     scenario = shipped.root() / "scenarios" / SCENARIO
@@ -40,9 +40,8 @@ def demo(seed: int, out: Path, browse: bool | None) -> None:
         rows = experiment.experiment(tasks, out=out, workers=2, progress=progress, tell=tell)
     for name in NAMES:
         [row] = rows[(rows["controller"] == name) & (rows["seed"] == seed)].to_dict("records")
-        minutes = (row["mean_trip_time_s"] + row["mean_departure_delay_s"]) / 60.0
         click.echo(f"{name + ':':12} {row['completed_veh']:,.0f} of {row['trips']:,.0f} trips served, "
-                   f"{minutes:.1f} minutes per trip")
+                   f"{card.minutes_per_trip(row):.1f} minutes per trip")
     page = html.write_page(out / "report.html", [results.read(out, scenario)], seed=seed)
     click.echo(f"Both side by side: {page.resolve()}")
     if has_screen() if browse is None else browse:

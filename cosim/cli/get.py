@@ -30,6 +30,6 @@ def get(name: str | None, out: Path | None) -> None:
         click.echo(download.listed())
         return
     with progress_line("get") as progress:
-        text = download.get(name, Path("cities") / name if out is None else out,
-                            (lambda stage: progress(0, 1, stage)) if progress else lambda stage: None)
+        text = download.get(
+            name, Path("cities") / name if out is None else out, lambda stage: progress(0, 1, stage))
     click.echo(text)

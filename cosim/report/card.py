@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -35,7 +36,7 @@ def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
     against, level = statistics.compared_with(rows), rows["demand"].iloc[0]
     others = [name for name in ranked(rows) if name != against]
     name = others[0] if others else against
-    rows = rows.assign(minutes=(rows["mean_trip_time_s"] + rows["mean_departure_delay_s"]) / MINUTE,
+    rows = rows.assign(minutes=minutes_per_trip(rows),
                        hours=rows[statistics.TTS] / HOUR, tonnes=rows["co2_kg"] / 1000.0)
     columns = [statistics.by_seed(rows, level, one, "minutes") for one in (name, against)]
     common = [seed for seed in columns[0] if seed in columns[1]]
@@ -55,6 +56,11 @@ def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
     figures.append(_saved(part, name, against))
     heading = name if name == against else f"{name} instead of {_words(against)}"
     return heading, [figure for figure in figures if "nan" not in figure.value], name
+
+
+def minutes_per_trip(facts: Any) -> Any:
+    """Of a row of sumo.csv [min], or of each in a table: from the wanted departure to the arrival."""
+    return (facts["mean_trip_time_s"] + facts["mean_departure_delay_s"]) / MINUTE
 
 
 def _figure(
