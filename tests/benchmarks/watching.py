@@ -1,10 +1,10 @@
 """What watching costs a run, and what a viewer gets: python tests/benchmarks/watching.py SCENARIO [--steps N]
 
-Runs of `cosim watch`, in turn without a viewer; with one elsewhere, who takes what is sent and draws nothing; with forty
-clients, one that reads slowly and one that sends garbage, all of these at the lowest priority, for they stand for other
-machines; with one in Chromium on this machine; and without a viewer while something else keeps a core busy, for virtual
-cores are often halves of one, and a browser that draws slows a run beside it for that alone. Ratios are of runs that
-came one after another, so that they mean something on a busy machine.
+Runs of `cosim watch`, in turn without a viewer; with one elsewhere, who takes what is sent and draws nothing; with
+forty clients, one that reads slowly and one that sends garbage, all of these at the lowest priority, for they stand for
+other machines; with one in Chromium on this machine; and without a viewer while something else keeps a core busy, for
+virtual cores are often halves of one, and a browser that draws slows a run beside it for that alone. Ratios are of
+runs that came one after another, so that they mean something on a busy machine.
 """
 
 import argparse
