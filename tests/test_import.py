@@ -327,6 +327,7 @@ def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
         plant.close()
 
 
+@pytest.mark.slow
 def test_identification_gives_both_models_and_the_import_takes_the_second_away(imported, config, tmp_path):
     """Drivers of their own ways and guided ones; an empty region keeps what it has; new regions need new models."""
     shutil.copytree(imported[0], tmp_path, dirs_exist_ok=True)
@@ -353,6 +354,7 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
     assert planning_model(load_scenario(scenario), "dpc-pcrg").network.regions == 2
 
 
+@pytest.mark.slow
 def test_the_chain_in_a_city_without_signals(tmp_path):
     """Nothing for perimeter control to do, and the evaluation says so."""
     net = tiny_city.network(tmp_path, "--default-junction-type", "priority", name="none.net.xml")

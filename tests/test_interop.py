@@ -26,6 +26,7 @@ def cosim_run(*arguments):
     return CliRunner().invoke(cosim.cli.main.main, ["run", *(str(a) for a in arguments)])
 
 
+@pytest.mark.slow
 def test_outputs_of_sumo_agree_with_ours_and_are_made_up_for(peak, tmp_path):
     out = tmp_path / "out"
     command = (peak, "--controller", "pi-gating+actuated", "--steps", "4", "--out", out)

@@ -215,16 +215,27 @@ def foreseen(policy, gates):
     pytest.param(1.0, 1.0, True, id="as foreseen"), pytest.param(1.2, 1.0, False, id="worse than foreseen"),
     pytest.param(1.2, 1.2, True, id="model wrong either way"), pytest.param(1.05, 1.0, True, id="half the gain")])
 def test_split_ratios_stay_while_they_pay(with_them, without, kept):
-    """Foreseen: 90 vehicles instead of 100. Measured: so many times what was foreseen, with them and without."""
-    judge, ahead = fallback.Judge(), foreseen(90.0, 100.0)
-    commanded = []
-    for step in range(60):
+    """Foreseen: 90 vehicles instead of 100, after a time when more were expected with them, so that both are seen.
+    Measured: so many times what was foreseen, with them and without."""
+    judge, commanded = fallback.Judge(), []
+    for step in range(80):
+        ahead = foreseen(90.0 if step >= 20 else 110.0, 100.0)
         commanded.append(not judge.problem(ahead))
         vehicles = 90.0 * with_them if commanded[-1] else 100.0 * without
         now = Observation(step=step, time=0.0, accumulation=np.array([[vehicles]]), backlog=np.zeros((1, 1)))
         judge.command(commanded[-1], ahead, now)
         judge.see(now)
-    assert commanded[0] and commanded[-1] == kept and all(commanded) == (with_them * 90.0 < 100.0), commanded
+    assert not any(commanded[:20]) and commanded[20] and commanded[-1] == all(commanded[20:]) == kept, commanded
+
+
+def test_demand_that_is_not_as_forecast_is_no_fault_of_split_ratios():
+    """They were always commanded: nothing says what would have come without."""
+    judge, ahead = fallback.Judge(), foreseen(90.0, 100.0)
+    for step in range(60):
+        assert not judge.problem(ahead)
+        now = Observation(step=step, time=0.0, accumulation=np.array([[150.0]]), backlog=np.zeros((1, 1)))
+        judge.command(True, ahead, now)
+        judge.see(now)
 
 
 def test_split_ratios_that_cost_time_are_left_to_the_drivers():

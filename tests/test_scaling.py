@@ -49,6 +49,7 @@ def test_a_row(tmp_path):
         assert 10.0 < row["peak_memory_mib"] < 1e5
 
 
+@pytest.mark.slow
 def test_cases_are_kept_added_and_drawn(tmp_path):
     out = tmp_path / "out"
     first = nmfd("scaling", "--regions", 3, "--controllers", "mpc-pc", "--out", out)

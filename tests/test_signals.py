@@ -140,6 +140,7 @@ def test_pressure_is_upstream_minus_downstream(city, scenario):
     assert len(before) > 300 and held[held > 0] == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_perimeter_control_over_max_pressure(driven):
     """Open gateways leave max-pressure as it is; closed ones let less through, safely, and keep to their ration."""
     seen = {}

@@ -75,8 +75,9 @@ class Judge:
 
     They are not where the regional model expects them to cost time within LOOK_AHEAD intervals; nor where they have
     cost more, within JUDGED intervals, than they were expected to gain: where the time spent exceeds what was foreseen
-    with them by so much more than it does without. An error of the model that is there either way cancels out as soon
-    as both have been seen; until then, the one that has not been seen counts as foreseen exactly.
+    with them by so much more than it does without. Both must have been seen for that: what the model misses either way,
+    such as demand that is not as forecast, is no fault of the split ratios. (With what had not been seen taken as
+    foreseen exactly, noise of 1 veh/s on the demand of economic_mpc ended guidance, and the network locked.)
     """
 
     def __init__(self) -> None:
@@ -101,7 +102,9 @@ class Judge:
     def shortfall(self) -> float:
         """By how much the split ratios have cost more than they were expected to gain, as a share of the time spent
         [-]; of those that were to pay later no early gain is asked for."""
-        return self._missed.get(True, 0.0) - self._missed.get(False, 0.0) - max(self._claimed, 0.0)
+        if len(self._missed) < 2:
+            return 0.0
+        return self._missed[True] - self._missed[False] - max(self._claimed, 0.0)
 
     def problem(self, foreseen: Foreseen) -> str:
         """Why the policy's split ratios are not worth commanding now; "" if they are."""
