@@ -96,7 +96,8 @@ class RegionalModel:
             theta[i, :, j] = 0.0
             theta[i, list(shares), j] = list(shares.values())
         sums = theta.sum(axis=1, keepdims=True)
-        return theta / np.where(sums > 0, sums, 1.0)
+        theta /= np.where(sums > 0, sums, 1.0)  # in place: of very many regions it is as large as memory
+        return theta
 
     @property
     def open_capacity(self) -> PerPair | None:
