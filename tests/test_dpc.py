@@ -11,7 +11,14 @@ import torch
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc import policy as dpc
 from nmfd.controllers.dpc import training
-from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy, SoftExponential
+from nmfd.controllers.dpc.policy import (
+    Architecture,
+    DpcController,
+    Policy,
+    SoftExponential,
+    checkpoint,
+    load_policy,
+)
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
 from nmfd.model import dynamics
@@ -280,6 +287,43 @@ def test_a_sparse_policy_is_the_dense_one_with_the_same_weights(guidance):
         np.testing.assert_allclose(both[0].splits, both[1].splits, atol=1e-7)
     stuck = DpcController(sparse).act(measurement(np.full((7, 7), np.nan)))
     np.testing.assert_allclose(stuck.perimeter, np.where(NETWORK.adjacency, NETWORK.u_max, 0.0))
+
+
+def test_a_local_policy_looks_around_every_boundary():
+    """From region 2 of hexagon7, in the west, to 0 in the north-west: the numbers by hand; then the same network there
+    as everywhere, and in any city."""
+    torch.manual_seed(0)
+    local = Policy(NETWORK, Architecture(width=8, local=True))
+    critical, x = NETWORK.mfds[0].critical, 1000.0 * torch.rand(7, 7)
+    full, ending = x.sum(1) / critical, x.diagonal() / critical
+    by_hand = torch.stack([
+        full[2], full[[0, 3, 5]].mean(), ending[2], full[0], full[[1, 2, 3]].mean(), ending[0]])
+    share = torch.sigmoid(local.perimeter_decoder(local.backbone(by_hand)))
+    perimeter, splits = local(x)
+    assert splits is None and perimeter[2, 0].item() == pytest.approx(0.1 + 0.8 * share.item(), rel=1e-5)
+    assert ((perimeter > 0.0).numpy() == NETWORK.adjacency).all()
+    np.testing.assert_allclose(
+        DpcController(local).act(measurement(x.numpy().astype(float))).perimeter, perimeter.detach(), rtol=1e-5)
+    torch.testing.assert_close(local(x.expand(3, 2, 7, 7))[0], perimeter.expand(3, 2, 7, 7))
+    alike = local(torch.full((7, 7), 300.0))[0]  # the gates of the centre to all sides
+    assert alike[3, NETWORK.adjacency[3]].max() == alike[3, NETWORK.adjacency[3]].min()
+
+
+def test_a_local_policy_drives_another_city(tmp_path):
+    """Its weights are as many as in any other; one with numbers for its own regions is refused."""
+    other = load_network("two_regions")
+    for local in (True, False):
+        made = Policy(NETWORK, Architecture(width=8, local=local))
+        torch.save(checkpoint(made, NETWORK, {}), tmp_path / f"{local}.pt")
+    loaded, _ = load_policy(tmp_path / "True.pt", other)
+    assert loaded(torch.full((2, 2), 100.0))[0].shape == (2, 2)
+    with pytest.raises(InputError, match="trained for network 'hexagon7'"):
+        load_policy(tmp_path / "False.pt", other)
+
+
+def test_a_local_policy_guides_no_routes(scenario):
+    with pytest.raises(InputError, match="controllers.dpc-pcrg.local: a local policy guides no routes; train dpc-pc,"):
+        training.settings(replace(scenario, controller_options={"dpc-pcrg": {"local": True}}), "dpc-pcrg")
 
 
 def test_every_rollout_has_a_model_of_its_own(scenario):

@@ -23,7 +23,7 @@ CHOSEN = {
     "width": 8, "layers": 1, "activation": "relu", "steps": 3, "batch": 4, "learning_rate": 0.25, "alternating": False,
     "demand_spread": 0.5, "demand_low": 0.75, "demand_high": 1.5, "initial_share": 0.25, "noise": 0.125,
     "noise_all": 0.0625, "mfd_spread": 0.375, "mfd_scale": 0.875, "detour_cost": 20.0, "swing_cost": 3.0,
-    "from_no_control": True}
+    "from_no_control": True, "local": True}
 BEYOND = {
     "width": (0, 10**9), "layers": (0, 10**9), "steps": (0, 10**9), "batch": (0, 10**9), "learning_rate": (0.0, 1.1),
     "demand_spread": (-0.1, 1.1), "demand_low": (0.0, 1.1), "demand_high": (0.9, 101.0), "initial_share": (-0.1, 1.1),

@@ -186,7 +186,7 @@ def ablation(
 
 @click.command()
 @declared("nmfd.studies.settings:Scaling", "regions", instead="2,4,8,... to 64, hexagonal to 256")
-@controllers_option("Which to measure, out of these four.", "dpc-pc,dpc-pcrg,mpc-pc,mpc-pcrg")
+@controllers_option("Which to measure, out of these four and dpc-pc-local.", "dpc-pc,dpc-pcrg,mpc-pc,mpc-pcrg")
 @declared("nmfd.studies.settings:Scaling", "family", "load", "workers", "memory", "time_limit")
 @click.option("--out", type=FOLDER, default=Path("runs/scaling"), show_default=True, metavar="DIR",
               help="The run folder.")
@@ -207,7 +207,7 @@ def scaling(
     """
     from nmfd.studies import scaling as method  # heavy
 
-    names = controller_names(controllers, ready=lambda: method.CONTROLLERS)
+    names = controller_names(controllers, check=method.known, ready=lambda: method.CONTROLLERS)
 
     with resumable("scaling", out, "scaling.csv") as progress:
         rows = method.scaling(

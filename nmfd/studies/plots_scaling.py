@@ -8,7 +8,7 @@ from matplotlib.ticker import NullLocator, ScalarFormatter
 
 from nmfd.studies import plots
 
-MARKERS = {"dpc-pc": "o", "dpc-pcrg": "s", "mpc-pc": "^", "mpc-pcrg": "D"}
+MARKERS = {"dpc-pc": "o", "dpc-pcrg": "s", "mpc-pc": "^", "mpc-pcrg": "D", "dpc-pc-local": "v"}
 PUBLISHED_LIMITS = {"mpc-pc": 16, "mpc-pcrg": 8}  # regions, the most that the published MPC solved
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import psutil
 import torch
 
+from nmfd.controllers import registry
 from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy
 from nmfd.controllers.mpc import edge_model
 from nmfd.controllers.mpc.controller import EconomicMpc
@@ -37,7 +38,9 @@ SPREAD = 0.2            # every region's speed and size is drawn from 1 +- SPREA
 INTERVAL, INTERVALS = 30.0, 10  # s, and control intervals
 REGIONS = {"complete": (2, 4, 8, 16, 32, 64), "hexagonal": (2, 4, 8, 16, 32, 64, 128, 256)}
 LOADS = ("published", "congested")
-CONTROLLERS = {"dpc-pc": False, "dpc-pcrg": True, "mpc-pc": False, "mpc-pcrg": True}  # name -> with route guidance
+LOCAL = "dpc-pc-local"  # dpc-pc with the option local, and as few units as do
+CONTROLLERS = {  # name -> with route guidance
+    "dpc-pc": False, "dpc-pcrg": True, "mpc-pc": False, "mpc-pcrg": True, LOCAL: False}
 COLUMNS = {
     "family": str, "load": str, "regions": int, "controller": str, "status": str, "set_up_s": float,
     "first_decision_s": float, "median_decision_s": float, "longest_decision_s": float, "unsolved_decisions": int,
@@ -98,7 +101,15 @@ def made(name: str, planning: PlanningModel) -> Controller:
     if name.startswith("mpc"):
         return EconomicMpc(planning, guidance=CONTROLLERS[name])
     torch.manual_seed(0)
-    return DpcController(Policy(planning.network, Architecture(guidance=CONTROLLERS[name], sparse=True)))
+    architecture = (
+        Architecture(width=32, local=True) if name == LOCAL else Architecture(guidance=CONTROLLERS[name], sparse=True))
+    return DpcController(Policy(planning.network, architecture))
+
+
+def known(name: str) -> None:
+    """InputError for what is no controller at all."""
+    if name not in CONTROLLERS:
+        registry.check(name)
 
 
 @one_thread()

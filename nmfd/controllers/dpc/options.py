@@ -28,6 +28,9 @@ class Training(Options):
     width: int = whole("units per hidden layer", 128, low=1, high=WIDEST)
     layers: int = whole("hidden layers", 2, low=1, high=DEEPEST)
     activation: Activation = setting("of the hidden units", "gelu")
+    local: bool = setting(
+        "the same small network decides at every boundary, by how full the regions around it are: perimeter control "
+        "of very many regions, and by a policy that was trained in another city", False)
     steps: int = whole("Adam steps", 400, low=1, high=MOST_STEPS)
     batch: int = whole("rollouts per step", 16, low=1, high=100_000)
     learning_rate: float = setting(

@@ -25,6 +25,7 @@ from nmfd.tensors import PerPair, PerTurn
 from nmfd.types import Controls, Observation, Status
 
 FORMAT = 1
+FEATURES = 6  # of a boundary, that a local policy sees
 
 
 class SoftExponential(nn.Module):
@@ -62,13 +63,21 @@ ACTIVATIONS: dict[Activation, Callable[[int], nn.Module]] = {
 class Architecture:
     """width: units per hidden layer; layers: hidden layers of the backbone; activation: a key of ACTIVATIONS;
     guidance: with a decoder for the split ratios; sparse: decoders with outputs for adjacent regions only, which a
-    city of many regions needs (their number grows with R^2 instead of R^3)."""
+    city of many regions needs (their number grows with R^2 instead of R^3); local: one small network, the same at
+    every boundary, which knows FEATURES numbers of what is around it: it has no more weights in a large city than in
+    a small one, and one that was trained in one city can drive another. Perimeter control only."""
 
     width: int = 128
     layers: int = 2
     activation: Activation = "gelu"
     guidance: bool = False
     sparse: bool = False
+    local: bool = False
+
+    @property
+    def listed(self) -> bool:
+        """Whether outputs are those towards adjacent regions only."""
+        return self.sparse or self.local
 
 
 class Policy(nn.Module):
@@ -82,18 +91,21 @@ class Policy(nn.Module):
         regions, width = network.regions, architecture.width
         self.architecture, self.regions = architecture, regions
         self.u_min, self.u_max = network.u_min, network.u_max
-        self.register_buffer("scale", torch.tensor([[m.critical] for m in network.mfds], dtype=torch.float32))
-        onward = _neighbours(network.adjacency) if architecture.sparse else np.tile(np.arange(regions), (regions, 1))
+        self.register_buffer(
+            "scale", torch.tensor([[m.critical] for m in network.mfds], dtype=torch.float32),
+            persistent=not architecture.local)
+        onward = _neighbours(network.adjacency) if architecture.listed else np.tile(np.arange(regions), (regions, 1))
         here = np.arange(regions)[:, None]
         allowed = torch.tensor(network.adjacency[here, onward] & (np.diff(onward, prepend=-1) != 0))
         self.register_buffer("adjacency", allowed.float(), persistent=False)
         self.register_buffer("onward", torch.tensor(onward), persistent=False)
         layers: list[nn.Module] = []
         for layer in range(architecture.layers):
-            layers += [nn.Linear(regions**2 if layer == 0 else width, width),
+            inputs = FEATURES if architecture.local else regions**2
+            layers += [nn.Linear(inputs if layer == 0 else width, width),
                        ACTIVATIONS[architecture.activation](width)]
         self.backbone = nn.Sequential(*layers)
-        self.perimeter_decoder = nn.Linear(width, onward.size)
+        self.perimeter_decoder = nn.Linear(width, 1 if architecture.local else onward.size)
         if architecture.guidance:
             self.splits_decoder = nn.Linear(width, onward.size * regions)
             mask = torch.tensor(network.split_mask[here, onward]) & allowed.unsqueeze(-1)
@@ -106,7 +118,7 @@ class Policy(nn.Module):
     def forward(self, x: PerPair) -> tuple[PerPair, PerTurn | None]:
         """Perimeter and splits of the states x."""
         perimeter, splits = self.listed(x)
-        if not self.architecture.sparse:
+        if not self.architecture.listed:
             return perimeter, splits
         onward, shape = self.onward, (self.regions,) * 2
         perimeter = perimeter.new_zeros(*x.shape[:-2], *shape).scatter_add(-1, onward.expand_as(perimeter), perimeter)
@@ -119,14 +131,25 @@ class Policy(nn.Module):
         self, x: PerPair,
     ) -> tuple[Float[torch.Tensor, "*#B R D"], Float[torch.Tensor, "*#B R D R"] | None]:
         """Perimeter (..., R, D) and splits (..., R, D, R) towards the regions `onward` (R, D); all D = R if dense."""
-        hidden = self.backbone((x / self.scale).flatten(-2))
         shape = self.onward.shape
-        open_share = torch.sigmoid(self.perimeter_decoder(hidden)).unflatten(-1, shape)
+        hidden = self.backbone(self._around(x) if self.architecture.local else (x / self.scale).flatten(-2))
+        open_share = torch.sigmoid(self.perimeter_decoder(hidden)).reshape(*x.shape[:-2], *shape)
         perimeter = (self.u_min + (self.u_max - self.u_min) * open_share) * self.adjacency
         if not self.architecture.guidance:
             return perimeter, None
         logits = self.splits_decoder(hidden).unflatten(-1, (*shape, self.regions)) + self.split_bias
         return perimeter, torch.softmax(logits, dim=-2) * self.split_mask
+
+    def _around(self, x: PerPair) -> Float[torch.Tensor, "*#B R D F"]:
+        """Of every boundary (i, h): how full i and h are, their neighbours on average, and how many of those in i and h
+        end there, in critical accumulations."""
+        critical = self.scale.squeeze(-1)
+        full, ending = (
+            n.to(critical.dtype) / critical for n in (x.sum(-1), torch.diagonal(x, dim1=-2, dim2=-1)))
+        beside = (full[..., self.onward] * self.adjacency).sum(-1) / self.adjacency.sum(-1).clamp(min=1.0)
+        regions = torch.stack([full, beside, ending], dim=-1)
+        here = regions.unsqueeze(-2).expand(*regions.shape[:-1], self.onward.shape[1], -1)
+        return torch.cat([here, regions[..., self.onward, :]], dim=-1)
 
 
 def _neighbours(adjacency: Adjacency) -> Int[np.ndarray, "R D"]:
@@ -143,7 +166,7 @@ class DpcController:
         self._policy = policy.eval()
         self.name = "dpc-pcrg" if policy.architecture.guidance else "dpc-pc"
         self.fault: str | None = None  # injected (nmfd.faults)
-        self._onward = policy.onward.numpy() if policy.architecture.sparse else None
+        self._onward = policy.onward.numpy() if policy.architecture.listed else None
         self._u_max = self._full(policy.u_max * policy.adjacency.numpy())
 
     def reset(self, seed: int = 0) -> None:
@@ -151,7 +174,8 @@ class DpcController:
 
     def act(self, observation: Observation) -> Controls:
         with torch.inference_mode():
-            x = torch.from_numpy(observation.accumulation.astype(np.float32))
+            seen = observation.accumulation  # of which a local policy needs the sums only, and no copy
+            x = torch.from_numpy(seen if self._policy.architecture.local else seen.astype(np.float32))
             perimeter, splits = self._policy.listed(x)
         perimeter = perimeter.numpy()
         if self.fault == "policy-nan":
@@ -216,12 +240,12 @@ def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
     try:
         if content["format"] != FORMAT:
             raise InputError(f"{path}: format: expected {FORMAT}, got {content['format']!r} instead; train it again")
-        if content["network_hash"] != network.hash:
+        architecture = Architecture(**content["architecture"])
+        if content["network_hash"] != network.hash and architecture.local is not True:
             raise InputError(
                 f"{path}: network_hash: the policy was trained for network {content['network']!r} "
                 f"({content['network_hash']}), not for {network.name!r} ({network.hash}); train one with 'nmfd train'")
-        architecture = Architecture(**content["architecture"])
-        flags = {type(architecture.guidance), type(architecture.sparse)}
+        flags = {type(architecture.guidance), type(architecture.sparse), type(architecture.local)}
         if not (0 < architecture.width <= WIDEST and 0 < architecture.layers <= DEEPEST and flags == {bool}):
             raise KeyError("architecture")
         policy = Policy(network, architecture)

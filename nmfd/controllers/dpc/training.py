@@ -53,6 +53,10 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
             f"--controller: {controller!r} needs a table [controllers.\"{controller}\"] in {scenario.folder}/"
             f"scenario.toml that says what is different from {name}; add one, or train {name}")
     chosen = options(TRAINED[name], planning_model(scenario, controller), name, controller)
+    if chosen.local and NAMES[name]:
+        raise InputError(
+            f"{scenario.folder}/scenario.toml: controllers.{controller}.local: a local policy guides no routes; train "
+            f"{name.replace('pcrg', 'pc')}, or omit it")
     return chosen if steps is None else chosen.changed(steps=steps)
 
 
@@ -107,7 +111,8 @@ def train(
         generator = torch.Generator().manual_seed(seed)
         guidance = NAMES[controller.partition("+")[0]]
         architecture = Architecture(
-            width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=guidance)
+            width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=guidance,
+            local=chosen.local)
         policy = Policy(planning.network, architecture)
         if chosen.from_no_control:
             begin_as_no_control(policy, planning.network)
@@ -217,7 +222,7 @@ def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> f
         demand = demand * (low + (high - low) * level[torch.randperm(count, generator=generator)]).to(
             demand)[:, None, None]
     with torch.no_grad():
-        total = rollout.total_time_spent(policy, torch.zeros_like(demand[0]), demand, generator)
+        total = rollout.total_time_spent(policy, rollout.start.expand_as(demand[0]), demand, generator)
     return torch.log(total).mean().exp().item()
 
 
