@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from cosim.cli.city import identify, import_
+from cosim.cli.compete import compete
 from cosim.cli.demo import demo
 from cosim.cli.get import get
 from cosim.cli.options import CONTROLLER_HELP, REFERENCE, chosen_scheduler, scheduler_options, tell
@@ -151,5 +152,5 @@ def sweep(
 
 for command in (
         demo, listing("cosim.plant.strategy:options"), run, compare, report, video, watch, identify, import_, get,
-        reference, tune, frontier):
+        reference, tune, frontier, compete):
     main.add_command(command)
