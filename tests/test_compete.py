@@ -167,7 +167,7 @@ def test_what_is_run_for_an_entry():
     ('id = "noisy"', 'id = "../noisy"', "tasks[1].id: expected"),
     ("seeds = [0]", "seeds = []", "tasks[1].seeds: expected"),
     ("seeds = [0]", "seed = [0]", "unknown key; did you mean seeds"),
-    ('scenario = "scenario"', 'scenario = "nothing"', "mine.toml: nominal: scenario: there is no nothing/scenario.toml"),
+    ('scenario = "scenario"', 'scenario = "nothing"', "nominal: scenario: there is no nothing/scenario.toml"),
     ("time_limit = 5.0", "time_limit = 0.0", "time_limit: expected a number above 0"),
 ])
 def test_a_wrong_task_set(place, old, new, words):
@@ -317,7 +317,7 @@ def test_strangers_in_sumo(place):
     copies.peak(place)
     Path("mine.toml").write_text(
         TASKS.replace('"scenario"', '"scenarios/peak"').replace('"acyclic"', '"sumo"').replace(
-            "time_limit = 0.2", "time_limit = 3.0").replace("seeds = [1, 2, 3, 4, 5]", "seeds = [0, 1, 3, 5]"),
+            "time_limit = 0.2", "time_limit = 3.0").replace("seeds = [1, 2, 3, 4, 5]", "seeds = [1, 5]"),
         encoding="utf-8")
     Path("trouble.py").write_text(TROUBLE, encoding="utf-8")
     good(nmfd("new-controller", "mine.py"))
@@ -329,7 +329,7 @@ def test_strangers_in_sumo(place):
     rows = {(row.name, row.task): row for group in beside.by_task.values() for row in group}
     assert all(rows[row.name, row.task] == row for group in alone.by_task.values() for row in group)
     trouble, without = rows["trouble.py:Trouble", "nominal"], rows["bound-pc", "nominal"]
-    assert (trouble.runs, trouble.failed, without.failed) == (2, 2, 4) and trouble.metrics["late_decisions"] >= 1
+    assert (trouble.runs, trouble.failed, without.failed) == (1, 1, 2) and trouble.metrics["late_decisions"] >= 1
     assert "no such plan for bound-pc" in without.reasons[0]
     known = rows["no-control", "nominal"].metrics
     assert known["co2_kg"] > 0 and known["locked"] == 1.0 and 0.0 <= known["delay_gini"] < 1.0

@@ -97,7 +97,7 @@ def _table(tables: tuple[str, ...], out: Path | None) -> None:
     page.write(folder / "leaderboard.html", board)
     table.write_csv(folder / "leaderboard.csv", board)
     click.echo(text_table([{
-        "controller": row.name, "rank": "-" if row.rank is None else row.rank,
-        "worth": "-" if row.worth is None else f"{row.worth:.3f}", "runs": row.runs, "failed": row.failed,
-        "missing": row.missing} for row in board.overall], table.RULE))
+        "controller": row.name, "rank": row.rank or "-", "worth": page.number(row.worth, ".3f") or "-",
+        **{task: page.in_task(one) for task, rows in board.by_task.items() for one in rows if one.name == row.name},
+        "failed": row.failed} for row in board.overall], table.RULE))
     click.echo(f"Written to {folder}: see leaderboard.html and leaderboard.csv")

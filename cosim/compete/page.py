@@ -48,27 +48,30 @@ def _overall(board: Leaderboard) -> dict:
     worths = {(row.name, task): row for task, rows in board.by_task.items() for row in rows}
     columns = ["controller", "rank", "worth", *board.tasks, "runs", "failed", "late"]
     rows = [
-        (row.name, row.rank, _number(row.worth, ".3f"), *(_in_task(worths[row.name, task]) for task in board.tasks),
-         _runs(row), row.failed, _number(row.metrics["late_decisions"], ".0f"))
+        (row.name, row.rank, number(row.worth, ".3f"), *(in_task(worths[row.name, task]) for task in board.tasks),
+         _runs(row), row.failed, number(row.metrics["late_decisions"], ".0f"))
         for row in board.overall]
     return html.table("all tasks", columns, rows, lambda name: HEADINGS.get(name, "worth in this task"))
 
 
-def _in_task(row: Row) -> str:
+def in_task(row: Row) -> str:
     """What the overall table says of a task."""
     if row.failed:
         return f"{row.failed} failed"
-    return "not run" if row.missing and not row.runs else f"{row.missing} missing" if row.missing else _number(
+    return "not run" if row.missing and not row.runs else f"{row.missing} missing" if row.missing else number(
         row.worth, ".3f")
 
 
-def _task(task: str, rows: Sequence[Row]) -> dict:
+def _task(task: str, rows: Sequence[Row]) -> dict | None:
+    """None where nobody has run it."""
+    if not any(row.runs or row.failed for row in rows):
+        return None
     shown = [TTS, *(name for name in SHOWN if any(row.metrics[name] is not None for row in rows))]
     told = {metric.heading: metric.text for metric in METRICS.values()} | HEADINGS
     columns = ["controller", "rank", "worth", "runs", "failed", *(METRICS[name].heading for name in shown)]
     lines = [
-        (row.name, row.rank, _number(row.worth, ".3f"), _runs(row), row.failed,
-         *(_number(row.metrics[name], DIGITS.get(name, ",.1f" if name.endswith("_s") else ",.0f")) for name in shown))
+        (row.name, row.rank, number(row.worth, ".3f"), _runs(row), row.failed,
+         *(number(row.metrics[name], DIGITS.get(name, ",.1f" if name.endswith("_s") else ",.0f")) for name in shown))
         for row in rows]
     return html.table(task, columns, lines, told.__getitem__)
 
@@ -81,11 +84,12 @@ def _made(name: str, one: Entry) -> tuple[str, ...]:
     versions, commits, dates = dict[str, str](), dict[str, None](), list[str]()
     for session in one.sessions:
         versions |= session.get("versions", {})
-        commits[f"{session.get('commit') or 'unknown'}{' with changes' if session.get('dirty') else ''}"] = None
+        commits[f"{str(session.get('commit') or 'unknown')[:12]}{' with changes' if session.get('dirty') else ''}"] = None
         dates.append(str(session.get("date", "")))
     return (name, one.command, ", ".join(f"{package} {version}" for package, version in versions.items()),
             ", ".join(commits), " to ".join(dict.fromkeys([min(dates), max(dates)] if dates else [])))
 
 
-def _number(value: float | None, form: str) -> str:
+def number(value: float | None, form: str) -> str:
+    """Nothing for what is not known."""
     return "" if value is None else format(value, form)

@@ -27,11 +27,11 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
 from nmfd.runs.files import locked
 from nmfd.runs.provenance import provenance
-from nmfd.runs.tally import Progress
 from nmfd.studies import benchmark
 from nmfd.studies.benchmark import happening
 
 Tell = Callable[[str], None]
+Progress = Callable[[int, int, str], None]
 Key = tuple[str, str, int]  # controller, task, seed
 
 
@@ -188,7 +188,7 @@ class _Books:
                 runs.append(Run(
                     seed=seed, session=None if here == row["evaluation_time_s"] else session,
                     metrics=_metrics(task, scenario, row, folder)))
-        ended = {one.seed for one in (*runs, *failed)}
+        ended = {*(one.seed for one in runs), *(one.seed for one in failed)}
         return Outcome(
             task=task.id, text=task.text, strategy=called, plant=task.plant, scenario=scenario.name,
             scenario_hash=scenario.hash, network=scenario.network.name, network_hash=scenario.network.hash,

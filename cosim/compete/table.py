@@ -26,7 +26,8 @@ from nmfd.studies.benchmark import REFERENCE
 ALL = "all tasks"
 RULE = (
     "Worth: total time spent over that of no control with the same seed, geometric mean over the seeds of a task, and "
-    "over the tasks, each counted the same; less is better. Ranked is whose every run in every task of the set counts.")
+    "over the tasks, each counted the same; less is better. An entry has a rank in a task, or overall, if its every run "
+    "there counts, and those of no control.")
 SUMMED = ("teleports", *COUNTED)  # of the metrics, those that are summed over seeds
 
 
