@@ -236,8 +236,8 @@ def made(name: str, spent: dict[str, dict[int, float]], seeds=(1, 2)) -> entry.E
 
     tasks = tuple(outcome(task, values) for task, values in spent.items())
     return entry.Entry(
-        controller=name, task_set=entry.TaskSetName(name="v0", hash="h", released=True), command="cosim compete",
-        sessions=({"date": "2026-01-01", "versions": {"torch": "2"}, "commit": None},), tasks=tasks,
+        controller=name, task_set=entry.TaskSetName(name="v0", named="v0", hash="h", released=True),
+        command="cosim compete", sessions=({"date": "2026-01-01", "versions": {"torch": "2"}, "commit": None},), tasks=tasks,
         missing=tuple(one.task for one in tasks if not one.complete), metrics=entry.about_metrics())
 
 
@@ -309,6 +309,25 @@ def test_a_file_that_is_no_entry(tmp_path):
     folder = written(tmp_path / "all")
     (folder / "other.json").write_text("[1", encoding="utf-8")
     assert "other.json: is no entry" in error_line(cosim("compete", "--table", folder))
+
+
+@pytest.mark.usefixtures("here")
+def test_a_row_is_made_again_and_compared(place):
+    competed("no-control", "pi-gating", only="noisy")
+    same = "11 figures to the last digit, the kept run to the byte"
+    assert same in good(cosim("verify", "out/noisy", "--row", "pi-gating*"))
+    assert "17 figures to the last digit" in good(cosim("verify", "out", "--row", "pi-gating*"))
+    summary = Path("out/noisy/summary.csv")
+    rows = summary.read_text(encoding="utf-8")
+    spent = next(row["total_time_spent_veh_s"] for row in csv.DictReader(rows.splitlines()))
+    summary.write_text(rows.replace(spent, spent[:-1] + str((int(spent[-1]) + 1) % 10)), encoding="utf-8")
+    done = cosim("verify", "out/noisy", "--row", "no-control,*")
+    assert done.exit_code == 1 and f"total_time_spent_veh_s differs: {spent[:-1]}" in done.stdout
+    assert "1 of 11 figures differ" in done.stderr
+    assert "within 1e-12" in good(cosim("verify", "out/noisy", "--row", "no-control,*", "--within", "1e-12"))
+    assert good(cosim("verify", "out/noisy", "--list")).split() == ["no-control,0", "pi-gating,0"]
+    assert "no row matches 'x'; there are no-control,0" in error_line(cosim("verify", "out/noisy", "--row", "x"))
+    assert "does not say how its rows were made" in error_line(cosim("verify", "network"))
 
 
 @pytest.mark.slow

@@ -60,6 +60,7 @@ class TaskSetName(Settings):
     """Which tasks."""
 
     name: Text = setting("of the task set")
+    named: Text = setting("as --tasks has it")
     hash: Text = setting("of what it says")
     released: bool = setting("whether it came with the package and was released")
 

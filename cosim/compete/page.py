@@ -84,7 +84,8 @@ def _made(name: str, one: Entry) -> tuple[str, ...]:
     versions, commits, dates = dict[str, str](), dict[str, None](), list[str]()
     for session in one.sessions:
         versions |= session.get("versions", {})
-        commits[f"{str(session.get('commit') or 'unknown')[:12]}{' with changes' if session.get('dirty') else ''}"] = None
+        commit = str(session.get("commit") or "unknown")[:12]
+        commits[f"{commit} with changes" if session.get("dirty") else commit] = None
         dates.append(str(session.get("date", "")))
     return (name, one.command, ", ".join(f"{package} {version}" for package, version in versions.items()),
             ", ".join(commits), " to ".join(dict.fromkeys([min(dates), max(dates)] if dates else [])))

@@ -157,10 +157,10 @@ class _Books:
         tasks = tuple(outcome.changed(runs=tuple(
             run if run.session is None else run.changed(session=used.index(run.session)) for run in outcome.runs))
             for outcome in tasks)
-        which = loaded.tasks.name if loaded.worlds is not None else str(loaded.file)
         return Entry(
-            controller=name, command=shlex.join(["cosim", "compete", name, "--tasks", which]),
-            task_set=TaskSetName(name=loaded.tasks.name, hash=loaded.hash, released=loaded.worlds is not None),
+            controller=name, command=shlex.join(["cosim", "compete", name, "--tasks", loaded.named]),
+            task_set=TaskSetName(name=loaded.tasks.name, named=loaded.named, hash=loaded.hash,
+                                 released=loaded.worlds is not None),
             sessions=tuple(sessions[number] for number in used), tasks=tasks, metrics=entry.about_metrics(),
             missing=tuple(outcome.task for outcome in tasks if not outcome.complete))
 

@@ -26,8 +26,8 @@ from nmfd.studies.benchmark import REFERENCE
 ALL = "all tasks"
 RULE = (
     "Worth: total time spent over that of no control with the same seed, geometric mean over the seeds of a task, and "
-    "over the tasks, each counted the same; less is better. An entry has a rank in a task, or overall, if its every run "
-    "there counts, and those of no control.")
+    "over the tasks, each counted the same; less is better. An entry has a rank in a task, or overall, if its every "
+    "run there counts, and those of no control.")
 SUMMED = ("teleports", *COUNTED)  # of the metrics, those that are summed over seeds
 
 
@@ -76,9 +76,11 @@ def read(places: Sequence[str]) -> Leaderboard:
                for file, one in found.items()}
     first = next(iter(found.values()))
     tasks = {outcome.task: outcome for outcome in first.tasks}
-    reference = next((one for one in found.values() if one.controller == REFERENCE), None)
-    by_task = {task: _ranked([_row(name, file, one, task, reference) for name, (file, one) in by_name.items()])
-               for task in tasks}
+    by_task = {}
+    for task in tasks:
+        without = next((outcome for one in found.values() if one.controller == REFERENCE and (
+            outcome := one.outcome(task)) is not None and outcome.complete), None)
+        by_task[task] = _ranked([_row(name, file, one, task, without) for name, (file, one) in by_name.items()])
     overall = _ranked([
         _all(name, file, [row for task in tasks for row in by_task[task] if row.name == name])
         for name, (file, _) in by_name.items()])
@@ -127,7 +129,7 @@ def _worlds(one: Entry) -> dict[str, tuple]:
     return {outcome.task: (outcome.world, outcome.seeds) for outcome in one.tasks}
 
 
-def _row(name: str, file: Path, one: Entry, task: str, reference: Entry | None) -> Row:
+def _row(name: str, file: Path, one: Entry, task: str, reference: Outcome | None) -> Row:
     outcome = one.outcome(task)
     assert outcome is not None  # `_check`
     means = {}
@@ -140,12 +142,13 @@ def _row(name: str, file: Path, one: Entry, task: str, reference: Entry | None) 
         name=name, place=file, task=task, rank=None, runs=len(outcome.runs), failed=len(outcome.failed),
         missing=len(outcome.missing), metrics=means, reasons=tuple(
             f"{task}, seed {failure.seed}: {failure.reason}" for failure in outcome.failed),
-        worth=_worth(outcome, None if reference is None else reference.outcome(task)))
+        worth=_worth(outcome, reference))
 
 
 def _worth(outcome: Outcome, reference: Outcome | None) -> float | None:
-    """None where a run is missing on either side, or took no time at all."""
-    if reference is None or not (outcome.complete and reference.complete):
+    """Against no control, whose runs are all there; None where there is none such, where a run is missing, or one took
+    no time at all."""
+    if reference is None or not outcome.complete:
         return None
     spent, without = ({run.seed: run.metrics.get(TTS) or 0.0 for run in one.runs} for one in (outcome, reference))
     if not all((*spent.values(), *without.values())):

@@ -88,10 +88,11 @@ class TaskSet(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Loaded:
-    """A task set that was read. file: where; hash: of what stands there; worlds: task -> `world` at the release, of a
-    released one, None of another."""
+    """A task set that was read. named: as --tasks has it; file: where; hash: of what stands there; worlds: task ->
+    `world` at the release, of a released one, None of another."""
 
     tasks: TaskSet
+    named: str
     file: Path
     hash: str
     worlds: Mapping[str, str] | None
@@ -141,7 +142,7 @@ def read(name: str) -> Loaded:
         raise InputError(
             f"{file}: is not the task set {name} that was released ({now} instead of {release['hash']}); restore it, "
             "and give what is to be different a new number")
-    return Loaded(tasks=found, file=file, hash=now, worlds=None if release is None else release["worlds"])
+    return Loaded(tasks=found, named=name, file=file, hash=now, worlds=None if release is None else release["worlds"])
 
 
 def fingerprint(content: object) -> str:
