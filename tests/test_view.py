@@ -1,6 +1,7 @@
 """The live view: watching changes nothing, gates that are switched are ordered faults, frames, the page, the server."""
 
 import http.client
+import itertools
 import multiprocessing
 import re
 import threading
@@ -310,7 +311,8 @@ def test_the_guard_stands_before_everything():
         import asyncio
 
         asyncio.set_event_loop(asyncio.new_event_loop())
-        server = Server(lambda document: document.add_root(Button(label="x", name="x")))
+        generous = Budget(clock=itertools.count(0.0, 10.0).__next__)
+        server = Server(lambda document: document.add_root(Button(label="x", name="x")), budget=generous)
         box.append(server)
         loop.append(IOLoop.current())
         ready.set()
@@ -364,7 +366,7 @@ def test_the_processor_time_of_viewers_is_limited():
     budget = Budget(clock=lambda: now[0], spent=lambda: spent[0])
     made = 0
     while now[0] < 100.0:  # ever more ask for pages of half a second each
-        if budget.left():
+        if budget.page():
             made, spent[0] = made + 1, spent[0] + 0.5
         now[0] += 0.1
     assert made == pytest.approx((100 * SHARE + SAVED) / 0.5, abs=1.5)
@@ -377,6 +379,11 @@ def test_the_processor_time_of_viewers_is_limited():
         now[0], spent[0] = now[0] + 0.25, spent[0] + 0.01
         budget.slower()
     assert budget.slower() == 1.0
+
+
+def test_pages_that_are_asked_for_at_once_are_paid_for_before_they_are_made():
+    budget = Budget(clock=lambda: 0.0, spent=lambda: 0.0)
+    assert sum(budget.page() for _ in range(40)) == 3
 
 
 def test_a_port_that_is_taken_and_a_host_that_is_elsewhere():

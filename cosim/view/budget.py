@@ -5,6 +5,8 @@ from collections.abc import Callable
 
 SHARE = 0.2    # of a core, for pages and pictures
 SAVED = 2.0    # s of processor time that may be spent at once: the first few pages
+PAGE = 0.7     # s that one page takes, of a city with 5,747 streets: paid in advance
+SETTLED = 1.0  # s after which a page is made, and what was paid too much comes back
 WINDOW = 2.0   # s, over which pictures are counted
 SLOWEST = 40.0  # times the usual period
 
@@ -18,12 +20,22 @@ class Budget:
         """clock, spent: wall time and processor time so far [s]"""
         self._clock, self._spent, self._saved, self._slower = clock, spent, SAVED, 1.0
         self._at, self._since = (clock(), spent()), (clock(), spent())
+        self._paid, self._page_at = 0.0, 0.0
 
-    def left(self) -> bool:
-        """Whether something costly, such as a page, may be made now."""
+    def page(self) -> bool:
+        """Whether a page may be made now. It is paid for at once: many may be asked for before the first is made."""
         before, self._at = self._at, (self._clock(), self._spent())
-        self._saved = min(self._saved + SHARE * (self._at[0] - before[0]) - (self._at[1] - before[1]), SAVED)
-        return self._saved > 0.0
+        spent = self._at[1] - before[1]
+        covered = min(spent, self._paid)
+        self._paid -= covered
+        back = self._paid if self._at[0] - self._page_at > SETTLED else 0.0
+        self._paid -= back
+        self._saved = min(self._saved + SHARE * (self._at[0] - before[0]) - (spent - covered) + back, SAVED)
+        if self._saved <= 0.0:
+            return False
+        self._saved -= PAGE
+        self._paid, self._page_at = self._paid + PAGE, self._at[0]
+        return True
 
     def slower(self) -> float:
         """Times the usual period between two pictures: so that all of them together keep to the share."""

@@ -16,6 +16,7 @@ from urllib.parse import parse_qs, urlsplit
 from bokeh.application import Application
 from bokeh.application.handlers import FunctionHandler
 from bokeh.document import Document
+from bokeh.resources import Resources
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
 from bokeh.util.token import check_token_signature
@@ -55,9 +56,14 @@ class Guarded(BokehTornado):
             return self.get_handler_delegate(request, Waiting)
         return super().find_handler(request, **more)
 
+    def resources(self, absolute_url: str | bool | None = None) -> Resources:
+        """Without Bokeh's scripts for formulas, tables and WebGL: nothing on the page needs them, and a browser
+        would read them first."""
+        return super().resources(absolute_url).clone(components=["bokeh", "bokeh-widgets"])
+
     def room(self) -> bool:
         """Whether a page may be made now."""
-        return len(self.get_sessions("/")) < MOST_VIEWERS and self._budget.left()
+        return len(self.get_sessions("/")) < MOST_VIEWERS and self._budget.page()
 
     def allowed(self, request: HTTPServerRequest) -> bool:
         """Whether a request may have an answer."""

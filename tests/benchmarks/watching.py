@@ -1,8 +1,10 @@
 """What watching costs a run, and what a viewer gets: python tests/benchmarks/watching.py SCENARIO [--steps N]
 
-Runs of `cosim watch`, in turn without a viewer, with one in Chromium, and with forty clients, one that reads slowly and
-one that sends garbage, all of these at the lowest priority, for they stand for other machines. Ratios are of runs
-that came one after another, so that they mean something on a busy machine.
+Runs of `cosim watch`, in turn without a viewer; with one elsewhere, who takes what is sent and draws nothing; with
+forty clients, one that reads slowly and one that sends garbage, all of these at the lowest priority, for they stand for
+other machines; with one in Chromium on this machine; and without a viewer while something else keeps a core busy, for
+virtual cores are often halves of one, and a browser that draws slows a run beside it for that alone. Ratios are of
+runs that came one after another, so that they mean something on a busy machine.
 """
 
 import argparse
@@ -28,6 +30,8 @@ IDLE = 5.0  # s without processor time: the run has ended (too little where it i
 PULL = [json.dumps(part) for part in ({"msgid": "1", "msgtype": "PULL-DOC-REQ"}, {}, {})]
 THERE = """() => { try { return Bokeh.documents[0].is_idle && !!Bokeh.documents[0].get_model_by_name("map0") }
 catch { return false } }"""
+# As browsers count it: ms from the request to the first text on the screen.
+PAINTED = "() => performance.getEntriesByName('first-contentful-paint')[0].startTime"
 # Of the page: how many pictures came, told by the times that its sources changed.
 COUNT = """() => { window.pictures = 0; window.times = []
 const map = Bokeh.documents[0].get_model_by_name("map0")
@@ -42,9 +46,11 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=2)
     parser.add_argument("--controller", default="no-control")
     chosen = parser.parse_args()
-    rows: dict[str, list[dict]] = {"nobody": [], "one in Chromium": [], "forty, slow, garbage": []}
+    kinds = {"nobody": None, "one elsewhere": elsewhere, "forty, slow, garbage": crowd, "one in Chromium": browser,
+             "nobody, a busy core": busy}
+    rows: dict[str, list[dict]] = {kind: [] for kind in kinds}
     for _ in range(chosen.pairs):
-        for kind, visitors in zip(rows, (None, browser, crowd), strict=True):
+        for kind, visitors in kinds.items():
             rows[kind].append(watched(chosen, visitors))
             print(kind, json.dumps(rows[kind][-1]), flush=True)
     for kind, found in rows.items():
@@ -68,6 +74,7 @@ def watched(chosen: argparse.Namespace, visitors) -> dict:
     if other:
         other.start()
     cpu, end, spent, seen = before, begin, made, dict[str, float]()
+    there: tuple[float, float] | None = None  # time and processor time when the browser had its first picture
     while time.perf_counter() - end < IDLE:  # the process waits for another task when the run has ended
         time.sleep(0.05)
         with suppress(psutil.NoSuchProcess):  # without a viewer it ends soon
@@ -75,11 +82,16 @@ def watched(chosen: argparse.Namespace, visitors) -> dict:
                 cpu, end, spent = now, time.perf_counter(), sum(server.cpu_times()[:2])
                 while other and not told.empty():
                     seen |= told.get()
+                if there is None and "map_s" in seen:
+                    there = end, cpu
     found = {"wall_s": round(end - begin, 2), "cpu_s": round(cpu - before, 2),
              "server_cpu_s": round(spent - made, 2), **seen}
+    if there and end - there[0] > IDLE:  # the share of its time that the run was kept waiting, for a core or the page
+        found["waiting"] = round(1.0 - (cpu - there[1]) / (end - there[0]), 3)
     if other:
         for child in (*psutil.Process(other.pid).children(recursive=True), psutil.Process(other.pid)):
-            child.kill()
+            with suppress(psutil.NoSuchProcess):
+                child.kill()
         other.join()
     process.terminate()
     process.wait()
@@ -87,7 +99,7 @@ def watched(chosen: argparse.Namespace, visitors) -> dict:
 
 
 def browser(address: str, told) -> None:
-    """First paint, frames per second, bytes, every few seconds."""
+    """First paint, the whole map, pictures per second, bytes, every few seconds."""
     from playwright.sync_api import sync_playwright
 
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -103,7 +115,8 @@ def browser(address: str, told) -> None:
         begin = time.perf_counter()
         page.goto(address)
         page.wait_for_function(THERE, timeout=300e3)
-        told.put({"first_paint_s": round(time.perf_counter() - begin, 2), **sizes})
+        told.put({"first_paint_s": round(page.evaluate(PAINTED) / 1000, 2),
+                  "map_s": round(time.perf_counter() - begin, 2), **sizes})
         page.evaluate(COUNT)
         sizes["websocket_bytes"] = 0
         begin = time.perf_counter()
@@ -114,8 +127,20 @@ def browser(address: str, told) -> None:
                       "kB_per_s": round(sizes["websocket_bytes"] / 1000 / seconds, 1)})
 
 
-def crowd(address: str, told) -> None:
-    """Forty that ask at once, and those for whom there is no room again and again; a slow one; garbage."""
+def busy(_: str, __) -> None:
+    """Nobody who looks, but a core that is in use."""
+    while True:
+        pass
+
+
+def elsewhere(address: str, told) -> None:
+    """One who looks from another machine: takes what is sent."""
+    crowd(address, told, clients=1, harmful=False)
+
+
+def crowd(address: str, told, clients: int = CLIENTS + 1, harmful: bool = True) -> None:
+    """Clients that ask at once, and those for whom there is no room again and again. harmful: one is slow, and there is
+    garbage"""
     psutil.Process().nice(19 if os.name == "posix" else psutil.IDLE_PRIORITY_CLASS)
     port, count = int(re.search(r":(\d+)/", address)[1]), {"in": 0, "waited": 0, "messages": 0}
 
@@ -156,7 +181,9 @@ def crowd(address: str, told) -> None:
             told.put(dict(count))
 
     async def all_of_them() -> None:
-        await asyncio.gather(*(client(n == 0) for n in range(CLIENTS + 1)), garbage(), tell(), return_exceptions=True)
+        harm = [garbage()] if harmful else []
+        await asyncio.gather(
+            *(client(harmful and n == 0) for n in range(clients)), *harm, tell(), return_exceptions=True)
 
     asyncio.run(all_of_them())
 
