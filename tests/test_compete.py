@@ -237,8 +237,8 @@ def made(name: str, spent: dict[str, dict[int, float]], seeds=(1, 2)) -> entry.E
     tasks = tuple(outcome(task, values) for task, values in spent.items())
     return entry.Entry(
         controller=name, task_set=entry.TaskSetName(name="v0", named="v0", hash="h", released=True),
-        command="cosim compete", sessions=({"date": "2026-01-01", "versions": {"torch": "2"}, "commit": None},), tasks=tasks,
-        missing=tuple(one.task for one in tasks if not one.complete), metrics=entry.about_metrics())
+        command="cosim compete", sessions=({"date": "2026-01-01", "versions": {"torch": "2"}, "commit": None},),
+        tasks=tasks, missing=tuple(one.task for one in tasks if not one.complete), metrics=entry.about_metrics())
 
 
 ENTRIES = {
