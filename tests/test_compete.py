@@ -286,6 +286,17 @@ def test_the_page_and_the_csv(tmp_path):
     assert [row["rank"] for row in rows if row["task"] == "all tasks"] == ["1", "2", "", ""]
 
 
+def test_the_entries_that_come_with_the_package(tmp_path):
+    board = table.read(["v1"])
+    loaded = task_set.read("v1")
+    assert board.hash == loaded.hash and board.released and "no-control" in board.entries
+    for task, about in board.tasks.items():
+        assert about.world == loaded.worlds[task]
+    page.write(tmp_path / "page.html", board)
+    assert good(cosim("compete", "--table", "v1", "--out", tmp_path))
+    assert "--out: missing" in error_line(cosim("compete", "--table", "v1"))
+
+
 @pytest.mark.parametrize("change, words", [
     (lambda one: one["task_set"].update(name="v9"), "its task set is v9, but that of"),
     (lambda one: one["task_set"].update(hash="other"), "its hash is other, but that of"),
