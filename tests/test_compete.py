@@ -292,7 +292,6 @@ def test_the_entries_that_come_with_the_package(tmp_path):
     assert board.hash == loaded.hash and board.released and "no-control" in board.entries
     for task, about in board.tasks.items():
         assert about.world == loaded.worlds[task]
-    page.write(tmp_path / "page.html", board)
     assert good(cosim("compete", "--table", "v1", "--out", tmp_path))
     assert "--out: missing" in error_line(cosim("compete", "--table", "v1"))
 

@@ -22,7 +22,7 @@ def scenario(tmp_path_factory):
 
 def test_time_spent_by_origin_adds_up_to_all_of_it(scenario):
     done = run(scenario, "pi-gating", plant="acyclic", progress=False)
-    spent = delays._time_spent(scenario, done.perimeter, done.splits)
+    spent, _ = delays._time_spent(scenario, done.perimeter, done.splits)
     assert spent.sum() == pytest.approx(total_time_spent(done)) and spent[1] == 0.0 and spent[0] > spent[2] > 0.0
 
 

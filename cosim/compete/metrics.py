@@ -47,7 +47,7 @@ METRICS = {
         resco="departDelay (part of their timeLoss)"),
     "completed_veh": Metric(
         heading="throughput [veh]", text="trips that reached their end within the horizon", libsignal="throughput"),
-    "trips_veh": Metric(heading="trips [veh]", text="that were due within the horizon"),
+    "trips_veh": Metric(heading="trips [veh]", text="that were due within the horizon, or under way when it began"),
     "queue_veh": Metric(
         heading="queue [veh]", text="halting on the edges before gateways, mean over edges and time; SUMO",
         resco="queue_lengths (theirs of all lanes of a signal)",
@@ -82,7 +82,7 @@ def of_city(row: Mapping, horizon: float) -> Metrics:
 
 def of_region(row: Mapping, scenario: Scenario, trajectory: Trajectory, acyclic: bool) -> Metrics:
     """Of a run on a regional model, by its row of summary.csv. scenario: what happened."""
-    trips = float(scenario.step * scenario.demand.sum())
+    trips = float(scenario.step * scenario.demand.sum() + trajectory.accumulation[0].sum())
     found = {
         **_of_every_plant(row), "mean_trip_time_s": row[TTS] / trips if trips else None,
         "mean_departure_delay_s": 0.0, "trips_veh": trips, "backlog_veh": 0.0, "removed_veh": 0.0}

@@ -151,21 +151,19 @@ def fingerprint(content: object) -> str:
 
 
 def world(task: TaskTable, scenario: Scenario) -> str:
-    """A fingerprint of all that happens in a task, whatever controllers are given; of the regional model it holds what
-    the plant takes of it."""
+    """A fingerprint of all that happens in a task, whatever controllers are given. Of a city in SUMO it holds of the
+    regional model only what the plant takes of it."""
+    if task.plant != SUMO:
+        seeds = task.seeds if task.noise else task.seeds[:1]
+        happens = [replace(happening(scenario, noise_of(task), seed), controller_options={}) for seed in seeds]
+        return fingerprint([replace(one, demand=one.demand.round(9)).hash for one in happens])
     network = scenario.network
-    common = [
+    chosen = settings(scenario).model_dump(mode="json", exclude_defaults=True)
+    files = [scenario.folder / name for key in FILES for name in chosen.pop(key, ())] if scenario.folder else []
+    return fingerprint([
         scenario.name, scenario.step, scenario.steps, scenario.measurement_std, scenario.faults, network.u_min,
-        network.u_max, network.adjacency.tolist()]
-    if task.plant == SUMO:
-        chosen = settings(scenario).model_dump(mode="json", exclude_defaults=True)
-        files = [scenario.folder / name for key in FILES for name in chosen.pop(key, ())] if scenario.folder else []
-        common += [chosen, [_content(file) for file in (*files, *sources(network))]]
-    else:
-        common += [network.hash, scenario.integrator, scenario.substeps, task.noise, task.noise_where]
-    seeds = task.seeds if task.noise else task.seeds[:1]
-    demands = [happening(scenario, noise_of(task), seed).demand.round(9).tobytes() for seed in seeds]
-    return fingerprint([*common, [hashlib.sha256(demand).hexdigest() for demand in demands]])
+        network.u_max, network.adjacency.tolist(), chosen, [_content(file) for file in (*files, *sources(network))],
+        hashlib.sha256(scenario.demand.round(9).tobytes()).hexdigest()])
 
 
 def noise_of(task: TaskTable) -> Noise | None:

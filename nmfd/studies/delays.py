@@ -20,21 +20,25 @@ def delays_by_origin(scenario: Scenario, trajectory: Trajectory) -> tuple[PerReg
     open, nominal split ratios, and nobody else there; never below 0. Trips that do not end within the horizon count
     with what they have spent.
     """
-    trips = scenario.step * scenario.demand.sum(axis=(0, 2))
     network, many = scenario.network, (scenario.steps, 1, 1)
-    spent = _time_spent(scenario, trajectory.perimeter, trajectory.splits)
-    free = _time_spent(
+    spent, trips = _time_spent(scenario, trajectory.perimeter, trajectory.splits)
+    free, few = _time_spent(
         replace(scenario, demand=FREE * scenario.demand), np.tile(network.u_max * network.adjacency, many),
         np.tile(network.nominal_splits, (*many, 1)))
-    return np.maximum(spent - free / FREE, 0.0) / np.where(trips > 0, trips, 1.0), trips
+    each = [np.divide(time, begun, out=np.zeros_like(time), where=begun > 0) for time, begun in (
+        (spent, trips), (free, few))]
+    return np.maximum(each[0] - each[1], 0.0), trips
 
 
-def _time_spent(scenario: Scenario, perimeter: PairsOverTime, splits: TurnsOverTime) -> PerRegion:
-    """(R,) [veh s] by origin, counted as total time spent is."""
+def _time_spent(
+    scenario: Scenario, perimeter: PairsOverTime, splits: TurnsOverTime,
+) -> tuple[PerRegion, PerRegion]:
+    """(R,) [veh s], counted as total time spent is, and (R,) [veh], trips, both by origin."""
     plant = AcyclicPlant(scenario)
     plant.reset(0)
-    spent = np.zeros(scenario.network.regions)
+    spent, begun = np.zeros(scenario.network.regions), scenario.step * scenario.demand.sum(axis=(0, 2))
+    trips = plant.by_origin() + begun
     for gates, shares in zip(perimeter, splits, strict=True):
         spent += scenario.step * plant.by_origin()
         plant.step(Controls(perimeter=gates, splits=shares))
-    return spent
+    return spent, trips
