@@ -183,6 +183,8 @@ def test_reset_forgets_the_plan(states):
 @pytest.mark.parametrize("options, problem", [
     ({"horizen": 8}, "horizen: unknown key"), ({"horizon": 1}, "horizon: expected a whole number from 2"),
     ({"max_iterations": -1}, "max_iterations: expected a whole number from 0"),
+    ({"control_horizon": 0}, "control_horizon: expected a whole number from 1"),
+    ({"control_horizon": 2, "solver": "ipopt"}, "control_horizon: ipopt has controls of its own"),
     ({"time_limit": 0.0}, "time_limit: expected a number above 0")])
 def test_wrong_options(options, problem):
     with pytest.raises(InputError, match=f"controllers.mpc-pc.{problem}") as caught:

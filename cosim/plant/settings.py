@@ -105,6 +105,8 @@ def settings(scenario: "Scenario") -> Settings:
     if scenario.folder is None:
         return Settings()
     path = scenario_file(scenario)
+    if scenario.initial is not None:
+        raise config.error(path, "initial", "a city in SUMO begins empty; remove it, or use the regional model (nmfd)")
     chosen = Settings(**vars(config.checked(SumoTable, read_tables(scenario.folder).get("sumo", {}), path, "sumo.")))
     for key in FILES:
         for name in getattr(chosen, key):

@@ -41,7 +41,7 @@ def main() -> None:
 
 @main.command()
 @SCENARIO
-@controllers_option("Which to run: no-control, route-guidance, pi-gating, mpc-pc, mpc-pcrg, probing-pc, "
+@controllers_option("Which to run: no-control, route-guidance, pi-gating, greedy, mpc-pc, mpc-pcrg, probing-pc, "
                      "probing-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, dpc-pcrg-robust, dpc-pc-guarded, "
                     "dpc-pcrg-guarded, dpc-pc-online, dpc-pcrg-online, bound-pc, bound-pcrg, or file.py:Class "
                     "(see nmfd new-controller).")

@@ -13,6 +13,7 @@ from nmfd.controllers import custom, open_loop
 from nmfd.controllers.dpc import fallback, online, policy, training
 from nmfd.controllers.dpc.options import TRAINED, Online
 from nmfd.controllers.excitation import Probing
+from nmfd.controllers.greedy import Greedy
 from nmfd.controllers.mpc import controller as mpc
 from nmfd.controllers.no_control import NoControl, RouteGuidance
 from nmfd.controllers.options import Options, options
@@ -54,6 +55,7 @@ _ENTRIES = {
         text="drivers are guided by travel times alone, every gateway open", make=RouteGuidance, guides=True),
     "pi-gating": Entry(
         text="a PI gate holds the protected regions at a set point", make=PiGating, declared=Gating),
+    "greedy": Entry(text="bang-bang: every gate closed into the more congested region of its two", make=Greedy),
     "mpc-pc": Entry(
         text="economic MPC on the regional model, perimeter control", make=partial(mpc.EconomicMpc, guidance=False),
         declared=mpc.Mpc),

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 
-from nmfd.arrays import PairsOverTime
+from nmfd.arrays import PairsOverTime, PerPair
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel, check_step, load_network
 from nmfd.model.scenario import Scenario
@@ -36,6 +37,7 @@ class PlanningModel:
     integrator, substeps: of the regional model, as of nmfd.model.scenario.Scenario
     protected: the regions that gating protects
     controller_options: controller name -> its table in [controllers]
+    initial: (R, R) [veh], [i, j] = vehicles in i bound for j when a run begins; None: nobody
     folder: of the scenario, or None
     """
 
@@ -49,7 +51,14 @@ class PlanningModel:
     substeps: int = 1
     protected: tuple[int, ...] = ()
     controller_options: Mapping[str, dict] = field(default_factory=dict)
+    initial: PerPair | None = None
     folder: Path | None = None
+
+    @property
+    def destinations(self) -> Bool[np.ndarray, " R"]:
+        """(R,): whether anybody is bound for a region."""
+        vehicles = self.forecast.sum(axis=(0, 1))
+        return (vehicles if self.initial is None else vehicles + self.initial.sum(axis=0)) > 0
 
     @property
     def where(self) -> str:
@@ -80,7 +89,7 @@ def planning_model(scenario: Scenario, controller: str = "") -> PlanningModel:
         name=scenario.name, network=network, step=scenario.step, steps=scenario.steps,
         forecast=scenario.forecast.copy(),
         measurement_std=scenario.measurement_std, integrator=scenario.integrator, substeps=scenario.substeps,
-        protected=scenario.protected, folder=scenario.folder,
+        protected=scenario.protected, initial=copy.copy(scenario.initial), folder=scenario.folder,
         controller_options=copy.deepcopy({**tables, name: options} if name else dict(tables)))
 
 

@@ -27,9 +27,9 @@ class NmfdPlant:
         self._demand = torch.from_numpy(scenario.demand)
 
     def reset(self, seed: int) -> State:
-        """Empty network; the model is deterministic, `seed` changes nothing."""
-        self._k, self._entered, self._ended = 0, 0.0, 0.0
-        self._x = torch.zeros_like(self._demand[0])
+        """As the scenario begins; the model is deterministic, `seed` changes nothing."""
+        self._x = torch.from_numpy(self._scenario.start)
+        self._k, self._entered, self._ended = 0, float(self._x.sum()), 0.0
         return self._state()
 
     def step(self, controls: Controls) -> State:
@@ -68,9 +68,11 @@ class AcyclicPlant:
         self._model = acyclic.build(scenario.network)
 
     def reset(self, seed: int) -> State:
-        """Empty network; the model is deterministic, `seed` changes nothing."""
-        self._k, self._entered, self._ended, self._forced = 0, 0.0, 0.0, 0.0
+        """As the scenario begins, with the trips of all who are inside beginning where they are; the model is
+        deterministic, `seed` changes nothing."""
         self._x = np.zeros(len(self._model.region))
+        self._x[self._model.start] = self._scenario.start
+        self._k, self._entered, self._ended, self._forced = 0, float(self._x.sum()), 0.0, 0.0
         return self._state()
 
     @property

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nmfd.arrays import Intervals, PairsOverTime
+from nmfd.arrays import Intervals, PairsOverTime, PerPair
 from nmfd.errors import InputError
 from nmfd.faults import Fault, parse
 from nmfd.model.regional_model import RegionalModel, check_step, load_network
@@ -37,6 +37,7 @@ class Scenario:
     controller_options: controller name -> its table in [controllers], checked by that controller
     faults: injected into every run (nmfd.faults)
     own_time_limit: of every call of a controller of the user's own [s], 0 for none; no result depends on it
+    initial: (R, R) [veh], [i, j] = vehicles that are in i bound for j when a run begins; None: nobody
     folder: where scenario.toml was, or None
     """
 
@@ -55,7 +56,13 @@ class Scenario:
     forecast_seed: int = 0
     faults: tuple[str, ...] = ()
     own_time_limit: float = OWN_TIME_LIMIT
+    initial: PerPair | None = None
     folder: Path | None = None
+
+    @property
+    def start(self) -> PerPair:
+        """(R, R) [veh]: `initial` as an array of its own, zeros for nobody."""
+        return np.zeros(self.demand.shape[1:]) if self.initial is None else self.initial.copy()
 
     @cached_property
     def forecast(self) -> PairsOverTime:
@@ -71,7 +78,6 @@ class Scenario:
         normal = random.standard_normal((1, *self.demand.shape[1:])) + random.standard_normal(self.demand.shape)
         return self.demand * np.exp(spread * normal - spread**2)
 
-
     @cached_property
     def hash(self) -> str:
         """A fingerprint of all that a run depends on, whatever its files are called."""
@@ -82,6 +88,8 @@ class Scenario:
             settings.append([self.forecast_error, self.forecast_seed])
         if self.faults:
             settings.append(self.faults)
+        if self.initial is not None:
+            settings.append(self.initial.tolist())
         text = json.dumps(settings, sort_keys=True, default=str)
         return hashlib.sha256(text.encode() + np.ascontiguousarray(self.demand).tobytes()).hexdigest()[:16]
 
@@ -135,7 +143,7 @@ def read_scenario(folder: Path | str) -> Scenario:
         measurement_std=table.noise.measurement_std, integrator=table.integrator, substeps=table.substeps,
         protected=table.protected, controller_options=table.controllers, demand_factor=table.demand_factor,
         forecast_error=table.forecast.error, forecast_seed=table.forecast.seed, faults=table.faults,
-        own_time_limit=table.own_time_limit, folder=folder)
+        own_time_limit=table.own_time_limit, initial=_initial(table, network.regions), folder=folder)
     _ = scenario.ordered_faults  # checked here, where the file is known
     return scenario
 
@@ -146,10 +154,12 @@ def _check_regions(table: ScenarioTable, network: RegionalModel, path: Path) -> 
     if max(table.protected, default=0) > most:
         raise config.error(path, "protected", config.got(
             f"a list of distinct whole numbers from 0 to {most}", list(table.protected)))
-    for number, row in enumerate(table.demand or ()):
-        for key, region in (("from", row.origin), ("to", row.to)):
+    ends = [(f"demand[{n}]", (("from", row.origin), ("to", row.to))) for n, row in enumerate(table.demand or ())]
+    ends += [(f"initial[{n}]", (("region", row.region), ("to", row.to))) for n, row in enumerate(table.initial)]
+    for where, pair in ends:
+        for key, region in pair:
             if region > most:
-                raise config.error(path, f"demand[{number}].{key}", f"region {region} is unknown; {known}")
+                raise config.error(path, f"{where}.{key}", f"region {region} is unknown; {known}")
     if table.steps > MOST_NUMBERS // network.regions**2:
         raise config.error(path, "steps", config.got(
             f"a whole number from 1 to {MOST_NUMBERS // network.regions**2}", table.steps))
@@ -165,6 +175,16 @@ def _trapezoids(table: ScenarioTable, regions: int) -> PairsOverTime:
         if row.both_ways:
             demand[:, row.to, row.origin] += rate
     return demand
+
+
+def _initial(table: ScenarioTable, regions: int) -> PerPair | None:
+    """(R, R) [veh]: the vehicles of [[initial]]."""
+    if not table.initial:
+        return None
+    inside = np.zeros((regions, regions))
+    for row in table.initial:
+        inside[row.region, row.to] += row.vehicles
+    return inside
 
 
 def _demand_file(path: Path, steps: int, regions: int) -> PairsOverTime:

@@ -41,6 +41,14 @@ class DemandTable(Settings):
     both_ways: bool = setting("the same flow the other way, too", False)
 
 
+class InitialTable(Settings):
+    """Vehicles that are inside when the run begins, in the regional model; a city in SUMO begins empty."""
+
+    region: Region = setting("region that they are in")
+    to: Region = setting("region that they are bound for")
+    vehicles: float = setting("how many; tables of the same pair of regions add up", unit="veh", ge=0.0, le=1e9)
+
+
 class PlanningOptions(Settings):
     """Of every controller, beside its own options."""
 
@@ -72,6 +80,7 @@ class ScenarioTable(Settings):
     noise: NoiseTable = setting("of the measurements", NoiseTable())
     forecast: ForecastTable = setting("of the demand", ForecastTable())
     demand: Rows[DemandTable] | None = setting("one table per flow; may be left out beside demand_file", None)
+    initial: Rows[InitialTable] = setting("one table per pair of regions; without any, the city begins empty", ())
     controllers: dict[str, dict[str, Any]] = setting("options of controllers", {})
     sumo: dict[str, Any] = setting("how the city is simulated, for cosim", {})
 

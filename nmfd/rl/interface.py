@@ -72,7 +72,8 @@ class Interface:
     def bounds(self, scenario: Scenario) -> tuple[Float[np.ndarray, " O"], Float[np.ndarray, " O"]]:
         """The lowest and the highest observation (observation_size,): of nobody, and of twice all vehicles of the
         scenario besides full regions at every place, give and take the noise."""
-        trips = 2.0 * scenario.step * scenario.demand.sum() + sum(mfd.jam for mfd in scenario.network.mfds)
+        trips = 2.0 * (scenario.step * scenario.demand.sum() + scenario.start.sum()) + sum(
+            mfd.jam for mfd in scenario.network.mfds)
         off, nobody = NOISE * scenario.measurement_std, np.zeros_like(self._open)
         return self.observation(nobody - off, nobody), self.observation(nobody + trips + off, nobody + trips)
 

@@ -57,7 +57,7 @@ class NmfdVectorEnv(VectorEnv):
             self._x, self._demand = self._rollout.random_start(self.num_envs, self._spread, self._share, generator)
         else:
             self._demand = self._rollout.demand.unsqueeze(1).expand(-1, self.num_envs, -1, -1)
-            self._x = torch.zeros_like(self._demand[0])
+            self._x = self._rollout.start.expand_as(self._demand[0])
         self._k, self._spent = 0, np.zeros(self.num_envs)
         return self._observations(), self._info()
 

@@ -154,8 +154,8 @@ def _total_time_spent(
     scenario: Scenario, parameters: dynamics.Parameters, demand: Float[torch.Tensor, "T R R"],
     perimeter: Float[torch.Tensor, "T B R R"], splits: Float[torch.Tensor, "T b R R R"],  # b: B or 1
 ) -> Float[torch.Tensor, " B"]:
-    """TTS (B,) [veh s] of plans from the empty network by the definition of nmfd.metrics."""
-    x = demand.new_zeros(perimeter.shape[1], *demand.shape[1:])
+    """TTS (B,) [veh s] of plans from the start of the scenario by the definition of nmfd.metrics."""
+    x = torch.from_numpy(scenario.start).expand(perimeter.shape[1], -1, -1)
     states = [x]
     for k in range(scenario.steps - 1):
         x = dynamics.advance(

@@ -43,7 +43,8 @@ class Rollout:
         self.demand = tensor(planning.forecast)
         self.nominal_splits = tensor(network.nominal_splits)
         self.jam = tensor([m.jam for m in network.mfds])
-        self.bound = (self.demand.sum((0, 1)) > 0).to(dtype)
+        self.bound = tensor(planning.destinations)
+        self.start = torch.zeros_like(self.demand[0]) if planning.initial is None else tensor(planning.initial)
 
     def random_start(
         self, batch: int, spread: float, share: float, generator: torch.Generator,
@@ -53,7 +54,8 @@ class Rollout:
 
         levels: the demand of a whole rollout is multiplied by a number between these
         A share of the rollouts starts at a random time of the scenario from a random state, which fills the regions
-        up to between nothing and 80 % of their jam accumulation with vehicles for the destinations in use.
+        up to between nothing and 80 % of their jam accumulation with vehicles for the destinations in use; the others
+        start as the scenario does.
         """
         def uniform(*shape: int) -> torch.Tensor:
             return torch.rand(*shape, generator=generator, dtype=self.dtype).to(self.device)
@@ -70,7 +72,7 @@ class Rollout:
         x = total.unsqueeze(-1) * weight / weight.sum(-1, keepdim=True).clamp(min=1e-6)
         if levels[0] < levels[1]:
             demand = demand * (levels[0] + (levels[1] - levels[0]) * uniform(batch, 1, 1))
-        return x * (rollout < share * batch)[:, None, None], demand
+        return torch.where((rollout < share * batch)[:, None, None], x, self.start), demand
 
     def draw_model(self, batch: int, spread: float, generator: torch.Generator, scale: float = 1.0) -> None:
         """From now on every one of `batch` rollouts has a regional model of its own, around the nominal one.

@@ -217,7 +217,7 @@ def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> f
         demand = demand * (low + (high - low) * level[torch.randperm(count, generator=generator)]).to(
             demand)[:, None, None]
     with torch.no_grad():
-        total = rollout.total_time_spent(policy, torch.zeros_like(demand[0]), demand, generator)
+        total = rollout.total_time_spent(policy, rollout.start.expand_as(demand[0]), demand, generator)
     return torch.log(total).mean().exp().item()
 
 

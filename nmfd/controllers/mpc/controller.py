@@ -14,6 +14,7 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
+from pydantic import model_validator
 
 from nmfd.arrays import PerPair, PerTurn
 from nmfd.controllers.mpc import edge_model
@@ -24,7 +25,7 @@ from nmfd.controllers.options import Options, options
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs.config import setting, whole
+from nmfd.runs.config import Problem, setting, whole
 from nmfd.types import Controls, Observation, Status
 
 ROUNDING = 0.005    # of the smallest jam accumulation: over which the solver sees the kink of the MFD there rounded off
@@ -41,6 +42,9 @@ class Mpc(Options):
     """Of model predictive control."""
 
     horizon: int = whole("control intervals that the plan looks ahead", 8, low=2, high=1000)
+    control_horizon: int | None = whole(
+        "control intervals with controls of their own, the last of which stay in force over the rest of the horizon; "
+        "without it, all of them", None, low=1, high=1000)
     solver: Literal["projected-gradient", "ipopt"] = setting(
         "ipopt: the published formulation by CasADi and IPOPT, two orders of magnitude slower: the reference",
         "projected-gradient")
@@ -48,6 +52,12 @@ class Mpc(Options):
     time_limit: float | None = setting(
         "deadline of a decision; without one, the control interval: a later answer is of no use. What is later all the "
         "same is late in the books", None, unit="s", gt=0.0)
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Mpc":
+        if self.control_horizon is not None and self.solver == "ipopt":
+            raise Problem("control_horizon", "ipopt has controls of its own in every interval; omit one of the keys")
+        return self
 
 
 class Admissible:
@@ -135,13 +145,13 @@ class EconomicMpc:
         self.name = "mpc-pcrg" if guidance else "mpc-pc"
         self.options = options(Mpc, planning, self.name)
         network, horizon = planning.network, self.options.horizon
-        used = np.flatnonzero(planning.forecast.sum(axis=(0, 1)) > 0)
+        used = np.flatnonzero(planning.destinations)
         self._regions = network.regions
         self._used = used if len(used) else np.arange(network.regions)
         self._demand, self._step, self._steps = planning.forecast, planning.step, planning.steps
         # With one Euler step per interval, the last controls move vehicles that the horizon does not see arrive.
         blind = planning.integrator == "euler" and planning.substeps == 1
-        self._moves = horizon - 1 if blind else horizon
+        self._moves = min(horizon - 1 if blind else horizon, self.options.control_horizon or horizon)
         self._model = edge_model.build(network, self._used, guidance=guidance)
         rounded = replace(self._model, rounding=ROUNDING * min(mfd.jam for mfd in network.mfds))
         scheme: dict = {"step": planning.step, "substeps": planning.substeps, "integrator": planning.integrator}
