@@ -131,6 +131,12 @@ def test_the_samples_are_those_of_every_edge(scenario, plant_of):
         assert counts.tolist() == [session.vehicle_count(edge) for edge in edges]
         there = [[libsumo.vehicle.getSpeed(one) for one in session.vehicles_on(edge)] for edge in edges]
         np.testing.assert_allclose(speeds, [np.mean(one) if one else 0.0 for one in there], atol=1e-9)
+        sampler.sample()
+        means = sampler.finish(np.full(len(edges), False))
+        routed = [libsumo.edge.getLastStepMeanSpeed(edge) if one else np.nan
+                  for edge, one in zip(edges, there, strict=True)]
+        np.testing.assert_allclose(means.speed, routed)  # guidance goes by what SUMO's own drivers have
+        assert means.production.sum() == pytest.approx(sum(map(sum, there)))
 
     for _ in range(18):
         for _ in range(10):

@@ -7,6 +7,7 @@ Runs are made and kept by nmfd.studies.benchmark and cosim.evaluation.experiment
 up in its own entry; the others go on.
 """
 
+import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ from cosim.plant.strategy import ALONE, parse
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
-from nmfd.runs import run_folder
+from nmfd.runs import run_folder, shipped
 from nmfd.runs.files import locked
 from nmfd.runs.provenance import provenance
 from nmfd.studies import benchmark
@@ -128,8 +129,9 @@ class _Books:
         return found
 
     def fail(self, name: str, task: TaskTable, reason: str, seeds: Sequence[int]) -> None:
-        """Book runs that failed."""
-        self.failed |= {(name, task.id, seed): reason for seed in seeds}
+        """Book runs that failed; where this package lies is nobody's business."""
+        told = reason.replace(f"{shipped.root()}{os.sep}", "")
+        self.failed |= {(name, task.id, seed): told for seed in seeds}
 
     def begin(self, name: str, task: TaskTable) -> None:
         """Failed runs are tried again."""

@@ -17,7 +17,8 @@ EVERY = 10.0  # s, between two samples
 class StreetMeans:
     """Means over the samples of one control interval.
 
-    vehicles: (E,) [veh], by the city's edges; speed: (E,) [m/s], NaN where there were none, 0 on closed streets
+    vehicles: (E,) [veh], by the city's edges; speed: (E,) [m/s], that routing goes by (`Session.routing_speed`), NaN
+    where there were no vehicles, 0 on closed streets
     accumulation: (R,) [veh]; production: (R,) [veh m/s]
     queue, queue_max: (G,) [veh] halting on the edge before a gateway, mean and largest
     """
@@ -49,16 +50,20 @@ class StreetSampler:
 
     @property
     def last(self) -> tuple[PerEdge, PerEdge]:
-        """Vehicles (E,) [veh] and mean speed (E,) [m/s] of the sample that was taken last."""
+        """Vehicles (E,) [veh] and their mean speed (E,) [m/s] of the sample that was taken last."""
         return self._last
 
     def _begin(self) -> None:
-        self._vehicles, self._metres = np.zeros((2, len(self._city.edges)))  # sums over the samples: n and n v
+        # Sums over the samples: n, n v, and n times the speed that routing goes by.
+        self._vehicles, self._metres, self._routed = np.zeros((3, len(self._city.edges)))
         self._queues: list[list[int]] = []
 
     def sample(self) -> None:
         """Take one sample."""
         self._last = counts, speeds = self.present()
+        routing_speed, edges = self._session.routing_speed, self._city.edges
+        there = np.flatnonzero(counts)
+        self._routed[there] += counts[there] * [routing_speed(edges[n]) for n in there]
         self._vehicles, self._metres = self._vehicles + counts, self._metres + counts * speeds
         self._queues.append([self._session.halting(edge) for edge in self._upstream])
 
@@ -67,7 +72,7 @@ class StreetSampler:
         samples, vehicles, metres = len(self._queues), self._vehicles, self._metres
         queues = np.array(self._queues).reshape(samples, len(self._upstream))
         with np.errstate(invalid="ignore"):
-            speed = metres / vehicles
+            speed = self._routed / vehicles
         speed[closed] = 0.0  # nobody is sent through a street because it is empty
         production, accumulation = (
             np.bincount(self._region, amount, self._city.regions) / samples for amount in (metres, vehicles))

@@ -110,6 +110,9 @@ class Session:
         # Edges: the vehicles on one, their number, and of these under 0.1 m/s.
         self.vehicles_on, self.vehicle_count = sumo.edge.getLastStepVehicleIDs, sumo.edge.getLastStepVehicleNumber
         self.halting = sumo.edge.getLastStepHaltingNumber
+        # The mean speed [m/s] that SUMO's own routing goes by: an empty lane counts as one vehicle at the limit, so
+        # that a queue before one turn does not keep away who has another lane to himself. The limit where nobody is.
+        self.routing_speed = sumo.edge.getLastStepMeanSpeed
         self._lanes_of: dict[str, tuple[str, ...]] = {}  # of edges that were asked for
         # Lanes: the same, for max-pressure control, which asks for a thousand of them every few seconds.
         self.lane_vehicles = sumo.lane.getLastStepVehicleNumber
@@ -118,10 +121,7 @@ class Session:
         self.loop_occupancy = sumo.inductionloop.getLastStepOccupancy
 
     def mean_speed(self, edge: str) -> float:
-        """Mean speed [m/s] of the vehicles on an edge, its speed limit where there are none.
-
-        Not SUMO's own of several lanes: that counts every empty lane as one vehicle at the limit.
-        """
+        """Mean speed [m/s] of the vehicles on an edge, its limit where there are none: not the `routing_speed`."""
         lanes = self._lanes_of.get(edge)
         if lanes is None:
             lanes = tuple(f"{edge}_{n}" for n in range(self._sumo.edge.getLaneNumber(edge)))
