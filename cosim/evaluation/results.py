@@ -81,7 +81,7 @@ def read(path: Path, scenario: Path | None = None) -> Finished:
         folders = {_manifest(path)["configuration"]["demand_factor"]: path}
     levels = tuple(_level(demand, folder, _order(path)) for demand, folder in folders.items())
     configuration = levels[0].manifest["configuration"]
-    loaded = load_scenario(scenario or scenario_folder(folders[levels[0].demand], levels[0].manifest))
+    loaded = load_scenario(scenario or scenario_folder(levels[0].folder, levels[0].manifest))
     if configuration.get("scenario") != loaded.name:
         raise InputError(
             f"--scenario: the runs are of {configuration.get('scenario')}, not of {loaded.name}; give its folder")
