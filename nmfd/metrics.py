@@ -5,6 +5,7 @@ from collections import Counter
 
 import numpy as np
 
+from nmfd.arrays import PerRegion
 from nmfd.types import Status, Trajectory
 
 # What was not as it should be with decisions: column of summary.csv -> its heading in every table, and what it counts.
@@ -54,6 +55,23 @@ def percent_change(value: float, reference: float) -> float:
         50.0
     """
     return 100.0 * (value / reference - 1.0) if reference else math.nan
+
+
+def gini(values: PerRegion, weights: PerRegion) -> float:
+    """Gini coefficient of `values` (N,), none below 0, each that of `weights` (N,) people:
+
+        G = sum_ij w_i w_j |v_i - v_j| / (2 W sum_i w_i v_i), W = sum_i w_i
+
+    0 where all have the same, nearly 1 where few have everything; NaN of nobody.
+
+        >>> float(gini(np.array([0.0, 100.0]), np.array([1.0, 1.0])))
+        0.5
+    """
+    people, total = weights.sum(), (weights * values).sum()
+    if not total:
+        return 0.0 if people else math.nan
+    apart = np.abs(values[:, None] - values[None, :])
+    return float(weights @ apart @ weights / (2.0 * people * total))
 
 
 def decisions(trajectory: Trajectory, kind: Status) -> int:

@@ -106,7 +106,7 @@ def _check_words(words: list[str], *, complete: bool) -> None:
     for name, value in context.params.items():
         if name in ("controller", "controllers", "against", "reference") and value:
             check = parse if words[0] == "cosim" else registry.check
-            for controller in value.split(","):
+            for controller in value if isinstance(value, tuple) else value.split(","):
                 own = controller.partition(".py:")[0]
                 if set(controller) & set("*?[") or own != controller and own.startswith(PLACEHOLDERS):
                     continue  # a pattern, or the reader's own

@@ -5,11 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trajectories
 
 from cosim.evaluation import run_metrics
 from cosim.plant.plant import SumoPlant
+from cosim.plant.record import Record
 from cosim.sumo.net import edge_room
 from cosim.sumo.tripinfo import CLASS, read_trip_facts
+from nmfd import metrics
 from nmfd.api import load_scenario
 from nmfd.types import Controls
 
@@ -53,6 +56,31 @@ def test_time_on_the_road_is_that_of_the_vehicles_seen_second_by_second(run):
     plant, record, running, trips = run
     assert trips.travel_time == pytest.approx(sum(running), rel=0.01)  # a second at either end of a trip
     assert trips.completed == record.arrivals.sum() and trips.trips >= record.departures.sum()
+
+
+def test_what_is_lost_on_the_road_is_known_by_origin(run):
+    plant, record, running, trips = run
+    lost = plant.time_loss()
+    assert lost.sum() == pytest.approx(trips.time_loss) and 0.0 < trips.time_loss < trips.travel_time
+    assert ((lost > 0.0) == (record.departures.sum(axis=(0, 2)) > 0)).all()
+
+
+def test_fairness_is_that_of_mean_delays_by_origin():
+    waiting = np.zeros((3, 2, 2))
+    waiting[:, 1, 0] = [10.0, 10.0, 5.0]  # two intervals of 30 s, five that never entered
+    departures = np.zeros((2, 2, 2))
+    departures[0], departures[1, 1, 0] = [[20.0, 10.0], [0.0, 5.0]], 20.0
+    run = trajectories.made(
+        controller="no-control", plant="sumo", seed=0, step=30.0, accumulation=waiting, backlog=waiting,
+        completed=np.zeros(3), perimeter=np.zeros((2, 2, 2)), splits=np.zeros((2, 2, 2, 2)))
+    record = Record(**trajectories.record(2, regions=2) | {
+        "departures": departures, "given_up": np.zeros((2, 2, 2))})
+    # 30 trips from region 0 lose 10 s each, 30 from region 1 wait 20 s and lose 10 s each
+    assert run_metrics.delay_gini(run, record, np.array([300.0, 300.0])) == pytest.approx((30 - 10) / (2 * (30 + 10)))
+    assert metrics.gini(np.array([5.0, 5.0, 5.0]), np.array([1.0, 9.0, 0.0])) == 0.0
+    assert metrics.gini(np.array([0.0, 0.0, 3.0]), np.array([1.0, 1.0, 1.0])) == pytest.approx(2 / 3)
+    assert metrics.gini(np.array([0.0, 3.0]), np.array([2.0, 1.0])) == pytest.approx(2 / 3)  # people, not regions
+    assert metrics.gini(np.zeros(2), np.ones(2)) == 0.0 and np.isnan(metrics.gini(np.ones(2), np.zeros(2)))
 
 
 def test_vehicles_under_way_have_emitted(run):

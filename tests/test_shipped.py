@@ -118,9 +118,8 @@ def test_cities_are_built_in_the_cache(installed, tmp_path, monkeypatch):
 
 
 def test_runs_find_their_scenario_again_by_its_name(installed, tmp_path):
-    level = results.Level(
-        demand=1.0, folder=tmp_path, rows=None, manifest={"sessions": [{"scenario_folder": "grid7_peak"}]})
-    assert results._scenario_folder(level) == installed / "scenarios" / "grid7_peak"
+    manifest = {"sessions": [{"scenario_folder": "grid7_peak"}]}
+    assert results.scenario_folder(tmp_path, manifest) == installed / "scenarios" / "grid7_peak"
 
 
 @pytest.mark.parametrize("program", [nmfd, cosim], ids=["nmfd", "cosim"])

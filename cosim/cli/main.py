@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from cosim.cli.city import identify, import_
+from cosim.cli.compete import compete
 from cosim.cli.demo import demo
 from cosim.cli.get import get
 from cosim.cli.options import CONTROLLER_HELP, REFERENCE, chosen_scheduler, scheduler_options, tell
@@ -16,6 +17,7 @@ from cosim.cli.reference import reference
 from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
 from cosim.cli.search import frontier, tune
+from cosim.cli.verify import verify
 from nmfd.cli.about import about, listing
 from nmfd.cli.declared import declared
 from nmfd.cli.errors import Commands
@@ -151,5 +153,5 @@ def sweep(
 
 for command in (
         demo, listing("cosim.plant.strategy:options"), run, compare, report, video, watch, identify, import_, get,
-        reference, tune, frontier):
+        reference, tune, frontier, compete, verify):
     main.add_command(command)

@@ -96,7 +96,8 @@ def perform(
     holds runs of another city or demand.
     """
     where = {task: path for path, task in plan}
-    settings_of = {path: _settings([t for t in where if where[t] == path]) for path in dict.fromkeys(where.values())}
+    settings_of = {
+        path: shared_configuration([t for t in where if where[t] == path]) for path in dict.fromkeys(where.values())}
     failures = []
     with ExitStack() as stack:
         folders = {}
@@ -161,8 +162,9 @@ def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> d
         "model_hash": hashlib.sha256(model.encode()).hexdigest()[:16], "torch": metadata.version("torch")}
 
 
-def _settings(tasks: Sequence[Task]) -> tuple[dict, dict]:
-    """The configuration that the tasks of one folder share, and what each of their controllers depends on."""
+def shared_configuration(tasks: Sequence[Task]) -> tuple[dict, dict]:
+    """The configuration that the tasks of one folder share, and what each of their controllers depends on. Raises
+    InputError for a city or controller that cannot be made."""
     first = tasks[0]
     scenario = scenario_of(first)
     controllers = {task.controller: dependencies(task.controller, scenario_of(task), task.policy)

@@ -81,7 +81,7 @@ def read(path: Path, scenario: Path | None = None) -> Finished:
         folders = {_manifest(path)["configuration"]["demand_factor"]: path}
     levels = tuple(_level(demand, folder, _order(path)) for demand, folder in folders.items())
     configuration = levels[0].manifest["configuration"]
-    loaded = load_scenario(scenario or _scenario_folder(levels[0]))
+    loaded = load_scenario(scenario or scenario_folder(levels[0].folder, levels[0].manifest))
     if configuration.get("scenario") != loaded.name:
         raise InputError(
             f"--scenario: the runs are of {configuration.get('scenario')}, not of {loaded.name}; give its folder")
@@ -131,15 +131,16 @@ def _manifest(folder: Path) -> dict:
         raise InputError(f"{path}: is no manifest of runs in SUMO; give a folder of `cosim run`") from None
 
 
-def _scenario_folder(level: Level) -> Path:
-    """Where the manifest says, from here or from a folder above the runs, or as it came with the package."""
-    name = Path(level.manifest["sessions"][-1]["scenario_folder"])
-    for folder in (Path(), *level.folder.resolve().parents):
-        if (folder / name / "scenario.toml").is_file():
-            return folder / name
-    if ((folder := shipped.found(name, shipped.SCENARIO, beside=Path())) / "scenario.toml").is_file():
-        return folder
-    raise InputError(f"{level.folder / 'manifest.json'}: scenario_folder: there is no {name}; give it with --scenario")
+def scenario_folder(folder: Path, manifest: Mapping) -> Path:
+    """Of the runs in `folder`: where the manifest says, from here or from a folder above the runs, or as it came with
+    the package. InputError."""
+    name = Path(manifest["sessions"][-1]["scenario_folder"])
+    for above in (Path(), *folder.resolve().parents):
+        if (above / name / "scenario.toml").is_file():
+            return above / name
+    if ((found := shipped.found(name, shipped.SCENARIO, beside=Path())) / "scenario.toml").is_file():
+        return found
+    raise InputError(f"{folder / 'manifest.json'}: scenario_folder: there is no {name}; give it with --scenario")
 
 
 def _changed(configuration: Mapping, files: SumoFiles) -> str:

@@ -9,6 +9,9 @@ from cosim.plant.record import Record
 from cosim.sumo.arrays import EdgesOverTime, RegionCounts
 from cosim.sumo.net import City, Gateway, gateway_room_taken
 from cosim.sumo.tripinfo import TripFacts
+from nmfd.arrays import PerRegion
+from nmfd.metrics import gini
+from nmfd.types import Trajectory
 
 FULL = 0.8         # share of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards
 
@@ -18,7 +21,21 @@ def trip_facts(facts: TripFacts) -> dict:
     trips = max(facts.trips, 1)
     return {
         "mean_trip_time_s": facts.travel_time / trips, "mean_departure_delay_s": facts.departure_delay / trips,
-        "co2_kg": facts.co2, "fuel_kg": facts.fuel}
+        "mean_time_loss_s": facts.time_loss / trips, "co2_kg": facts.co2, "fuel_kg": facts.fuel}
+
+
+def delay_gini(trajectory: Trajectory, record: Record, time_loss: PerRegion) -> float:
+    """Fairness over origins: the Gini coefficient (nmfd.metrics.gini) of the mean delays of regions of origin, each
+    weighted by its trips.
+
+    The delay of a trip is what it lost on the road against driving freely (SUMO's timeLoss) and what it waited to
+    enter; trips that had not ended count with what they had lost by then. time_loss: (R,) [s], of all trips that began
+    in a region; the waiting is the backlog by origin, summed over control intervals as in total time spent.
+    """
+    begun = record.departures.sum(axis=(0, 2)) + trajectory.backlog[-1].sum(axis=1)
+    trips = begun + record.given_up.sum(axis=(0, 2))
+    waiting = trajectory.step * trajectory.backlog[:-1].sum(axis=(0, 2))
+    return gini((time_loss + waiting) / np.maximum(trips, 1.0), trips.astype(float))
 
 
 def queue_facts(record: Record, city: City) -> dict:

@@ -17,7 +17,7 @@ from cosim.sumo.arrays import PerGateway
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
 from cosim.sumo.tripinfo import End, TripReader
-from nmfd.arrays import PerPair
+from nmfd.arrays import PerPair, PerRegion
 from nmfd.ledger import LedgerError
 from nmfd.types import State
 
@@ -78,6 +78,8 @@ class Meter:
     crossings (R, R, R) [i, h, j] from i to h where a gateway leads there; jumps, the same where none does: by teleport,
         by a street closed to cars, moved by another program, or past a region so fast that nobody saw it there
     redirected (R, R, R) [i, j, l], in i, bound for j and from now on for l
+    time_loss (R,) [s], lost on the road against driving freely, by the region where trips began; complete when the
+        books are closed
     teleports, and entry_flow, (source region, first edge behind the boundary) -> vehicles seen there
     """
 
@@ -101,7 +103,7 @@ class Meter:
         self.teleports, regions = 0, city.regions
         self._running, self.departures, self.probe_departures, self.removals, self.given_up = np.zeros(
             (5, regions, regions), dtype=int)
-        self.arrivals = np.zeros(regions, dtype=int)
+        self.arrivals, self.time_loss = np.zeros(regions, dtype=int), np.zeros(regions)
         self.crossings, self.jumps, self.redirected = np.zeros((3, regions, regions, regions), dtype=int)
         self.entry_flow: Counter[tuple[int, str]] = Counter()
         # Several movements may lead from one region to one edge: they share its flow.
@@ -193,6 +195,9 @@ class Meter:
         if self._trips is None:
             return
         self._settle(self._trips.finish(self._gone))
+        for vehicle, lost in self._trips.under_way.items():
+            if vehicle in self._vehicles:
+                self.time_loss[self._vehicles[vehicle].origin] += lost
         facts, booked = self._trips.facts, (int(self.arrivals.sum()), int(self.removals.sum()))
         if self._gone or (facts.completed, facts.removed) != booked:
             raise LedgerError(
@@ -220,6 +225,7 @@ class Meter:
                 self._under_way(end.vehicle)
                 self._leave(end.vehicle)
             gone = self._gone[end.vehicle].pop(0)
+            self.time_loss[gone.vehicle.origin] += end.time_loss
             if not self._gone[end.vehicle]:
                 del self._gone[end.vehicle]
             if gone.guess is not None:
@@ -269,6 +275,11 @@ class Meter:
         for vehicle in ahead.difference(self._session.known()) if ahead else ():
             self._leave(vehicle)
         return waiting
+
+    def on_the_road(self) -> PerRegion:
+        """(R,) [veh]: those on their way, by the region where they began."""
+        begun = [known.origin for known in self._vehicles.values() if known.region is not None]
+        return np.bincount(begun, minlength=len(self.time_loss)).astype(float)
 
     def probes(self) -> PerPair:
         """(R, R) [veh]: the probes among the accumulation, where it last counted them."""

@@ -23,7 +23,7 @@ from cosim.sumo.build import ensure_built
 from cosim.sumo.net import City, Gateway, check_adjacency, edge_shapes, load_city
 from cosim.sumo.session import Session, Window
 from cosim.sumo.tripinfo import TripFacts, TripReader
-from nmfd.arrays import PerTurn, Positions
+from nmfd.arrays import PerRegion, PerTurn, Positions
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
@@ -138,6 +138,12 @@ class SumoPlant:
             self._facts = self._with_standstill(self._trips.facts, *emitted)
         return self._facts
 
+    def time_loss(self) -> PerRegion:
+        """(R,) [s]: lost on the road against driving freely until the end, by the region where trips began. After
+        `trip_facts`."""
+        meter = self._sensing.meter
+        return meter.time_loss + self.booked * self._scenario.step * meter.on_the_road()
+
     def map(self) -> tuple[Positions, list[Points]]:
         """Where the regions are (R, 2), and the streets, E lines (n, 2) [m]."""
         shapes = edge_shapes(self.city)
@@ -193,6 +199,7 @@ class SumoPlant:
         return replace(
             facts, travel_time=facts.travel_time + time * float(state.accumulation.sum()),
             departure_delay=facts.departure_delay + time * float(state.backlog.sum()),
+            time_loss=facts.time_loss + time * float(state.accumulation.sum()),
             co2=facts.co2 + time * co2, fuel=facts.fuel + time * fuel)
 
     def _book(self) -> State:

@@ -82,14 +82,10 @@ def write_page(
                 progress(done, total)
         runs.append({**_run(run), "anchor": f"run-{number}", "levels": levels})
     shown, missing = _replay(found[0], reference, seed)
-    scripts = [*(shown.replay.scripts if shown else ()), (HERE / "sort.js").read_text(encoding="utf-8")]
-    environment = Environment(
-        loader=ChoiceLoader([PackageLoader("cosim.report", "."), PackageLoader("cosim.view", ".")]), autoescape=True,
-        trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
-    environment.filters |= {"cell": cell, "typeset": typeset}
-    files.write_text(path, environment.get_template("report.html.j2").render(
+    scripts = [*(shown.replay.scripts if shown else ()), sorting()]
+    files.write_text(path, environment("cosim.report", "cosim.view").get_template("report.html.j2").render(
         runs=runs, words=WORDS, caption=statistics.CAPTION, shown=shown, without_replay=missing, scripts=scripts,
-        allowed=" ".join(f"'{_digest(script)}'" for script in scripts), style=style("runs.css"),
+        allowed=allowed(scripts), style=style("runs.css"),
         names=", ".join(dict.fromkeys(run.scenario.name for run in found)),
         paths=", ".join(str(run.path) for run in found),
         version=found[-1].levels[-1].manifest["sessions"][-1].get("versions", {}).get("perimeter-cosim", "")))
@@ -106,12 +102,27 @@ def _replay(run: Finished, reference: str | None, seed: int | None) -> tuple[rep
         return None, f"There is no map with a slider: {error}."
 
 
-def _digest(script: str) -> str:
-    """By which the page lets the browser run this script and no other, whatever a name in it may be."""
-    return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
+def environment(*packages: str) -> Environment:
+    """Of the templates in these packages, which escape what is put in."""
+    made = Environment(
+        loader=ChoiceLoader([PackageLoader(package, ".") for package in packages]), autoescape=True, trim_blocks=True,
+        lstrip_blocks=True, undefined=StrictUndefined)
+    made.filters |= {"cell": cell, "typeset": typeset}
+    return made
 
 
-def _table(
+def sorting() -> str:
+    """The script by which tables are sorted."""
+    return (HERE / "sort.js").read_text(encoding="utf-8")
+
+
+def allowed(scripts: Sequence[str]) -> str:
+    """By which the page lets the browser run these scripts and no others, whatever a name in it may be."""
+    digests = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
+    return " ".join(f"'sha256-{digest}'" for digest in digests)
+
+
+def table(
     label: str, columns: Sequence[str], rows: Sequence[Sequence[object]], meaning: Callable[[str], str],
     words: bool = False,
 ) -> dict:
@@ -121,7 +132,7 @@ def _table(
 
 
 def _frame(label: str, frame: pd.DataFrame, meaning: Callable[[str], str]) -> dict:
-    return _table(label, list(frame), frame.to_dict("split")["data"], meaning)
+    return table(label, list(frame), frame.to_dict("split")["data"], meaning)
 
 
 def _run(run: Finished) -> dict:
@@ -142,8 +153,8 @@ def _run(run: Finished) -> dict:
             "why": explain.at_a_glance(level.demand, level.folder, run.scenario.network, level.rows, name)},
         "story": [first, *(_at(run, level) + summary_text.head(level.rows) for level in run.levels)],
         "models": _models(run), "pictures": shown,
-        "configuration": _table("configuration", [*SETTINGS], _configuration(run), SETTINGS.__getitem__, words=True),
-        "strategies": _table("strategies", [*DEPENDS], list({
+        "configuration": table("configuration", [*SETTINGS], _configuration(run), SETTINGS.__getitem__, words=True),
+        "strategies": table("strategies", [*DEPENDS], list({
             name: (name, _plain(depends) or "nothing of its own") for level in run.levels
             for name, depends in level.manifest.get("controllers", {}).items()}.values()), DEPENDS.__getitem__,
             words=True)}

@@ -82,6 +82,19 @@ def ensure_built(network: RegionalModel) -> SumoFiles:
 
     Raises InputError if network.toml has no [sumo] table, a key of it or a file it names is wrong, or netconvert fails.
     """
+    files = sources(network)
+    if len(files) == 1:
+        return _built(files[0], network)
+    for key, file in zip(("net", "regions"), files, strict=True):
+        if not file.is_file():
+            path = network_folder(network) / "network.toml"
+            raise config.error(path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one")
+    return SumoFiles(net_file=files[0], regions_csv=files[1])
+
+
+def sources(network: RegionalModel) -> tuple[Path, ...]:
+    """The files that say what the city of `network` is: a recipe, or a SUMO network and the regions of its edges, there
+    or not. Raises InputError as `ensure_built`."""
     folder = network_folder(network)
     path = folder / "network.toml"
     content = config.read(path)
@@ -90,13 +103,9 @@ def ensure_built(network: RegionalModel) -> SumoFiles:
             f'{path}: sumo: missing; this network has no city to simulate: add [sumo] with recipe = "city.toml"')
     table = config.checked(CityTable, content["sumo"], path, "sumo.")
     if table.recipe is not None:
-        return _built(folder / table.recipe, network)
+        return (folder / table.recipe,)
     assert table.net is not None and table.regions is not None  # CityTable takes no table without either
-    files = SumoFiles(net_file=folder / table.net, regions_csv=folder / table.regions)
-    for key, file in (("net", files.net_file), ("regions", files.regions_csv)):
-        if not file.is_file():
-            raise config.error(path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one")
-    return files
+    return folder / table.net, folder / table.regions
 
 
 def _built(recipe_file: Path, network: RegionalModel) -> SumoFiles:

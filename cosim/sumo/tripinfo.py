@@ -27,7 +27,7 @@ class TripFacts:
 
     trips: their number; completed: those that reached the last edge of their route; removed: those that were taken out
     on their way; travel_time: sum of the times on the road [s]; departure_delay: sum of the times between the wanted
-    and the real departure [s]; co2, fuel: [kg]
+    and the real departure [s]; time_loss: sum of the times lost on the road against driving freely [s]; co2, fuel: [kg]
     """
 
     trips: int = 0
@@ -35,6 +35,7 @@ class TripFacts:
     removed: int = 0
     travel_time: float = 0.0
     departure_delay: float = 0.0
+    time_loss: float = 0.0
     co2: float = 0.0
     fuel: float = 0.0
 
@@ -43,11 +44,12 @@ class TripFacts:
 class End:
     """A vehicle has left the simulation. edge: where, "" if SUMO does not say; reason: why it is no completed trip
     (tripinfo's `vaporized`: calibrator, collision, teleport, traci ...), "" of one on the last edge of its route, as
-    that was in the end."""
+    that was in the end; time_loss: on the road against driving freely [s]."""
 
     vehicle: str
     edge: str = ""
     reason: str = ""
+    time_loss: float = 0.0
 
 
 def trip_options(path: Path) -> tuple[str, ...]:
@@ -61,6 +63,7 @@ class TripReader:
     """Reads SUMO's tripinfo output while SUMO writes it.
 
     facts: of all that was read; prompt: whether SUMO had written all that it knew when it was last read
+    under_way: vehicle -> what it had lost on the road [s], of those that were there at the end of the simulation
     """
 
     def __init__(self, path: Path, flush: Callable[[], bool] = lambda: False):
@@ -68,6 +71,7 @@ class TripReader:
         self._path, self._flush, self._offset = path, flush, 0
         self._parser: ElementTree.XMLPullParser[Element] = ElementTree.XMLPullParser()
         self.facts, self.prompt = TripFacts(), False
+        self.under_way: dict[str, float] = {}
 
     def ends(self) -> list[End]:
         """Of the vehicles that SUMO has written since the last call. Raises RunFailed for a file that is broken."""
@@ -108,7 +112,9 @@ class TripReader:
                 if ended:
                     ends.append(End(
                         vehicle=element.get("id", ""), edge=element.get("arrivalLane", "").rpartition("_")[0],
-                        reason=reason))
+                        reason=reason, time_loss=_time_loss(element)))
+                elif float(attribute(element, "depart")) >= 0:
+                    self.under_way[element.get("id", "")] = _time_loss(element)
                 element.clear()
         return ends
 
@@ -120,6 +126,10 @@ def read_trip_facts(path: Path) -> TripFacts:
     return reader.facts
 
 
+def _time_loss(trip: Element) -> float:
+    return max(float(trip.get("timeLoss", 0.0)), 0.0)
+
+
 def _added(facts: TripFacts, trip: Element, *, ended: bool, completed: bool) -> TripFacts:
     co2, fuel = facts.co2, facts.fuel
     for emissions in trip.iter("emissions"):
@@ -128,4 +138,5 @@ def _added(facts: TripFacts, trip: Element, *, ended: bool, completed: bool) -> 
     return TripFacts(
         trips=facts.trips + 1, completed=facts.completed + completed, removed=facts.removed + (ended and not completed),
         travel_time=facts.travel_time + max(float(attribute(trip, "duration")), 0.0),
-        departure_delay=facts.departure_delay + float(attribute(trip, "departDelay")), co2=co2, fuel=fuel)
+        departure_delay=facts.departure_delay + float(attribute(trip, "departDelay")),
+        time_loss=facts.time_loss + _time_loss(trip), co2=co2, fuel=fuel)

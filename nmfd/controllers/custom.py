@@ -185,7 +185,7 @@ class OwnController:
     def __init__(self, name: str, controller: Any, network: RegionalModel, limit: float):
         """limit: of every call [s], 0 for none"""
         self._where, self._controller, self._network, self._limit = name, controller, network, limit
-        self.name = name
+        self.name, self.deadline = name, _guarded(name, "deadline", getattr, controller, "deadline", None, limit=limit)
 
     def reset(self, seed: int = 0) -> None:
         _guarded(self._where, "reset", self._controller.reset, seed, limit=self._limit)

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from nmfd import ledger
+from nmfd.arrays import PerRegion
 from nmfd.model import acyclic, dynamics
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
@@ -78,6 +79,10 @@ class AcyclicPlant:
     def state(self) -> acyclic.PerCell:
         """x_ogij (C,) [veh], in the cells of `nmfd.model.acyclic.build`."""
         return self._x.copy()
+
+    def by_origin(self) -> PerRegion:
+        """(R,) [veh], by the region where they began."""
+        return np.bincount(self._model.origin, self._x, self._scenario.network.regions)
 
     @property
     def forced_moves(self) -> float:

@@ -5,11 +5,13 @@ import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from scipy.special import stdtrit
 
 from nmfd import closed_loop, faults
 from nmfd.controllers import registry
+from nmfd.model.demand_noise import perturbed
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
@@ -23,6 +25,13 @@ PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": 
 REFERENCE = "no-control"
 
 
+class Noise(NamedTuple):
+    """On the demand (nmfd.model.demand_noise), drawn from the seed of a run: its standard deviation [veh/s]."""
+
+    sigma: float
+    where: str
+
+
 def compared_with(controllers: Iterable[str]) -> str:
     """What controllers are compared with: no control, or the first of them where that is not among them."""
     names = list(controllers)
@@ -30,14 +39,19 @@ def compared_with(controllers: Iterable[str]) -> str:
 
 
 def run_one(
-    run: tuple[str, int], *, scenario: Scenario, plant: str, policies: Mapping[str, Path],
+    run: tuple[str, int], *, scenario: Scenario, plant: str, policies: Mapping[str, Path], noise: Noise | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
-    """The closed loop of `run` = (controller, seed), on one thread."""
+    """The closed loop of `run` = (controller, seed), on one thread; the controller knows nothing of the `noise`."""
     name, seed = run
-    controller = registry.make(name, scenario, policy=policies.get(name))
-    trajectory = closed_loop.run(PLANTS[plant](scenario), controller, scenario, seed=seed, progress=progress)
+    controller, actual = registry.make(name, scenario, policy=policies.get(name)), happening(scenario, noise, seed)
+    trajectory = closed_loop.run(PLANTS[plant](actual), controller, actual, seed=seed, progress=progress)
     return run_folder.labelled(trajectory, controller=name, plant=plant)
+
+
+def happening(scenario: Scenario, noise: Noise | None, seed: int) -> Scenario:
+    """What happens in the run of `seed`, where controllers are made for `scenario`."""
+    return scenario if noise is None else perturbed(scenario, noise.sigma, seed, where=noise.where)
 
 
 def run_all(
@@ -47,32 +61,50 @@ def run_all(
 ) -> list[dict]:
     """Run what is not yet in the run folder `out`, add the figures, and return all rows of its summary.csv.
 
-    progress: called with the control intervals done and to do, and what is running.
+    As `perform` does it; RunFailed, or an InputError, at the end if runs failed, which the message names.
+    """
+    rows, failures = perform(
+        scenario, controllers, seeds, plant, out=out, policies=policies, workers=workers, progress=progress)
+    if rows:
+        kept = [run_folder.run_path(out, row["controller"], row["seed"]) for row in rows]
+        draw(out, scenario, [run_folder.read_trajectory(path) for path in kept if path.is_file()])
+    if failures:
+        raise ended([(f"controller {_label(run)}", failure) for run, failure in failures])
+    return rows
 
-    Raises InputError, before anything is written, for a controller that cannot be made; RunFailed at the end if runs
-    failed, which the message names. Every finished run is kept, whatever happens to the others.
+
+def perform(
+    scenario: Scenario, controllers: Sequence[str], seeds: Sequence[int], plant: str, *, out: Path,
+    policies: Mapping[str, Path] | None = None, noise: Noise | None = None, workers: int = 1,
+    progress: Callable[[int, int, str], None] | None = None, renew: Callable[[str], None] | None = None,
+) -> tuple[list[dict], list[tuple[tuple[str, int], Failure]]]:
+    """Run what is not yet in the run folder `out`; returns all rows of its summary.csv, and the runs that failed.
+
+    progress: called with the control intervals done and to do, and what is running
+    renew: takes one line where the runs of a controller do not count any more because it changed; None: an InputError
+
+    Raises InputError, before anything is written, for a controller that cannot be made. Every finished run is kept,
+    whatever happens to the others.
     """
     policies = policies or {}
     for name in controllers:
         registry.verify(name, scenario, policy=policies.get(name))
     common, settings = configuration(scenario, controllers, plant, policies)
+    if noise is not None:
+        common["demand_noise"] = noise._asdict()
     wanted = [(name, seed) for name in controllers for seed in seeds]
     session = {"scenario_folder": str(scenario.folder), "workers": workers}
     with run_folder.open_folder(
-            out, configuration=common, controllers=settings, order=wanted, session=session) as folder:
+            out, configuration=common, controllers=settings, order=wanted, session=session, renew=renew) as folder:
         todo = [run for run in wanted if run not in folder.finished]
         failures = []
-        work = partial(run_one, scenario=scenario, plant=plant, policies=policies)
+        work = partial(run_one, scenario=scenario, plant=plant, policies=policies, noise=noise)
         for run, outcome in results(work, todo, workers, scenario.steps, progress, label=_label):
             if isinstance(outcome, Failure):
-                failures.append((f"controller {_label(run)}", outcome))
+                failures.append((run, outcome))
             else:
                 folder.add(outcome)
-        if folder.finished:
-            draw(folder.path, scenario, folder.trajectories())
-        if failures:
-            raise ended(failures)
-        return folder.rows()
+        return folder.rows(), failures
 
 
 def configuration(

@@ -1,0 +1,238 @@
+"""A row of a published table, or of a run folder, made again from what is written beside it, and compared.
+
+    manifest.json with summary.csv      runs on a regional model (nmfd benchmark), or in SUMO (cosim run)
+    demand-<level>/                     such folders of an evaluation
+    manifest.json with robustness.csv   nmfd robustness
+    *.json                              entries of cosim compete
+
+Figures are compared to the last digit, or within what is asked for; those that are wall times are not. Where the run
+itself is kept, it is compared to the byte.
+"""
+
+import csv
+import math
+import random
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from cosim.compete import entry, run, task_set
+from cosim.compete.entry import Entry
+from cosim.evaluation import evaluate, experiment, results
+from cosim.evaluation.simulate import Task
+from nmfd.api import load_scenario
+from nmfd.errors import InputError
+from nmfd.model.scenario import Scenario
+from nmfd.runs import run_folder
+from nmfd.runs.files import check_file
+from nmfd.runs.provenance import provenance
+from nmfd.runs.scratch import Scratch
+from nmfd.studies import benchmark, robustness
+
+Figures = Mapping[str, object]
+CLOCK = (  # columns and metrics that are wall times, or depend on them
+    "evaluation_time_s", "control_step_ms_median", "control_step_ms_max", "late_decisions", "wall_time_s",
+    "sumo_time_s", "overhead_share", "setup_time_s", "decision_ms_median", "decision_ms_max", "notes")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """label: what tells it from the others; figures: as published; depends: what they depended on, versions and commit
+    among it; file: the kept run, None without; again: makes it anew in a folder: figures, depends, file."""
+
+    label: str
+    figures: Figures
+    depends: Figures
+    file: Path | None
+    again: Callable[[Path], tuple[Figures, Figures, Path | None]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """differ: figure -> as published, as made again; depends: the same of what they depend on; same_bytes: of the runs'
+    files, None without one; compared: how many figures."""
+
+    label: str
+    compared: int
+    differ: Mapping[str, tuple[object, object]]
+    depends: Mapping[str, tuple[object, object]]
+    same_bytes: bool | None
+
+    @property
+    def good(self) -> bool:
+        """Whether it came out the same."""
+        return not self.differ and self.same_bytes is not False
+
+
+def rows(folder: Path) -> list[Row]:
+    """All that can be made again. InputError for a folder that does not say how."""
+    if levels := evaluate.level_folders(folder):
+        return [replace(row, label=f"{level:g},{row.label}") for level, at in levels.items() for row in rows(at)]
+    if (folder / "manifest.json").is_file():
+        manifest = run_folder.read_manifest(folder / "manifest.json")
+        scenario = load_scenario(results.scenario_folder(folder, manifest))
+        if (folder / "robustness.csv").is_file():
+            return _of_robustness(folder, manifest, scenario)
+        if (folder / "summary.csv").is_file():
+            return _in_sumo(folder, manifest, scenario) if manifest["configuration"].get("plant") == "sumo" else (
+                _regional(folder, manifest, scenario))
+    if files := sorted(file for file in folder.glob("*.json") if file.name != "manifest.json"):
+        return [row for file in files for row in _of_entry(entry.read(file))]
+    raise InputError(
+        f"{folder}: does not say how its rows were made; give a folder with manifest.json and summary.csv or "
+        "robustness.csv, one of an evaluation, or one of entries")
+
+
+def chosen(found: Sequence[Row], pattern: str | None, seed: int | None) -> Row:
+    """One at random of those whose label matches. InputError for none."""
+    fitting = [row for row in found if pattern is None or fnmatchcase(row.label, pattern)]
+    if not fitting:
+        raise InputError(f"--row: no row matches {pattern!r}; there are {', '.join(row.label for row in found[:20])}"
+                         + (" ..." if len(found) > 20 else ""))
+    return random.Random(seed).choice(fitting)
+
+
+def verify(row: Row, within: float = 0.0) -> Verdict:
+    """Make it again, in a scratch folder. within: by which share figures may differ. InputError or RunFailed where that
+    fails."""
+    with Scratch("cosim-verify-") as scratch:
+        figures, depends, file = row.again(Path(scratch) / "again")
+        same = None if row.file is None or file is None else row.file.read_bytes() == file.read_bytes()
+    keys = [key for key in row.figures if key not in CLOCK and key in figures]
+    return Verdict(
+        label=row.label, compared=len(keys), same_bytes=same,
+        differ={key: (row.figures[key], figures[key]) for key in keys
+                if not _same(row.figures[key], figures[key], within)},
+        depends={key: (row.depends.get(key), depends.get(key)) for key in {**row.depends, **depends}
+                 if row.depends.get(key) != depends.get(key)})
+
+
+def _same(a: object, b: object, within: float) -> bool:
+    if isinstance(a, float) and isinstance(b, float):
+        return math.isclose(a, b, rel_tol=within) or (math.isnan(a) and math.isnan(b))
+    return a == b
+
+
+def _regional(folder: Path, manifest: Mapping, scenario: Scenario) -> list[Row]:
+    """Of nmfd benchmark."""
+    plant, noise = manifest["configuration"]["plant"], manifest["configuration"].get("demand_noise")
+    steps = manifest["configuration"]["steps"]
+    scenario = replace(scenario, steps=steps, demand=scenario.demand[:steps])
+
+    def row(published: Mapping) -> Row:
+        name, seed = published["controller"], published["seed"]
+
+        def again(out: Path) -> tuple[Figures, Figures, Path | None]:
+            made, failures = benchmark.perform(
+                scenario, [name], [seed], plant, out=out, noise=benchmark.Noise(**noise) if noise else None)
+            if failures:
+                raise InputError(f"{name}, seed {seed}: {failures[0][1].reason}")
+            return made[0], _depends(run_folder.read_manifest(out / "manifest.json"), name), _kept(out, name, seed)
+
+        return Row(label=f"{name},{seed}", figures=published, depends=_depends(manifest, name, seed),
+                   file=_kept(folder, name, seed), again=again)
+
+    return [row(published) for published in _read(folder / "summary.csv")]
+
+
+def _read(file: Path) -> list[dict]:
+    """The rows of a summary.csv, with the columns that the version had which wrote it. InputError."""
+    check_file(file)
+    try:
+        with file.open(newline="", encoding="utf-8") as stream:
+            return [{name: run_folder.COLUMNS.get(name, str)(value) for name, value in row.items()}
+                    for row in csv.DictReader(stream)]
+    except (OSError, ValueError, TypeError, csv.Error) as error:
+        raise InputError(f"{file}: is no table of runs ({error}); give a folder that holds one") from None
+
+
+def _in_sumo(folder: Path, manifest: Mapping, scenario: Scenario) -> list[Row]:
+    """Of cosim run, or a level of cosim evaluate."""
+    about = manifest["configuration"]
+
+    def row(published: Mapping) -> Row:
+        name, seed = published["controller"], published["seed"]
+        task = Task(
+            scenario=results.scenario_folder(folder, manifest), controller=name, seed=seed, steps=about["steps"],
+            demand_factor=about["demand_factor"],
+            faults=tuple(fault for fault in about.get("faults", ()) if fault not in scenario.faults))
+
+        def again(out: Path) -> tuple[Figures, Figures, Path | None]:
+            if failures := experiment.perform([(out, task)], fresh=True):
+                raise InputError(f"{experiment.label(task)}: {failures[0][1].reason}")
+            made = experiment.overview(out).to_dict("records")[0]
+            return made, _depends(run_folder.read_manifest(out / "manifest.json"), name), _kept(out, name, seed)
+
+        return Row(label=f"{name},{seed}", figures=published, depends=_depends(manifest, name, seed),
+                   file=_kept(folder, name, seed), again=again)
+
+    return [row(published) for published in experiment.overview(folder).to_dict("records")]
+
+
+def _of_robustness(folder: Path, manifest: Mapping, scenario: Scenario) -> list[Row]:
+    """Of nmfd robustness."""
+    plant, where = manifest["configuration"]["plant"], manifest["configuration"]["where"]
+
+    def row(published: Mapping) -> Row:
+        one = robustness.Run(published["sigma_veh_per_s"], published["scenario"], published["controller"])
+
+        def again(out: Path) -> tuple[Figures, Figures, Path | None]:
+            made = robustness.run_one(one, scenario=scenario, plant=plant, where=where, policies={})
+            common, settings = benchmark.configuration(scenario, [one.controller], plant, {})
+            now = {"configuration": {**common, "where": where}, "controllers": settings, "sessions": [provenance()]}
+            return made, _depends(now, one.controller), None
+
+        return Row(label=f"{one.sigma:g},{one.scenario},{one.controller}", figures=published, file=None,
+                   depends=_depends(manifest, one.controller), again=again)
+
+    return [row(published) for published in robustness.read(folder / "robustness.csv")]
+
+
+def _of_entry(one: Entry) -> list[Row]:
+    """Of cosim compete."""
+    loaded = task_set.read(one.task_set.named)
+    if loaded.hash != one.task_set.hash:
+        raise InputError(f"{one.controller}: is an entry in {one.task_set.name} {one.task_set.hash}, but that is "
+                         f"{loaded.hash} here; verify it with the version of that release")
+    tasks = {task.id: task for task in loaded.tasks.tasks}
+
+    def row(outcome: entry.Outcome, kept: entry.Run) -> Row:
+        alone = tasks[outcome.task].changed(seeds=(kept.seed,))
+        order = run.Order(
+            task_set=replace(loaded, worlds=None, tasks=loaded.tasks.changed(tasks=(alone,))),
+            controllers=(one.controller,), out=Path())
+
+        def again(out: Path) -> tuple[Figures, Figures, Path | None]:
+            made = run.compete(replace(order, out=out))[0]
+            found = made.tasks[0]
+            if found.failed:
+                raise InputError(f"{one.controller}, {outcome.task}: {found.failed[0].reason}")
+            return found.runs[0].metrics, _of_outcome(found, made.sessions[0]), None
+
+        session = {} if kept.session is None else one.sessions[kept.session]
+        return Row(label=f"{one.controller},{outcome.task},{kept.seed}", figures=kept.metrics, file=None,
+                   depends=_of_outcome(outcome, session), again=again)
+
+    return [row(outcome, kept) for outcome in one.tasks for kept in outcome.runs]
+
+
+def _of_outcome(outcome: entry.Outcome, session: Mapping) -> Figures:
+    about = {key: getattr(outcome, key) for key in ("scenario_hash", "network_hash", "strategy")}
+    return {**about, **outcome.depends_on, **_of_session(session)}
+
+
+def _depends(manifest: Mapping, name: str, seed: int | None = None) -> Figures:
+    """What a row depended on; seed: of the last session that asked for it."""
+    sessions = [one for one in manifest["sessions"] if seed is None or seed in one.get("seeds", ())]
+    return {**manifest["configuration"], **manifest["controllers"].get(name, {}),
+            **_of_session((sessions or manifest["sessions"])[-1])}
+
+
+def _of_session(session: Mapping) -> Figures:
+    return {**session.get("versions", {}), "commit": session.get("commit"), "uncommitted changes": session.get("dirty")}
+
+
+def _kept(folder: Path, name: str, seed: int) -> Path | None:
+    file = run_folder.run_path(folder, name, seed)
+    return file if file.is_file() else None
