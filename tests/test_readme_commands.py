@@ -20,8 +20,12 @@ NOT_RUN = {  # what takes long or needs more, and where it is tested
     "cosim watch": "test_watch.py", "cosim video": "test_video.py", "cosim tune": "test_tuning.py",
     "cosim frontier": "test_tuning.py", "nmfd bound": "test_bound.py", "nmfd robustness": "test_robustness.py",
     "nmfd scaling": "test_scaling.py", "nmfd ablation": "test_ablation.py", "nmfd adaptation": "test_adaptation.py",
-    "cosim get": "test_get.py", "cosim demo": "test_demo.py", "nmfd identify": "test_measured.py"}
+    "cosim compete": "test_compete.py", "cosim verify": "test_compete.py", "cosim get": "test_get.py", "cosim demo": "test_demo.py", "nmfd identify": "test_measured.py"}
 LONG = ("scenarios/grid7_peak", "networks/grid7", "scenarios/demo")  # whose loading runs and training take minutes
+DESCRIBED = {"scenarios/r100": """base = "../grid7_peak"
+[controllers."dpc-pc+rerouting-100"]
+model = "../../networks/grid7_rerouting"
+"""}  # of a user's own, as the text says that it is
 FIRST = ["README.md", "nmfd/README.md", "cosim/README.md"]  # with every controller that they name
 HERE = [str(file.relative_to(ROOT).as_posix()) for file in FILES if file not in NOTEBOOKS and any(
     words[0] in MAINS and "..." not in words and " ".join(words[:2]) not in NOT_RUN for words in read(file).commands)]
@@ -69,6 +73,9 @@ def test_the_commands_run(name, tmp_path, monkeypatch):
             pytest.importorskip("onnxscript", reason="no extra onnx")
         if command == "import":
             words = instead(words)
+        elif words and words[0] in DESCRIBED and not Path(words[0]).exists():
+            Path(words[0]).mkdir()
+            Path(words[0], "scenario.toml").write_text(DESCRIBED[words[0]], encoding="utf-8")
         good(call(program, command, *reduced(name, kind, words)))
         done.add(shape)
         ran += 1
