@@ -73,6 +73,7 @@ def interrupted(file: Path, *command, after: float, by: int = signal.SIGINT) -> 
     return os.waitstatus_to_exitcode(status), file.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_ctrl_c_at_random_moments(tmp_path):
     """Status 130 and a line, unless it was too late; the same command then goes on to the same bytes."""
     scenario, out, draw = tiny.write(tmp_path), tmp_path / "out", random.Random(4)
@@ -111,6 +112,7 @@ def test_sigterm_ends_like_ctrl_c(tmp_path, command):
 BOUNDARIES = [(1, False), (1, True), (2, False), (2, True), (3, False), (3, True), (5, True), (6, False), (8, True)]
 
 
+@pytest.mark.slow
 def test_benchmark_killed_beside_its_writes(tmp_path):
     scenario, out = tiny.write(tmp_path), tmp_path / "out"
     command = ("nmfd", "benchmark", scenario, "--controllers", "no-control,pi-gating", "--out")
@@ -123,6 +125,7 @@ def test_benchmark_killed_beside_its_writes(tmp_path):
     assert {path.name for path in out.iterdir()} == {path.name for path in (tmp_path / "whole").iterdir()}
 
 
+@pytest.mark.slow
 def test_benchmark_killed_at_random_moments(tmp_path):
     scenario, out, draw = tiny.write(tmp_path), tmp_path / "out", random.Random(1)
     command = ("nmfd", "benchmark", scenario, "--controllers", "no-control,pi-gating,mpc-pc", "--seeds", 3, "--out")

@@ -56,6 +56,7 @@ def city(tmp_path_factory):
     return folder / "scenarios" / "tiny"
 
 
+@pytest.mark.slow
 def test_runs_in_sumo_and_workers(city, tmp_path):
     """Two runs in this process, one after the other, and the same two side by side in processes of their own."""
     names = ("route-guidance+rerouting-50", "probing-pcrg")

@@ -76,6 +76,7 @@ def test_what_takes_too_much_is_a_row_with_its_reason(tmp_path):
     assert files.read_rows(tmp_path / "big" / "scaling.csv", scaling.COLUMNS)[0]["status"] == big[0]["status"]
 
 
+@pytest.mark.slow
 def test_fresh_processes_and_their_time_limit():
     results = dict(outcomes(whose, ["a", "b", "late", "c"], 2, fresh=True, seconds=5.0))
     assert results["late"] == Failure("not finished after 5 s")

@@ -138,6 +138,7 @@ def test_killed_it_goes_on(peak, tmp_path, ran, write, behind):
     assert not [path for path in out.rglob(".*")]
 
 
+@pytest.mark.slow
 def test_one_run_for_real(peak, tmp_path):
     done = sweep(peak, "--controllers", "actuated", "--steps", 2, "--workers", 1, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output + str(done.exception)

@@ -87,6 +87,7 @@ def test_the_best_options_are_found_and_written(city, tmp_path, runs):
     assert written == {"set_point": [best["set_point[0]"]], "kp": best["kp"]}
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_goes_on_as_if_it_had_not_been(city, tmp_path, runs):
     tasks, _ = runs
     whole = tuning.tune(order(city, tmp_path / "whole", candidates=13))

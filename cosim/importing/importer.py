@@ -13,6 +13,7 @@ from cosim.importing.assignment import Assigned, Effort, relative_gap
 from cosim.importing.baseline import Baseline, Tell
 from cosim.importing.case import SumoInput, seconds
 from cosim.importing.demand import Traffic, read_traffic
+from cosim.importing.given import read_given
 from cosim.importing.partition import Clustered, Drawn, alternatives, partition
 from cosim.importing.regions import positions
 from cosim.importing.streets import Streets, read_streets
@@ -78,6 +79,8 @@ def import_city(order: ImportOptions, tell: Tell = lambda stage, share=0.0: None
 def _import(case: SumoInput, order: ImportOptions, tell: Tell) -> str:
     case = replace(case, routes=(*case.routes, *order.routes))
     streets = read_streets(case.net, case.additional)
+    if isinstance(order.cut, Drawn):  # mistakes in it are told now, not after the simulations
+        read_given(streets, order.cut.file, order.cut.method)
     order = replace(order, mesoscopic=order.mesoscopic or case.mesoscopic)
     scale = 1.0 if order.peak else case.scale
     traffic = _traffic(case, streets, order)
