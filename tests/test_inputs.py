@@ -81,7 +81,7 @@ def check_file_error(scenario, command, fragments):
 @pytest.mark.parametrize("arguments, fragment", [pytest.param(*case, id=" ".join(case[0])[:80]) for case in (
     (["benchmark", "{tmp}/none", "--controllers", "no-control"], "none/scenario.toml: no such file"),
     (["show", "{tmp}/none"], "none/scenario.toml: no such file"),
-    ([*BENCHMARK, "none"], "controller 'none' is unknown; choose from no-control, route-guidance, pi-gating, mpc-pc"),
+    ([*BENCHMARK, "none"], "controller 'none' is unknown; choose from no-control, route-guidance, pi-gating, greedy"),
     ([*BENCHMARK, ""], "--controllers: expected at least one controller, got none"),
     ([*BENCHMARK, "no-control,no-control"], "no-control is there twice"),
     ([*BENCHMARK, "no-control", "--seeds", "0"], "'--seeds': expected a whole number from 1 to 1000000, got '0'"),
