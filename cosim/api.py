@@ -14,7 +14,7 @@ from cosim.sumo.outputs import check
 from nmfd.api import load_scenario, named
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
-from nmfd.model.scenario import Scenario
+from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs.progress import Progress, watched
 from nmfd.types import Controller
 
@@ -52,10 +52,7 @@ def run(
         raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
     if not 0.0 < demand_factor <= 10.0:
         raise InputError(f"demand_factor: expected a number above 0 up to 10, got {demand_factor:g} instead")
-    steps = scenario.steps if steps is None else min(steps, scenario.steps)
-    scenario = replace(
-        scenario, steps=steps, demand=demand_factor * scenario.demand[:steps],
-        demand_factor=demand_factor * scenario.demand_factor)
+    scenario = with_demand(scenario, steps=steps, factor=demand_factor)
     if isinstance(controller, str):
         strategy = parse(f"{controller}+{city}" if city else controller)
         _, acting = named(configured(strategy.name, scenario.controller_options), scenario, policy)

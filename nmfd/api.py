@@ -1,14 +1,13 @@
 """What the command line `nmfd` does, as functions of a few arguments; exported by the package `nmfd`."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from nmfd import closed_loop
 from nmfd.controllers import names, registry
 from nmfd.controllers.dpc import training
 from nmfd.errors import InputError, did_you_mean
-from nmfd.model.scenario import Scenario, read_scenario
+from nmfd.model.scenario import Scenario, read_scenario, with_demand
 from nmfd.runs import config, run_folder
 from nmfd.runs.progress import Progress, watched
 from nmfd.studies import measured
@@ -72,8 +71,7 @@ def run(
     if steps is not None:
         if steps < 1:
             raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
-        steps = min(steps, scenario.steps)
-        scenario = replace(scenario, steps=steps, demand=scenario.demand[:steps])
+        scenario = with_demand(scenario, steps=steps)
     if isinstance(plant, str):
         _check_plant(plant, ", or give an object")
     name, acting = named(controller, scenario, policy)

@@ -125,7 +125,7 @@ def test_the_samples_are_those_of_every_edge(scenario, plant_of):
     sampler = StreetSampler(plant.session, plant.city)
 
     def compared():
-        counts, speeds = sampler.present()
+        counts, speeds, _ = sampler.present()
         asked.append(len(sampler.travelled()))
         session, edges = plant.session, plant.city.edges
         assert counts.tolist() == [session.vehicle_count(edge) for edge in edges]

@@ -10,7 +10,7 @@ from nmfd.errors import InputError
 from nmfd.runs import config
 from nmfd.runs.config import Rows, Settings, Text, setting, whole
 from nmfd.runs.files import check_file, write_text
-from nmfd.runs.run_folder import run_name
+from nmfd.runs.run_folder import controller_name
 
 MOST = 10**7  # bytes of a file: a hundred times what one has
 
@@ -91,7 +91,7 @@ def about_metrics() -> dict[str, dict[str, str]]:
 
 def path(folder: Path, controller: str) -> Path:
     """Where the entry of a controller lies."""
-    return folder / f"{run_name(controller, 0).removesuffix('-0')}.json"
+    return folder / f"{controller_name(controller)}.json"
 
 
 def write(file: Path, entry: Entry) -> None:

@@ -11,10 +11,6 @@ from nmfd import __version__
 from nmfd.metrics import COUNTED
 from nmfd.runs.files import write_text
 
-SHOWN = (  # of METRICS, in the table of a task
-    "mean_trip_time_s", "mean_delay_s", "mean_departure_delay_s", "completed_veh", "trips_veh", "queue_veh",
-    "backlog_veh", "co2_kg", "locked", "delay_gini", "removed_veh", "teleports", *COUNTED, "decision_ms_median",
-    "decision_ms_max")
 DIGITS = {TTS: ".4g", "delay_gini": ".2f", "locked": ".0%", "decision_ms_median": ".2g", "decision_ms_max": ".2g"}
 HEADINGS = {
     "controller": "the entry", "rank": "1 is the best; none where a run is missing or failed",
@@ -66,7 +62,7 @@ def _task(task: str, rows: Sequence[Row]) -> dict | None:
     """None where nobody has run it."""
     if not any(row.runs or row.failed for row in rows):
         return None
-    shown = [TTS, *(name for name in SHOWN if any(row.metrics[name] is not None for row in rows))]
+    shown = [name for name in METRICS if name == TTS or any(row.metrics[name] is not None for row in rows)]
     told = {metric.heading: metric.text for metric in METRICS.values()} | HEADINGS
     columns = ["controller", "rank", "worth", "runs", "failed", *(METRICS[name].heading for name in shown)]
     lines = [

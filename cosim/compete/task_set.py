@@ -19,7 +19,7 @@ from cosim.plant.settings import FILES, FIXED, Signals, settings
 from cosim.sumo.build import sources
 from nmfd.api import load_scenario
 from nmfd.errors import InputError, did_you_mean
-from nmfd.model.scenario import Scenario, with_time_limit
+from nmfd.model.scenario import Scenario, with_demand, with_time_limit
 from nmfd.runs import config, shipped
 from nmfd.runs.config import DISTINCT, Name, Problem, Rows, Settings, Text, setting, whole
 from nmfd.runs.files import file_name
@@ -100,9 +100,7 @@ class Loaded:
     def scenario(self, task: TaskTable) -> Scenario:
         """What controllers are made for. InputError."""
         loaded = with_time_limit(load_scenario(self.folder(task)), task.time_limit)
-        steps = loaded.steps if task.steps is None else min(task.steps, loaded.steps)
-        return replace(loaded, steps=steps, demand=task.demand * loaded.demand[:steps],
-                       demand_factor=task.demand * loaded.demand_factor)
+        return with_demand(loaded, steps=task.steps, factor=task.demand)
 
     def folder(self, task: TaskTable) -> Path:
         """That of its scenario: beside the file of the set, or of the package; never where somebody happens to be.

@@ -15,6 +15,7 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 
 from cosim.compete import entry, run, task_set
@@ -23,7 +24,7 @@ from cosim.evaluation import evaluate, experiment, results
 from cosim.evaluation.simulate import Task
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
-from nmfd.model.scenario import Scenario
+from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs import run_folder
 from nmfd.runs.files import check_file
 from nmfd.runs.provenance import provenance
@@ -71,11 +72,12 @@ def rows(folder: Path) -> list[Row]:
         return [replace(row, label=f"{level:g},{row.label}") for level, at in levels.items() for row in rows(at)]
     if (folder / "manifest.json").is_file():
         manifest = run_folder.read_manifest(folder / "manifest.json")
-        scenario = load_scenario(results.scenario_folder(folder, manifest))
+        at = results.scenario_folder(folder, manifest)
+        scenario = load_scenario(at)
         if (folder / "robustness.csv").is_file():
             return _of_robustness(folder, manifest, scenario)
         if (folder / "summary.csv").is_file():
-            return _in_sumo(folder, manifest, scenario) if manifest["configuration"].get("plant") == "sumo" else (
+            return _in_sumo(folder, manifest, scenario, at) if manifest["configuration"].get("plant") == "sumo" else (
                 _regional(folder, manifest, scenario))
     if files := sorted(file for file in folder.glob("*.json") if file.name != "manifest.json"):
         return [row for file in files for row in _of_entry(entry.read(file))]
@@ -114,26 +116,32 @@ def _same(a: object, b: object, within: float) -> bool:
     return a == b
 
 
+def _of_run(folder: Path, manifest: Mapping, published: Mapping, make: Callable[[Path], Figures]) -> Row:
+    """Of a run folder. make: makes the run in another one, and gives its row there."""
+    name, seed = published["controller"], published["seed"]
+
+    def again(out: Path) -> tuple[Figures, Figures, Path | None]:
+        made = make(out)
+        return made, _depends(run_folder.read_manifest(out / "manifest.json"), name), _kept(out, name, seed)
+
+    return Row(label=f"{name},{seed}", figures=published, depends=_depends(manifest, name, seed),
+               file=_kept(folder, name, seed), again=again)
+
+
 def _regional(folder: Path, manifest: Mapping, scenario: Scenario) -> list[Row]:
     """Of nmfd benchmark."""
     plant, noise = manifest["configuration"]["plant"], manifest["configuration"].get("demand_noise")
-    steps = manifest["configuration"]["steps"]
-    scenario = replace(scenario, steps=steps, demand=scenario.demand[:steps])
+    scenario = with_demand(scenario, steps=manifest["configuration"]["steps"])
 
-    def row(published: Mapping) -> Row:
-        name, seed = published["controller"], published["seed"]
+    def make(name: str, seed: int, out: Path) -> Figures:
+        made, failures = benchmark.perform(
+            scenario, [name], [seed], plant, out=out, noise=benchmark.Noise(**noise) if noise else None)
+        if failures:
+            raise InputError(f"{name}, seed {seed}: {failures[0][1].reason}")
+        return made[0]
 
-        def again(out: Path) -> tuple[Figures, Figures, Path | None]:
-            made, failures = benchmark.perform(
-                scenario, [name], [seed], plant, out=out, noise=benchmark.Noise(**noise) if noise else None)
-            if failures:
-                raise InputError(f"{name}, seed {seed}: {failures[0][1].reason}")
-            return made[0], _depends(run_folder.read_manifest(out / "manifest.json"), name), _kept(out, name, seed)
-
-        return Row(label=f"{name},{seed}", figures=published, depends=_depends(manifest, name, seed),
-                   file=_kept(folder, name, seed), again=again)
-
-    return [row(published) for published in _read(folder / "summary.csv")]
+    return [_of_run(folder, manifest, published, partial(make, published["controller"], published["seed"]))
+            for published in _read(folder / "summary.csv")]
 
 
 def _read(file: Path) -> list[dict]:
@@ -147,27 +155,20 @@ def _read(file: Path) -> list[dict]:
         raise InputError(f"{file}: is no table of runs ({error}); give a folder that holds one") from None
 
 
-def _in_sumo(folder: Path, manifest: Mapping, scenario: Scenario) -> list[Row]:
-    """Of cosim run, or a level of cosim evaluate."""
+def _in_sumo(folder: Path, manifest: Mapping, scenario: Scenario, at: Path) -> list[Row]:
+    """Of cosim run, or a level of cosim evaluate. at: the folder of the scenario"""
     about = manifest["configuration"]
+    faults = tuple(fault for fault in about.get("faults", ()) if fault not in scenario.faults)
 
-    def row(published: Mapping) -> Row:
-        name, seed = published["controller"], published["seed"]
-        task = Task(
-            scenario=results.scenario_folder(folder, manifest), controller=name, seed=seed, steps=about["steps"],
-            demand_factor=about["demand_factor"],
-            faults=tuple(fault for fault in about.get("faults", ()) if fault not in scenario.faults))
+    def make(task: Task, out: Path) -> Figures:
+        if failures := experiment.perform([(out, task)], fresh=True):
+            raise InputError(f"{experiment.label(task)}: {failures[0][1].reason}")
+        return experiment.overview(out).to_dict("records")[0]
 
-        def again(out: Path) -> tuple[Figures, Figures, Path | None]:
-            if failures := experiment.perform([(out, task)], fresh=True):
-                raise InputError(f"{experiment.label(task)}: {failures[0][1].reason}")
-            made = experiment.overview(out).to_dict("records")[0]
-            return made, _depends(run_folder.read_manifest(out / "manifest.json"), name), _kept(out, name, seed)
-
-        return Row(label=f"{name},{seed}", figures=published, depends=_depends(manifest, name, seed),
-                   file=_kept(folder, name, seed), again=again)
-
-    return [row(published) for published in experiment.overview(folder).to_dict("records")]
+    return [_of_run(folder, manifest, published, partial(make, Task(
+                scenario=at, controller=published["controller"], seed=published["seed"], steps=about["steps"],
+                demand_factor=about["demand_factor"], faults=faults)))
+            for published in experiment.overview(folder).to_dict("records")]
 
 
 def _of_robustness(folder: Path, manifest: Mapping, scenario: Scenario) -> list[Row]:

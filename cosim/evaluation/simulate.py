@@ -24,7 +24,7 @@ from nmfd.api import load_scenario
 from nmfd.controllers import registry
 from nmfd.html import html_table
 from nmfd.model.planning import PlanningModel
-from nmfd.model.scenario import Scenario, with_faults
+from nmfd.model.scenario import Scenario, with_demand, with_faults, with_time_limit
 from nmfd.quantities import variables
 from nmfd.runs import run_folder
 from nmfd.runs.files import atomic
@@ -116,13 +116,9 @@ class Result:
 
 def scenario_of(task: Task) -> Scenario:
     """The scenario with the horizon and demand of `task`. Raises InputError."""
-    scenario = load_scenario(task.scenario)
-    steps = scenario.steps if task.steps is None else min(task.steps, scenario.steps)
-    scenario = with_faults(scenario, task.faults)
-    scenario = replace(
-        scenario, steps=steps, demand=task.demand_factor * scenario.demand[:steps],
-        demand_factor=task.demand_factor * scenario.demand_factor,
-        own_time_limit=scenario.own_time_limit if task.time_limit is None else task.time_limit)
+    scenario = with_faults(load_scenario(task.scenario), task.faults)
+    scenario = with_time_limit(
+        with_demand(scenario, steps=task.steps, factor=task.demand_factor), task.time_limit)
     if not task.options:
         return scenario
     tables = scenario.controller_options

@@ -7,7 +7,6 @@ One simulation per process: close an environment before the next is reset, and u
 (gymnasium.vector.AsyncVectorEnv, Stable-Baselines3's SubprocVecEnv).
 """
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,7 @@ from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.model.scenario import Scenario
+from nmfd.model.scenario import Scenario, with_demand
 from nmfd.rl import register
 
 if TYPE_CHECKING:
@@ -51,7 +50,7 @@ def pettingzoo_env(
 def _city(scenario: Scenario | Path | str, steps: int | None, city: str) -> tuple[Scenario, SumoPlant]:
     loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     if steps is not None:
-        loaded = replace(loaded, steps=min(steps, loaded.steps), demand=loaded.demand[:steps])
+        loaded = with_demand(loaded, steps=steps)
     overrides = {**(parse(city).overrides if city else {}), "gateways_fixed": True}
     return loaded, SumoPlant(loaded, overrides=settings(loaded).changed(**overrides))
 

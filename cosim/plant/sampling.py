@@ -17,7 +17,7 @@ EVERY = 10.0  # s, between two samples
 class StreetMeans:
     """Means over the samples of one control interval.
 
-    vehicles: (E,) [veh], by the city's edges; speed: (E,) [m/s], that routing goes by (`Session.routing_speed`), NaN
+    vehicles: (E,) [veh], by the city's edges; speed: (E,) [m/s], that routing goes by (`Session.speeds`), NaN
     where there were no vehicles, 0 on closed streets
     accumulation: (R,) [veh]; production: (R,) [veh m/s]
     queue, queue_max: (G,) [veh] halting on the edge before a gateway, mean and largest
@@ -60,11 +60,10 @@ class StreetSampler:
 
     def sample(self) -> None:
         """Take one sample."""
-        self._last = counts, speeds = self.present()
-        routing_speed, edges = self._session.routing_speed, self._city.edges
-        there = np.flatnonzero(counts)
-        self._routed[there] += counts[there] * [routing_speed(edges[n]) for n in there]
+        counts, speeds, routing = self.present()
+        self._last = counts, speeds
         self._vehicles, self._metres = self._vehicles + counts, self._metres + counts * speeds
+        self._routed += counts * routing
         self._queues.append([self._session.halting(edge) for edge in self._upstream])
 
     def finish(self, closed: EdgeMask) -> StreetMeans:
@@ -82,15 +81,15 @@ class StreetSampler:
             vehicles=vehicles / samples, speed=speed, accumulation=accumulation, production=production, queue=mean,
             queue_max=largest)
 
-    def present(self) -> tuple[PerEdge, PerEdge]:
-        """Vehicles (E,) [veh] and mean speed (E,) [m/s] by edge, now."""
-        count, mean_speed, edges = self._session.vehicle_count, self._session.mean_speed, self._city.edges
-        counts, speeds = np.zeros((2, len(edges)))
+    def present(self) -> tuple[PerEdge, PerEdge, PerEdge]:
+        """Vehicles (E,) [veh], their mean speed (E,) [m/s], and that which routing goes by, by edge, now."""
+        count, speeds_of, edges = self._session.vehicle_count, self._session.speeds, self._city.edges
+        counts, speeds, routing = np.zeros((3, len(edges)))
         travelled = self.travelled()
         counts[travelled] = [count(edges[n]) for n in travelled]
         for n in np.flatnonzero(counts):
-            speeds[n] = mean_speed(edges[n])
-        return counts, speeds
+            speeds[n], routing[n] = speeds_of(edges[n])
+        return counts, speeds, routing
 
     def travelled(self) -> list[int]:
         """Numbers of edges, among them all that have vehicles: a large city has more edges than vehicles under way."""

@@ -110,9 +110,6 @@ class Session:
         # Edges: the vehicles on one, their number, and of these under 0.1 m/s.
         self.vehicles_on, self.vehicle_count = sumo.edge.getLastStepVehicleIDs, sumo.edge.getLastStepVehicleNumber
         self.halting = sumo.edge.getLastStepHaltingNumber
-        # The mean speed [m/s] that SUMO's own routing goes by: an empty lane counts as one vehicle at the limit, so
-        # that a queue before one turn does not keep away who has another lane to himself. The limit where nobody is.
-        self.routing_speed = sumo.edge.getLastStepMeanSpeed
         self._lanes_of: dict[str, tuple[str, ...]] = {}  # of edges that were asked for
         # Lanes: the same, for max-pressure control, which asks for a thousand of them every few seconds.
         self.lane_vehicles = sumo.lane.getLastStepVehicleNumber
@@ -120,8 +117,12 @@ class Session:
         # Loop detectors: the share of the last step in which a vehicle was on one [%].
         self.loop_occupancy = sumo.inductionloop.getLastStepOccupancy
 
-    def mean_speed(self, edge: str) -> float:
-        """Mean speed [m/s] of the vehicles on an edge, its limit where there are none: not the `routing_speed`."""
+    def speeds(self, edge: str) -> tuple[float, float]:
+        """Two mean speeds [m/s] of an edge, both the limit where nobody is: that of its vehicles, and that which SUMO's
+        own routing goes by. There an empty lane counts as one vehicle at the limit, so that a queue before one turn
+        does not keep away who has another lane to himself.
+        """
+        routing = self._sumo.edge.getLastStepMeanSpeed(edge)
         lanes = self._lanes_of.get(edge)
         if lanes is None:
             lanes = tuple(f"{edge}_{n}" for n in range(self._sumo.edge.getLaneNumber(edge)))
@@ -130,8 +131,8 @@ class Session:
             counts = [self._sumo.lane.getLastStepVehicleNumber(lane) for lane in lanes]
             if total := sum(counts):  # the mesoscopic model knows no lanes, and counts none
                 speed = self._sumo.lane.getLastStepMeanSpeed
-                return sum(n * speed(lane) for n, lane in zip(counts, lanes, strict=True) if n) / total
-        return self._sumo.edge.getLastStepMeanSpeed(edge)
+                return sum(n * speed(lane) for n, lane in zip(counts, lanes, strict=True) if n) / total, routing
+        return routing, routing
 
     def close(self) -> None:
         """End the simulation, which completes SUMO's own outputs; a second time it does nothing."""

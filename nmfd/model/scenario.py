@@ -112,6 +112,13 @@ def with_time_limit(scenario: Scenario, seconds: float | None) -> Scenario:
     return scenario if seconds is None else replace(scenario, own_time_limit=seconds)
 
 
+def with_demand(scenario: Scenario, *, steps: int | None = None, factor: float = 1.0) -> Scenario:
+    """The first `steps` control intervals of `scenario`, at most all of them, with `factor` times its demand."""
+    steps = scenario.steps if steps is None else min(steps, scenario.steps)
+    return replace(scenario, steps=steps, demand=factor * scenario.demand[:steps],
+                   demand_factor=factor * scenario.demand_factor)
+
+
 def trapezoid(
     time: Intervals, *, start: float, peak: float, ramp_up: float, flat: float, ramp_down: float,
 ) -> Intervals:

@@ -143,9 +143,14 @@ def read_summary(path: Path) -> list[dict]:
     return files.read_rows(path, COLUMNS)
 
 
+def controller_name(controller: str) -> str:
+    """What files of a controller are called; of one in a file, path/to/file.py:Class, without the / and :."""
+    return quote(controller, safe="+,-._ ")
+
+
 def run_name(controller: str, seed: int) -> str:
-    """What the files of a run are called; of a controller in a file, path/to/file.py:Class, without the / and :."""
-    return f"{quote(controller, safe='+,-._ ')}-{seed}"
+    """What the files of a run are called."""
+    return f"{controller_name(controller)}-{seed}"
 
 
 def run_path(folder: Path, controller: str, seed: int) -> Path:

@@ -11,16 +11,14 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from nmfd import closed_loop
 from nmfd.controllers import registry
 from nmfd.metrics import percent_change, summary
-from nmfd.model.demand_noise import perturbed
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_columns
 from nmfd.runs.workers import Failure, ended
-from nmfd.studies import plots, plots_studies
-from nmfd.studies.benchmark import PLANTS, REFERENCE, configuration, interval, results
+from nmfd.studies import benchmark, plots, plots_studies
+from nmfd.studies.benchmark import REFERENCE, configuration, interval, results
 
 COLUMNS = {
     "sigma_veh_per_s": float, "scenario": int, "controller": str, "trips_veh": float,
@@ -43,9 +41,11 @@ def run_one(
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
     """The row of `run` in robustness.csv, on one thread."""
-    actual = perturbed(scenario, run.sigma, run.scenario, where=where)
-    controller = registry.make(run.controller, scenario, policy=policies.get(run.controller))
-    row = summary(closed_loop.run(PLANTS[plant](actual), controller, actual, seed=run.scenario, progress=progress))
+    noise = benchmark.Noise(run.sigma, where)
+    row = summary(benchmark.run_one(
+        (run.controller, run.scenario), scenario=scenario, plant=plant, policies=policies, noise=noise,
+        progress=progress))
+    actual = benchmark.happening(scenario, noise, run.scenario)
     return {
         "sigma_veh_per_s": run.sigma, "scenario": run.scenario, "controller": run.controller,
         "trips_veh": float(actual.step * actual.demand.sum()),
