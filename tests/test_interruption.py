@@ -109,6 +109,21 @@ def test_sigterm_ends_like_ctrl_c(tmp_path, command):
         everything_readable(out)
 
 
+def test_an_interrupt_that_a_compiled_library_made_an_error_of_its_own_of(monkeypatch, capsys):
+    """matplotlib's drawing of a path says `Invalid bounding box` where Ctrl-C comes while it reads an array."""
+    def draw(**_):
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(number)
+        raise ValueError("Invalid bounding box")
+
+    monkeypatch.setattr(MAINS["nmfd"].commands["list"], "callback", draw)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        with pytest.raises(SystemExit) as end:
+            MAINS["nmfd"](["list"])
+        assert end.value.code == 128 + number and capsys.readouterr().err == "nmfd: interrupted\n"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 BOUNDARIES = [(1, False), (1, True), (2, False), (2, True), (3, False), (3, True), (5, True), (6, False), (8, True)]
 
 

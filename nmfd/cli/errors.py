@@ -37,14 +37,16 @@ class Commands(click.Group):
             try:
                 _check_texts(arguments)
                 result = super().main(arguments, self.name, **extra)
-                if told:  # a command that makes do with what it has found
+                if signal.SIGTERM in told:  # a command that makes do with what it has found
                     raise Interrupted("interrupted")
-            except Exception as error:
+            except (Exception, KeyboardInterrupt) as error:
                 text, status = _verdict(error)
+                if told and not isinstance(error, Interrupted):  # compiled libraries make an error of their own of it
+                    text, status = "interrupted", 130
                 if text is None:
                     raise
                 click.echo(f"{self.name}: {_printable(text)}", err=True)
-                sys.exit(128 + signal.SIGTERM if told and status == 130 else status)
+                sys.exit(128 + told[-1] if told and status == 130 else status)
         # Outside its standalone mode click returns what the command returned, or an exit status.
         sys.exit(result if isinstance(result, int) else 0)
 
@@ -58,22 +60,29 @@ class Commands(click.Group):
 
 @contextmanager
 def _told_to_end() -> Iterator[list[int]]:
-    """SIGTERM is a KeyboardInterrupt in here; the list then holds it. A second one makes no difference."""
+    """SIGTERM is a KeyboardInterrupt in here, as Ctrl-C is; the list then holds which it was.
+
+    A second SIGTERM makes no difference. Where Ctrl-C is ignored or somebody else's, as in a notebook, it stays so.
+    """
     told: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield told
         return
 
     def end(number: int, _: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        if number == signal.SIGTERM:
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
         told.append(number)
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, end)
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, end)}
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, end)
     try:
         yield told
     finally:
-        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)
 
 
 def _check_texts(arguments: Sequence[str]) -> None:
@@ -92,12 +101,12 @@ def _printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
 
 
-def _verdict(error: Exception) -> tuple[str | None, int]:
+def _verdict(error: BaseException) -> tuple[str | None, int]:
     """The line for `error` and the exit status; None for a bug."""
     match error:
         case Interrupted():
             return str(error), 130
-        case click.Abort():
+        case click.Abort() | KeyboardInterrupt():
             return "interrupted", 130
         case RunFailed():
             return f"error: {error}", 1
