@@ -4,6 +4,10 @@ Drivers who are told travel times do not keep to the split ratios that they had 
 followed up, and theta shifts it as it shifts the drivers' own split ratios in the regional model (`shifted`). A
 controller that asks for these gets guidance by travel times alone; one that asks for everybody gets everybody.
 
+Prices are the other way to the same end: travel times through a region are told longer than they are, for everybody
+alike and in all of the ways that are compared, and no share is commanded. Who has a good way round takes it, whoever
+has none goes through. Measured on grid7: what shares gain in the regional model is lost on those who are sent.
+
 Who is sent where is not drawn by lot: a driver at the western edge of a region would be sent round its eastern end as
 often as the others, and trips get so much longer that guidance with the drivers' own split ratios jams a city that
 flows without it (measured on grid7). Instead everybody takes the next region that costs least, with a bonus for the
@@ -34,7 +38,7 @@ from cosim.plant.shortest_paths import Home, Moves, Ways
 from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
-from nmfd.arrays import PerTurn
+from nmfd.arrays import PerRegion, PerTurn
 
 SMOOTHING = 0.5            # weight of the newest travel times
 DRIVER_CLASSES = 4         # groups of drivers who see different travel times: were all sent one way, it would jam
@@ -110,7 +114,7 @@ class Guide:
         self._taste = np.exp(SPREAD * random.standard_normal((DRIVER_CLASSES, len(city.edges))))
         self._length = np.array([city.length[edge] for edge in city.edges])
         self._free = self._length / np.array([city.speed[edge] for edge in city.edges])
-        self._time = self._free.copy()
+        self._measured = self._time = self._free.copy()
         self._reached: dict[int, np.ndarray] = {}
         self._ahead: dict[tuple[int, int], np.ndarray] = {}
         self._ways: dict[tuple[int, int], Ways] = {}
@@ -120,11 +124,12 @@ class Guide:
         self.realised = np.zeros((city.regions,) * 3, dtype=int)
         self.refused = 0
 
-    def command(self, splits: PerTurn | None, speed: PerEdge | None) -> None:
+    def command(self, splits: PerTurn | None, speed: PerEdge | None, prices: PerRegion | None = None) -> None:
         """Take over theta (R, R, R) [-] for the next control interval; None: no guidance.
 
         speed: (E,) [m/s] of the city's edges, the mean over the last interval and NaN on empty ones; None: as before.
         A mean, because the speed at one instant is that of a red or a green signal, every time the same one.
+        prices: (R,) [-], by how much longer than they take drivers are told that the ways through each region take
         """
         self._guides = splits is not None
         if splits is not None:
@@ -132,7 +137,8 @@ class Guide:
             self._interval += 1
             if speed is not None:
                 now = np.where(np.isnan(speed), self._free, self._length / np.maximum(speed, SLOWEST))
-                self._time += SMOOTHING * (np.maximum(now, self._free) - self._time)
+                self._measured += SMOOTHING * (np.maximum(now, self._free) - self._measured)
+            self._time = self._measured if prices is None else self._measured * (1.0 + prices)[self._region]
             self._ways, self._homes = {}, {}
             self._assigned *= MEMORY
             self._wished *= MEMORY

@@ -100,7 +100,7 @@ class SumoPlant:
         network = self._scenario.network
         self._actuation.command(
             self._incidents.gated(controls.perimeter, network.u_min, network.u_max), vehicles)
-        self._guide.command(self._splits(controls), speed)
+        self._guide.command(self._splits(controls), speed, controls.prices)
         self._sensing.begin()
         for _ in range(round(self._scenario.step / session.step_length)):
             self._actuation.play()
@@ -210,9 +210,10 @@ class SumoPlant:
         return self._state
 
     def _splits(self, controls: Controls) -> PerTurn | None:
-        """What drivers are guided by: the drivers' own split ratios mean guidance by travel times alone."""
-        return self._scenario.network.nominal_splits if controls.splits is None and self._settings.guided else (
-            controls.splits)
+        """What drivers are guided by: their own split ratios mean guidance by travel times alone; where there are
+        prices, these bring the split ratios about."""
+        guided = controls.splits is None and self._settings.guided
+        return self._scenario.network.nominal_splits if guided or controls.prices is not None else controls.splits
 
     def _new_sensing(self, seed: int) -> Sensing:
         chosen = self._settings
