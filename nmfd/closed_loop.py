@@ -101,8 +101,10 @@ def _deadline(controller: Controller, step: float) -> float:
 
 def _copied(controls: Controls) -> Controls:
     """With arrays of its own: a controller may go on writing into those that it returned."""
-    splits, prices = (None if asked is None else np.array(asked) for asked in (controls.splits, controls.prices))
-    return replace(controls, perimeter=np.array(controls.perimeter), splits=splits, prices=prices)
+    splits, prices, metering = (
+        None if asked is None else np.array(asked) for asked in (controls.splits, controls.prices, controls.metering))
+    return replace(
+        controls, perimeter=np.array(controls.perimeter), splits=splits, prices=prices, metering=metering)
 
 
 def _booked(controls: Controls, status: Status, note: str) -> Controls:

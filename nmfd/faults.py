@@ -211,7 +211,7 @@ class Supervised:
             kinds = [fault.kind for fault in self._faults if fault.active(observation.step)]
             self._controller.fault = kinds[0] if kinds else None
         controls = self._controller.act(observation)
-        asked = (controls.perimeter, controls.splits, controls.prices)
+        asked = (controls.perimeter, controls.splits, controls.prices, controls.metering)
         if not all(np.isfinite(numbers).all() for numbers in asked if numbers is not None):
             controls = Controls(
                 perimeter=self._opened, splits=None, status=Status.SOLVER_FAILURE | Status.FALLBACK,

@@ -106,9 +106,11 @@ class Controls:
         ignored where h is not adjacent to i
     splits: (R, R, R) [-], [i, h, j] = theta_ihj, share of the vehicles in i bound for j that head for h;
         None without route guidance: drivers keep the routes they have (in the regional model the nominal splits)
-    prices: (R,) [-], by how much longer than it is guided drivers are told that a way through region i takes: 1 for
-        twice as long. In a city they are how `splits` come about: drivers are guided by these travel times, and their
-        shares are not commanded besides. The regional model takes `splits`. None: nobody is told so
+    prices: (R,) [-], by how much longer than it is guided drivers who are bound for elsewhere are told that a way
+        through region i takes: 1 for twice as long. In a city they are how `splits` come about: drivers are guided by
+        these travel times, and shares are not commanded besides. The regional model takes `splits`. None: no prices
+    metering: (R,) [veh/s], the most trips that may begin in region i; who is due beyond that waits outside, in the
+        backlog. Only cities with `+metering` can do that. None: nobody is made to wait
     status: OK, or what these controls are instead; note: the same in words, "" if OK
     """
 
@@ -117,6 +119,7 @@ class Controls:
     status: Status = Status.OK
     note: str = ""
     prices: PerRegion | None = None
+    metering: PerRegion | None = None
 
 
 @runtime_checkable

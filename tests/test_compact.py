@@ -1,4 +1,4 @@
-"""Policies of seven numbers: what they command, and that they are trained, kept and watched as the others."""
+"""Policies of eight numbers: what they command, and that they are trained, kept and watched as the others."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from commands import good, nmfd
 
 from nmfd import closed_loop
 from nmfd.api import load_scenario
-from nmfd.controllers.dpc.compact import CompactPolicy, Numbers
+from nmfd.controllers.dpc.compact import HELD, CompactPolicy, Numbers
 from nmfd.controllers.dpc.fallback import Guarded, statistics
 from nmfd.controllers.dpc.policy import Architecture, DpcController
 from nmfd.controllers.dpc.policy_file import load_policy
@@ -19,12 +19,12 @@ from nmfd.model.plant import NmfdPlant
 from nmfd.types import Observation
 
 NUMBERS = Numbers(
-    set_point=1.1, gain=2.0, relief=0.5, price=3.0, price_from=0.7, elsewhere=0.4, elsewhere_from=1.2)
+    set_point=1.1, gain=2.0, relief=0.5, price=3.0, price_from=0.7, elsewhere=0.4, elsewhere_from=1.2, metering=1.3)
 CENTRE = 3
 TABLE = """
 [controllers.dpc-pcrg]
 compact = true
-numbers = [1.0, 2.0, 0.0, {price}, 0.6, 0.0, 0.6]
+numbers = [1.0, 2.0, 0.0, {price}, 0.6, 0.0, 0.6, 1.5]
 steps = {steps}
 batch = 2
 learning_rate = 0.05
@@ -36,8 +36,8 @@ def network():
     return load_scenario("economic_mpc").network
 
 
-def policy(network, numbers=NUMBERS, guidance=True):
-    made = CompactPolicy(network, Architecture(guidance=guidance, compact=(CENTRE,)))
+def policy(network, numbers=NUMBERS, guidance=True, metering=False):
+    made = CompactPolicy(network, Architecture(guidance=guidance, compact=(CENTRE,), metering=metering))
     with torch.no_grad():
         made.numbers.copy_(torch.tensor(numbers))
     return made
@@ -63,6 +63,11 @@ def test_gates_and_prices_are_those_of_the_formula(network):
     expected = np.where(
         np.arange(network.regions) == CENTRE, 3.0 * np.maximum(full - 0.7, 0.0), 0.4 * np.maximum(full - 1.2, 0.0))
     np.testing.assert_allclose(controls.prices, expected, atol=1e-5)
+    assert controls.metering is None
+    controls = DpcController(policy(network, metering=True)).act(
+        Observation(step=0, time=0.0, accumulation=x, backlog=0.0 * x))
+    expected = np.maximum(1.3 - full, 0.0) * [mfd.critical for mfd in network.mfds] / HELD
+    np.testing.assert_allclose(controls.metering, expected, rtol=1e-5, atol=1e-5)
     assert (controls.prices > 0.0).any() and (controls.prices == 0.0).any()
 
 
@@ -83,9 +88,10 @@ def test_the_regional_model_sends_fewer_through_a_dear_region_and_nobody_where_t
 
 def test_every_number_has_a_gradient_and_perimeter_control_alone_has_no_prices(network):
     x = torch.from_numpy(np.stack([crowded(network, seed) for seed in range(4)])).float()
-    made = policy(network)
+    made = policy(network, metering=True)
     perimeter, splits = made(x)
-    ((perimeter * torch.rand_like(perimeter)).sum() + (splits * torch.rand_like(splits)).sum()).backward()
+    ((perimeter * torch.rand_like(perimeter)).sum() + (splits * torch.rand_like(splits)).sum()
+     + made.metering(x).sum()).backward()
     assert (made.numbers.grad.abs() > 0.0).all()
     alone = policy(network, guidance=False)
     assert alone.prices(x) is None and alone(x)[1] is None
@@ -101,7 +107,7 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
         good(nmfd("train", scenario, "--controller", "dpc-pcrg", "--no-compile", "--out", files[steps]))
     loaded = load_scenario(scenario)
     first, trained = (load_policy(file, loaded.network) for file in files.values())
-    assert first[0].numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6])
+    assert first[0].numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5])
     assert isinstance(trained[0], CompactPolicy) and (trained[0].numbers != first[0].numbers).any()
     assert trained[1]["configuration"]["validation_veh_s"] < first[1]["configuration"]["validation_veh_s"]
     good(nmfd("benchmark", scenario, "--controllers", "dpc-pcrg,dpc-pcrg-guarded", "--out",
@@ -109,10 +115,11 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
 
 
 @pytest.mark.parametrize("table, expected", [
-    ("numbers = [1.0, 2.0, 0.0, 1.0, 0.6, 0.0, 0.6]", "numbers: expected seven numbers >= 0 of a compact policy"),
+    ("numbers = [1.0, 2.0, 0.0, 1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected eight numbers >= 0 of a compact policy"),
     ("compact = true\nnumbers = [1.0]", "numbers: "),
-    ("compact = true\nnumbers = [1.0, 2.0, 0.0, -1.0, 0.6, 0.0, 0.6]", "numbers: expected seven numbers >= 0"),
+    ("compact = true\nnumbers = [1.0, 2.0, 0.0, -1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected eight numbers >= 0"),
     ("compact = true\nlocal = true", "compact: begins with its numbers"),
+    ("metering = true", "metering: only compact policies let trips wait"),
     ("steps = 0", "steps: expected a whole number from 1"),
 ])
 def test_wrong_settings(tmp_path, table, expected):

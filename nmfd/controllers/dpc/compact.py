@@ -1,4 +1,4 @@
-"""A policy of a few numbers that can be read: gates and prices by how full the regions are.
+"""A policy of a few numbers that can be read: gates, prices and metering by how full the regions are.
 
 With z_i = n_i / n_cr,i, how full region i is in critical accumulations, the entries h -> p of every protected region p,
 and the prices of all ways through p, are
@@ -7,10 +7,12 @@ and the prices of all ways through p, are
     c_p  = price max(z_p - price_from, 0)
 
 and every other entry is open; the prices of the other regions are elsewhere max(z_i - elsewhere_from, 0). `relief`
-opens a gate for a region that is beyond its own critical accumulation.
+opens a gate for a region that is beyond its own critical accumulation. Where trips can be made to wait,
+n_cr,i max(metering - z_i, 0) / HELD may begin in region i per second.
 
-Guided drivers are told that a way through region i takes 1 + c_i times as long as it does (nmfd.types.Controls). What
-they make of it in the regional model is a logit over the next regions, around their own split ratios theta0:
+Guided drivers who are bound for elsewhere are told that a way through region i takes 1 + c_i times as long as it does
+(nmfd.types.Controls). What they make of it in the regional model is a logit over the next regions, around their own
+split ratios theta0:
 
     theta_ihj ~ theta0_ihj exp(-e_hj / DISPERSION),    e_hj = c_h t_hj + sum_g theta0_hgj e_gj for h != j,
 
@@ -30,11 +32,12 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.tensors import PerPair, PerRegion, PerTurn
 
 DISPERSION = 60.0  # s: how differently drivers see the same ways; about what their own ways differ by in grid7
+HELD = 90.0        # s, a cycle of the signals: how fast a region may fill
 LONGEST = 20.0     # times as long as in free flow: the most that it takes in the model to leave a region
 
 
 class Numbers(NamedTuple):
-    """What a compact policy consists of, in this order; see above. All but elsewhere_from and price_from may be 0."""
+    """What a compact policy consists of, in this order; see above. `metering` counts where it lets trips wait."""
 
     set_point: float = 1.0
     gain: float = 2.0
@@ -43,12 +46,13 @@ class Numbers(NamedTuple):
     price_from: float = 0.6
     elsewhere: float = 0.0
     elsewhere_from: float = 0.6
+    metering: float = 1.5
 
 
 class CompactPolicy(Policy):
     """The policy of these numbers, for the protected regions `architecture.compact`.
 
-    numbers: (7,) [-], `Numbers`
+    numbers: (8,) [-], `Numbers`
     """
 
     def _build(self, network: RegionalModel) -> None:
@@ -77,6 +81,17 @@ class CompactPolicy(Policy):
         return torch.where(
             self.held, numbers.price * (full - numbers.price_from).clamp(min=0.0),
             numbers.elsewhere * (full - numbers.elsewhere_from).clamp(min=0.0))
+
+    def metering(self, x: PerPair) -> PerRegion | None:
+        """(..., R) [veh/s], the most trips that may begin in each region in the states x; None where nobody waits."""
+        if not self.architecture.metering:
+            return None
+        return self.scale.squeeze(-1) * (self._read().metering - self._full(x)).clamp(min=0.0) / HELD
+
+    def bound(self) -> None:
+        """Set numbers that fell below 0 to 0."""
+        with torch.no_grad():
+            self.numbers.clamp_(min=0.0)
 
     def _read(self) -> Numbers:
         return Numbers(*self.numbers.clamp(min=0.0))

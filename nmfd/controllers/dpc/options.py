@@ -32,12 +32,14 @@ class Training(Options):
         "the same small network decides at every boundary, by how full the regions around it are: perimeter control "
         "of very many regions, and by a policy that was trained in another city", False)
     compact: bool = setting(
-        "a policy of seven numbers that can be read instead of a network: a gate on the protected regions, and prices "
-        "of the ways through crowded regions, by which drivers are guided; runs on the CPU", False)
-    numbers: Annotated[Numbers, Field(min_length=7, max_length=7)] | None = setting(
+        "a policy of eight numbers that can be read instead of a network: a gate on the protected regions, and prices "
+        "of the ways through crowded regions, by which drivers are guided; trained on the CPU", False)
+    numbers: Annotated[Numbers, Field(min_length=8, max_length=8)] | None = setting(
         "those that a compact policy begins with: set_point and gain of the gate, its relief for crowded regions "
-        "before it, price and price_from of the protected regions, elsewhere and elsewhere_from of the others "
-        "(nmfd/controllers/dpc/compact.py)", None, unit="-")
+        "before it, price and price_from of the protected regions, elsewhere and elsewhere_from of the others, "
+        "metering (nmfd/controllers/dpc/compact.py)", None, unit="-")
+    metering: bool = setting(
+        "a compact policy lets trips wait where regions are full; for cities with +metering", False)
     steps: int = whole("Adam steps; 0 leaves a compact policy as it begins", 400, low=0, high=MOST_STEPS)
     batch: int = whole("rollouts per step", 16, low=1, high=100_000)
     learning_rate: float = setting(
@@ -77,7 +79,9 @@ class Training(Options):
         if self.compact and (self.local or self.from_gating or self.from_no_control):
             raise Problem("compact", "begins with its numbers; omit local, from_gating, from_no_control")
         if self.numbers and not (self.compact and min(self.numbers) >= 0.0):
-            raise Problem("numbers", "expected seven numbers >= 0 of a compact policy; add compact = true, or omit it")
+            raise Problem("numbers", "expected eight numbers >= 0 of a compact policy; add compact = true, or omit it")
+        if self.metering and not self.compact:
+            raise Problem("metering", "only compact policies let trips wait; add compact = true, or omit it")
         if not (self.steps or self.compact):
             raise Problem("steps", "expected a whole number from 1, or a compact policy")
         return self

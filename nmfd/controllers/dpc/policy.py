@@ -60,7 +60,8 @@ class Architecture:
     city of many regions needs (their number grows with R^2 instead of R^3); local: one small network, the same at
     every boundary, which knows FEATURES numbers of what is around it: it has no more weights in a large city than in
     a small one, and one that was trained in one city can drive another. Perimeter control only; compact: the protected
-    regions of a policy of a few numbers (nmfd.controllers.dpc.compact), () for a network."""
+    regions of a policy of a few numbers (nmfd.controllers.dpc.compact), () for a network; metering: whether that policy
+    lets trips wait."""
 
     width: int = 128
     layers: int = 2
@@ -69,6 +70,7 @@ class Architecture:
     sparse: bool = False
     local: bool = False
     compact: tuple[int, ...] = ()
+    metering: bool = False
 
     @property
     def listed(self) -> bool:
@@ -146,6 +148,10 @@ class Policy(nn.Module):
         """(..., R) [-] of the ways through each region, of a policy that brings its split ratios about by prices."""
         return None
 
+    def metering(self, x: PerPair) -> PerRegion | None:
+        """(..., R) [veh/s], the most trips that may begin in each region, of a policy that lets trips wait."""
+        return None
+
     def _around(self, x: PerPair) -> Float[torch.Tensor, "*#B R D F"]:
         """Of every boundary (i, h): how full i and h are, their neighbours on average, and how many of those in i and h
         end there, in critical accumulations."""
@@ -182,7 +188,10 @@ class DpcController:
         with torch.inference_mode():
             seen = observation.accumulation  # of which a local policy needs the sums only, and no copy
             x = torch.from_numpy(seen if self._policy.architecture.local else seen.astype(np.float32))
-            (perimeter, splits), prices = self._policy.listed(x), self._policy.prices(x)
+            perimeter, splits = self._policy.listed(x)
+            prices, metering = (
+                None if asked is None else asked.numpy().astype(float)
+                for asked in (self._policy.prices(x), self._policy.metering(x)))
         perimeter = perimeter.numpy()
         if self.fault == "policy-nan":
             perimeter = np.full_like(perimeter, np.nan)
@@ -198,7 +207,7 @@ class DpcController:
             splits /= np.maximum(sums, 1e-9)  # float32 sums miss 1 by 1e-7; those of j = i are 0
         return Controls(
             perimeter=self._full(perimeter), splits=None if splits is None else self._full(splits),
-            prices=None if prices is None else prices.numpy().astype(float))
+            prices=prices, metering=metering)
 
     def _full(self, listed: np.ndarray) -> np.ndarray:
         """(R, R) or (R, R, R) of (R, D) or (R, D, R): the second axis, over the policy's neighbours, over all regions.

@@ -114,7 +114,7 @@ def train(
         guidance = NAMES[controller.partition("+")[0]]
         architecture = Architecture(
             width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=guidance,
-            local=chosen.local, compact=planning.protected if chosen.compact else ())
+            local=chosen.local, compact=planning.protected if chosen.compact else (), metering=chosen.metering)
         policy = new_policy(planning.network, architecture)
         if chosen.numbers and isinstance(policy, CompactPolicy):
             with torch.no_grad():
@@ -157,6 +157,8 @@ def train(
                         weights.grad = None
                 torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
                 optimizer.step()
+                if isinstance(policy, CompactPolicy):
+                    policy.bound()
                 last = step + 1 == chosen.steps
                 if (step + 1) % VALIDATE_EVERY == 0 or last:
                     score = validate(policy, rollout, seed, chosen)
@@ -246,7 +248,7 @@ def visited(policy: Policy, rollout: Rollout, chosen: Training, seed: int) -> Fl
     demand = rollout.perturb(
         demand, torch.rand(4 * chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
     with torch.no_grad():
-        _, seen = rollout.states(policy, x, demand, generator)
+        _, seen, _ = rollout.states(policy, x, demand, generator)
         return (seen / policy.scale).flatten(0, 1).flatten(-2).double().cpu().numpy()
 
 
