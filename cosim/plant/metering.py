@@ -57,7 +57,7 @@ class Metering:
         self._credit = np.minimum(
             self._credit + self._rate * self._session.step_length, np.maximum(1.0, self._rate))
         for region, queue in enumerate(self._queues):
-            while queue and self._credit[region] >= 1.0:
+            while queue and self._credit[region] >= 1.0 - 1e-9:
                 self._credit[region] -= 1.0
                 trip = queue.popleft()
                 self._session.begin_trip(f"v{trip}", f"r{trip}", self._trips.arrival[trip])
