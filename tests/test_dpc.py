@@ -408,7 +408,7 @@ def test_detours_cost_what_they_divert(scenario):
     def total(rollout):
         return rollout.total_time_spent(made, x, demand, generator.manual_seed(1))
 
-    exact, seen = plain.states(made, x, demand, generator.manual_seed(1))
+    exact, seen, _ = plain.states(made, x, demand, generator.manual_seed(1))
     _, splits = made(seen)
     leaving = dynamics.rate(plain.parameters, exact.sum(-1)).unsqueeze(-1) * exact
     diverted = 0.5 * (splits - plain.nominal_splits).abs().sum(-2) * leaving

@@ -112,7 +112,7 @@ def test_travel_times_are_smoothed(by_b, expected):
     """a, 20 s when it is free, took 70 s: half way is 45 s. One interval later it is 57.5 s."""
     town = Town(through_a=20.0, through_b=by_b, theta=0.5)
     town.command(a=20.0 / 70.0)
-    index, time = EDGES.index, town.guide._time
+    index, time = EDGES.index, town.guide._measured
     assert time[index("a")] == pytest.approx(45.0)
     assert time[index("b")] == pytest.approx(by_b)  # nobody was seen there: as when it is free
     town.routes["new"] = ("s",)

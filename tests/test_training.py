@@ -184,7 +184,7 @@ def test_the_total_time_spent_is_that_of_the_states(scenario, generator):
     """Vehicles at every beginning of an interval, times its length."""
     rollout, policy = Rollout(planning_model(scenario), dtype=torch.float32), made(scenario)
     x, demand = rollout.random_start(5, 0.2, 0.5, generator)
-    exact, seen = rollout.states(policy, x, demand, generator.manual_seed(1))
+    exact, seen, _ = rollout.states(policy, x, demand, generator.manual_seed(1))
     assert torch.equal(exact[0], x) and exact.shape == (20, 5, 2, 2)
     assert (seen - exact).std().item() == pytest.approx(scenario.measurement_std, rel=0.1)
     again = torch.stack([rollout.step(policy, exact[k], demand[k], seen[k] - exact[k]) for k in range(19)])
