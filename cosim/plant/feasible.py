@@ -30,8 +30,8 @@ def check_metering(scenario: Scenario, chosen: Settings) -> None:
     """InputError where the trips are not the scenario's own, to be held back one by one."""
     if chosen.metering and chosen.routes:
         raise InputError(
-            f"{scenario_file(scenario)}: sumo.metering: trips of route files (sumo.routes) cannot be made to wait, only "
-            "those drawn from the scenario's demand; omit it")
+            f"{scenario_file(scenario)}: sumo.metering: trips of route files (sumo.routes) cannot be made to wait, "
+            "only those drawn from the scenario's demand; omit it")
 
 
 def check_lanes(scenario: Scenario, chosen: Settings) -> None:

@@ -1,4 +1,4 @@
-"""Metering: trips begin at a commanded rate; who is due beyond that waits outside the network, first come, first served.
+"""Metering: trips begin at a commanded rate; who is due beyond that waits outside, first come, first served.
 
 Gates move a queue; what cannot stand inside must stand outside. The trips of a metered city are not given to SUMO
 beforehand, but one by one when they may begin: on the same routes, with the same ids and by the same seed as without

@@ -44,7 +44,7 @@ def write_trips(
 ) -> Trips:
     """Write the trips of `demand` (T, R, R) [veh/s], intervals of `step` [s], to a SUMO route file.
 
-    The vehicles are v0, v1, ... by departure; the same seed gives the same bytes. metered: only their routes r0, r1, ...
+    The vehicles are v0, v1, ... by departure; the same seed gives the same bytes. metered: their routes r0, r1, ...
     """
     trips = make_trips(city, demand, step, seed)
     lines = ['<routes>\n  <vType id="car" sigma="0.2"/>\n']
