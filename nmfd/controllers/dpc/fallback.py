@@ -225,23 +225,32 @@ class Guarded:
         """What the regional model expects from the measured state on, under the forecast demand."""
         x = torch.from_numpy(np.maximum(observation.accumulation, 0.0)).float().expand(3, -1, -1)
         first, totals = min(observation.step, len(self._demand) - 1), []
+        unlimited = torch.full_like(x[:1].sum(-1), torch.inf)
         with torch.inference_mode():
+            waiting = torch.zeros_like(x)
             for demand in self._demand[first : first + LOOK_AHEAD]:
-                perimeter, splits = self._network(x[:2])
+                (perimeter, splits), metering = self._network(x[:2]), self._network.metering(x[:2])
                 own = self._own.expand(3, -1, -1, -1)
+                entering, waiting = dynamics.admitted(
+                    waiting, demand.expand_as(x), None if metering is None else torch.cat([metering, unlimited]),
+                    self._planning.step)
                 x = self._advance(
-                    x, demand, torch.cat([perimeter, self._open[None]]),
+                    x, entering, torch.cat([perimeter, self._open[None]]),
                     own if splits is None else torch.cat([splits[:1], own[1:]]))
-                totals.append(x.sum((1, 2)))
+                totals.append((x + waiting).sum((1, 2)))
         policy, gates, none = torch.stack(totals, dim=-1).numpy().astype(float)
         return Foreseen(policy=policy, gates=gates, none=none)
 
     def _predict(self, observation: Observation, controls: Controls) -> None:
         splits = self._own if controls.splits is None else torch.from_numpy(controls.splits).float()
         demand = self._demand[min(observation.step, len(self._demand) - 1)]
+        metering = None if controls.metering is None else torch.from_numpy(controls.metering).float()
         with torch.inference_mode():
+            entering, _ = dynamics.admitted(
+                torch.from_numpy(observation.backlog).float() * (metering is not None), demand, metering,
+                self._planning.step)
             x = self._advance(
-                torch.from_numpy(observation.accumulation).float(), demand,
+                torch.from_numpy(observation.accumulation).float(), entering,
                 torch.from_numpy(controls.perimeter).float(), splits)
         self._predicted = x.sum(-1).numpy().astype(float)
 
