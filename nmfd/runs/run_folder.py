@@ -184,6 +184,11 @@ class RunFolder:
         """(controller, seed) of every run that is here with its row and its file; `order`'s own come last."""
         return [run for run in self._order if run in self._rows and self.trajectory_path(*run).is_file()]
 
+    def position(self, controller: str, seed: int) -> int:
+        """Of a run among all that are here or asked for, -1 for another one: as in summary.csv."""
+        run = controller, seed
+        return self._order.index(run) if run in self._order else -1
+
     def trajectory_path(self, controller: str, seed: int) -> Path:
         """Its file, there or not."""
         return run_path(self.path, controller, seed)
