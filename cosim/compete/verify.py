@@ -25,7 +25,7 @@ from cosim.evaluation.simulate import Task
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario, with_demand
-from nmfd.runs import run_folder
+from nmfd.runs import run_folder, trail
 from nmfd.runs.files import check_file
 from nmfd.runs.provenance import provenance
 from nmfd.runs.scratch import Scratch
@@ -149,8 +149,8 @@ def _read(file: Path) -> list[dict]:
     check_file(file)
     try:
         with file.open(newline="", encoding="utf-8") as stream:
-            return [{name: run_folder.COLUMNS.get(name, str)(value) for name, value in row.items()}
-                    for row in csv.DictReader(stream)]
+            return [{name: run_folder.COLUMNS.get(name, str)(value) for name, value in row.items()
+                     if name != trail.COLUMN} for row in csv.DictReader(stream)]
     except (OSError, ValueError, TypeError, csv.Error) as error:
         raise InputError(f"{file}: is no table of runs ({error}); give a folder that holds one") from None
 

@@ -30,8 +30,8 @@ from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.quantities import quantities, variables
-from nmfd.runs import run_folder
-from nmfd.runs.files import check_file, file_hash, write_text
+from nmfd.runs import run_folder, trail
+from nmfd.runs.files import check_file, file_hash, write_table
 from nmfd.runs.tables import text_table
 from nmfd.runs.tally import Progress, Tally
 from nmfd.runs.workers import Failure, Source, attempt, ended, outcomes
@@ -262,7 +262,7 @@ def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
     found = sorted([*rows[~same].to_dict("records"), result.facts],  # not as they ended, which is chance
                    key=lambda row: folder.position(row["controller"], row["seed"]))
     rows = pd.DataFrame(found, columns=[*FACTS])
-    write_text(path, rows.to_csv(index=False))
+    write_table(path, rows)
 
 
 def overview(folder: Path) -> pd.DataFrame:
@@ -275,7 +275,7 @@ def read_facts(path: Path) -> pd.DataFrame:
     """The rows of sumo.csv, with NaN for what an older version did not record. Raises InputError."""
     check_file(path, "delete the folder and run again")
     try:
-        rows = pd.read_csv(path)
+        rows = pd.read_csv(path).drop(columns=trail.COLUMN, errors="ignore")
         rows = rows.reindex(columns=[*rows.columns, *(name for name in FACTS if name not in rows.columns)])
         return rows.astype({"controller": str, "seed": int})
     except FileNotFoundError:

@@ -184,7 +184,7 @@ def tune(
         while points:
             found = _scored(order, points, len(rows), workers, source, progress, tell)
             rows += found
-            files.write_text(file, pd.DataFrame(rows).to_csv(index=False))
+            files.write_table(file, pd.DataFrame(rows))
             files.write_text(order.out / "tune.toml", toml(order, pd.DataFrame(rows)))
             if len(rows) > 1 and len(points) == search.popsize:
                 search.tell(points, _costs(found))

@@ -23,8 +23,7 @@ import numpy as np
 from nmfd.errors import InputError
 from nmfd.metrics import SUMMARY, summary
 from nmfd.quantities import quantities
-from nmfd.runs import files
-from nmfd.runs.provenance import provenance
+from nmfd.runs import files, trail
 from nmfd.types import Trajectory
 
 COLUMNS = {name: kind for name, (kind, _) in SUMMARY.items()}
@@ -286,7 +285,7 @@ def manifest(
                 if changed and renew is not None:
                     renew(changed)
             first = not sessions
-            sessions.append({**provenance(), **(session or {})})
+            sessions.append({**trail.session(), **(session or {})})
             content = {"configuration": configuration, "controllers": controllers, "sessions": sessions}
             try:
                 files.write_text(file, json.dumps(content, indent=2) + "\n")
