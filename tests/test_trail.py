@@ -92,7 +92,7 @@ def test_what_is_not_made_by_a_command_says_so(tmp_path):
 
 def test_nothing_ends_a_comment_early_and_a_film_stays_a_film(tmp_path):
     assert "-->" not in trail.text({"command": "nmfd --> <!-- é"})
-    pictures = [Image.new("P", (4, 4), n) for n in range(3)]
+    pictures = [Image.new("RGB", (4, 4), colour) for colour in ("red", "green", "blue")]
     file = tmp_path / "a.gif"
     pictures[0].save(file, save_all=True, append_images=pictures[1:])
     trail.into_gif(file, trail.text({"long": "x" * 700}))

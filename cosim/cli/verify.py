@@ -19,14 +19,16 @@ from nmfd.errors import RunFailed
 def verify(folder: Path, row: str | None, seed: int | None, within: float, listed: bool) -> None:
     """Make a row of a published table, or of a run folder, again from what is written beside it, and compare.
 
-    FOLDER holds manifest.json beside summary.csv or robustness.csv, the levels of an evaluation, or entries of cosim
-    compete. Everything but wall times has to be the same to the last digit, and a kept run to the byte. What differs in
-    versions, commit and hashes is shown; exit status 1 where the row came out differently.
+    FOLDER holds manifest.json beside summary.csv or robustness.csv, the levels of an evaluation, the runs.csv of one,
+    whose trail names the command, or entries of cosim compete. Everything but wall times has to be the same to the last
+    digit, and a kept run to the byte. What differs in versions, commit and hashes is shown; exit status 1 where the row
+    came out differently.
 
     \b
     Examples:
       cosim verify scenarios/economic_mpc/reference/robustness
       cosim verify scenarios/economic_mpc/reference/economic_mpc --row 'dpc-pcrg,*' --seed 1
+      cosim verify scenarios/bologna/reference --row '1,no-control,3000'
     """
     from cosim.compete import verify as method  # heavy
 

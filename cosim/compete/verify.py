@@ -4,21 +4,24 @@
     demand-<level>/                     such folders of an evaluation
     manifest.json with robustness.csv   nmfd robustness
     *.json                              entries of cosim compete
+    runs.csv                            of an evaluation whose run folders are not there: by the commands in its trail
 
-Figures are compared to the last digit, or within what is asked for; those that are wall times are not. Where the run
-itself is kept, it is compared to the byte.
+Figures are compared to the last digit, or within what is asked for; those that are wall times, and empty ones, are not.
+Where the run itself is kept, it is compared to the byte.
 """
 
 import csv
 import math
 import random
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 
 from cosim.compete import entry, run, task_set
+from cosim.compete.asked import Asked
 from cosim.compete.entry import Entry
 from cosim.evaluation import evaluate, experiment, results
 from cosim.evaluation.simulate import Task
@@ -35,6 +38,8 @@ Figures = Mapping[str, object]
 CLOCK = (  # columns and metrics that are wall times, or depend on them
     "evaluation_time_s", "control_step_ms_median", "control_step_ms_max", "late_decisions", "wall_time_s",
     "sumo_time_s", "overhead_share", "setup_time_s", "decision_ms_median", "decision_ms_max", "notes")
+
+KEYS = {"demand": float, "controller": str, "seed": int}  # of runs.csv
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +86,8 @@ def rows(folder: Path) -> list[Row]:
                 _regional(folder, manifest, scenario))
     if files := sorted(file for file in folder.glob("*.json") if file.name != "manifest.json"):
         return [row for file in files for row in _of_entry(entry.read(file))]
+    if (folder / "runs.csv").is_file():
+        return _of_table(folder / "runs.csv")
     raise InputError(
         f"{folder}: does not say how its rows were made; give a folder with manifest.json and summary.csv or "
         "robustness.csv, one of an evaluation, or one of entries")
@@ -101,7 +108,7 @@ def verify(row: Row, within: float = 0.0) -> Verdict:
     with Scratch("cosim-verify-") as scratch:
         figures, depends, file = row.again(Path(scratch) / "again")
         same = None if row.file is None or file is None else row.file.read_bytes() == file.read_bytes()
-    keys = [key for key in row.figures if key not in CLOCK and key in figures]
+    keys = [key for key, value in row.figures.items() if key not in CLOCK and key in figures and not _empty(value)]
     return Verdict(
         label=row.label, compared=len(keys), same_bytes=same,
         differ={key: (row.figures[key], figures[key]) for key in keys
@@ -110,9 +117,14 @@ def verify(row: Row, within: float = 0.0) -> Verdict:
                  if row.depends.get(key) != depends.get(key)})
 
 
+def _empty(value: object) -> bool:
+    """Not known, in a table of a version that did not record it."""
+    return isinstance(value, float) and math.isnan(value)
+
+
 def _same(a: object, b: object, within: float) -> bool:
-    if isinstance(a, float) and isinstance(b, float):
-        return math.isclose(a, b, rel_tol=within) or (math.isnan(a) and math.isnan(b))
+    if isinstance(a, (int, float)) and isinstance(b, (int, float)):
+        return math.isclose(a, b, rel_tol=within)
     return a == b
 
 
@@ -141,15 +153,23 @@ def _regional(folder: Path, manifest: Mapping, scenario: Scenario) -> list[Row]:
         return made[0]
 
     return [_of_run(folder, manifest, published, partial(make, published["controller"], published["seed"]))
-            for published in _read(folder / "summary.csv")]
+            for published in _read(folder / "summary.csv", run_folder.COLUMNS, str)]
 
 
-def _read(file: Path) -> list[dict]:
-    """The rows of a summary.csv, with the columns that the version had which wrote it. InputError."""
+def _value(text: str) -> object:
+    """A number exactly as it is written, which pandas does not promise; NaN of an empty cell."""
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text or "nan")
+    return text
+
+
+def _read(file: Path, columns: Mapping[str, Callable], others: Callable) -> list[dict]:
+    """The rows of a table, with the columns that the version had which wrote it. InputError."""
     check_file(file)
     try:
         with file.open(newline="", encoding="utf-8") as stream:
-            return [{name: run_folder.COLUMNS.get(name, str)(value) for name, value in row.items()
+            return [{name: columns.get(name, others)(value) for name, value in row.items()
                      if name != trail.COLUMN} for row in csv.DictReader(stream)]
     except (OSError, ValueError, TypeError, csv.Error) as error:
         raise InputError(f"{file}: is no table of runs ({error}); give a folder that holds one") from None
@@ -160,15 +180,53 @@ def _in_sumo(folder: Path, manifest: Mapping, scenario: Scenario, at: Path) -> l
     about = manifest["configuration"]
     faults = tuple(fault for fault in about.get("faults", ()) if fault not in scenario.faults)
 
-    def make(task: Task, out: Path) -> Figures:
-        if failures := experiment.perform([(out, task)], fresh=True):
-            raise InputError(f"{experiment.label(task)}: {failures[0][1].reason}")
-        return experiment.overview(out).to_dict("records")[0]
-
-    return [_of_run(folder, manifest, published, partial(make, Task(
+    return [_of_run(folder, manifest, published, partial(_simulated, Task(
                 scenario=at, controller=published["controller"], seed=published["seed"], steps=about["steps"],
                 demand_factor=about["demand_factor"], faults=faults)))
             for published in experiment.overview(folder).to_dict("records")]
+
+
+def _simulated(task: Task, out: Path) -> Figures:
+    """Its row."""
+    if failures := experiment.perform([(out, task)], fresh=True):
+        raise InputError(f"{experiment.label(task)}: {failures[0][1].reason}")
+    return experiment.overview(out).to_dict("records")[0]
+
+
+def _of_table(file: Path) -> list[Row]:
+    """Of cosim evaluate, by the commands that its trail names; rows that none of them asked for cannot be made."""
+    found = trail.read(file)
+    if why := found.get("not_again"):
+        raise InputError(f"{file}: cannot be made again: it is {why}")
+    there = [order for one in trail.commands(found) if (order := Asked.by(*one, file))]
+
+    def row(published: Mapping, asked: Asked) -> Row:
+        place = f"demand-{published['demand']:g}"
+        task = asked.task(published["controller"], published["seed"], published["demand"])
+        depends = {**_of_session(asked.session), **_hashes(found, place, task.controller)}
+
+        def again(out: Path) -> tuple[Figures, Figures, Path | None]:
+            made, now = _simulated(task, out), trail.of(out / file.name)
+            now = {**_of_session(now), **_hashes(now, ".", task.controller)}
+            return made, {key: now.get(key) for key in depends}, None
+
+        return Row(label=f"{published['demand']:g},{task.controller},{task.seed}", figures=published, file=None,
+                   depends=depends, again=again)
+
+    records = _read(file, KEYS, _value)
+    if not all(KEYS.keys() <= one.keys() for one in records):
+        raise InputError(f"{file}: is no table of runs (expected {', '.join(KEYS)}); give a folder that holds one")
+    asked = [(one, next((each for each in there if each.covers(one)), None)) for one in records]
+    if rows := [row(one, by) for one, by in asked if by]:
+        return rows
+    raise InputError(f"{file}: names no command (cosim evaluate) that asked for its rows; give a folder with the "
+                     "run folders of the evaluation, demand-*")
+
+
+def _hashes(found: Mapping, place: str, controller: str) -> dict:
+    """Of a trail: those of a run folder, and of a controller in it."""
+    there = found.get("hashes", {}).get(place, {})
+    return {**{key: value for key, value in there.items() if isinstance(value, str)}, **there.get(controller, {})}
 
 
 def _of_robustness(folder: Path, manifest: Mapping, scenario: Scenario) -> list[Row]:
@@ -231,7 +289,10 @@ def _depends(manifest: Mapping, name: str, seed: int | None = None) -> Figures:
 
 
 def _of_session(session: Mapping) -> Figures:
-    return {**session.get("versions", {}), "commit": session.get("commit"), "uncommitted changes": session.get("dirty")}
+    versions = session.get("versions", {})
+    if not isinstance(versions, Mapping):  # unknown
+        versions = dict.fromkeys(provenance()["versions"], versions)
+    return {**versions, "commit": session.get("commit"), "uncommitted changes": session.get("dirty")}
 
 
 def _kept(folder: Path, name: str, seed: int) -> Path | None:

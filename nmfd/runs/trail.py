@@ -8,7 +8,9 @@
 `command`, `commit`, `dirty`, `versions` are those of the process that wrote the file, `runs` those of the sessions
 that made the runs which it shows, with their seeds, as manifest.json has them; `hashes` what these runs depend on.
 Options that change no result (where to write, on how many processes) are not in commands. null: not called by a
-command, or not in a checkout; "unknown": made before files had a trail, and not known.
+command, or not in a checkout; "unknown": made before files had a trail, and not known. Of such a file `readme` has
+the commands that the README beside it gives, `published` the commit that it came into the repository with, `not_again`
+why it cannot be made again, if so.
 """
 
 import csv
@@ -74,6 +76,13 @@ def _add(runs: list[dict], one: Mapping) -> None:
             known["seeds"] = sorted({*known["seeds"], *one.get("seeds", ())})
             return
     runs.append({**about, "seeds": sorted(one.get("seeds", ()))})
+
+
+def commands(trail: Mapping) -> list[tuple[str, Mapping]]:
+    """Every command that made runs of a file, with what is known of its session; the last ones first. Of files from
+    before they had a trail, the commands are those that the README beside them gives."""
+    runs = [(one["command"], one) for one in trail.get("runs", ()) if one["command"] not in (None, UNKNOWN)]
+    return [*runs[::-1], *((command, trail) for command in trail.get("readme", ()))]
 
 
 def _hashes(about: Mapping) -> dict:
