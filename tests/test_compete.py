@@ -396,6 +396,15 @@ def test_tables_that_cannot_be_made_again(place, found, words):
     assert "runs.csv: is no table of runs" in error_line(cosim("verify", "out"))
 
 
+@pytest.mark.usefixtures("place")
+def test_what_is_unknown_of_a_table_is_said(monkeypatch):
+    monkeypatch.setattr(verify, "_simulated", lambda task, out: {"completed_veh": 5})
+    unknown = dict.fromkeys(("command", "commit", "dirty", "versions"), "unknown")
+    table_of(Path("out"), {**unknown, "readme": ["cosim evaluate scenario --controllers no-control --first-seed 0"]})
+    text = good(cosim("verify", "out", "--row", "1,*,0"))
+    assert "unknown then: python, " in text and ", commit, uncommitted changes" in text and " now" not in text
+
+
 def test_what_is_published_names_its_commands():
     """Every row of the evaluations that are of this version, but two that their README speaks of."""
     for city, rows in (("bologna", 15), ("luxembourg", 12), ("demo", 20), ("grid7_peak", 465)):

@@ -12,7 +12,7 @@ import trajectories
 from PIL import Image
 
 from nmfd.errors import InputError
-from nmfd.runs import files, run_folder, trail
+from nmfd.runs import files, frames, run_folder, trail
 from nmfd.studies import plots
 
 ROOT = Path(__file__).parents[1]
@@ -86,6 +86,8 @@ def test_what_is_not_made_by_a_command_says_so(tmp_path):
     (tmp_path / "manifest.json").write_text('{"sessions": 3}')
     drawing = plots.figure(1.0, 1.0)
     assert shown(plots.save(drawing, tmp_path / "a.png")) == found
+    frames.write_parquet(tmp_path / "a.parquet", pd.DataFrame({"x": [1]}))
+    assert pd.read_parquet(tmp_path / "a.parquet").attrs["trail"] == found
     files.write_text(tmp_path / "a.md", "text\n" + trail.comment(tmp_path / "a.md"))
     assert shown(tmp_path / "a.md") == found
 

@@ -6,6 +6,7 @@ import click
 
 from nmfd.cli.options import FOLDER, SEED
 from nmfd.errors import RunFailed
+from nmfd.runs.trail import UNKNOWN
 
 
 @click.command()
@@ -39,8 +40,12 @@ def verify(folder: Path, row: str | None, seed: int | None, within: float, liste
     one = method.chosen(found, row, seed)
     click.echo(f"{folder}: {one.label}, one of {len(found)} rows")
     verdict = method.verify(one, within)
+    unknown = [key for key, (before, _) in verdict.depends.items() if before == UNKNOWN]
+    if unknown:
+        click.echo(f"  unknown then: {', '.join(unknown)}")
     for key, (before, now) in verdict.depends.items():
-        click.echo(f"  {key}: {before} then, {now} now")
+        if before != UNKNOWN:
+            click.echo(f"  {key}: {before} then, {now} now")
     for key, (before, now) in verdict.differ.items():
         click.echo(f"  {key} differs: {before} published, {now} made again")
     if verdict.same_bytes is False:

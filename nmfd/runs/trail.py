@@ -2,6 +2,7 @@
 
     csv         a last column, `trail`, with the JSON in the first row and nothing below
     markdown    a comment at the end, <!-- trail: JSON -->
+    parquet     attrs["trail"] of the frame that pandas reads
     png         a text called Trail (PIL.Image.open(file).info, or exiftool)
     gif, mp4    the last comment
 
