@@ -6,8 +6,8 @@
     *.json                              entries of cosim compete
     runs.csv                            of an evaluation whose run folders are not there: by the commands in its trail
 
-Figures are compared to the last digit, or within what is asked for; those that are wall times, and empty ones, are not.
-Where the run itself is kept, it is compared to the byte.
+Figures are compared to the last digit, and a run that is kept to the byte; where version or commit is another one, or
+not known, figures within ROUNDING, unless another share is asked for. Wall times and empty cells are not compared.
 """
 
 import csv
@@ -35,6 +35,7 @@ from nmfd.runs.scratch import Scratch
 from nmfd.studies import benchmark, robustness
 
 Figures = Mapping[str, object]
+ROUNDING = 1e-9  # as a share: what sums in another order may come to
 CLOCK = (  # columns and metrics that are wall times, or depend on them
     "evaluation_time_s", "control_step_ms_median", "control_step_ms_max", "late_decisions", "wall_time_s",
     "sumo_time_s", "overhead_share", "setup_time_s", "decision_ms_median", "decision_ms_max", "notes")
@@ -56,19 +57,27 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """differ: figure -> as published, as made again; depends: the same of what they depend on; same_bytes: of the runs'
-    files, None without one; compared: how many figures."""
+    """differ: figure -> as published, as made again, of those that are further apart than `within`; depends: the same
+    of what they depend on; same_bytes: of the runs' files, None without one; compared: how many figures, equal: how
+    many of them are the same to the last digit."""
 
     label: str
     compared: int
+    equal: int
+    within: float
     differ: Mapping[str, tuple[object, object]]
     depends: Mapping[str, tuple[object, object]]
     same_bytes: bool | None
 
     @property
     def good(self) -> bool:
-        """Whether it came out the same."""
-        return not self.differ and self.same_bytes is not False
+        """Whether it came out the same, as far as the versions are."""
+        return not self.differ and (self.same_bytes is not False or self.another)
+
+    @property
+    def another(self) -> bool:
+        """Whether it was made by another version, or one that is not known."""
+        return any(not key.endswith("_hash") for key in self.depends)
 
 
 def rows(folder: Path) -> list[Row]:
@@ -102,19 +111,21 @@ def chosen(found: Sequence[Row], pattern: str | None, seed: int | None) -> Row:
     return random.Random(seed).choice(fitting)
 
 
-def verify(row: Row, within: float = 0.0) -> Verdict:
-    """Make it again, in a scratch folder. within: by which share figures may differ. InputError or RunFailed where that
-    fails."""
+def verify(row: Row, within: float | None = None) -> Verdict:
+    """Make it again, in a scratch folder. within: by which share figures may differ; None: none, or ROUNDING in another
+    version. InputError or RunFailed where that fails."""
     with Scratch("cosim-verify-") as scratch:
         figures, depends, file = row.again(Path(scratch) / "again")
         same = None if row.file is None or file is None else row.file.read_bytes() == file.read_bytes()
     keys = [key for key, value in row.figures.items() if key not in CLOCK and key in figures and not _empty(value)]
-    return Verdict(
-        label=row.label, compared=len(keys), same_bytes=same,
-        differ={key: (row.figures[key], figures[key]) for key in keys
-                if not _same(row.figures[key], figures[key], within)},
+    verdict = Verdict(
+        label=row.label, compared=len(keys), same_bytes=same, differ={}, within=0.0,
+        equal=sum(_same(row.figures[key], figures[key], 0.0) for key in keys),
         depends={key: (row.depends.get(key), depends.get(key)) for key in {**row.depends, **depends}
                  if row.depends.get(key) != depends.get(key)})
+    share = (ROUNDING if verdict.another else 0.0) if within is None else within
+    return replace(verdict, within=share, differ={
+        key: (row.figures[key], figures[key]) for key in keys if not _same(row.figures[key], figures[key], share)})
 
 
 def _empty(value: object) -> bool:
@@ -196,8 +207,7 @@ def _simulated(task: Task, out: Path) -> Figures:
 def _of_table(file: Path) -> list[Row]:
     """Of cosim evaluate, by the commands that its trail names; rows that none of them asked for cannot be made."""
     found = trail.read(file)
-    if why := found.get("not_again"):
-        raise InputError(f"{file}: cannot be made again: it is {why}")
+    refused = found.get("not_again", {})  # patterns of controllers, and why
     there = [order for one in trail.commands(found) if (order := Asked.by(*one, file))]
 
     def row(published: Mapping, asked: Asked) -> Row:
@@ -217,8 +227,12 @@ def _of_table(file: Path) -> list[Row]:
     if not all(KEYS.keys() <= one.keys() for one in records):
         raise InputError(f"{file}: is no table of runs (expected {', '.join(KEYS)}); give a folder that holds one")
     asked = [(one, next((each for each in there if each.covers(one)), None)) for one in records]
-    if rows := [row(one, by) for one, by in asked if by]:
+    why = [reason for one, _ in asked for name, reason in refused.items() if fnmatchcase(one["controller"], name)]
+    if rows := [row(one, by) for one, by in asked if by and not any(
+            fnmatchcase(one["controller"], name) for name in refused)]:
         return rows
+    if why:
+        raise InputError(f"{file}: cannot be made again: {why[0]}")
     raise InputError(f"{file}: names no command (cosim evaluate) that asked for its rows; give a folder with the "
                      "run folders of the evaluation, demand-*")
 

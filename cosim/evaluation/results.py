@@ -138,12 +138,15 @@ def scenario_folder(folder: Path, manifest: Mapping) -> Path:
 
 
 def found_again(name: Path, folder: Path, said: str) -> Path:
-    """The scenario `name`, of runs in `folder`; said: where that is written. InputError."""
-    for above in (Path(), *folder.resolve().parents):
-        if (above / name / "scenario.toml").is_file():
-            return above / name
-    if ((found := shipped.found(name, shipped.SCENARIO, beside=Path())) / "scenario.toml").is_file():
-        return found
+    """The scenario `name`, of runs in `folder`; said: where that is written. Of a whole path that is not there, as on
+    another machine, its end will do. InputError."""
+    ends = [Path(*name.parts[-count:]) for count in (3, 2, 1)] if name.is_absolute() else []
+    for end in (name, *ends):
+        for above in (Path(), *folder.resolve().parents):
+            if (above / end / "scenario.toml").is_file():
+                return above / end
+        if ((found := shipped.found(end, shipped.SCENARIO, beside=Path())) / "scenario.toml").is_file():
+            return found
     raise InputError(f"{folder / said}: there is no {name}; give it with --scenario, or go to where it is")
 
 

@@ -11,7 +11,7 @@ that made the runs which it shows, with their seeds, as manifest.json has them; 
 Options that change no result (where to write, on how many processes) are not in commands. null: not called by a
 command, or not in a checkout; "unknown": made before files had a trail, and not known. Of such a file `readme` has
 the commands that the README beside it gives, `published` the commit that it came into the repository with, `not_again`
-why it cannot be made again, if so.
+patterns of controllers whose rows cannot be made again, and why.
 """
 
 import csv
