@@ -13,6 +13,7 @@ PerPair = Float[np.ndarray, "R R"]      # [i, j] = in i bound for j, or [i, h] =
 PerTurn = Float[np.ndarray, "R R R"]    # [i, h, j] = in i, bound for j, by way of h
 PairsOverTime = Float[np.ndarray, "T R R"]
 TurnsOverTime = Float[np.ndarray, "T R R R"]
+RegionsOverTime = Float[np.ndarray, "T R"]
 StatesOverTime = Float[np.ndarray, "S R R"]
 Positions = Float[np.ndarray, "R 2"]
 Adjacency = Bool[np.ndarray, "R R"]

@@ -63,6 +63,7 @@ def run(
         decision_time=np.array(decision_time), status=np.array([c.status.value for c in controls]),
         note=tuple(c.note for c in controls),
         removed=np.stack([np.zeros_like(s.backlog) if s.removed is None else s.removed for s in states]),
+        prices=np.stack([np.zeros(network.regions) if c.prices is None else c.prices for c in controls]),
         wall_time=time.perf_counter() - begin)
 
 
@@ -100,8 +101,10 @@ def _deadline(controller: Controller, step: float) -> float:
 
 def _copied(controls: Controls) -> Controls:
     """With arrays of its own: a controller may go on writing into those that it returned."""
-    splits = None if controls.splits is None else np.array(controls.splits)
-    return replace(controls, perimeter=np.array(controls.perimeter), splits=splits)
+    splits, prices, metering = (
+        None if asked is None else np.array(asked) for asked in (controls.splits, controls.prices, controls.metering))
+    return replace(
+        controls, perimeter=np.array(controls.perimeter), splits=splits, prices=prices, metering=metering)
 
 
 def _booked(controls: Controls, status: Status, note: str) -> Controls:

@@ -211,8 +211,8 @@ class Supervised:
             kinds = [fault.kind for fault in self._faults if fault.active(observation.step)]
             self._controller.fault = kinds[0] if kinds else None
         controls = self._controller.act(observation)
-        if not np.isfinite(controls.perimeter).all() or (
-                controls.splits is not None and not np.isfinite(controls.splits).all()):
+        asked = (controls.perimeter, controls.splits, controls.prices, controls.metering)
+        if not all(np.isfinite(numbers).all() for numbers in asked if numbers is not None):
             controls = Controls(
                 perimeter=self._opened, splits=None, status=Status.SOLVER_FAILURE | Status.FALLBACK,
                 note="the controls were no numbers: perimeter opened")

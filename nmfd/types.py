@@ -6,7 +6,18 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
-from nmfd.arrays import Cumulative, Flags, Intervals, PairsOverTime, PerPair, PerTurn, StatesOverTime, TurnsOverTime
+from nmfd.arrays import (
+    Cumulative,
+    Flags,
+    Intervals,
+    PairsOverTime,
+    PerPair,
+    PerRegion,
+    PerTurn,
+    RegionsOverTime,
+    StatesOverTime,
+    TurnsOverTime,
+)
 from nmfd.html import html_table
 from nmfd.quantities import quantity, variables
 
@@ -95,6 +106,11 @@ class Controls:
         ignored where h is not adjacent to i
     splits: (R, R, R) [-], [i, h, j] = theta_ihj, share of the vehicles in i bound for j that head for h;
         None without route guidance: drivers keep the routes they have (in the regional model the nominal splits)
+    prices: (R,) [-], by how much longer than it is guided drivers who are bound for elsewhere are told that a way
+        through region i takes: 1 for twice as long. In a city they are how `splits` come about: drivers are guided by
+        these travel times, and shares are not commanded besides. The regional model takes `splits`. None: no prices
+    metering: (R,) [veh/s], the most trips that may begin in region i; who is due beyond that waits outside, in the
+        backlog. Only cities with `+metering` can do that. None: nobody is made to wait
     status: OK, or what these controls are instead; note: the same in words, "" if OK
     """
 
@@ -102,6 +118,8 @@ class Controls:
     splits: PerTurn | None
     status: Status = Status.OK
     note: str = ""
+    prices: PerRegion | None = None
+    metering: PerRegion | None = None
 
 
 @runtime_checkable
@@ -172,11 +190,16 @@ class Trajectory:
     note: tuple[str, ...] = quantity("interval", unit="", text="the status in words", repr=False)
     removed: StatesOverTime = quantity(
         "time", "region", "destination", unit="veh", text="vehicles taken out on their way, cumulative", default=None)
+    prices: RegionsOverTime = quantity(
+        "interval", "region", unit="1",
+        text="by how much longer than it is drivers were told that a way through the region takes", default=None)
 
     def __post_init__(self) -> None:
-        """Nobody is removed where nothing is said of it."""
+        """Nobody is removed, and nothing has a price, where nothing is said of it."""
         if self.removed is None:
             object.__setattr__(self, "removed", np.zeros_like(self.backlog))
+        if self.prices is None:
+            object.__setattr__(self, "prices", np.zeros(self.perimeter.shape[:2]))
 
     @property
     def variables(self) -> dict[str, tuple]:

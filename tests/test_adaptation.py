@@ -15,7 +15,8 @@ from nmfd.cli.main import main
 from nmfd.closed_loop import noisy
 from nmfd.controllers import registry
 from nmfd.controllers.dpc.online import ModelEstimate, OnlineDpc
-from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
+from nmfd.controllers.dpc.policy import Architecture, Policy
+from nmfd.controllers.dpc.policy_file import checkpoint
 from nmfd.metrics import total_time_spent
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant

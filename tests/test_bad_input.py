@@ -24,7 +24,8 @@ from cosim.sumo.recorded_trips import read_recorded_trips
 from nmfd import closed_loop
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc import training
-from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
+from nmfd.controllers.dpc.policy import Architecture, Policy
+from nmfd.controllers.dpc.policy_file import checkpoint
 from nmfd.model.regional_model import load_network
 from nmfd.studies import benchmark
 

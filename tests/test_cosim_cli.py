@@ -13,7 +13,8 @@ import torch
 from commands import cosim, error_line, good
 
 from nmfd.api import load_scenario
-from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
+from nmfd.controllers.dpc.policy import Architecture, Policy
+from nmfd.controllers.dpc.policy_file import checkpoint
 from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import load_network
 from nmfd.runs.run_folder import COLUMNS

@@ -11,14 +11,8 @@ import torch
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc import policy as dpc
 from nmfd.controllers.dpc import training
-from nmfd.controllers.dpc.policy import (
-    Architecture,
-    DpcController,
-    Policy,
-    SoftExponential,
-    checkpoint,
-    load_policy,
-)
+from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy, SoftExponential
+from nmfd.controllers.dpc.policy_file import checkpoint, load, load_policy
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
 from nmfd.model import dynamics
@@ -118,14 +112,14 @@ def scenario(tmp_path):
 
 
 def saved(path, made, network):
-    torch.save(dpc.checkpoint(made, network, {"seed": 0}), path)
+    torch.save(checkpoint(made, network, {"seed": 0}), path)
     return path
 
 
 @pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
 def test_a_policy_file_gives_the_policy_back(tmp_path, guidance):
     made = policy(guidance=guidance)
-    loaded, content = dpc.load_policy(saved(tmp_path / "p.pt", made, NETWORK), NETWORK)
+    loaded, content = load_policy(saved(tmp_path / "p.pt", made, NETWORK), NETWORK)
     x = 1000.0 * torch.rand(4, 7, 7)
     for before, after in zip(made(x), loaded(x), strict=True):
         assert (before is None and after is None) or torch.equal(before, after)
@@ -140,17 +134,17 @@ def one_line(caught, path):
 def test_a_policy_for_another_network_is_refused(tmp_path, scenario):
     path = saved(tmp_path / "p.pt", policy(guidance=False), NETWORK)
     with pytest.raises(InputError, match="trained for network 'hexagon7'") as caught:
-        dpc.load_policy(path, scenario.network)
+        load_policy(path, scenario.network)
     one_line(caught, path)
     wider = replace(NETWORK, u_max=1.0)
     with pytest.raises(InputError, match="network_hash"):
-        dpc.load_policy(path, wider)
+        load_policy(path, wider)
 
 
 def test_a_policy_of_the_other_kind_is_refused(tmp_path, scenario):
     path = saved(tmp_path / "p.pt", policy(guidance=False, network=scenario.network), scenario.network)
     with pytest.raises(InputError, match="dpc-pc policy, not dpc-pcrg") as caught:
-        dpc.load(path, planning_model(scenario), guidance=True)
+        load(path, planning_model(scenario), guidance=True)
     one_line(caught, path)
 
 
@@ -166,7 +160,7 @@ def test_a_damaged_policy_file_is_one_line(tmp_path, damage, problem):
     path = saved(tmp_path / "p.pt", policy(guidance=False), NETWORK)
     damage(path)
     with pytest.raises(InputError, match=problem) as caught:
-        dpc.load_policy(path, NETWORK)
+        load_policy(path, NETWORK)
     one_line(caught, path)
 
 
@@ -190,7 +184,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(tmp_path, scenario, monkeyp
     for name, tensor in weights(straight).items():
         assert torch.equal(tensor, weights(broken)[name]), name
     assert not list(tmp_path.glob("*.resume"))
-    loaded = dpc.load(broken, planning_model(scenario), guidance=training.NAMES[controller])
+    loaded = load(broken, planning_model(scenario), guidance=training.NAMES[controller])
     assert loaded.name == controller.removesuffix("-robust")
 
 
@@ -218,7 +212,7 @@ def test_training_lowers_the_total_time_spent(tmp_path, scenario):
     rollout = training.Rollout(planning_model(scenario))
     torch.manual_seed(0)
     fresh = Policy(scenario.network, Architecture())
-    after = training.validate(dpc.load_policy(trained, scenario.network)[0], rollout, 0, training.Training())
+    after = training.validate(load_policy(trained, scenario.network)[0], rollout, 0, training.Training())
     assert after < training.validate(fresh, rollout, 0, training.Training())
 
 

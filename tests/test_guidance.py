@@ -147,6 +147,16 @@ def test_ways_that_return_are_taken_where_they_are_faster_and_no_command_for_the
         assert guided(tuple("ambt"), ways_return=True, to_region_1=to_region_1)[0] == "ambt"
 
 
+def test_prices_lengthen_the_ways_through_a_region_and_go_when_none_are_commanded():
+    """Over m, in region 1, it takes 20 s and 10 (1 + price), on the side street 50 s."""
+    for price, way in ((0.0, "ambt"), (1.0, "ambt"), (9.0, "ast"), (None, "ambt")):
+        guide, splits, routes, _ = crossroads(tuple("ambt"), ways_return=True)
+        guide.command(splits, None, np.array([0.0, 9.0, 0.0]))
+        guide.command(splits, None, None if price is None else np.array([0.0, price, 0.0]))
+        guide.apply([DRIVER])
+        assert "".join(routes["driver"]) == way
+
+
 def test_drivers_are_asked_again_where_they_are():
     """On his way over m, which comes to a stand, a driver turns into the side street if he is asked in time."""
     for period, asked in ((0.0, 99), (2.5, 3), (6.0, 6)):

@@ -5,7 +5,8 @@ import tiny
 import torch
 from commands import nmfd
 
-from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
+from nmfd.controllers.dpc.policy import Architecture, Policy
+from nmfd.controllers.dpc.policy_file import checkpoint
 from nmfd.model.regional_model import load_network
 
 TO_1 = "to = 1"

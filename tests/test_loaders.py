@@ -17,7 +17,7 @@ from cosim.sumo.net import load_city
 from cosim.sumo.recorded_trips import read_recorded_trips
 from nmfd.api import load_scenario
 from nmfd.cli.options import policy_files
-from nmfd.controllers.dpc.policy import load_policy
+from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
 from nmfd.runs import run_folder

@@ -13,7 +13,7 @@ from cosim.evaluation import experiment
 from cosim.sumo.xml_files import read_xml
 from nmfd.api import load_scenario
 from nmfd.controllers import custom, open_loop
-from nmfd.controllers.dpc import policy
+from nmfd.controllers.dpc import policy_file
 from nmfd.errors import InputError
 from nmfd.runs import files, run_folder
 
@@ -66,7 +66,8 @@ def test_whatever_is_read_is_no_pipe(place):
     for read in (
             lambda: files.file_hash(pipe), lambda: files.read_rows(pipe, {"a": int}),
             lambda: run_folder.read_manifest(pipe), lambda: run_folder.read_trajectory(pipe.with_suffix(".nc")),
-            lambda: policy.load_policy(pipe, scenario.network), lambda: open_loop.read(pipe, scenario, guidance=False),
+            lambda: policy_file.load_policy(pipe, scenario.network),
+            lambda: open_loop.read(pipe, scenario, guidance=False),
             lambda: custom.check("pipe.py:Mine"), lambda: experiment.read_facts(pipe),
             lambda: read_xml(pipe.with_suffix(".xml"))):
         with pytest.raises(InputError, match="is a pipe, no file"):

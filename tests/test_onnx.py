@@ -9,7 +9,8 @@ import torch
 from commands import nmfd
 
 from nmfd.api import load_scenario
-from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint, load_policy
+from nmfd.controllers.dpc.policy import Architecture, Policy
+from nmfd.controllers.dpc.policy_file import checkpoint, load_policy
 from nmfd.model.regional_model import load_network
 
 ROOT = Path(__file__).parents[1]

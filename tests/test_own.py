@@ -120,6 +120,8 @@ def test_in_strategies(place, name, controller, options):
     (GOOD.replace("splits=None", "splits=np.zeros((2, 2))"), "act: splits: expected finite numbers of shape (2, 2, 2)"),
     (GOOD.replace("splits=None", "splits=np.zeros((2, 2, 2))"), "splits[0, :, 1]: expected shares with sum 1, got 0"),
     (GOOD.replace("splits=None", "splits=np.ones((2, 2, 2))"), "splits[0, 0, 0]: expected 0 (no way), got 1 instead"),
+    (GOOD.replace("splits=None", "splits=None, prices=np.array([0.0, -1.0])"), "prices[1]: expected a number from 0 to"),
+    (GOOD.replace("splits=None", "splits=None, prices=1.0"), "act: prices: expected finite numbers of shape (2,)"),
     (GOOD.replace("return Controls(", "return dict("), "act: expected nmfd.Controls, got dict instead"),
 ])
 @pytest.mark.usefixtures("unchecked")

@@ -15,7 +15,8 @@ from nmfd.api import load_scenario
 from nmfd.controllers import registry
 from nmfd.controllers.dpc import fallback, training
 from nmfd.controllers.dpc import policy as dpc
-from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint
+from nmfd.controllers.dpc.policy import Architecture, Policy
+from nmfd.controllers.dpc.policy_file import checkpoint
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.metrics import total_time_spent
 from nmfd.model.demand_noise import WHERE, entries, perturbed

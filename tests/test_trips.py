@@ -77,7 +77,7 @@ def test_seeds(city, scenario, tmp_path):
     first, again, other = (path.read_bytes() for path in paths)
     assert first == again != other
     vehicles = list(ElementTree.fromstring(first).iter("vehicle"))
-    assert [vehicle.get("id") for vehicle in vehicles] == [f"v{n}" for n in range(count[0])]
+    assert [vehicle.get("id") for vehicle in vehicles] == [f"v{n}" for n in range(len(count[0].routes))]
 
 
 def test_demand_for_other_regions(city):
@@ -86,4 +86,4 @@ def test_demand_for_other_regions(city):
 
 
 def test_no_demand_no_trips(city, tmp_path):
-    assert write_trips(city, np.zeros((2, 7, 7)), 90.0, 1, tmp_path / "none.rou.xml") == 0
+    assert not write_trips(city, np.zeros((2, 7, 7)), 90.0, 1, tmp_path / "none.rou.xml").routes

@@ -159,8 +159,8 @@ class Detectors:
                 probe_departures=departed.astype(float) if self._known.probe_share > 0 else unknown)
 
     def backlog(self) -> PerPair:
-        """(R, R) [veh]: the probes that wait to enter, expanded; zero without probes."""
-        return self._meter.probe_backlog() / max(self._known.probe_share, 1e-9)
+        """(R, R) [veh]: the probes that wait to enter, expanded; zero without probes. Who is made to wait is known."""
+        return self._meter.held() + self._meter.probe_backlog() / max(self._known.probe_share, 1e-9)
 
 
 def _loops(city: City, layout: Layout) -> list[tuple[str, str, float, int]]:

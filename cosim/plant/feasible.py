@@ -14,6 +14,7 @@ def check_strategy(name: str, scenario: Scenario, city: City) -> None:
     try:
         chosen = settings(scenario).changed(**parse(name).overrides)
         check_lanes(scenario, chosen)
+        check_metering(scenario, chosen)
         if chosen.signals != FIXED:
             signals_of(city, scenario, chosen)
     except InputError as error:
@@ -23,6 +24,14 @@ def check_strategy(name: str, scenario: Scenario, city: City) -> None:
 def signals_of(city: City, scenario: Scenario, chosen: Settings) -> CitySignals:
     """The signals of the city, by what may be done with them. InputError where the chosen programme fits none."""
     return city_signals(city, chosen, own_files(scenario, chosen.additional))
+
+
+def check_metering(scenario: Scenario, chosen: Settings) -> None:
+    """InputError where the trips are not the scenario's own, to be held back one by one."""
+    if chosen.metering and chosen.routes:
+        raise InputError(
+            f"{scenario_file(scenario)}: sumo.metering: trips of route files (sumo.routes) cannot be made to wait, only "
+            "those drawn from the scenario's demand; omit it")
 
 
 def check_lanes(scenario: Scenario, chosen: Settings) -> None:

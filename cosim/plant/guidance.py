@@ -4,6 +4,9 @@ Drivers who are told travel times do not keep to the split ratios that they had 
 followed up, and theta shifts it as it shifts the drivers' own split ratios in the regional model (`shifted`). A
 controller that asks for these gets guidance by travel times alone; one that asks for everybody gets everybody.
 
+Prices are the other way to the same end: travel times through a region are told longer than they are, to all who are
+bound for elsewhere, and no share is commanded. Who has a good way round takes it, whoever has none goes through.
+
 Who is sent where is not drawn by lot: a driver at the western edge of a region would be sent round its eastern end as
 often as the others, and trips get so much longer that guidance with the drivers' own split ratios jams a city that
 flows without it (measured on grid7). Instead everybody takes the next region that costs least, with a bonus for the
@@ -34,7 +37,7 @@ from cosim.plant.shortest_paths import Home, Moves, Ways
 from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
-from nmfd.arrays import PerTurn
+from nmfd.arrays import PerRegion, PerTurn
 
 SMOOTHING = 0.5            # weight of the newest travel times
 DRIVER_CLASSES = 4         # groups of drivers who see different travel times: were all sent one way, it would jam
@@ -110,21 +113,26 @@ class Guide:
         self._taste = np.exp(SPREAD * random.standard_normal((DRIVER_CLASSES, len(city.edges))))
         self._length = np.array([city.length[edge] for edge in city.edges])
         self._free = self._length / np.array([city.speed[edge] for edge in city.edges])
-        self._time = self._free.copy()
+        self._measured = self._free.copy()
+        self._prices: PerRegion | None = None
+        self._told: dict[int | None, PerEdge] = {}  # region without a price, None for all with theirs -> (E,) [s]
         self._reached: dict[int, np.ndarray] = {}
         self._ahead: dict[tuple[int, int], np.ndarray] = {}
-        self._ways: dict[tuple[int, int], Ways] = {}
-        self._homes: dict[tuple[int, int], Home] = {}
+        # By region, taste and region without a price.
+        self._ways: dict[tuple[int, int, int | None], Ways] = {}
+        self._homes: dict[tuple[int, int, int | None], Home] = {}
         self._guides, self._splits = False, own
         self._assigned, self._wished = np.zeros((2, *(city.regions,) * 3))
         self.realised = np.zeros((city.regions,) * 3, dtype=int)
         self.refused = 0
 
-    def command(self, splits: PerTurn | None, speed: PerEdge | None) -> None:
+    def command(self, splits: PerTurn | None, speed: PerEdge | None, prices: PerRegion | None = None) -> None:
         """Take over theta (R, R, R) [-] for the next control interval; None: no guidance.
 
         speed: (E,) [m/s] of the city's edges, the mean over the last interval and NaN on empty ones; None: as before.
         A mean, because the speed at one instant is that of a red or a green signal, every time the same one.
+        prices: (R,) [-], by how much longer than they take drivers are told that the ways through each region take,
+            unless it is the one that they are bound for
         """
         self._guides = splits is not None
         if splits is not None:
@@ -132,7 +140,8 @@ class Guide:
             self._interval += 1
             if speed is not None:
                 now = np.where(np.isnan(speed), self._free, self._length / np.maximum(speed, SLOWEST))
-                self._time += SMOOTHING * (np.maximum(now, self._free) - self._time)
+                self._measured += SMOOTHING * (np.maximum(now, self._free) - self._measured)
+            self._told, self._prices = {}, prices
             self._ways, self._homes = {}, {}
             self._assigned *= MEMORY
             self._wished *= MEMORY
@@ -172,7 +181,7 @@ class Guide:
 
     def _guide_home(self, visit: _Visit, here: int, target: int) -> None:
         """The fastest way inside the region of destination; if ways may return, the fastest of all."""
-        event, home = visit.event, self._home(visit.event.region, visit.taste)
+        event, home = visit.event, self._home(visit.event.region, visit.taste, visit.event.destination)
         present = self._present(event.vehicle)
         takes, bound = self._takes(present, here, home.time)
         cost = home.cost(here, target, takes + 1.0 if bound else np.inf)
@@ -182,7 +191,8 @@ class Guide:
 
     def _guide_on(self, visit: _Visit, here: int, target: int) -> None:
         """The next region, and the fastest way through it."""
-        event, ways = visit.event, self._ways_from(visit.event.region, visit.taste)
+        event, ways = visit.event, self._ways_from(
+            visit.event.region, visit.taste, visit.event.destination)
         present = self._present(event.vehicle)
         takes, bound = self._takes(present, here, ways.time)
         cost, reached = ways.cost(here, target, self._most_detour + takes + 1.0 if bound else np.inf)
@@ -193,7 +203,7 @@ class Guide:
         fastest = min(least, default=np.inf)
         returning = None  # the next region of the fastest way of all, where that is one that comes back
         if self._ways_return:
-            home = self._home(event.region, visit.taste)
+            home = self._home(event.region, visit.taste, event.destination)
             of_all = home.cost(here, target, takes + 1.0 if bound else np.inf)
             if of_all < fastest:
                 way, fastest = home.route(here, target), of_all
@@ -280,22 +290,35 @@ class Guide:
         self.refused += not taken
         return taken
 
-    def _home(self, region: int, taste: int) -> "Home":
-        region = 0 if self._ways_return else region
-        if (region, taste) not in self._homes:
-            self._homes[region, taste] = Home(self._homeward[region], self._time * self._taste[taste])
-        return self._homes[region, taste]
+    def _bound_for(self, destination: int) -> tuple[int | None, PerEdge]:
+        """What drivers on their way to region `destination` are told (E,) [s], and that region, if it has a price that
+        they do not see."""
+        free = destination if self._prices is not None and self._prices[destination] > 0.0 else None
+        if free not in self._told:
+            prices = np.zeros(self._city.regions) if self._prices is None else self._prices.copy()
+            prices[[] if free is None else free] = 0.0
+            self._told[free] = self._measured * (1.0 + prices)[self._region]
+        return free, self._told[free]
 
-    def _ways_from(self, region: int, taste: int) -> "Ways":
-        if (region, taste) not in self._ways:
+    def _home(self, region: int, taste: int, destination: int) -> "Home":
+        free, time = self._bound_for(destination)
+        key = 0 if self._ways_return else region, taste, free
+        if key not in self._homes:
+            self._homes[key] = Home(self._homeward[key[0]], time * self._taste[taste])
+        return self._homes[key]
+
+    def _ways_from(self, region: int, taste: int, destination: int) -> "Ways":
+        free, time = self._bound_for(destination)
+        key = region, taste, free
+        if key not in self._ways:
             outside = self._without_back[region]
             entries = outside.number[self._gateways[region][1]]
             if region not in self._reached:
                 self._reached[region] = outside.leading_to(entries)
             if (region, taste) not in self._ahead:
                 self._ahead[region, taste] = outside.ahead(entries, self._free * self._taste[taste])
-            self._ways[region, taste] = Ways(
+            self._ways[key] = Ways(
                 *self._gateways[region], inside=self._within[region], outside=outside,
                 reached=self._reached[region], ahead=self._ahead[region, taste],
-                time=self._time * self._taste[taste])
-        return self._ways[region, taste]
+                time=time * self._taste[taste])
+        return self._ways[key]

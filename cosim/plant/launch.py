@@ -18,7 +18,7 @@ from cosim.sumo.recorded_trips import (
 )
 from cosim.sumo.session import Session, Window
 from cosim.sumo.tripinfo import trip_options
-from cosim.sumo.trips import write_trips
+from cosim.sumo.trips import Trips, write_trips
 from cosim.sumo.turning_flows import own_flows, turning_flows
 from cosim.sumo.xml_files import file_list
 from nmfd.model.scenario import Scenario
@@ -46,7 +46,8 @@ def own_files(scenario: Scenario, names: Sequence[str]) -> list[Path]:
 class Launch:
     """Starts SUMO for one run after the other, in a scratch folder that `close` removes.
 
-    vehicles: ids of those of the last run; trip_file: what SUMO tells of their trips when it ends
+    vehicles: ids of those of the last run; trips: the same, where they are drawn from the scenario's demand; trip_file:
+    what SUMO tells of them when it ends
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class Launch:
         self._scratch = Scratch("cosim-")
         self._originals: RecordedTrips | None = None
         self.vehicles: list[str] = []
+        self.trips: Trips | None = None
         self.trip_file = outputs.get("tripinfo", self._scratch.path / "tripinfo.xml")
 
     def start(self, seed: int) -> Session:
@@ -112,7 +114,9 @@ class Launch:
         """The route file of one run; the ids of its vehicles."""
         scenario, chosen = self._scenario, self._settings
         if not chosen.routes:
-            return [f"v{n}" for n in range(write_trips(self._city, scenario.demand, scenario.step, seed, path))]
+            self.trips = write_trips(
+                self._city, scenario.demand, scenario.step, seed, path, metered=chosen.metering)
+            return [f"v{n}" for n in range(len(self.trips.routes))]
         if self._originals is None:
             self._originals = own_vehicles(scenario, chosen, self._city)
         return write_recorded_trips(

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cosim.plant.metering import Metering
 from cosim.sumo.arrays import PerGateway
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
@@ -85,9 +86,11 @@ class Meter:
 
     def __init__(
         self, session: Session, city: City, probes: frozenset[str] = frozenset(), trips: TripReader | None = None,
+        metering: Metering | None = None,
     ):
         """probes: vehicles that are counted apart, too; trips: what SUMO tells of those that have left, None to take
-        all that it calls arrived for arrivals"""
+        all that it calls arrived for arrivals; metering: who has trips wait, of whom SUMO does not know yet"""
+        self._metering = metering
         self._session, self._city, self._probes, self._trips = session, city, probes, trips
         self._vehicles: dict[str, _Vehicle] = {}
         self._gone: dict[str, list[_Gone]] = {}  # whose end SUMO has not told of: several where an id is used again
@@ -267,7 +270,7 @@ class Meter:
 
     def backlog(self) -> PerPair:
         """(R, R) [veh]: due to depart from i for j, but not inserted yet. Books those that SUMO has given up."""
-        waiting, pending = np.zeros(self._running.shape), self._session.pending()
+        waiting, pending = self.held(), self._session.pending()
         for vehicle in pending:
             known = self._load(vehicle)
             waiting[known.origin, known.destination] += 1
@@ -275,6 +278,10 @@ class Meter:
         for vehicle in ahead.difference(self._session.known()) if ahead else ():
             self._leave(vehicle)
         return waiting
+
+    def held(self) -> PerPair:
+        """(R, R) [veh]: those of the backlog who are made to wait."""
+        return np.zeros(self._running.shape) if self._metering is None else self._metering.backlog()
 
     def on_the_road(self) -> PerRegion:
         """(R,) [veh]: those on their way, by the region where they began."""

@@ -8,11 +8,12 @@ import numpy as np
 
 from cosim.plant.actuation import Actuation
 from cosim.plant.detectors import instruments, lay_out, probes
-from cosim.plant.feasible import check_lanes, signals_of
+from cosim.plant.feasible import check_lanes, check_metering, signals_of
 from cosim.plant.guidance import Guide
 from cosim.plant.incidents import Incidents
 from cosim.plant.launch import Launch
 from cosim.plant.meter import Meter
+from cosim.plant.metering import Metering
 from cosim.plant.observer import Observer
 from cosim.plant.record import Record, Recorder
 from cosim.plant.sensing import Estimation, Sensing
@@ -54,6 +55,7 @@ class SumoPlant:
         self._observer = observer
         self._settings = chosen = overrides or settings(scenario)
         check_lanes(scenario, chosen)
+        check_metering(scenario, chosen)
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
         check_adjacency(self.city, scenario.network)
@@ -71,6 +73,7 @@ class SumoPlant:
         self._k, self._session = 0, self._launch.start(seed)
         self._trips = TripReader(self._launch.trip_file, self.session.flush)
         self._incidents = Incidents(self._scenario.ordered_faults, self.session, self.city)
+        self._metering = self._new_metering()
         self._sensing = self._new_sensing(seed)
         self._guide = self._new_guide(seed)
         self._actuation = self._new_actuation()
@@ -100,10 +103,14 @@ class SumoPlant:
         network = self._scenario.network
         self._actuation.command(
             self._incidents.gated(controls.perimeter, network.u_min, network.u_max), vehicles)
-        self._guide.command(self._splits(controls), speed)
+        self._guide.command(self._splits(controls), speed, controls.prices)
+        if self._metering:
+            self._metering.command(controls.metering, self._state.accumulation.sum(axis=1))
         self._sensing.begin()
         for _ in range(round(self._scenario.step / session.step_length)):
             self._actuation.play()
+            if self._metering:
+                self._metering.play()
             session.step()
             entered = self._sensing.measure()
             self._guide.apply(entered)
@@ -135,7 +142,7 @@ class SumoPlant:
             self._end_session()
             self._sensing.meter.close_books()
             self._recorder.close()
-            self._facts = self._with_standstill(self._trips.facts, *emitted)
+            self._facts = self._with_standstill(self._with_held(self._trips.facts), *emitted)
         return self._facts
 
     def time_loss(self) -> PerRegion:
@@ -193,6 +200,14 @@ class SumoPlant:
         standing = self._standstill.reached(state, float(left))
         return standing and self.session.expected() <= state.accumulation.sum() + state.backlog.sum()
 
+    def _with_held(self, facts: TripFacts) -> TripFacts:
+        """And those who were made to wait, of which SUMO does not know."""
+        if self._metering is None:
+            return facts
+        held, waiting = self._metering.waiting()
+        return replace(
+            facts, trips=facts.trips + held, departure_delay=facts.departure_delay + self._metering.waited + waiting)
+
     def _with_standstill(self, facts: TripFacts, co2: float, fuel: float) -> TripFacts:
         """And what was booked without being simulated. co2, fuel: of everybody on the road at the end [kg/s]"""
         time, state = self.booked * self._scenario.step, self._state
@@ -210,17 +225,26 @@ class SumoPlant:
         return self._state
 
     def _splits(self, controls: Controls) -> PerTurn | None:
-        """What drivers are guided by: the drivers' own split ratios mean guidance by travel times alone."""
-        return self._scenario.network.nominal_splits if controls.splits is None and self._settings.guided else (
-            controls.splits)
+        """What drivers are guided by: their own split ratios mean guidance by travel times alone; where there are
+        prices, these bring the split ratios about."""
+        guided = controls.splits is None and self._settings.guided
+        return self._scenario.network.nominal_splits if guided or controls.prices is not None else controls.splits
+
+    def _new_metering(self) -> Metering | None:
+        chosen, network, trips = self._settings, self._planning.network, self._launch.trips
+        if not chosen.metering or trips is None:
+            return None
+        return Metering(
+            self.session, trips, np.array([mfd.critical for mfd in network.mfds]), level=chosen.metering_level,
+            step=self._scenario.step)
 
     def _new_sensing(self, seed: int) -> Sensing:
         chosen = self._settings
         if chosen.measurement != ESTIMATE:
-            meter, estimation = Meter(self.session, self.city, trips=self._trips), None
+            meter, estimation = Meter(self.session, self.city, trips=self._trips, metering=self._metering), None
         else:
             known = probes(self._launch.vehicles, chosen.probe_share, seed)
-            meter = Meter(self.session, self.city, known, self._trips)
+            meter = Meter(self.session, self.city, known, self._trips, self._metering)
             estimation = Estimation(self.session, self.city, self._layout, meter, self._instruments, self._planning)
         return Sensing(
             self._scenario, self.session, self.city, self._incidents, meter, estimation, self._observer)

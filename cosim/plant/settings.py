@@ -47,6 +47,11 @@ class SumoTable(config.Settings):
         "guided drivers may leave a region and come back to it where that is the fastest way of all, as on a main road "
         "along a ragged boundary", False)
     rerouting: Share = setting("share of the drivers with SUMO's own rerouting device", 0.0)
+    metering: bool = setting(
+        "trips begin in a region no faster than is commanded; without a command, its accumulation is held", False)
+    metering_level: float = setting(
+        "the accumulation that metering holds a region at without a command, in critical accumulations", 1.2, unit="-",
+        gt=0.0, le=10.0)
     measurement: Literal["exact", "estimate"] = setting(
         "what controllers see: the exact state, or what detectors and probes tell", EXACT)
     detector_share: Share = setting("share of the links with loop detectors", 0.3)

@@ -39,25 +39,27 @@ class Trips:
     arrival: PerTrip
 
 
-def write_trips(city: City, demand: PairsOverTime, step: float, seed: int, path: Path) -> int:
-    """Write the trips of `demand` (T, R, R) [veh/s], intervals of `step` [s], to a SUMO route file; returns how many.
+def write_trips(
+    city: City, demand: PairsOverTime, step: float, seed: int, path: Path, *, metered: bool = False,
+) -> Trips:
+    """Write the trips of `demand` (T, R, R) [veh/s], intervals of `step` [s], to a SUMO route file.
 
-    The vehicles are v0, v1, ... by departure; the same seed gives the same bytes.
+    The vehicles are v0, v1, ... by departure; the same seed gives the same bytes. metered: only their routes r0, r1, ...
     """
     trips = make_trips(city, demand, step, seed)
     lines = ['<routes>\n  <vType id="car" sigma="0.2"/>\n']
     for n, route in enumerate(trips.routes):
-        lines.append(
+        edges = quoteattr(" ".join(route))
+        lines.append(f'  <route id="r{n}" edges={edges}/>\n' if metered else (
             f'  <vehicle id="v{n}" type="car" depart="{trips.depart[n]:.2f}" departLane="best" departSpeed="max" '
-            f'departPos="random_free" arrivalPos="{trips.arrival[n]:.1f}">'
-            f"<route edges={quoteattr(' '.join(route))}/></vehicle>\n")
+            f'departPos="random_free" arrivalPos="{trips.arrival[n]:.1f}"><route edges={edges}/></vehicle>\n'))
     lines.append("</routes>\n")
     path = Path(path)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     with os.fdopen(handle, "w", encoding="utf-8") as stream:
         stream.writelines(lines)
     os.replace(temporary, path)
-    return len(trips.routes)
+    return trips
 
 
 def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Trips:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from nmfd.controllers import registry
-from nmfd.controllers.dpc.policy import read_policy_file
+from nmfd.controllers.dpc.policy_file import read_policy_file
 from nmfd.model.network_file import NetworkTable
 from nmfd.model.scenario_file import ScenarioTable, read_tables
 from nmfd.runs import config, shipped

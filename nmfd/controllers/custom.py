@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from nmfd.arrays import PerRegion
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import RegionalModel
@@ -39,6 +40,8 @@ from nmfd.types import Controls, Observation, Status
 GROUP = "nmfd.controllers"
 FILE_AND_CLASS = re.compile(r"(?P<file>.+\.py):(?P<cls>[^\W\d]\w*)")
 ROUNDING = 1e-5  # by how much bounds and sums may be missed: float32
+MOST_PRICE = 100.0  # beyond which nobody would take a way through the region, whatever the others cost
+MOST_RATE = 1e6      # veh/s, as good as no limit
 LONGEST = 300    # characters of what the user's code says
 
 
@@ -216,8 +219,12 @@ def checked(controls: object, network: RegionalModel, where: str) -> Controls:
                 f"{where}: perimeter[{i}, {h}]: expected a number in [{network.u_min:g}, {network.u_max:g}], got "
                 f"{perimeter[i, h]:g} instead; use numpy.clip")
     perimeter = np.where(network.adjacency, np.clip(perimeter, network.u_min, network.u_max), 0.0)
+    prices = _by_region(controls.prices, regions, MOST_PRICE, f"{where}: prices")
+    metering = _by_region(controls.metering, regions, MOST_RATE, f"{where}: metering")
     if controls.splits is None:
-        return Controls(perimeter=perimeter, splits=None, status=controls.status, note=_text(controls.note))
+        return Controls(
+            perimeter=perimeter, splits=None, status=controls.status, note=_text(controls.note), prices=prices,
+            metering=metering)
     splits = _array(controls.splits, (regions,) * 3, f"{where}: splits")
     allowed = network.split_mask
     if (wrong := np.argwhere((splits < -ROUNDING) | (~allowed & (splits > ROUNDING)))).size:
@@ -232,7 +239,17 @@ def checked(controls: object, network: RegionalModel, where: str) -> Controls:
         raise InputError(f"{where}: splits[{i}, :, {j}]: expected shares with sum 1, got {sums[i, j]:g} instead")
     return Controls(
         perimeter=perimeter, splits=splits / np.where(sums > 0, sums, 1.0)[:, None, :], status=controls.status,
-        note=_text(controls.note))
+        note=_text(controls.note), prices=prices, metering=metering)
+
+
+def _by_region(asked: object, regions: int, most: float, where: str) -> PerRegion | None:
+    if asked is None:
+        return None
+    numbers = _array(asked, (regions,), where)
+    if (wrong := np.flatnonzero((numbers < 0.0) | (numbers > most))).size:
+        i = wrong[0]
+        raise InputError(f"{where}[{i}]: expected a number from 0 to {most:g}, got {numbers[i]:g} instead")
+    return numbers
 
 
 def _array(values: object, shape: tuple[int, ...], where: str) -> np.ndarray:

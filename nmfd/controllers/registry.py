@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from nmfd.controllers import custom, open_loop
-from nmfd.controllers.dpc import fallback, online, policy, training
+from nmfd.controllers.dpc import fallback, online, policy_file, training
 from nmfd.controllers.dpc.options import TRAINED, Online
 from nmfd.controllers.excitation import Probing
 from nmfd.controllers.greedy import Greedy
@@ -70,7 +70,7 @@ _ENTRIES = {
     **{name: Entry(
         text=f"a policy trained by differentiable predictive control, perimeter control{ALSO * guides}"
              f"{', with noise on the demand' if 'robust' in name else ''}",
-        make=partial(policy.load, guidance=guides), guides=guides, policy=name, declared=TRAINED[name])
+        make=partial(policy_file.load, guidance=guides), guides=guides, policy=name, declared=TRAINED[name])
        for name, guides in training.NAMES.items()},
     "dpc-pc-guarded": Entry(
         text="dpc-pc, watched: PI gating where it has seen no such state", make=partial(fallback.load, guidance=False),
@@ -232,8 +232,8 @@ def outside_training(name: str, scenario: Scenario, level: float, *, file: Path 
     path = policy_path(name, scenario, file)
     if path is None or split(name)[0] not in policy_names():
         return ""
-    _, content = policy.load_policy(path, planning_model(scenario, _owner(name)).network)
-    return policy.outside_training(content, level)
+    _, content = policy_file.load_policy(path, planning_model(scenario, _owner(name)).network)
+    return policy_file.outside_training(content, level)
 
 
 def verify(name: str, scenario: Scenario, *, policy: Path | None = None) -> None:

@@ -95,6 +95,21 @@ def passing(p: Parameters, wish: PerPair, perimeter: PerPair, accumulation: PerR
     return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
 
 
+def admitted(
+    backlog: PerPair, demand: PerPair, metering: PerRegion | None, step: float,
+) -> tuple[PerPair, PerPair]:
+    """The demand (..., R, R) [veh/s] that may enter within `step` [s], and the backlog (..., R, R) [veh] after it.
+
+    metering: (..., R) [veh/s], the most trips that may begin in each region, in equal shares of all who wait for the
+        same; None for all, of whom nobody waits if nobody did
+    """
+    if metering is None:
+        return demand + backlog / step, torch.zeros_like(backlog)
+    due = backlog / step + demand
+    share = (metering / due.sum(-1).clamp(min=1e-9)).clamp(max=1.0).unsqueeze(-1)
+    return share * due, (1.0 - share) * due * step
+
+
 def derivative(p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn) -> PerPair:
     """dx_ij/dt (..., R, R) [veh/s]."""
     completions, transfers = flows(p, x, perimeter, splits)

@@ -30,11 +30,14 @@ class NmfdPlant:
         """As the scenario begins; the model is deterministic, `seed` changes nothing."""
         self._x = torch.from_numpy(self._scenario.start)
         self._k, self._entered, self._ended = 0, float(self._x.sum()), 0.0
+        self._backlog = torch.zeros_like(self._x)
         return self._state()
 
     def step(self, controls: Controls) -> State:
         """One control interval. LedgerError if vehicles appear or vanish."""
-        demand = self._demand[self._k]
+        metering = None if controls.metering is None else torch.from_numpy(controls.metering)
+        demand, self._backlog = dynamics.admitted(
+            self._backlog, self._demand[self._k], metering, self._scenario.step)
         splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
         self._x, ended = dynamics.advance_counted(
             self._parameters, self._x, demand, torch.from_numpy(controls.perimeter), torch.from_numpy(splits),
@@ -56,7 +59,7 @@ class NmfdPlant:
     def _state(self) -> State:
         x = self._x.numpy()
         return State(
-            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=np.zeros_like(x),
+            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=self._backlog.numpy().copy(),
             completed=self._ended)
 
 
@@ -73,6 +76,7 @@ class AcyclicPlant:
         self._x = np.zeros(len(self._model.region))
         self._x[self._model.start] = self._scenario.start
         self._k, self._entered, self._ended, self._forced = 0, float(self._x.sum()), 0.0, 0.0
+        self._backlog = torch.zeros(2 * (self._scenario.network.regions,), dtype=torch.float64)
         return self._state()
 
     @property
@@ -95,7 +99,10 @@ class AcyclicPlant:
     def step(self, controls: Controls) -> State:
         """One control interval. LedgerError if vehicles appear or vanish."""
         scenario, model = self._scenario, self._model
-        demand = scenario.demand[self._k]
+        metering = None if controls.metering is None else torch.from_numpy(controls.metering)
+        admitted, self._backlog = dynamics.admitted(
+            self._backlog, torch.from_numpy(scenario.demand[self._k]), metering, scenario.step)
+        demand = admitted.numpy()
         splits = scenario.network.nominal_splits if controls.splits is None else controls.splits
         theta, forced = acyclic.shares(model, splits)
         if forced.any():
@@ -122,5 +129,5 @@ class AcyclicPlant:
     def _state(self) -> State:
         x = acyclic.translate(self._model, self._x)
         return State(
-            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=np.zeros_like(x),
+            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=self._backlog.numpy().copy(),
             completed=self._ended)

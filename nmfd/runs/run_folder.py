@@ -28,6 +28,7 @@ from nmfd.types import Trajectory
 
 COLUMNS = {name: kind for name, (kind, _) in SUMMARY.items()}
 LOCK = ".lock"  # of a run folder
+YOUNGER = {"removed", "prices"}  # quantities that older runs do not have
 # What reading raises for a file that is no netCDF, cut off, changed, or without a variable that it should have.
 DAMAGED = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError, MemoryError)
 
@@ -80,7 +81,7 @@ def read_trajectory(path: Path) -> Trajectory:
 def trajectory_in(file: netCDF4.Dataset) -> Trajectory:
     """That of a run's file (`opened`)."""
     arrays = {name: file[name][...] for name in quantities(Trajectory)
-              if name != "decision_time" and (name in file.variables or name != "removed")}  # older runs had none
+              if name != "decision_time" and (name in file.variables or name not in YOUNGER)}
     arrays["note"] = tuple(arrays["note"])
     return Trajectory(
         controller=file.controller, plant=file.plant, seed=int(file.seed), step=float(file.step),

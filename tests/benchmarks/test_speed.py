@@ -14,7 +14,7 @@ import torch
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
 from nmfd.controllers import registry
-from nmfd.controllers.dpc.policy import load_policy
+from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.no_control import NoControl

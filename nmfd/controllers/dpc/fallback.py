@@ -16,7 +16,8 @@ from jaxtyping import Float
 
 from nmfd import tensors
 from nmfd.arrays import PerPair
-from nmfd.controllers.dpc.policy import DpcController, Policy, check_guidance, load_policy
+from nmfd.controllers.dpc.policy import DpcController, Policy
+from nmfd.controllers.dpc.policy_file import check_guidance, load_policy
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
 from nmfd.model import dynamics
@@ -204,7 +205,7 @@ class Guarded:
         if not problem:
             return controls
         return replace(
-            controls, splits=self._drivers, status=controls.status | Status.FALLBACK,
+            controls, splits=self._drivers, prices=None, status=controls.status | Status.FALLBACK,
             note=f"guard: {problem}, the drivers' own instead")
 
     def _problem(self, observation: Observation, foreseen: Foreseen) -> str | None:

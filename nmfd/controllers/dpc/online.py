@@ -15,7 +15,8 @@ from jaxtyping import Float
 
 from nmfd.arrays import PerPair, PerRegion
 from nmfd.controllers.dpc.options import Online
-from nmfd.controllers.dpc.policy import DpcController, Policy, check_guidance, load_policy
+from nmfd.controllers.dpc.policy import DpcController, Policy
+from nmfd.controllers.dpc.policy_file import check_guidance, load_policy
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.controllers.options import options
 from nmfd.model import dynamics

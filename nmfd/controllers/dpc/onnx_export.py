@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nmfd.controllers.dpc.policy import Policy, load_policy, read_policy_file
+from nmfd.controllers.dpc.policy import Policy
+from nmfd.controllers.dpc.policy_file import load_policy, read_policy_file
 from nmfd.errors import InputError, RunFailed
 from nmfd.extras import need
 from nmfd.model.planning import PlanningModel, planning_model

@@ -1,11 +1,11 @@
 """The options of DPC policies, declared: how they are trained, and how one goes on learning while it drives."""
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from nmfd.controllers.options import Options
-from nmfd.runs.config import Flow, Problem, Share, setting, whole
+from nmfd.runs.config import Flow, Numbers, Problem, Share, setting, whole
 
 if TYPE_CHECKING:
     from nmfd.model.planning import PlanningModel
@@ -31,7 +31,16 @@ class Training(Options):
     local: bool = setting(
         "the same small network decides at every boundary, by how full the regions around it are: perimeter control "
         "of very many regions, and by a policy that was trained in another city", False)
-    steps: int = whole("Adam steps", 400, low=1, high=MOST_STEPS)
+    compact: bool = setting(
+        "a policy of eight numbers that can be read instead of a network: a gate on the protected regions, and prices "
+        "of the ways through crowded regions, by which drivers are guided; trained on the CPU", False)
+    numbers: Annotated[Numbers, Field(min_length=8, max_length=8)] | None = setting(
+        "those that a compact policy begins with: set_point and gain of the gate, its relief for crowded regions "
+        "before it, price and price_from of the protected regions, elsewhere and elsewhere_from of the others, "
+        "metering (nmfd/controllers/dpc/compact.py)", None, unit="-")
+    metering: bool = setting(
+        "a compact policy lets trips wait where regions are full; for cities with +metering", False)
+    steps: int = whole("Adam steps; 0 leaves a compact policy as it begins", 400, low=0, high=MOST_STEPS)
     batch: int = whole("rollouts per step", 16, low=1, high=100_000)
     learning_rate: float = setting(
         "of Adam at the start; falls to a tenth along a cosine", 1e-3, unit="-", gt=0.0, le=1.0)
@@ -67,13 +76,23 @@ class Training(Options):
     def _begins_as_one(self) -> "Training":
         if self.from_gating and self.from_no_control:
             raise Problem("from_gating", "a policy cannot begin as both, a gate and no control; omit one")
+        if self.compact and (self.local or self.from_gating or self.from_no_control):
+            raise Problem("compact", "begins with its numbers; omit local, from_gating, from_no_control")
+        if self.numbers and not (self.compact and min(self.numbers) >= 0.0):
+            raise Problem("numbers", "expected eight numbers >= 0 of a compact policy; add compact = true, or omit it")
+        if self.metering and not self.compact:
+            raise Problem("metering", "only compact policies let trips wait; add compact = true, or omit it")
+        if not (self.steps or self.compact):
+            raise Problem("steps", "expected a whole number from 1, or a compact policy")
         return self
 
     def misfit(self, planning: "PlanningModel") -> Problem | None:
         """A gate without a region to protect."""
-        if not self.from_gating or planning.protected:
+        if not (self.from_gating or self.compact) or planning.protected:
             return None
-        return Problem("from_gating", "expected a scenario with protected regions; name them, or omit it")
+        return Problem(
+            "compact" if self.compact else "from_gating",
+            "expected a scenario with protected regions; name them, or omit it")
 
     @property
     def levels(self) -> tuple[float, float]:

@@ -5,10 +5,8 @@ As in Tumu et al.: an MLP backbone with one decoder for the perimeter (scaled si
 """
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,15 +14,11 @@ from jaxtyping import Float, Int
 from torch import nn
 
 from nmfd.arrays import Adjacency
-from nmfd.controllers.dpc.options import DEEPEST, WIDEST, Activation
-from nmfd.errors import InputError
-from nmfd.model.planning import PlanningModel
+from nmfd.controllers.dpc.options import Activation
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs.files import check_file
-from nmfd.tensors import PerPair, PerTurn
+from nmfd.tensors import PerPair, PerRegion, PerTurn
 from nmfd.types import Controls, Observation, Status
 
-FORMAT = 1
 FEATURES = 6  # of a boundary, that a local policy sees
 
 
@@ -65,7 +59,9 @@ class Architecture:
     guidance: with a decoder for the split ratios; sparse: decoders with outputs for adjacent regions only, which a
     city of many regions needs (their number grows with R^2 instead of R^3); local: one small network, the same at
     every boundary, which knows FEATURES numbers of what is around it: it has no more weights in a large city than in
-    a small one, and one that was trained in one city can drive another. Perimeter control only."""
+    a small one, and one that was trained in one city can drive another. Perimeter control only; compact: the protected
+    regions of a policy of a few numbers (nmfd.controllers.dpc.compact), () for a network; metering: whether that policy
+    lets trips wait."""
 
     width: int = 128
     layers: int = 2
@@ -73,6 +69,8 @@ class Architecture:
     guidance: bool = False
     sparse: bool = False
     local: bool = False
+    compact: tuple[int, ...] = ()
+    metering: bool = False
 
     @property
     def listed(self) -> bool:
@@ -88,7 +86,7 @@ class Policy(nn.Module):
 
     def __init__(self, network: RegionalModel, architecture: Architecture):
         super().__init__()
-        regions, width = network.regions, architecture.width
+        regions = network.regions
         self.architecture, self.regions = architecture, regions
         self.u_min, self.u_max = network.u_min, network.u_max
         self.register_buffer(
@@ -99,6 +97,12 @@ class Policy(nn.Module):
         allowed = torch.tensor(network.adjacency[here, onward] & (np.diff(onward, prepend=-1) != 0))
         self.register_buffer("adjacency", allowed.float(), persistent=False)
         self.register_buffer("onward", torch.tensor(onward), persistent=False)
+        self._build(network)
+
+    def _build(self, network: RegionalModel) -> None:
+        """Its weights."""
+        architecture, regions, width = self.architecture, self.regions, self.architecture.width
+        here, onward = np.arange(regions)[:, None], self.onward.numpy()
         layers: list[nn.Module] = []
         for layer in range(architecture.layers):
             inputs = FEATURES if architecture.local else regions**2
@@ -108,7 +112,7 @@ class Policy(nn.Module):
         self.perimeter_decoder = nn.Linear(width, 1 if architecture.local else onward.size)
         if architecture.guidance:
             self.splits_decoder = nn.Linear(width, onward.size * regions)
-            mask = torch.tensor(network.split_mask[here, onward]) & allowed.unsqueeze(-1)
+            mask = torch.tensor(network.split_mask[here, onward]) & self.adjacency.bool().unsqueeze(-1)
             # A softmax over nothing but -inf is NaN: rows with no way out (j = i) get finite logits and are zeroed.
             blocked = ~mask & mask.any(dim=1, keepdim=True)
             bias = torch.zeros(mask.shape).masked_fill(blocked, -torch.inf)
@@ -139,6 +143,14 @@ class Policy(nn.Module):
             return perimeter, None
         logits = self.splits_decoder(hidden).unflatten(-1, (*shape, self.regions)) + self.split_bias
         return perimeter, torch.softmax(logits, dim=-2) * self.split_mask
+
+    def prices(self, x: PerPair) -> PerRegion | None:
+        """(..., R) [-] of the ways through each region, of a policy that brings its split ratios about by prices."""
+        return None
+
+    def metering(self, x: PerPair) -> PerRegion | None:
+        """(..., R) [veh/s], the most trips that may begin in each region, of a policy that lets trips wait."""
+        return None
 
     def _around(self, x: PerPair) -> Float[torch.Tensor, "*#B R D F"]:
         """Of every boundary (i, h): how full i and h are, their neighbours on average, and how many of those in i and h
@@ -177,6 +189,9 @@ class DpcController:
             seen = observation.accumulation  # of which a local policy needs the sums only, and no copy
             x = torch.from_numpy(seen if self._policy.architecture.local else seen.astype(np.float32))
             perimeter, splits = self._policy.listed(x)
+            prices, metering = (
+                None if asked is None else asked.numpy().astype(float)
+                for asked in (self._policy.prices(x), self._policy.metering(x)))
         perimeter = perimeter.numpy()
         if self.fault == "policy-nan":
             perimeter = np.full_like(perimeter, np.nan)
@@ -190,7 +205,9 @@ class DpcController:
                 note="dpc: policy returned NaN, perimeter opened")
         if splits is not None:
             splits /= np.maximum(sums, 1e-9)  # float32 sums miss 1 by 1e-7; those of j = i are 0
-        return Controls(perimeter=self._full(perimeter), splits=None if splits is None else self._full(splits))
+        return Controls(
+            perimeter=self._full(perimeter), splits=None if splits is None else self._full(splits),
+            prices=prices, metering=metering)
 
     def _full(self, listed: np.ndarray) -> np.ndarray:
         """(R, R) or (R, R, R) of (R, D) or (R, D, R): the second axis, over the policy's neighbours, over all regions.
@@ -203,79 +220,3 @@ class DpcController:
         here, way = np.nonzero(np.diff(self._onward, prepend=-1))
         full[here, self._onward[here, way]] = listed[here, way]
         return full
-
-
-def checkpoint(policy: Policy, network: RegionalModel, configuration: Mapping, states: Mapping | None = None) -> dict:
-    """What a policy file holds: weights with the normalisation, architecture, network hash, configuration.
-
-    states: of nmfd.controllers.dpc.fallback.statistics, where the policy is to be guarded
-    """
-    return {
-        **({} if states is None else {"states": dict(states)}),
-        "format": FORMAT, "architecture": asdict(policy.architecture), "network": network.name,
-        "network_hash": network.hash, "configuration": dict(configuration),
-        "weights": {key: value.detach().cpu().clone() for key, value in policy.state_dict().items()}}
-
-
-def read_file(path: Path, missing: str, damaged: str) -> Any:
-    """What torch wrote to `path`, on the CPU; InputError in these words. No code of the file is executed."""
-    check_file(path, "train one with 'nmfd train'")
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise InputError(f"{path}: {missing}") from None
-    except Exception:
-        raise InputError(f"{path}: {damaged}") from None
-
-
-def read_policy_file(path: Path) -> Any:
-    """The checkpoint in `path`, unchecked. InputError if there is none."""
-    return read_file(
-        path, "no such policy; train one with 'nmfd train'", "is not a policy file; train one with 'nmfd train'")
-
-
-def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
-    """The policy in `path` and its whole checkpoint. InputError if it is none, or was trained for another network."""
-    content = read_policy_file(path)
-    try:
-        if content["format"] != FORMAT:
-            raise InputError(f"{path}: format: expected {FORMAT}, got {content['format']!r} instead; train it again")
-        architecture = Architecture(**content["architecture"])
-        if content["network_hash"] != network.hash and architecture.local is not True:
-            raise InputError(
-                f"{path}: network_hash: the policy was trained for network {content['network']!r} "
-                f"({content['network_hash']}), not for {network.name!r} ({network.hash}); train one with 'nmfd train'")
-        flags = {type(architecture.guidance), type(architecture.sparse), type(architecture.local)}
-        if not (0 < architecture.width <= WIDEST and 0 < architecture.layers <= DEEPEST and flags == {bool}):
-            raise KeyError("architecture")
-        policy = Policy(network, architecture)
-        policy.load_state_dict(content["weights"])
-    except (LookupError, TypeError, RuntimeError, AttributeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: is damaged or of another version; train it again with 'nmfd train'") from None
-    return policy, content
-
-
-def outside_training(content: Mapping, level: float) -> str:
-    """What to say of a run at `level` times the demand, outside of what the policy of this checkpoint was trained on;
-    "" within it."""
-    low, high = (content["configuration"].get(key, 1.0) for key in ("demand_low", "demand_high"))
-    if low - 1e-9 <= level <= high + 1e-9:
-        return ""
-    trained = f"{low:g} times" if low == high else f"{low:g} to {high:g} times"
-    return f"demand times {level:g} is outside of what the policy was trained on, {trained} that of the scenario"
-
-
-def check_guidance(policy: Policy, path: Path, guidance: bool) -> None:
-    """InputError if the policy in `path` is of the other kind."""
-    if policy.architecture.guidance != guidance:
-        has, wanted = ("dpc-pc", "dpc-pcrg") if guidance else ("dpc-pcrg", "dpc-pc")
-        raise InputError(f"{path}: is a {has} policy, not {wanted}; choose --controller {has} or another file")
-
-
-def load(path: Path, planning: PlanningModel, *, guidance: bool) -> DpcController:
-    """The controller in the policy file `path`; InputError if it does not fit the scenario's network or the name."""
-    policy, _ = load_policy(path, planning.network)
-    check_guidance(policy, path, guidance)
-    return DpcController(policy)

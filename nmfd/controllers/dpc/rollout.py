@@ -127,26 +127,30 @@ class Rollout:
 
     def states(
         self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None,
-    ) -> tuple[Demands, Demands]:
-        """The states (T, B, R, R) [veh] under `policy` from x (B, R, R), and what it saw of them through the noise.
+    ) -> tuple[Demands, Demands, Demands]:
+        """The states (T, B, R, R) [veh] under `policy` from x (B, R, R), what it saw of them through the noise, and who
+        waited to enter, because it did not let them.
 
         step: what to use instead of `self.step`, such as its compiled form
         """
         noise = torch.randn(demand.shape, generator=generator, dtype=self.dtype).to(self.device)
         noise *= self.planning.measurement_std
-        states = [x]
+        states, waiting = [x], [torch.zeros_like(x)]
         for k in range(demand.shape[0] - 1):
-            states.append((step or self.step)(policy, states[-1], demand[k], noise[k]))
+            entering, backlog = dynamics.admitted(
+                waiting[-1], demand[k], policy.metering(states[-1] + noise[k]), self.planning.step)
+            states.append((step or self.step)(policy, states[-1], entering, noise[k]))
+            waiting.append(backlog)
         exact = torch.stack(states)
-        return exact, exact + noise
+        return exact, exact + noise, torch.stack(waiting)
 
     def total_time_spent(
         self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None,
     ) -> Levels:
         """TTS (B,) [veh s] of rollouts from x (B, R, R) under `policy`, with detours and swings; arguments as `states`.
         """
-        exact, seen = self.states(policy, x, demand, generator, step)
-        vehicles = exact.sum((0, -2, -1))
+        exact, seen, waiting = self.states(policy, x, demand, generator, step)
+        vehicles = (exact + waiting).sum((0, -2, -1))
         if self.detour_cost and policy.architecture.guidance:
             vehicles = vehicles + self.detour_cost * self._diverted(exact, policy(seen)[1]).sum((0, -2, -1))
         swings = self.swing_cost * self._swings(policy(seen)[0]) if self.swing_cost else 0.0

@@ -16,8 +16,10 @@ import torch
 from jaxtyping import Float
 
 from nmfd.controllers.dpc import fallback
+from nmfd.controllers.dpc.compact import CompactPolicy
 from nmfd.controllers.dpc.options import TRAINED, Training
-from nmfd.controllers.dpc.policy import Architecture, Policy, checkpoint, read_file
+from nmfd.controllers.dpc.policy import Architecture, Policy
+from nmfd.controllers.dpc.policy_file import checkpoint, new_policy, read_file
 from nmfd.controllers.dpc.rollout import Rollout, compiled_step
 from nmfd.controllers.options import options
 from nmfd.controllers.pi_gating import PiGating
@@ -112,10 +114,14 @@ def train(
         guidance = NAMES[controller.partition("+")[0]]
         architecture = Architecture(
             width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=guidance,
-            local=chosen.local)
-        policy = Policy(planning.network, architecture)
+            local=chosen.local, compact=planning.protected if chosen.compact else (), metering=chosen.metering)
+        policy = new_policy(planning.network, architecture)
+        if chosen.numbers and isinstance(policy, CompactPolicy):
+            with torch.no_grad():
+                policy.numbers.copy_(torch.tensor(chosen.numbers))
         if chosen.from_no_control:
             begin_as_no_control(policy, planning.network)
+        device = "cpu" if chosen.compact else device
         policy = policy.to(device)
         rollout = Rollout(
             planning, device=device, detour_cost=chosen.detour_cost, swing_cost=chosen.swing_cost)
@@ -145,12 +151,14 @@ def train(
                 loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
                 optimizer.zero_grad()
                 loss.backward()
-                if architecture.guidance and chosen.alternating:
+                if architecture.guidance and chosen.alternating and not chosen.compact:
                     # Not by requires_grad, which would compile the step once for each decoder.
                     for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
                         weights.grad = None
                 torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
                 optimizer.step()
+                if isinstance(policy, CompactPolicy):
+                    policy.bound()
                 last = step + 1 == chosen.steps
                 if (step + 1) % VALIDATE_EVERY == 0 or last:
                     score = validate(policy, rollout, seed, chosen)
@@ -159,14 +167,19 @@ def train(
                         log(step + 1, history[-1][1], score)
                     if score < best:
                         best = score
-                        states = fallback.statistics(visited(policy, rollout, chosen, seed))
-                        _write(checkpoint(
-                            policy, planning.network, {**configuration, "validation_veh_s": best}, states), out)
+                        _keep(policy, rollout, chosen, configuration, best, out)
                     if not last:
                         _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
                 reached((step + 1) / chosen.steps)
                 if progress:
                     progress(step + 1, chosen.steps, f"best {best:.4g} veh s")
+            if not chosen.steps:
+                best = validate(policy, rollout, seed, chosen)
+                if log:
+                    log(0, best, best)
+                if progress:
+                    progress(1, 1, f"as it begins {best:.4g} veh s")
+                _keep(policy, rollout, chosen, configuration, best, out)
             if not math.isfinite(best):
                 raise RunFailed(
                     f"{controller}: every validation of {chosen.steps} steps diverged; lower the learning rate")
@@ -235,8 +248,16 @@ def visited(policy: Policy, rollout: Rollout, chosen: Training, seed: int) -> Fl
     demand = rollout.perturb(
         demand, torch.rand(4 * chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
     with torch.no_grad():
-        _, seen = rollout.states(policy, x, demand, generator)
+        _, seen, _ = rollout.states(policy, x, demand, generator)
         return (seen / policy.scale).flatten(0, 1).flatten(-2).double().cpu().numpy()
+
+
+def _keep(
+    policy: Policy, rollout: Rollout, chosen: Training, configuration: Mapping[str, Any], score: float, out: Path,
+) -> None:
+    """Write the policy to `out`, with its `score` in validation [veh s] and statistics of the states that it sees."""
+    states = fallback.statistics(visited(policy, rollout, chosen, configuration["seed"]))
+    _write(checkpoint(policy, rollout.planning.network, {**configuration, "validation_veh_s": score}, states), out)
 
 
 def _state(

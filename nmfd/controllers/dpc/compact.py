@@ -1,0 +1,115 @@
+"""A policy of a few numbers that can be read: gates, prices and metering by how full the regions are.
+
+With z_i = n_i / n_cr,i, how full region i is in critical accumulations, the entries h -> p of every protected region p,
+and the prices of all ways through p, are
+
+    u_hp = u_min + (u_max - u_min) s(4 (gain (set_point - z_p) + relief max(z_h - 1, 0)))        s(x) = 1 / (1 + e^-x)
+    c_p  = price max(z_p - price_from, 0)
+
+and every other entry is open; the prices of the other regions are elsewhere max(z_i - elsewhere_from, 0). `relief`
+opens a gate for a region that is beyond its own critical accumulation. Where trips can be made to wait,
+n_cr,i max(metering - z_i, 0) / HELD may begin in region i per second.
+
+Guided drivers who are bound for elsewhere are told that a way through region i takes 1 + c_i times as long as it does
+(nmfd.types.Controls). What they make of it in the regional model is a logit over the next regions, around their own
+split ratios theta0:
+
+    theta_ihj ~ theta0_ihj exp(-e_hj / DISPERSION),    e_hj = c_h t_hj + sum_g theta0_hgj e_gj for h != j,
+
+t_hj the mean time that it takes to leave h on the way to j, so that e_hj is what the prices add from h on. That keeps
+the policy differentiable: it is trained as the others are (`training`).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import nn
+
+from nmfd.controllers.dpc.policy import Policy
+from nmfd.model import dynamics
+from nmfd.model.regional_model import RegionalModel
+from nmfd.tensors import PerPair, PerRegion, PerTurn
+
+DISPERSION = 60.0  # s: how differently drivers see the same ways; about what their own ways differ by in grid7
+HELD = 90.0        # s, a cycle of the signals: how fast a region may fill
+LONGEST = 20.0     # times as long as in free flow: the most that it takes in the model to leave a region
+
+
+class Numbers(NamedTuple):
+    """What a compact policy consists of, in this order; see above. `metering` counts where it lets trips wait."""
+
+    set_point: float = 1.0
+    gain: float = 2.0
+    relief: float = 0.0
+    price: float = 1.0
+    price_from: float = 0.6
+    elsewhere: float = 0.0
+    elsewhere_from: float = 0.6
+    metering: float = 1.5
+
+
+class CompactPolicy(Policy):
+    """The policy of these numbers, for the protected regions `architecture.compact`.
+
+    numbers: (8,) [-], `Numbers`
+    """
+
+    def _build(self, network: RegionalModel) -> None:
+        self.numbers = nn.Parameter(torch.tensor(Numbers()))
+        held = np.isin(np.arange(network.regions), self.architecture.compact)
+        self.register_buffer("held", torch.tensor(held), persistent=False)
+        self.register_buffer("own", torch.tensor(network.nominal_splits, dtype=torch.float32), persistent=False)
+        self._model = dynamics.parameters(network, dtype=torch.float32)
+        self._hops = int(network.hops.max())
+
+    def listed(self, x: PerPair) -> tuple[PerPair, PerTurn | None]:
+        """Perimeter and splits of the states x."""
+        numbers, full = self._read(), self._full(x)
+        want = numbers.gain * (numbers.set_point - full).unsqueeze(-2) + numbers.relief * (
+            full - 1.0).clamp(min=0.0).unsqueeze(-1)
+        share = torch.where(self.held, torch.sigmoid(4.0 * want), torch.ones_like(want))
+        perimeter = (self.u_min + (self.u_max - self.u_min) * share) * self.adjacency
+        prices = self.prices(x)
+        return perimeter, None if prices is None else self._answer(x.to(self.scale.dtype), prices)
+
+    def prices(self, x: PerPair) -> PerRegion | None:
+        """(..., R) [-], of the ways through each region in the states x."""
+        if not self.architecture.guidance:
+            return None
+        numbers, full = self._read(), self._full(x)
+        return torch.where(
+            self.held, numbers.price * (full - numbers.price_from).clamp(min=0.0),
+            numbers.elsewhere * (full - numbers.elsewhere_from).clamp(min=0.0))
+
+    def metering(self, x: PerPair) -> PerRegion | None:
+        """(..., R) [veh/s], the most trips that may begin in each region in the states x; None where nobody waits."""
+        if not self.architecture.metering:
+            return None
+        return self.scale.squeeze(-1) * (self._read().metering - self._full(x)).clamp(min=0.0) / HELD
+
+    def bound(self) -> None:
+        """Set numbers that fell below 0 to 0."""
+        with torch.no_grad():
+            self.numbers.clamp_(min=0.0)
+
+    def _read(self) -> Numbers:
+        return Numbers(*self.numbers.clamp(min=0.0))
+
+    def _full(self, x: PerPair) -> PerRegion:
+        """(..., R) [-], how full each region is, in critical accumulations."""
+        return x.to(self.scale.dtype).sum(-1) / self.scale.squeeze(-1)
+
+    def _answer(self, x: PerPair, prices: PerRegion) -> PerTurn:
+        """(..., R, R, R) [-], the split ratios that prices (..., R) [-] bring about in the regional model."""
+        p = self._model
+        rate = torch.maximum(dynamics.rate(p, x.sum(-1)), p.c / LONGEST)
+        leaving = rate.unsqueeze(-1) * (1.0 if p.exit_rates is None else p.exit_rates)
+        here = prices.unsqueeze(-1) / leaving * p.off_diagonal
+        extra = here
+        for _ in range(self._hops):
+            extra = here + torch.einsum("hgj,...gj->...hj", self.own, extra) * p.off_diagonal
+        costs = extra.unsqueeze(-3) + torch.zeros_like(self.own)
+        least = torch.where(self.own > 0, costs, torch.inf).amin(-2, keepdim=True)
+        weight = self.own * torch.exp(-(costs - torch.where(least.isfinite(), least, 0.0)).clamp(min=0.0) / DISPERSION)
+        return weight / weight.sum(-2, keepdim=True).clamp(min=1e-9)

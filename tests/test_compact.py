@@ -1,0 +1,144 @@
+"""Policies of eight numbers: what they command, and that they are trained, kept and watched as the others."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from commands import good, nmfd
+
+from nmfd import closed_loop
+from nmfd.api import load_scenario
+from nmfd.controllers.dpc.compact import HELD, CompactPolicy, Numbers
+from nmfd.controllers.dpc.fallback import Guarded, statistics
+from nmfd.controllers.dpc.policy import Architecture, DpcController
+from nmfd.controllers.dpc.policy_file import load_policy
+from nmfd.model.planning import planning_model
+from nmfd.model.plant import NmfdPlant
+from nmfd.types import Observation
+
+NUMBERS = Numbers(
+    set_point=1.1, gain=2.0, relief=0.5, price=3.0, price_from=0.7, elsewhere=0.4, elsewhere_from=1.2, metering=1.3)
+CENTRE = 3
+TABLE = """
+[controllers.dpc-pcrg]
+compact = true
+numbers = [1.0, 2.0, 0.0, {price}, 0.6, 0.0, 0.6, 1.5]
+steps = {steps}
+batch = 2
+learning_rate = 0.05
+"""
+
+
+@pytest.fixture(scope="module")
+def network():
+    return load_scenario("economic_mpc").network
+
+
+def policy(network, numbers=NUMBERS, guidance=True, metering=False):
+    made = CompactPolicy(network, Architecture(guidance=guidance, compact=(CENTRE,), metering=metering))
+    with torch.no_grad():
+        made.numbers.copy_(torch.tensor(numbers))
+    return made
+
+
+def crowded(network, seed=0):
+    """(R, R) [veh], regions from half to twice their critical accumulation."""
+    random = np.random.default_rng(seed)
+    critical = np.array([[mfd.critical] for mfd in network.mfds])
+    return 2.0 * critical * random.uniform(0.25, 1.0, (network.regions, 1)) * random.dirichlet(
+        np.ones(network.regions), network.regions)
+
+
+def test_gates_and_prices_are_those_of_the_formula(network):
+    x = crowded(network)
+    controls = DpcController(policy(network)).act(Observation(step=0, time=0.0, accumulation=x, backlog=0.0 * x))
+    full = x.sum(axis=1) / [mfd.critical for mfd in network.mfds]
+    for i, h in np.argwhere(network.adjacency):
+        wanted = 4.0 * (2.0 * (1.1 - full[h]) + 0.5 * max(full[i] - 1.0, 0.0))
+        share = 1.0 / (1.0 + np.exp(-wanted)) if h == CENTRE else 1.0
+        expected = network.u_min + (network.u_max - network.u_min) * share
+        assert controls.perimeter[i, h] == pytest.approx(expected, abs=1e-5)
+    expected = np.where(
+        np.arange(network.regions) == CENTRE, 3.0 * np.maximum(full - 0.7, 0.0), 0.4 * np.maximum(full - 1.2, 0.0))
+    np.testing.assert_allclose(controls.prices, expected, atol=1e-5)
+    assert controls.metering is None
+    controls = DpcController(policy(network, metering=True)).act(
+        Observation(step=0, time=0.0, accumulation=x, backlog=0.0 * x))
+    expected = np.maximum(1.3 - full, 0.0) * [mfd.critical for mfd in network.mfds] / HELD
+    np.testing.assert_allclose(controls.metering, expected, rtol=1e-5, atol=1e-5)
+    assert (controls.prices > 0.0).any() and (controls.prices == 0.0).any()
+
+
+def test_the_regional_model_sends_fewer_through_a_dear_region_and_nobody_where_there_is_no_way(network):
+    x = torch.from_numpy(crowded(network)).float()
+    own = network.nominal_splits
+    free = policy(network, NUMBERS._replace(price=0.0, elsewhere=0.0))(x)[1].detach().numpy()
+    np.testing.assert_allclose(free, own, atol=1e-6)
+    x[CENTRE] *= 1.5 * network.mfds[CENTRE].critical / x[CENTRE].sum()
+    splits = policy(network, NUMBERS._replace(elsewhere=0.0))(x)[1].detach().numpy()
+    np.testing.assert_allclose(splits.sum(axis=1), own.sum(axis=1), atol=1e-6)
+    assert (splits[~network.split_mask] == 0.0).all()
+    others = [j for j in range(network.regions) if j != CENTRE]
+    through = np.array([[splits[i, CENTRE, j] - own[i, CENTRE, j] for j in others if j != i] for i in others])
+    assert (through < 1e-6).all() and through.min() < -0.05
+    np.testing.assert_allclose(splits[:, :, CENTRE], own[:, :, CENTRE], atol=1e-6)  # a price is paid on any way there
+
+
+def test_every_number_has_a_gradient_and_perimeter_control_alone_has_no_prices(network):
+    x = torch.from_numpy(np.stack([crowded(network, seed) for seed in range(4)])).float()
+    made = policy(network, metering=True)
+    perimeter, splits = made(x)
+    ((perimeter * torch.rand_like(perimeter)).sum() + (splits * torch.rand_like(splits)).sum()
+     + made.metering(x).sum()).backward()
+    assert (made.numbers.grad.abs() > 0.0).all()
+    alone = policy(network, guidance=False)
+    assert alone.prices(x) is None and alone(x)[1] is None
+
+
+def test_it_is_trained_and_kept_in_a_file(tmp_path):
+    scenario = tiny.write(tmp_path)
+    text = (scenario / "scenario.toml").read_text()
+    files = {}
+    for steps in (0, 5):
+        (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, steps=steps))
+        files[steps] = scenario / "dpc-pcrg.pt" if steps else tmp_path / "first.pt"
+        good(nmfd("train", scenario, "--controller", "dpc-pcrg", "--no-compile", "--out", files[steps]))
+    loaded = load_scenario(scenario)
+    first, trained = (load_policy(file, loaded.network) for file in files.values())
+    assert first[0].numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5])
+    assert isinstance(trained[0], CompactPolicy) and (trained[0].numbers != first[0].numbers).any()
+    assert trained[1]["configuration"]["validation_veh_s"] < first[1]["configuration"]["validation_veh_s"]
+    good(nmfd("benchmark", scenario, "--controllers", "dpc-pcrg,dpc-pcrg-guarded", "--out",
+              tmp_path / "out"))
+
+
+@pytest.mark.parametrize("table, expected", [
+    ("numbers = [1.0, 2.0, 0.0, 1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected eight numbers >= 0 of a compact policy"),
+    ("compact = true\nnumbers = [1.0]", "numbers: "),
+    ("compact = true\nnumbers = [1.0, 2.0, 0.0, -1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected eight numbers >= 0"),
+    ("compact = true\nlocal = true", "compact: begins with its numbers"),
+    ("metering = true", "metering: only compact policies let trips wait"),
+    ("steps = 0", "steps: expected a whole number from 1"),
+])
+def test_wrong_settings(tmp_path, table, expected):
+    scenario = tiny.write(tmp_path)
+    with (scenario / "scenario.toml").open("a") as stream:
+        stream.write(f"\n[controllers.dpc-pcrg]\n{table}\n")
+    done = nmfd("train", scenario, "--controller", "dpc-pcrg")
+    assert done.exit_code == 2 and done.stderr.count("\n") == 1 and expected in done.stderr, done.stderr
+
+
+def test_prices_are_in_the_run_and_go_where_the_guard_withdraws_the_split_ratios(network):
+    scenario = replace(load_scenario("economic_mpc"), steps=4)
+    planning, made = planning_model(scenario, "dpc-pcrg"), policy(network, NUMBERS._replace(elsewhere_from=0.0))
+    run = closed_loop.run(NmfdPlant(scenario), DpcController(made), scenario, seed=0)
+    states = run.accumulation[:4] / made.scale.numpy()
+    np.testing.assert_allclose(
+        run.prices, [made.prices(torch.from_numpy(x)).detach().numpy() for x in run.observed[:4]], atol=1e-5)
+    watched = Guarded(made, statistics(np.repeat(states, 40, axis=0).reshape(160, -1)), planning)
+    watched._judge.problem = lambda foreseen: "told"
+    x = run.observed[2]
+    controls = watched.act(Observation(step=2, time=0.0, accumulation=x, backlog=0.0 * x))
+    assert controls.prices is None and (controls.splits == network.nominal_splits).all()

@@ -1,0 +1,111 @@
+"""Trips that are made to wait: how many, who first, and that nobody is lost or counted twice."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import tiny_city
+from commands import cosim, error_line, good
+
+from cosim.plant.metering import FILLING, KI, KP, Metering
+from cosim.plant.plant import SumoPlant
+from cosim.plant.settings import settings
+from cosim.sumo.trips import Trips
+from nmfd.api import load_scenario
+from nmfd.model.plant import AcyclicPlant, NmfdPlant
+from nmfd.types import Controls
+
+CRITICAL = np.array([100.0, 50.0])
+
+
+def metering(depart, origin, level=1.2):
+    """Of trips to region 1, and who has begun: (time, vehicle, route)."""
+    begun, count = [], len(depart)
+    session = SimpleNamespace(time=0.0, step_length=1.0)
+    session.begin_trip = lambda vehicle, route, arrival: begun.append((session.time, vehicle, route))
+    trips = Trips(
+        depart=np.array(depart, dtype=float), origin=np.array(origin, dtype=int), destination=np.ones(count, dtype=int),
+        routes=(("a", "b"),) * count, arrival=np.zeros(count))
+    return Metering(session, trips, CRITICAL, level=level, step=90.0), session, begun
+
+
+def played(meters, session, seconds):
+    for _ in range(seconds):
+        meters.play()
+        session.time += 1.0
+
+
+def test_trips_begin_in_turn_at_the_rate_and_what_is_not_used_is_not_saved():
+    meters, session, begun = metering([0.0] * 6 + [100.0] * 3, [0, 1, 0, 0, 0, 1, 0, 0, 0])
+    meters.command(np.array([0.1, 0.0]), CRITICAL)
+    played(meters, session, 60)
+    assert [(time, vehicle) for time, vehicle, _ in begun] == [
+        (0.0, "v0"), (0.0, "v1"), (10.0, "v2"), (20.0, "v3"), (30.0, "v4")]
+    assert all(vehicle[1:] == route[1:] for _, vehicle, route in begun)
+    assert meters.backlog().tolist() == [[0.0, 0.0], [0.0, 1.0]] and meters.waiting() == (1, 60.0)
+    assert meters.waited == 10.0 + 20.0 + 30.0
+    played(meters, session, 55)
+    assert [time for time, _, _ in begun[5:]] == [100.0, 110.0]
+
+
+def test_without_a_command_regions_are_held_at_their_level():
+    meters, session, _ = metering([], [])
+    most, rates = CRITICAL / FILLING, []
+    for full in (0.5, 1.5, 1.5, 1.3):
+        meters.command(None, full * CRITICAL)
+        rates.append(meters._rate / CRITICAL * 90.0)
+    expected = [np.full(2, 90.0 / FILLING)]
+    for before, now in ((0.5, 1.5), (1.5, 1.5), (1.5, 1.3)):
+        expected.append(np.clip(expected[-1] + KP * (before - now) + KI * (1.2 - now), 0.0, 90.0 / FILLING))
+    np.testing.assert_allclose(rates, expected)
+    assert 0.0 < rates[1][0] < rates[0][0] and (meters._rate <= most).all()
+
+
+@pytest.mark.parametrize("kind", [NmfdPlant, AcyclicPlant])
+def test_in_the_regional_model_who_may_not_enter_waits_and_enters_later(kind):
+    scenario = replace(load_scenario("economic_mpc"), steps=12)
+    network, plant = scenario.network, kind(scenario)
+    opened = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None)
+    due = scenario.demand.sum(axis=(1, 2)) * scenario.step
+    state = plant.reset(0)
+    for k in range(12):
+        rate = np.full(network.regions, 0.001 if k < 6 else 1e6)
+        state = plant.step(replace(opened, metering=rate))
+        inside = scenario.start.sum() + due[: k + 1].sum() - state.completed
+        assert state.accumulation.sum() + state.backlog.sum() == pytest.approx(inside)
+        assert (state.backlog >= 0.0).all() and (state.backlog.sum() > 1.0) == (0 < k < 6)
+    assert state.backlog.sum() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_in_a_city_the_books_hold_and_waiting_counts():
+    """grid7 with hardly anybody let in: the same trips, due at the same times, wait."""
+    scenario = replace(load_scenario("grid7_peak"), steps=3)
+    network = scenario.network
+    opened = Controls(
+        perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None, metering=np.full(7, 0.02))
+    runs = []
+    for chosen in (settings(scenario), settings(scenario).changed(metering=True)):
+        plant = SumoPlant(scenario, overrides=chosen)
+        plant.reset(5)
+        states = [plant.step(opened) for _ in range(3)]
+        runs.append((states, plant.trip_facts(), plant.trips))
+        plant.close()
+    (free, facts, trips), (held, metered, count) = runs
+    assert count == trips and metered.trips == facts.trips
+    inside = [(state.accumulation.sum() + state.backlog.sum() + state.completed) for state in held]
+    assert inside == [state.accumulation.sum() + state.backlog.sum() + state.completed for state in free]
+    assert held[-1].backlog.sum() > 0.4 * inside[-1] > free[-1].backlog.sum()
+    began = inside[-1] - held[-1].backlog.sum()
+    assert 0 < began <= 7 * (1 + 0.02 * 270)
+    spent = 90.0 * sum(state.backlog.sum() for state in held[:2])  # the integral, from below
+    assert spent < metered.departure_delay < spent + 90.0 * held[-1].backlog.sum()
+
+
+def test_trips_of_route_files_cannot_be_made_to_wait(tmp_path):
+    config = tiny_city.city(tmp_path)
+    good(cosim("import", config, "--regions", 3, "--no-run", "--method", "geometric", "--out",
+               tmp_path / "networks" / "tiny"))
+    scenario = tmp_path / "scenarios" / "tiny"
+    line = error_line(cosim("run", scenario, "--controller", "no-control+metering", "--out", tmp_path / "out"))
+    assert "sumo.metering: trips of route files" in line and not (tmp_path / "out").exists()
