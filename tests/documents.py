@@ -17,7 +17,8 @@ FILES = [ROOT / "README.md", *sorted(
     file for folder in FOLDERS for pattern in ("README.md", "record.md", "*.ipynb")
     for file in (ROOT / folder).rglob(pattern) if not any(part[0] == "." for part in file.relative_to(ROOT).parts))]
 NOTEBOOKS = [file for file in FILES if file.suffix == ".ipynb"]
-PROGRAMS = ("nmfd", "cosim", "python", "python3", "pip", "pytest", "dask", "pdoc", "jupyter", ".", "netgenerate")
+PROGRAMS = ("nmfd", "cosim", "python", "python3", "pip", "pytest", "dask", "pdoc", "jupyter", ".", "netgenerate",
+            "openssl")
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import pytest
 import tiny
 import torch
 from commands import nmfd
+from PIL import Image
 
 from cosim.cli.main import main
 from nmfd import closed_loop, extras
@@ -92,10 +93,12 @@ def test_benchmark_writes_a_run_folder(benchmark_command, tmp_path):
     assert "±" in lines[3] and lines[3].count("%") == 1
     assert lines[-1] == f"Written to {tmp_path / 'out'}"
     summary = (tmp_path / "out" / "summary.csv").read_text().splitlines()
-    assert summary[0] == COLUMNS
+    assert summary[0] == f"{COLUMNS},trail" and '""command"":""nmfd benchmark ' in summary[1]
     assert [line.split(",")[:3] for line in summary[1:]] == [
         [name, seed, "nmfd"] for name in ("no-control", "pi-gating") for seed in "01"]
     manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    with Image.open(tmp_path / "out" / "mfd.png") as picture:
+        assert json.loads(picture.info["Trail"])["command"] == manifest["sessions"][0]["command"]
     assert manifest["configuration"]["plant"] == "nmfd"
     assert manifest["sessions"][0]["seeds"] == [0, 1] and manifest["sessions"][0]["versions"]["torch"]
     assert {path.name for path in (tmp_path / "out").iterdir()} == {

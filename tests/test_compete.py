@@ -3,17 +3,22 @@
 import csv
 import itertools
 import json
+import math
+import re
 import shutil
 import tomllib
 from pathlib import Path
 
 import copies
+import pandas as pd
 import pytest
 import tiny
+import tiny_city
 from commands import cosim, error_line, good, nmfd
 
-from cosim.compete import entry, page, run, table, task_set
+from cosim.compete import entry, page, run, table, task_set, verify
 from cosim.compete.metrics import METRICS, TTS
+from cosim.evaluation.simulate import Task
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.runs import config
@@ -338,6 +343,96 @@ def test_a_row_is_made_again_and_compared(place):
     assert good(cosim("verify", "out/noisy", "--list")).split() == ["no-control,0", "pi-gating,0"]
     assert "no row matches 'x'; there are no-control,0" in error_line(cosim("verify", "out/noisy", "--row", "x"))
     assert "does not say how its rows were made" in error_line(cosim("verify", "network"))
+
+
+def asked(command: str, seeds: str = "0 1", **more) -> dict:
+    """The trail of a table that a command made."""
+    session = {"command": command, "commit": "abc", "dirty": False, "versions": {"python": "2.7"}}
+    return {**session, "runs": [{**session, "seeds": seeds.split()}], **more}
+
+
+def table_of(folder: Path, trail_of_it: dict, **changed) -> None:
+    rows = pd.DataFrame({"demand": [1.0, 1.0, 1.3], "controller": "no-control", "seed": [0, 1, 0],
+                         "completed_veh": [5.0, 6.0, 7.0], "co2_kg": [0.1 + 0.2, math.nan, 0.5], "wall_time_s": 1.0})
+    folder.mkdir()
+    rows.assign(**changed, trail=[json.dumps(trail_of_it), "", ""]).to_csv(folder / "runs.csv", index=False)
+
+
+def test_a_published_table_is_made_again_by_the_command_that_it_names(place, monkeypatch):
+    made = []
+
+    def simulated(task, out):
+        made.append(task)
+        return {"completed_veh": 5 + task.seed, "co2_kg": 0.1 + 0.2, "wall_time_s": 2.0, "demand": 1.0}
+
+    monkeypatch.setattr(verify, "_simulated", simulated)
+    table_of(place / "out", asked("cosim evaluate --seeds=2 scenario --controllers 'no-*,x' --first-seed 0 --steps 3 "
+                                  "--policy x=y.pt --policy no-control=mine.pt"))
+    assert good(cosim("verify", "out", "--list")).split() == ["1,no-control,0", "1,no-control,1"]  # 1.3: nobody asked
+    text = good(cosim("verify", "out", "--row", "*,0"))
+    assert "The same: 3 figures to the last digit" in text and "commit: abc then" in text and "python: 2.7 then" in text
+    assert made == [Task(scenario=Path("scenario"), controller="no-control", seed=0, steps=3, policy=Path("mine.pt"))]
+    assert "The same: 2 figures" in good(cosim("verify", "out", "--row", "*,1"))  # an empty one is none
+    table_of(place / "other", asked("cosim evaluate scenario --controllers no-control --seeds 2 --first-seed 0"),
+             completed_veh=[5.0, 7.0, 7.0])
+    done = cosim("verify", "other", "--row", "*,1")
+    assert done.exit_code == 1 and "completed_veh differs: 7.0 published, 6 made again" in done.stdout
+    near = good(cosim("verify", "other", "--row", "*,1", "--within", 0.2))
+    assert "2 figures within 0.2, 1 to the last digit" in near
+    table_of(place / "rounded", asked("cosim evaluate scenario --controllers no-control --seeds 2 --first-seed 0"),
+             completed_veh=[5.0, 6.0 + 1e-14, 7.0])  # of another version
+    assert "2 figures within 1e-09, 1 to the last digit" in good(cosim("verify", "rounded", "--row", "*,1"))
+    assert cosim("verify", "rounded", "--row", "*,1", "--within", 0).exit_code == 1
+
+
+@pytest.mark.parametrize("found, words", [
+    (asked("cosim evaluate scenario --controllers no-control", not_again={"no-*": "too old"}), "made again: too old"),
+    (asked("cosim evaluate scenario --controllers no-control"), "names no command"),  # seeds from 2000 up
+    (asked("cosim sweep scenario --controllers no-control --first-seed 0"), "names no command"),
+    (asked("cosim evaluate nowhere --controllers no-control --first-seed 0"), "there is no nowhere"),
+    (asked("cosim evaluate scenario --first-seed 0"), "is no command of version"),
+    (asked("cosim evaluate scenario --controllers no-control --seeds many"), "is no command of version"),
+    (asked("unknown"), "names no command"), ({}, "names no command")])
+def test_tables_that_cannot_be_made_again(place, found, words):
+    table_of(place / "out", found)
+    line = error_line(cosim("verify", "out"))
+    assert words in line and "runs.csv" in line
+    Path("out/runs.csv").write_text("a,trail\n1,\n", encoding="utf-8")
+    assert "runs.csv: is no table of runs" in error_line(cosim("verify", "out"))
+
+
+@pytest.mark.usefixtures("place")
+def test_what_is_unknown_of_a_table_is_said(monkeypatch):
+    monkeypatch.setattr(verify, "_simulated", lambda task, out: {"completed_veh": 5})
+    unknown = dict.fromkeys(("command", "commit", "dirty", "versions"), "unknown")
+    table_of(Path("out"), {**unknown, "readme": ["cosim evaluate scenario --controllers no-control --first-seed 0"]})
+    text = good(cosim("verify", "out", "--row", "1,*,0"))
+    assert "unknown then: python, " in text and ", commit, uncommitted changes" in text and " now" not in text
+
+
+def test_what_is_published_names_its_commands():
+    """Every row of the evaluations that are of this version, but one, for whose seed nobody asked (its README)."""
+    for city, rows in (("bologna", 15), ("luxembourg", 12), ("demo", 20), ("grid7_peak", 321)):
+        assert len(verify.rows(Path(__file__).parents[1] / "scenarios" / city / "reference")) == rows
+
+
+@pytest.mark.slow
+def test_a_table_of_a_city_is_made_again(place):
+    tiny_city.city(place)
+    tiny_city.imported(place)
+    good(cosim("evaluate", "scenarios/tiny", "--controllers", "no-control,pi-gating", "--seeds", 1, "--first-seed", 0,
+               "--steps", 2, "--demand", "1,1.3", "--out", "evaluated"))
+    Path("published").mkdir()
+    shutil.copy("evaluated/runs.csv", "published")
+    for row in ("1.3,pi-gating,0", "1,no-control,0"):
+        text = good(cosim("verify", "published", "--row", row))
+        assert "The same" in text and " then" not in text, text  # hashes, versions and commit, too
+    file = Path("scenarios/tiny/scenario.toml")
+    text = re.sub(r"demand_factor = .*", "demand_factor = 0.7", file.read_text(encoding="utf-8"))
+    file.write_text(text, encoding="utf-8")
+    done = cosim("verify", "published", "--row", "1,no-control,0")
+    assert done.exit_code == 1, done.stderr
+    assert "demand_hash: " in done.stdout and "total_time_spent_veh_s differs" in done.stdout
 
 
 @pytest.mark.slow

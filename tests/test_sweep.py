@@ -1,12 +1,6 @@
-"""cosim sweep: one tidy table, failures as rows, resumption; and on a Dask cluster, one worker killed in mid-run."""
+"""cosim sweep: one tidy table, failures as rows, resumption."""
 
-import os
 import re
-import shutil
-import signal
-import subprocess
-import threading
-import time
 from pathlib import Path
 
 import copies
@@ -18,8 +12,8 @@ from click.testing import CliRunner
 from commands import killed
 
 from cosim.cli.main import main
-from cosim.evaluation import dask_cluster, dask_worker, experiment, sweeps
-from cosim.evaluation.simulate import FACTS, Result, Task
+from cosim.evaluation import experiment, sweeps
+from cosim.evaluation.simulate import FACTS, Result
 from nmfd.errors import InputError
 from nmfd.runs.run_folder import read_summary
 from nmfd.runs.workers import Failure
@@ -166,140 +160,6 @@ def test_a_damaged_table_is_one_line(peak, tmp_path, content):
     done = sweep(peak, "--controllers", "no-control", "--out", tmp_path)
     assert done.exit_code == 2 and done.stderr.count("\n") == 1, done.stderr + repr(done.exception)
     assert f"{file}: is no table of a sweep" in done.stderr and [p.name for p in tmp_path.iterdir()] == [file.name]
-
-
-def test_a_process_that_dies_is_a_failure(monkeypatch, tmp_path):
-    monkeypatch.setattr(dask_worker.sys, "executable", shutil.which("false"))
-    task = Task(scenario=tmp_path, controller="no-control", seed=0)
-    assert dask_worker.run(task, str(tmp_path)) == Failure("its process died (status 1)")
-
-
-def test_remote_gives_the_reason(tmp_path):
-    task = Task(scenario=Path("nowhere"), controller="no-control", seed=0)
-    outcome = dask_worker.run(task, str(tmp_path))
-    assert "nowhere: no such folder here" in outcome.reason and "\n" not in outcome.reason
-
-
-def test_no_scheduler_answers(peak, tmp_path, monkeypatch):
-    pytest.importorskip("distributed", reason="the extra dask is not installed")
-    monkeypatch.setattr("cosim.evaluation.dask_cluster.PATIENCE", 0.5)
-    for address in ("tcp://127.0.0.1:9", "nonsense://x"):
-        done = sweep(peak, "--controllers", "no-control", "--scheduler", address, "--out", tmp_path / "out")
-        assert done.exit_code == 2 and "no Dask scheduler answers at" in done.stderr, done.output + str(done.exception)
-        assert done.stderr.count("\n") == 1 and not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-def test_two_dask_workers_one_killed_in_mid_run(peak, tmp_path):
-    distributed = pytest.importorskip("distributed", reason="the extra dask is not installed")
-    with distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50, memory_limit=0) as cluster:
-        killed = []
-
-        def kill():
-            """The first worker that is at a run, a moment after it began."""
-            with distributed.Client(cluster.scheduler_address, set_as_default=False) as client:
-                pids = client.run(os.getpid)
-                deadline = time.monotonic() + 60
-                while not killed and time.monotonic() < deadline:
-                    busy = [worker for worker, tasks in client.processing().items() if tasks and worker in pids]
-                    if busy:
-                        time.sleep(1.0)
-                        os.kill(pids[busy[0]], signal.SIGKILL)
-                        killed.append(busy[0])
-                    time.sleep(0.05)
-
-        thread = threading.Thread(target=kill)
-        thread.start()
-        done = sweep(
-            peak, "--controllers", "no-control", "--seeds", 2, "--steps", 1, "--scheduler", cluster.scheduler_address,
-            "--out", tmp_path / "out")
-        thread.join()
-    assert killed and done.exit_code == 0, done.output + str(done.exception)
-    rows = pd.read_parquet(tmp_path / "out" / "sweep.parquet")
-    assert rows["seed"].tolist() == [0, 1] and set(rows["reason"]) == {""}
-    # The same code and the same bytes as here.
-    here = sweep(peak, "--controllers", "no-control", "--steps", 1, "--workers", 1, "--out", tmp_path / "here")
-    assert here.exit_code == 0
-    name = Path("demand-1") / "no-control-0.nc"
-    assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
-
-
-@pytest.fixture(scope="module")
-def certificates(tmp_path_factory) -> Path:
-    """A folder with two authorities, here and other, and a certificate of each: NAME-ca.pem, NAME.pem, NAME.key."""
-    folder = tmp_path_factory.mktemp("certificates")
-
-    def openssl(*arguments):
-        subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
-
-    new = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
-    for name in ("here", "other"):
-        openssl("req", "-x509", *new, "-keyout", f"{name}-ca.key", "-out", f"{name}-ca.pem", "-days", "2",
-                "-subj", f"/CN={name} authority")
-        openssl("req", *new, "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", "/CN=localhost")
-        openssl("x509", "-req", "-in", f"{name}.csr", "-CA", f"{name}-ca.pem", "-CAkey", f"{name}-ca.key",
-                "-CAcreateserial", "-out", f"{name}.pem", "-days", "2")
-    return folder
-
-
-def shown(folder: Path, name: str, authority: str) -> dict:
-    return {"ca": folder / f"{authority}-ca.pem", "cert": folder / f"{name}.pem", "key": folder / f"{name}.key"}
-
-
-def encrypted(folder: Path, **more):
-    """A cluster that trusts who has a certificate of the authority here."""
-    distributed = pytest.importorskip("distributed", reason="the extra dask is not installed")
-    security = distributed.security.Security(require_encryption=True, tls_ca_file=str(folder / "here-ca.pem"), **{
-        f"tls_{side}_{what}": str(folder / f"here.{end}")
-        for side in ("client", "scheduler", "worker") for what, end in (("cert", "pem"), ("key", "key"))})
-    return distributed.LocalCluster(
-        security=security, protocol="tls://", threads_per_worker=1, dashboard_address=None, silence_logs=50,
-        memory_limit=0, **more)
-
-
-def test_an_encrypted_scheduler_is_reached_with_its_authority_only(certificates, monkeypatch):
-    monkeypatch.setattr(dask_cluster, "PATIENCE", 1.0)
-    with encrypted(certificates, n_workers=0, processes=False) as cluster:
-        address = cluster.scheduler_address
-        assert address.startswith("tls://")
-        dask_cluster.connect(dask_cluster.Scheduler(address=address, **shown(certificates, "here", "here"))).close()
-        for cert, authority in (("other", "here"), ("here", "other")):
-            with pytest.raises(InputError, match="no Dask scheduler answers at .* with certificates that it trusts"):
-                dask_cluster.connect(dask_cluster.Scheduler(address=address, **shown(certificates, cert, authority)))
-        with pytest.raises(InputError, match="--scheduler-ca: missing"):
-            dask_cluster.connect(address)
-
-
-@pytest.mark.parametrize("address, warned", [
-    ("tcp://127.0.0.1:1", False), ("localhost:1", False), ("tcp://[::1]:1", False), ("tls://far:1", False),
-    ("inproc://1/2", False), ("tcp://far:1", True), ("10.0.0.1:8786", True), ("ucx://10.0.0.1:1", True), ("", True)])
-def test_who_is_trusted_is_said(address, warned):
-    assert ("whoever reaches it can run code" in dask_cluster.Scheduler(address=address).warning) == warned
-
-
-@pytest.mark.parametrize("arguments, expected", [
-    (("--scheduler", "tcp://x:1", "--scheduler-ca", "here-ca.pem"), "--scheduler-ca: is for an encrypted scheduler"),
-    (("--scheduler", "tls://x:1", "--scheduler-ca", "nowhere.pem"), "nowhere.pem: no such file"),
-    (("--scheduler", "tls://x:1", "--scheduler-ca", "here-ca.pem"), "--scheduler-cert: missing"),
-    (("--scheduler", "tls://x:1", *(word for what in ("ca", "cert", "key") for word in (
-        f"--scheduler-{what}", "here.csr"))), "no Dask scheduler answers"),
-    (("--scheduler-key", "here.key"), "--scheduler: missing")])
-def test_mistakes_with_certificates(peak, tmp_path, certificates, monkeypatch, arguments, expected):
-    monkeypatch.chdir(certificates)
-    done = sweep(peak, "--controllers", "no-control", *arguments, "--out", tmp_path / "out")
-    assert done.exit_code == 2 and expected in done.stderr and done.stderr.count("\n") == 1, done.output
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-def test_a_sweep_on_an_encrypted_cluster(peak, tmp_path, certificates):
-    with encrypted(certificates, n_workers=1) as cluster:
-        options = [str(word) for what, file in shown(certificates, "here", "here").items() for word in (
-            f"--scheduler-{what}", file)]
-        done = sweep(peak, "--controllers", "no-control", "--steps", 1, "--scheduler", cluster.scheduler_address,
-                     *options, "--out", tmp_path / "out")
-    assert done.exit_code == 0 and pd.read_parquet(tmp_path / "out" / "sweep.parquet")["status"].tolist() == ["ok"]
 
 
 def test_compliance_needs_whole_percentages_from_python_too(peak, tmp_path):

@@ -55,12 +55,15 @@ def main() -> None:
 @REFERENCE
 @POLICIES
 @declared("cosim.evaluation.settings:Evaluation", "workers", instead="one per core")
+@scheduler_options
 @STEPS
 @TIME_LIMIT
 @out_option("evaluate", "The folder.")
 def evaluate(
     scenario: Path, controllers: str, seeds: int, first_seed: int, demand: tuple[float, ...], reference: str | None,
-    policies: tuple[str, ...], workers: int | None, steps: int | None, own_time_limit: float | None, out: Path | None,
+    policies: tuple[str, ...], workers: int | None, scheduler: str | None, scheduler_ca: Path | None,
+    scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None, own_time_limit: float | None,
+    out: Path | None,
 ) -> None:
     """Compare controllers in the microsimulation over seeds and demand levels; print and write tables, draw figures.
 
@@ -77,6 +80,7 @@ def evaluate(
 
     names = controller_names(controllers, scenario, policies=policies, check=parse, ready=ready)
     files = policy_files(policies, names)
+    cluster = chosen_scheduler(workers, scheduler, scheduler_ca, scheduler_cert, scheduler_key)
 
     from cosim.evaluation import evaluate, statistics  # heavy
     from cosim.report import pictures
@@ -89,7 +93,8 @@ def evaluate(
         out=Path("runs") / f"{file_name(loaded.name)}-evaluate" if out is None else out)
     workers = cores() if workers is None else workers
     with resumable("evaluate", chosen.out) as progress:
-        table, failures = evaluate.evaluate(chosen, workers=workers, progress=progress, tell=tell)
+        table, failures = evaluate.evaluate(
+            chosen, workers=workers, scheduler=cluster, progress=progress, tell=tell)
         if len(table):
             pictures.draw_all(
                 chosen.out, evaluate.level_folders(chosen.out), loaded, evaluate.all_runs(chosen))

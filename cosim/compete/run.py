@@ -12,7 +12,6 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from functools import partial
 from pathlib import Path
 
 from cosim.compete import entry, metrics
@@ -28,6 +27,7 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder, shipped
 from nmfd.runs.files import locked
 from nmfd.runs.provenance import provenance
+from nmfd.runs.workers import Source
 from nmfd.studies import benchmark
 from nmfd.studies.benchmark import happening
 
@@ -71,8 +71,8 @@ def compete(
 ) -> list[Entry]:
     """Run what is not there yet of the chosen tasks; returns the entries, which are in the folder.
 
-    Failed runs are tried again. scheduler: of a Dask cluster, which does the runs in SUMO instead of `workers`
-    processes here. Raises InputError for what concerns every controller: a task that is not as it was released, a
+    Failed runs are tried again. scheduler: of a Dask cluster, which does the runs instead of `workers` processes
+    here. Raises InputError for what concerns every controller: a task that is not as it was released, a
     folder of another task set.
     """
     tasks = order.chosen()
@@ -80,16 +80,16 @@ def compete(
     worlds = {task.id: world(task, scenarios[task.id]) for task in order.task_set.tasks.tasks}
     for task in tasks:
         order.task_set.check_world(task, worlds[task.id])
-    cluster = None if scheduler is None else dask_cluster.checked(scheduler, tell)
+    source = dask_cluster.source(scheduler, tell)
     order.out.mkdir(parents=True, exist_ok=True)
     with locked(order.out / run_folder.LOCK, order.out):
         books = _Books(order, scenarios, worlds)
         for task in tasks:
             if task.plant != SUMO:
                 for name in order.controllers:
-                    _regional(books, task, name, workers=workers, progress=progress, tell=tell)
-        _in_sumo(books, [task for task in tasks if task.plant == SUMO], workers=workers, cluster=cluster,
-                 progress=progress, tell=tell)
+                    _regional(books, task, name, workers=workers, progress=progress, tell=tell, source=source)
+        _in_sumo(books, [task for task in tasks if task.plant == SUMO], workers=workers, progress=progress,
+                 tell=tell, source=source)
         return books.write()
 
 
@@ -201,13 +201,14 @@ class _Books:
 
 def _regional(
     books: _Books, task: TaskTable, name: str, *, workers: int, progress: Progress | None, tell: Tell | None,
+    source: Source | None,
 ) -> None:
     """The runs of one controller on a regional model."""
     books.begin(name, task)
     try:
         _, failures = benchmark.perform(
             books.scenarios[task.id], [strategy(name, task)], task.seeds, task.plant, out=books.order.out / task.id,
-            noise=noise_of(task), workers=workers, progress=progress, renew=tell or _silent)
+            noise=noise_of(task), workers=workers, progress=progress, renew=tell or _silent, source=source)
         for (_, seed), failure in failures:
             books.fail(name, task, failure.reason, [seed])
     except InputError as error:
@@ -217,8 +218,8 @@ def _regional(
 
 
 def _in_sumo(
-    books: _Books, tasks: Sequence[TaskTable], *, workers: int, cluster: dask_cluster.Scheduler | None,
-    progress: Progress | None, tell: Tell | None,
+    books: _Books, tasks: Sequence[TaskTable], *, workers: int, progress: Progress | None, tell: Tell | None,
+    source: Source | None,
 ) -> None:
     """The runs in SUMO of all controllers, seed by seed."""
     entrants: dict[Task, list[tuple[str, TaskTable]]] = {}
@@ -239,7 +240,7 @@ def _in_sumo(
 
     experiment.perform(
         plan, workers=workers, fresh=True, progress=progress, tell=tell or _silent, kept=books.write, failed=failed,
-        source=None if cluster is None else partial(dask_cluster.outcomes, cluster))
+        source=source)
 
 
 def _able(books: _Books, task: TaskTable) -> list[str]:

@@ -20,7 +20,7 @@ from cosim.compete.metrics import METRICS, TTS
 from cosim.compete.task_set import HERE, names
 from nmfd.errors import InputError
 from nmfd.metrics import COUNTED
-from nmfd.runs.files import write_text
+from nmfd.runs.files import write_table
 from nmfd.studies.benchmark import REFERENCE
 
 ALL = "all tasks"
@@ -96,7 +96,7 @@ def write_csv(path: Path, board: Leaderboard) -> None:
         "task": row.task, "controller": row.name, "entry": row.place.as_posix(), "rank": row.rank, "worth": row.worth,
         "runs": row.runs, "failed": row.failed, "missing": row.missing,
         **{name: row.metrics.get(name) for name in METRICS}, "reasons": "; ".join(row.reasons)} for row in rows])
-    write_text(path, frame.astype({"rank": "Int64"}).to_csv(index=False))
+    write_table(path, frame.astype({"rank": "Int64"}))
 
 
 def _files(place: str) -> list[Path]:

@@ -4,37 +4,43 @@
     demand-<level>/                     such folders of an evaluation
     manifest.json with robustness.csv   nmfd robustness
     *.json                              entries of cosim compete
+    runs.csv                            of an evaluation whose run folders are not there: by the commands in its trail
 
-Figures are compared to the last digit, or within what is asked for; those that are wall times are not. Where the run
-itself is kept, it is compared to the byte.
+Figures are compared to the last digit, and a run that is kept to the byte; where version or commit is another one, or
+not known, figures within ROUNDING, unless another share is asked for. Wall times and empty cells are not compared.
 """
 
 import csv
 import math
 import random
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 
 from cosim.compete import entry, run, task_set
+from cosim.compete.asked import Asked
 from cosim.compete.entry import Entry
 from cosim.evaluation import evaluate, experiment, results
 from cosim.evaluation.simulate import Task
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario, with_demand
-from nmfd.runs import run_folder
+from nmfd.runs import run_folder, trail
 from nmfd.runs.files import check_file
 from nmfd.runs.provenance import provenance
 from nmfd.runs.scratch import Scratch
 from nmfd.studies import benchmark, robustness
 
 Figures = Mapping[str, object]
+ROUNDING = 1e-9  # as a share: what sums in another order may come to
 CLOCK = (  # columns and metrics that are wall times, or depend on them
     "evaluation_time_s", "control_step_ms_median", "control_step_ms_max", "late_decisions", "wall_time_s",
     "sumo_time_s", "overhead_share", "setup_time_s", "decision_ms_median", "decision_ms_max", "notes")
+
+KEYS = {"demand": float, "controller": str, "seed": int}  # of runs.csv
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,19 +57,27 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """differ: figure -> as published, as made again; depends: the same of what they depend on; same_bytes: of the runs'
-    files, None without one; compared: how many figures."""
+    """differ: figure -> as published, as made again, of those that are further apart than `within`; depends: the same
+    of what they depend on; same_bytes: of the runs' files, None without one; compared: how many figures, equal: how
+    many of them are the same to the last digit."""
 
     label: str
     compared: int
+    equal: int
+    within: float
     differ: Mapping[str, tuple[object, object]]
     depends: Mapping[str, tuple[object, object]]
     same_bytes: bool | None
 
     @property
     def good(self) -> bool:
-        """Whether it came out the same."""
-        return not self.differ and self.same_bytes is not False
+        """Whether it came out the same, as far as the versions are."""
+        return not self.differ and (self.same_bytes is not False or self.another)
+
+    @property
+    def another(self) -> bool:
+        """Whether it was made by another version, or one that is not known."""
+        return any(not key.endswith("_hash") for key in self.depends)
 
 
 def rows(folder: Path) -> list[Row]:
@@ -81,6 +95,8 @@ def rows(folder: Path) -> list[Row]:
                 _regional(folder, manifest, scenario))
     if files := sorted(file for file in folder.glob("*.json") if file.name != "manifest.json"):
         return [row for file in files for row in _of_entry(entry.read(file))]
+    if (folder / "runs.csv").is_file():
+        return _of_table(folder / "runs.csv")
     raise InputError(
         f"{folder}: does not say how its rows were made; give a folder with manifest.json and summary.csv or "
         "robustness.csv, one of an evaluation, or one of entries")
@@ -95,24 +111,31 @@ def chosen(found: Sequence[Row], pattern: str | None, seed: int | None) -> Row:
     return random.Random(seed).choice(fitting)
 
 
-def verify(row: Row, within: float = 0.0) -> Verdict:
-    """Make it again, in a scratch folder. within: by which share figures may differ. InputError or RunFailed where that
-    fails."""
+def verify(row: Row, within: float | None = None) -> Verdict:
+    """Make it again, in a scratch folder. within: by which share figures may differ; None: none, or ROUNDING in another
+    version. InputError or RunFailed where that fails."""
     with Scratch("cosim-verify-") as scratch:
         figures, depends, file = row.again(Path(scratch) / "again")
         same = None if row.file is None or file is None else row.file.read_bytes() == file.read_bytes()
-    keys = [key for key in row.figures if key not in CLOCK and key in figures]
-    return Verdict(
-        label=row.label, compared=len(keys), same_bytes=same,
-        differ={key: (row.figures[key], figures[key]) for key in keys
-                if not _same(row.figures[key], figures[key], within)},
+    keys = [key for key, value in row.figures.items() if key not in CLOCK and key in figures and not _empty(value)]
+    verdict = Verdict(
+        label=row.label, compared=len(keys), same_bytes=same, differ={}, within=0.0,
+        equal=sum(_same(row.figures[key], figures[key], 0.0) for key in keys),
         depends={key: (row.depends.get(key), depends.get(key)) for key in {**row.depends, **depends}
                  if row.depends.get(key) != depends.get(key)})
+    share = (ROUNDING if verdict.another else 0.0) if within is None else within
+    return replace(verdict, within=share, differ={
+        key: (row.figures[key], figures[key]) for key in keys if not _same(row.figures[key], figures[key], share)})
+
+
+def _empty(value: object) -> bool:
+    """Not known, in a table of a version that did not record it."""
+    return isinstance(value, float) and math.isnan(value)
 
 
 def _same(a: object, b: object, within: float) -> bool:
-    if isinstance(a, float) and isinstance(b, float):
-        return math.isclose(a, b, rel_tol=within) or (math.isnan(a) and math.isnan(b))
+    if isinstance(a, (int, float)) and isinstance(b, (int, float)):
+        return math.isclose(a, b, rel_tol=within)
     return a == b
 
 
@@ -141,16 +164,24 @@ def _regional(folder: Path, manifest: Mapping, scenario: Scenario) -> list[Row]:
         return made[0]
 
     return [_of_run(folder, manifest, published, partial(make, published["controller"], published["seed"]))
-            for published in _read(folder / "summary.csv")]
+            for published in _read(folder / "summary.csv", run_folder.COLUMNS, str)]
 
 
-def _read(file: Path) -> list[dict]:
-    """The rows of a summary.csv, with the columns that the version had which wrote it. InputError."""
+def _value(text: str) -> object:
+    """A number exactly as it is written, which pandas does not promise; NaN of an empty cell."""
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text or "nan")
+    return text
+
+
+def _read(file: Path, columns: Mapping[str, Callable], others: Callable) -> list[dict]:
+    """The rows of a table, with the columns that the version had which wrote it. InputError."""
     check_file(file)
     try:
         with file.open(newline="", encoding="utf-8") as stream:
-            return [{name: run_folder.COLUMNS.get(name, str)(value) for name, value in row.items()}
-                    for row in csv.DictReader(stream)]
+            return [{name: columns.get(name, others)(value) for name, value in row.items()
+                     if name != trail.COLUMN} for row in csv.DictReader(stream)]
     except (OSError, ValueError, TypeError, csv.Error) as error:
         raise InputError(f"{file}: is no table of runs ({error}); give a folder that holds one") from None
 
@@ -160,15 +191,56 @@ def _in_sumo(folder: Path, manifest: Mapping, scenario: Scenario, at: Path) -> l
     about = manifest["configuration"]
     faults = tuple(fault for fault in about.get("faults", ()) if fault not in scenario.faults)
 
-    def make(task: Task, out: Path) -> Figures:
-        if failures := experiment.perform([(out, task)], fresh=True):
-            raise InputError(f"{experiment.label(task)}: {failures[0][1].reason}")
-        return experiment.overview(out).to_dict("records")[0]
-
-    return [_of_run(folder, manifest, published, partial(make, Task(
+    return [_of_run(folder, manifest, published, partial(_simulated, Task(
                 scenario=at, controller=published["controller"], seed=published["seed"], steps=about["steps"],
                 demand_factor=about["demand_factor"], faults=faults)))
             for published in experiment.overview(folder).to_dict("records")]
+
+
+def _simulated(task: Task, out: Path) -> Figures:
+    """Its row."""
+    if failures := experiment.perform([(out, task)], fresh=True):
+        raise InputError(f"{experiment.label(task)}: {failures[0][1].reason}")
+    return experiment.overview(out).to_dict("records")[0]
+
+
+def _of_table(file: Path) -> list[Row]:
+    """Of cosim evaluate, by the commands that its trail names; rows that none of them asked for cannot be made."""
+    found = trail.read(file)
+    refused = found.get("not_again", {})  # patterns of controllers, and why
+    there = [order for one in trail.commands(found) if (order := Asked.by(*one, file))]
+
+    def row(published: Mapping, asked: Asked) -> Row:
+        place = f"demand-{published['demand']:g}"
+        task = asked.task(published["controller"], published["seed"], published["demand"])
+        depends = {**_of_session(asked.session), **_hashes(found, place, task.controller)}
+
+        def again(out: Path) -> tuple[Figures, Figures, Path | None]:
+            made, now = _simulated(task, out), trail.of(out / file.name)
+            now = {**_of_session(now), **_hashes(now, ".", task.controller)}
+            return made, {key: now.get(key) for key in depends}, None
+
+        return Row(label=f"{published['demand']:g},{task.controller},{task.seed}", figures=published, file=None,
+                   depends=depends, again=again)
+
+    records = _read(file, KEYS, _value)
+    if not all(KEYS.keys() <= one.keys() for one in records):
+        raise InputError(f"{file}: is no table of runs (expected {', '.join(KEYS)}); give a folder that holds one")
+    asked = [(one, next((each for each in there if each.covers(one)), None)) for one in records]
+    why = [reason for one, _ in asked for name, reason in refused.items() if fnmatchcase(one["controller"], name)]
+    if rows := [row(one, by) for one, by in asked if by and not any(
+            fnmatchcase(one["controller"], name) for name in refused)]:
+        return rows
+    if why:
+        raise InputError(f"{file}: cannot be made again: {why[0]}")
+    raise InputError(f"{file}: names no command (cosim evaluate) that asked for its rows; give a folder with the "
+                     "run folders of the evaluation, demand-*")
+
+
+def _hashes(found: Mapping, place: str, controller: str) -> dict:
+    """Of a trail: those of a run folder, and of a controller in it."""
+    there = found.get("hashes", {}).get(place, {})
+    return {**{key: value for key, value in there.items() if isinstance(value, str)}, **there.get(controller, {})}
 
 
 def _of_robustness(folder: Path, manifest: Mapping, scenario: Scenario) -> list[Row]:
@@ -231,7 +303,10 @@ def _depends(manifest: Mapping, name: str, seed: int | None = None) -> Figures:
 
 
 def _of_session(session: Mapping) -> Figures:
-    return {**session.get("versions", {}), "commit": session.get("commit"), "uncommitted changes": session.get("dirty")}
+    versions = session.get("versions", {})
+    if not isinstance(versions, Mapping):  # unknown
+        versions = dict.fromkeys(provenance()["versions"], versions)
+    return {**versions, "commit": session.get("commit"), "uncommitted changes": session.get("dirty")}
 
 
 def _kept(folder: Path, name: str, seed: int) -> Path | None:

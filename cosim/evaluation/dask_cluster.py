@@ -9,6 +9,7 @@ alone).
 import ipaddress
 import logging
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,17 +18,19 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from cosim.evaluation import dask_worker
-from cosim.evaluation.simulate import Result, Task
 from nmfd.errors import InputError
 from nmfd.extras import need
 from nmfd.runs.files import check_file
-from nmfd.runs.workers import Failure
+from nmfd.runs.workers import Failure, Source
 
 if TYPE_CHECKING:
     from distributed import Client
     from distributed.security import Security
 
 PATIENCE = 10.0  # s, for the scheduler to answer
+RETURN = 300.0   # s, for one that was lost to come back
+LOSSES = 5       # of the scheduler, without a run that ended between them: then it may be the runs that it dies of
+Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,43 +66,80 @@ def _here(address: str) -> bool:
         return False
 
 
-def checked(scheduler: Scheduler | str, tell: Callable[[str], None] | None = None) -> Scheduler:
-    """The scheduler, of which somebody has answered; before anything is written. tell: takes one line where others
-    may listen. InputError as `connect`."""
+def source(scheduler: Scheduler | str | None, tell: Tell | None = None) -> Source | None:
+    """`outcomes` of a scheduler, which has answered before anything is written; None without one. tell: takes one line
+    where others may listen, and where it was lost. InputError as `connect`."""
+    if scheduler is None:
+        return None
     found = Scheduler(address=scheduler) if isinstance(scheduler, str) else scheduler
     connect(found).close()
     if tell and found.warning:
         tell(found.warning)
-    return found
+    return partial(outcomes, found, tell=tell)
 
 
-def outcomes(scheduler: Scheduler | str, tasks: Sequence[Task]) -> Iterator[tuple[Task, Result | Failure]]:
-    """(task, Result or Failure) of every task, as they finish, from the workers of the scheduler.
+def outcomes(
+    scheduler: Scheduler | str, function: Callable, tasks: Sequence, *, tell: Tell | None = None,
+) -> Iterator[tuple]:
+    """(task, `function(task)` or Failure) of every task, once each, as they finish, from the workers of the scheduler.
 
     A task whose worker dies goes to another one; after several (Dask's distributed.scheduler.allowed-failures) it is
-    a Failure. Raises InputError without the extra `dask`, and where no scheduler answers.
+    a Failure. A scheduler that is lost is waited for, at the same address, and given the tasks that have not ended:
+    what it knew is gone with it, what had ended was handed over here at once. Raises InputError without the extra
+    `dask`, and where no scheduler answers at first.
     """
-    client = connect(scheduler)
+    at = Scheduler(address=scheduler) if isinstance(scheduler, str) else scheduler
+    todo, losses, client = dict.fromkeys(tasks), 0, None
+    while todo:
+        client = connect(at) if client is None else _connect_again(at)
+        if client is None or losses > LOSSES:
+            why = f"did not come back in {RETURN:g} s" if client is None else f"was lost {losses} times in a row"
+            yield from ((task, Failure(f"the scheduler at {at.address} {why}")) for task in todo)
+            return
+        for task, outcome in _until_lost(client, function, list(todo)):
+            del todo[task]
+            losses = 0
+            yield task, outcome
+        losses += 1
+        if todo and tell:
+            tell(f"the scheduler at {at.address} was lost; its {len(todo)} runs begin again when it is "
+                 f"back, within {RETURN:g} s")
+
+
+def _until_lost(client: "Client", function: Callable, tasks: Sequence) -> Iterator[tuple]:
+    """(task, outcome) as they finish, of all or until the scheduler is lost; closes the client."""
+    from distributed import CancelledError, as_completed  # of an extra, which `connect` has asked for
+
+    run = partial(dask_worker.run, function, folder=os.getcwd())
     futures = {}
     try:
-        from distributed import as_completed  # of an extra, which `connect` has asked for
-
-        run = partial(dask_worker.run, folder=os.getcwd())
         futures = {client.submit(run, task, pure=False): task for task in tasks}
         for future in as_completed(list(futures), loop=client.loop):
-            task = futures.pop(future)
-            if future.status == "finished":
-                outcome = future.result()
-            elif future.status == "cancelled":
-                outcome = Failure(f"the scheduler at {client.scheduler.address} was lost")
-            else:
+            if future.status not in ("finished", "error"):
+                return
+            try:
                 error = future.exception()
-                outcome = Failure(f"{type(error).__name__}: {' '.join(str(error).split())}")
+                outcome = future.result() if error is None else Failure(
+                    f"{type(error).__name__}: {' '.join(str(error).split())}")
+            except (CancelledError, OSError, TimeoutError):  # lost between its end and here
+                return
             future.release()
-            yield task, outcome
+            yield futures.pop(future), outcome
     finally:
-        client.cancel(list(futures), force=True)
+        if client.status == "running":
+            client.cancel(list(futures), force=True)
         client.close()
+
+
+def _connect_again(scheduler: Scheduler) -> "Client | None":
+    """To one that was lost; None where it does not come back."""
+    deadline = time.monotonic() + RETURN
+    while time.monotonic() < deadline:
+        try:
+            return connect(scheduler)
+        except InputError:
+            time.sleep(1.0)
+    return None
 
 
 def connect(scheduler: Scheduler | str) -> "Client":
@@ -108,7 +148,8 @@ def connect(scheduler: Scheduler | str) -> "Client":
     from distributed import Client  # of an extra: not there for everybody
 
     scheduler = Scheduler(address=scheduler) if isinstance(scheduler, str) else scheduler
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what went wrong is in the outcomes
+    for logger in ("distributed", "distributed.client"):  # Dask sets both; what went wrong is in the outcomes
+        logging.getLogger(logger).setLevel(logging.CRITICAL)
     security = _security(scheduler)
     try:
         return Client(scheduler.address, timeout=PATIENCE, set_as_default=False, security=security)

@@ -10,24 +10,26 @@ import pickle
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from contextlib import suppress
+from typing import Any
 
-from cosim.evaluation.simulate import Result, Task, simulate
 from nmfd.controllers import registry
 from nmfd.runs.workers import Failure, attempt, outcomes
 
 HEADER = 8  # bytes, the length of the pickle that follows
 
 
-def run(task: Task, folder: str) -> Result | Failure:
-    """`simulate(task)` in a new process in `folder`, to which the relative paths in `task` refer."""
+def run(function: Callable, task: Any, folder: str) -> Any:
+    """`attempt(function, task)` in a new process in `folder`, to which the relative paths in `task` refer. task: a
+    simulate.Task, or a tuple (controller, ...); function: of a module, so that it can be pickled."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     process = subprocess.Popen(
         [sys.executable, "-m", "cosim.evaluation.dask_worker"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         cwd=folder, env=environment)
     with process:
         assert process.stdin is not None and process.stdout is not None  # they are pipes
-        message = pickle.dumps(task)
+        message = pickle.dumps((function, task))
         try:
             process.stdin.write(len(message).to_bytes(HEADER) + message)
             process.stdin.flush()
@@ -44,13 +46,13 @@ def _serve() -> None:
     """The other side: one task from stdin, its outcome to stdout."""
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print must not get between
-    task = pickle.loads(sys.stdin.buffer.read(int.from_bytes(sys.stdin.buffer.read(HEADER))))
+    function, task = pickle.loads(sys.stdin.buffer.read(int.from_bytes(sys.stdin.buffer.read(HEADER))))
     answered = threading.Event()
     threading.Thread(target=_end_with_the_caller, args=[answered], daemon=True).start()
-    if registry.runs_apart(task.controller):
-        ((_, found),) = outcomes(simulate, [task], 1)
+    if registry.runs_apart(task[0] if isinstance(task, tuple) else task.controller):
+        ((_, found),) = outcomes(function, [task], 1)
     else:
-        found = attempt(simulate, task)
+        found = attempt(function, task)
     outcome = pickle.dumps(found)
     answer.write(outcome)
     answer.flush()

@@ -53,7 +53,7 @@ def write_errors(
     rows = pd.DataFrame([row for trajectory in estimated for row in errors(network, trajectory)], columns=COLUMNS)
     if not estimated:
         return rows
-    files.write_text(folder / "estimation.csv", rows.to_csv(index=False))
+    files.write_table(folder / "estimation.csv", rows)
     for trajectory in estimated:
         path = folder / f"estimate-{run_folder.run_name(trajectory.controller, trajectory.seed)}.png"
         if not path.exists():

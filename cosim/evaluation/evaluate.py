@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pandas as pd
 
-from cosim.evaluation import experiment, explain, statistics
+from cosim.evaluation import dask_cluster, experiment, explain, statistics
 from cosim.evaluation.simulate import Task
 from nmfd.api import load_scenario
 from nmfd.errors import InputError, did_you_mean
-from nmfd.runs import files
+from nmfd.runs import files, trail
 from nmfd.runs.workers import ended
 
 
@@ -48,12 +48,13 @@ class Evaluation:
 
 
 def evaluate(
-    evaluation: Evaluation, *, workers: int = 1, progress: Callable[[int, int, str], None] | None = None,
-    tell: Callable[[str], None] | None = None,
+    evaluation: Evaluation, *, workers: int = 1, scheduler: dask_cluster.Scheduler | str | None = None,
+    progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Run what is not there yet and write tables; returns `tables.statistics` and a line per failed run.
 
-    The tables are of all runs in the folder. progress, tell: as in `experiment.perform`. Raises InputError.
+    The tables are of all runs in the folder. scheduler: a Dask scheduler or its address, whose workers do the runs
+    instead of `workers` processes here; progress, tell: as in `experiment.perform`. Raises InputError.
     """
     out = evaluation.out
     check_folder(out)
@@ -64,6 +65,7 @@ def evaluate(
             f"{did_you_mean(evaluation.reference, known)}; add it to them")
     failures = experiment.perform(
         evaluation.plan(), workers=workers, fresh=True, progress=progress, tell=tell,
+        source=dask_cluster.source(scheduler, tell),
         kept=lambda: statistics.write_tables(out, all_runs(evaluation), None))
     rows, table = all_runs(evaluation), pd.DataFrame()
     if len(rows):
@@ -73,7 +75,7 @@ def evaluate(
         remarks = "".join(f"- {line}\n" for line in experiment.remarks(rows))
         files.write_text(
             out / "evaluate.md", "\n".join(filter(None, (
-                statistics.markdown(table, evaluation.reference), remarks, why))))
+                statistics.markdown(table, evaluation.reference), remarks, why))) + trail.comment(out / "evaluate.md"))
     if failures and table.empty and all(failure.mistake for _, failure in failures):
         raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])
     return table, [f"{experiment.label(task)}: {failure.reason}" for task, failure in failures]

@@ -30,11 +30,11 @@ from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.quantities import quantities, variables
-from nmfd.runs import run_folder
-from nmfd.runs.files import check_file, file_hash, write_text
+from nmfd.runs import run_folder, trail
+from nmfd.runs.files import check_file, file_hash, write_table
 from nmfd.runs.tables import text_table
 from nmfd.runs.tally import Progress, Tally
-from nmfd.runs.workers import Failure, attempt, ended, outcomes
+from nmfd.runs.workers import Failure, Source, attempt, ended, outcomes
 from nmfd.studies.benchmark import REFERENCE, compared_with, draw_accumulations, interval
 from nmfd.studies.traffic_states import OutflowOf, RegionalOutflow
 from nmfd.types import Trajectory
@@ -74,7 +74,7 @@ def perform(
     plan: Sequence[tuple[Path, Task]], *, workers: int = 1, fresh: bool = False,
     progress: Progress | None = None, tell: Callable[[str], None] | None = None,
     kept: Callable[[], object] | None = None, failed: Callable[[Task, str], None] | None = None,
-    source: Callable[[Sequence[Task]], Outcomes] | None = None,
+    source: Source | None = None,
 ) -> list[tuple[Task, Failure]]:
     """Run every task, in this order, that is not yet in its run folder; returns those that failed, and why.
 
@@ -111,7 +111,7 @@ def perform(
         todo = [task for task in where if (task.controller, task.seed) not in there[where[task]] or not all(
             file.is_file() for _, file in task.sumo_output)]
         tally = _tally(todo, progress)
-        found = _outcomes(todo, workers, fresh, tally) if source is None else source(todo) if todo else ()
+        found = _outcomes(todo, workers, fresh, tally) if source is None else source(simulate, todo)
         for task, outcome in found:
             tally.end(task, failed=isinstance(outcome, Failure))
             if isinstance(outcome, Failure):
@@ -259,8 +259,10 @@ def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
     path = folder.path / "sumo.csv"
     rows = read_facts(path) if path.is_file() else pd.DataFrame(columns=[*FACTS])
     same = (rows["controller"] == result.facts["controller"]) & (rows["seed"] == result.facts["seed"])
-    rows = pd.DataFrame([*rows[~same].to_dict("records"), result.facts], columns=[*FACTS])
-    write_text(path, rows.to_csv(index=False))
+    found = sorted([*rows[~same].to_dict("records"), result.facts],  # not as they ended, which is chance
+                   key=lambda row: folder.position(row["controller"], row["seed"]))
+    rows = pd.DataFrame(found, columns=[*FACTS])
+    write_table(path, rows)
 
 
 def overview(folder: Path) -> pd.DataFrame:
@@ -273,7 +275,7 @@ def read_facts(path: Path) -> pd.DataFrame:
     """The rows of sumo.csv, with NaN for what an older version did not record. Raises InputError."""
     check_file(path, "delete the folder and run again")
     try:
-        rows = pd.read_csv(path)
+        rows = pd.read_csv(path).drop(columns=trail.COLUMN, errors="ignore")
         rows = rows.reindex(columns=[*rows.columns, *(name for name in FACTS if name not in rows.columns)])
         return rows.astype({"controller": str, "seed": int})
     except FileNotFoundError:

@@ -19,7 +19,7 @@ from scipy.stats import binomtest
 from cosim.evaluation import experiment
 from cosim.evaluation.evaluate import Evaluation, all_runs, check_folder
 from cosim.evaluation.statistics import TTS
-from nmfd.runs import files
+from nmfd.runs import files, trail
 from nmfd.runs.tables import markdown_table, text_table
 from nmfd.runs.workers import ended
 from nmfd.studies.benchmark import interval
@@ -111,9 +111,9 @@ def text(table: pd.DataFrame) -> str:
 
 def _write(order: Evaluation, rows: pd.DataFrame) -> pd.DataFrame:
     table, folder = shares(rows), order.out
-    files.write_text(folder / "runs.csv", rows.to_csv(index=False))
-    files.write_text(folder / "frontier.csv", table.to_csv(index=False))
+    files.write_table(folder / "runs.csv", rows)
+    files.write_table(folder / "frontier.csv", table)
     shown = lines(table)
     body = markdown_table(list(shown[0]), [list(row.values()) for row in shown])
-    files.write_text(folder / "frontier.md", f"{body}\n\n{CAPTION}\n")
+    files.write_text(folder / "frontier.md", f"{body}\n\n{CAPTION}\n{trail.comment(folder / 'frontier.md')}")
     return table

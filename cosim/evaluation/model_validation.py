@@ -175,7 +175,7 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
     predicted = predict(scenario, result)
     rows = pd.DataFrame(errors(scenario, result, predicted), columns=COLUMNS)
     name = run_folder.run_name(result.trajectory.controller, result.trajectory.seed)
-    files.write_text(folder / f"compare-{name}.csv", rows.to_csv(index=False))
+    files.write_table(folder / f"compare-{name}.csv", rows)
     drawing, axes = plots.panels(scenario.network.regions + 1)
     measured = run_metrics.regional_outflow(result.record, result.trajectory.step)
     predicted_outflow = model_outflow(scenario.network)

@@ -96,4 +96,4 @@ def write_foresights(path: Path, foresights: Sequence[ModelError]) -> None:
          one.errors[0, region], one.persistence[0, region], one.ahead, one.errors[1, region],
          one.persistence[1, region])
         for one in foresights for region in range(len(one.critical))]
-    files.write_text(path, pd.DataFrame(rows, columns=COLUMNS).to_csv(index=False, float_format="%.6g"))
+    files.write_table(path, pd.DataFrame(rows, columns=COLUMNS), float_format="%.6g")

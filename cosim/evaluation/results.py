@@ -134,13 +134,20 @@ def _manifest(folder: Path) -> dict:
 def scenario_folder(folder: Path, manifest: Mapping) -> Path:
     """Of the runs in `folder`: where the manifest says, from here or from a folder above the runs, or as it came with
     the package. InputError."""
-    name = Path(manifest["sessions"][-1]["scenario_folder"])
-    for above in (Path(), *folder.resolve().parents):
-        if (above / name / "scenario.toml").is_file():
-            return above / name
-    if ((found := shipped.found(name, shipped.SCENARIO, beside=Path())) / "scenario.toml").is_file():
-        return found
-    raise InputError(f"{folder / 'manifest.json'}: scenario_folder: there is no {name}; give it with --scenario")
+    return found_again(Path(manifest["sessions"][-1]["scenario_folder"]), folder, "manifest.json: scenario_folder")
+
+
+def found_again(name: Path, folder: Path, said: str) -> Path:
+    """The scenario `name`, of runs in `folder`; said: where that is written. Of a whole path that is not there, as on
+    another machine, its end will do. InputError."""
+    ends = [Path(*name.parts[-count:]) for count in (3, 2, 1)] if name.is_absolute() else []
+    for end in (name, *ends):
+        for above in (Path(), *folder.resolve().parents):
+            if (above / end / "scenario.toml").is_file():
+                return above / end
+        if ((found := shipped.found(end, shipped.SCENARIO, beside=Path())) / "scenario.toml").is_file():
+            return found
+    raise InputError(f"{folder / said}: there is no {name}; give it with --scenario, or go to where it is")
 
 
 def _changed(configuration: Mapping, files: SumoFiles) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from nmfd.metrics import COUNTED, percent_change
-from nmfd.runs import files
+from nmfd.runs import files, trail
 from nmfd.runs.tables import markdown_table, text_table, wrapped
 from nmfd.studies import benchmark
 from nmfd.studies.benchmark import REFERENCE, interval
@@ -212,6 +212,6 @@ def write_tables(folder: Path, rows: pd.DataFrame, reference: str | None = None)
     """evaluate.csv, evaluate.md, pairs.csv and runs.csv in `folder`; returns `statistics`."""
     table = statistics(rows, reference)
     for name, content in (("runs.csv", rows), ("evaluate.csv", table), ("pairs.csv", pairs(rows))):
-        files.write_text(folder / name, content.to_csv(index=False))
-    files.write_text(folder / "evaluate.md", markdown(table, reference))
+        files.write_table(folder / name, content)
+    files.write_text(folder / "evaluate.md", markdown(table, reference) + trail.comment(folder / "evaluate.md"))
     return table

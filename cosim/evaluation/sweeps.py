@@ -6,7 +6,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -103,10 +102,10 @@ def sweep(
         failures[task.controller, task.seed, task.demand_factor] = reason
         write()
 
-    cluster = None if scheduler is None else dask_cluster.checked(scheduler, tell)
+    source = dask_cluster.source(scheduler, tell)
     failed_now = experiment.perform(
         plan, workers=workers, fresh=True, progress=progress, tell=tell, kept=write, failed=failed,
-        source=None if cluster is None else partial(dask_cluster.outcomes, cluster))
+        source=source)
     rows = write()
     if failed_now and (rows["status"] == FAILED).all():
         raise ended([(experiment.label(task), failure) for task, failure in failed_now[:1]])

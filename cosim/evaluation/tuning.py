@@ -14,7 +14,6 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ from nmfd.controllers.dpc import training
 from nmfd.errors import InputError
 from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_table
-from nmfd.runs.workers import Failure, ended, outcomes
+from nmfd.runs.workers import Failure, Source, ended, outcomes
 
 SCORE = "score_veh_s"
 NAME = re.compile(r"[a-z_]\w*(\[[0-9]\])?")  # of an option, or of one number of a list
@@ -175,7 +174,7 @@ def tune(
     Raises InputError, and RunFailed if none of a generation could be scored.
     """
     check(order)
-    cluster = None if scheduler is None else dask_cluster.checked(scheduler, tell)
+    source = dask_cluster.source(scheduler, tell)
     search, rows = _search(order), list[dict[str, object]]()
     file = order.out / "tune.csv"
     with run_folder.manifest(
@@ -183,9 +182,9 @@ def tune(
             session={"scenario_folder": str(order.scenario), "workers": workers}):
         points = [_start(order)]
         while points:
-            found = _scored(order, points, len(rows), workers, cluster, progress, tell)
+            found = _scored(order, points, len(rows), workers, source, progress, tell)
             rows += found
-            files.write_text(file, pd.DataFrame(rows).to_csv(index=False))
+            files.write_table(file, pd.DataFrame(rows))
             files.write_text(order.out / "tune.toml", toml(order, pd.DataFrame(rows)))
             if len(rows) > 1 and len(points) == search.popsize:
                 search.tell(points, _costs(found))
@@ -269,7 +268,7 @@ def _configuration(order: Tuning) -> dict[str, object]:
 
 def _scored(
     order: Tuning, points: Sequence[Sequence[float]], begin: int, workers: int,
-    cluster: dask_cluster.Scheduler | None, progress: experiment.Progress | None, tell: Callable[[str], None] | None,
+    source: Source | None, progress: experiment.Progress | None, tell: Callable[[str], None] | None,
 ) -> list[dict[str, object]]:
     """Run the candidates `begin`, `begin` + 1, ... at `points`; their rows of tune.csv."""
     options = {begin + n: order.options(point) for n, point in enumerate(points)}
@@ -285,7 +284,7 @@ def _scored(
         _train(order, options, workers, lambda note: report(0, len(points) * each, note))
     failures = experiment.perform(
         plan, workers=workers, fresh=True, progress=report, tell=tell,
-        source=None if cluster is None else partial(dask_cluster.outcomes, cluster))
+        source=source)
     rows = [_row(order, candidate, points[candidate - begin]) for candidate in options]
     if all(math.isnan(row[SCORE]) for row in rows):
         raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])

@@ -15,6 +15,7 @@ from cosim.evaluation.simulate import Result
 from cosim.report import figures, pictures
 from cosim.sumo.net import City, edge_shapes
 from nmfd.errors import InputError, did_you_mean
+from nmfd.runs import trail
 from nmfd.runs.files import atomic, file_name
 from nmfd.studies import plots
 
@@ -69,12 +70,15 @@ def film(
         drawing, update = scene(finished.map(), results, f"{finished.scenario.name}, demand times {level.demand:g}")
         steps = min(len(result.record["edge_vehicles"]) for result in results.values())
         shown = range(0, steps, -(-steps // FRAMES))
-        with atomic(path) as temporary, writer.saving(drawing, str(temporary), DPI):
-            for n, k in enumerate(shown):
-                update(k)
-                writer.grab_frame()
-                if progress:
-                    progress(n + 1, len(shown))
+        with atomic(path) as temporary:
+            with writer.saving(drawing, str(temporary), DPI):
+                for n, k in enumerate(shown):
+                    update(k)
+                    writer.grab_frame()
+                    if progress:
+                        progress(n + 1, len(shown))
+            if path.suffix == ".gif":
+                trail.into_gif(temporary, trail.text(trail.of(path)))
     return path
 
 
@@ -128,7 +132,8 @@ def _writer(path: Path, rate: int) -> Iterator[animation.AbstractMovieWriter]:
         if program is None:
             raise InputError(f"--out: {path}: there is no ffmpeg for mp4; {FFMPEG_HINT}")
         with rc_context({"animation.ffmpeg_path": program}):
-            yield animation.FFMpegWriter(fps=rate, codec="h264", bitrate=1500)
+            yield animation.FFMpegWriter(fps=rate, codec="h264", bitrate=1500,
+                                         metadata={"comment": trail.text(trail.of(path))})
     else:
         raise InputError(f"--out: {path}: expected a name that ends in {' or '.join(SUFFIXES)}; choose another")
 

@@ -10,10 +10,15 @@ import stat
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from filelock import FileLock, Timeout
 
 from nmfd.errors import InputError
+from nmfd.runs import trail
+
+if TYPE_CHECKING:  # heavy
+    import pandas as pd
 
 KINDS = {stat.S_ISDIR: "folder", stat.S_ISFIFO: "pipe", stat.S_ISSOCK: "socket"}
 TEMPORARY = re.compile(r"\.(?P<stem>.+)-\d+\.tmp(\.\w+)?")  # names that `atomic` gives
@@ -108,12 +113,19 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def write_table(path: Path, frame: "pd.DataFrame", **options: str) -> None:
+    """`frame` as a csv file with its trail (nmfd.runs.trail), atomically; options: of DataFrame.to_csv."""
+    if len(frame):
+        frame = frame.assign(**{trail.COLUMN: [trail.text(trail.of(path)), *[""] * (len(frame) - 1)]})
+    write_text(path, frame.to_csv(index=False, **options))
+
+
 def write_rows(path: Path, columns: Mapping[str, type], rows: Sequence[Mapping]) -> None:
-    """`rows` as a csv file with `columns`, atomically."""
+    """`rows` as a csv file with `columns` and their trail (nmfd.runs.trail), atomically."""
     with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(columns), lineterminator="\n")
+        writer = csv.DictWriter(file, fieldnames=[*columns, trail.COLUMN], lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows([{**row, trail.COLUMN: "" if n else trail.text(trail.of(path))} for n, row in enumerate(rows)])
 
 
 def read_rows(path: Path, columns: Mapping[str, type]) -> list[dict]:
@@ -122,7 +134,7 @@ def read_rows(path: Path, columns: Mapping[str, type]) -> list[dict]:
     try:
         with Path(path).open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
-            if reader.fieldnames != list(columns):
+            if [name for name in reader.fieldnames or () if name != trail.COLUMN] != list(columns):
                 raise ValueError(f"expected the columns {', '.join(columns)}")
             return [{name: convert(row[name]) for name, convert in columns.items()} for row in reader]
     except FileNotFoundError:

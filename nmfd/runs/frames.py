@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from nmfd.runs import trail
 from nmfd.runs.files import atomic
 from nmfd.types import Trajectory
 
@@ -23,7 +24,9 @@ def write(folder: Path, trajectories: Sequence[Trajectory], tables: Mapping[str,
 
 
 def write_parquet(path: Path, frame: pd.DataFrame) -> Path:
-    """Write `frame` to `path`, atomically."""
+    """Write `frame` to `path`, atomically, with its trail (nmfd.runs.trail) in its attrs."""
+    frame = frame.copy(deep=False)
+    frame.attrs["trail"] = trail.of(path)
     with atomic(path) as temporary:
         frame.to_parquet(temporary, index=False)
     return path

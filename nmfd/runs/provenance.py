@@ -15,14 +15,19 @@ PACKAGES = ("numpy", "torch", "casadi", "libsumo")
 
 def provenance() -> dict:
     """Date, versions, and the commit of the checkout that this package lies in; commit is None outside one."""
+    commit, dirty = _checkout()
+    return {
+        "date": datetime.now().astimezone().isoformat(timespec="seconds"), "versions": dict(_versions()),
+        "commit": commit, "dirty": dirty}
+
+
+@cache
+def _versions() -> tuple[tuple[str, str], ...]:
     versions = {"python": platform.python_version(), "perimeter-cosim": __version__}
     for package in PACKAGES:
         with suppress(metadata.PackageNotFoundError):
             versions[package] = metadata.version(package)
-    commit, dirty = _checkout()
-    return {
-        "date": datetime.now().astimezone().isoformat(timespec="seconds"), "versions": versions, "commit": commit,
-        "dirty": dirty}
+    return tuple(versions.items())
 
 
 @cache

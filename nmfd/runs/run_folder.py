@@ -23,8 +23,7 @@ import numpy as np
 from nmfd.errors import InputError
 from nmfd.metrics import SUMMARY, summary
 from nmfd.quantities import quantities
-from nmfd.runs import files
-from nmfd.runs.provenance import provenance
+from nmfd.runs import files, trail
 from nmfd.types import Trajectory
 
 COLUMNS = {name: kind for name, (kind, _) in SUMMARY.items()}
@@ -185,6 +184,11 @@ class RunFolder:
         """(controller, seed) of every run that is here with its row and its file; `order`'s own come last."""
         return [run for run in self._order if run in self._rows and self.trajectory_path(*run).is_file()]
 
+    def position(self, controller: str, seed: int) -> int:
+        """Of a run among all that are here or asked for, -1 for another one: as in summary.csv."""
+        run = controller, seed
+        return self._order.index(run) if run in self._order else -1
+
     def trajectory_path(self, controller: str, seed: int) -> Path:
         """Its file, there or not."""
         return run_path(self.path, controller, seed)
@@ -282,7 +286,7 @@ def manifest(
                 if changed and renew is not None:
                     renew(changed)
             first = not sessions
-            sessions.append({**provenance(), **(session or {})})
+            sessions.append({**trail.session(), **(session or {})})
             content = {"configuration": configuration, "controllers": controllers, "sessions": sessions}
             try:
                 files.write_text(file, json.dumps(content, indent=2) + "\n")

@@ -29,6 +29,8 @@ GRACE = 2.0   # s, from the end of a time limit, of which a task is told, to tha
 LEAVE = 5.0   # s, for a process that has nothing more to do
 LOOK = 0.5    # s, between two looks at the time limits
 SAID = 300    # bytes, of what a task is at
+# Where tasks are done, other than in processes here: (function, tasks) -> (task, outcome) as they finish.
+Source = Callable[[Callable, Sequence], Iterator[tuple]]
 
 
 @dataclass(frozen=True)

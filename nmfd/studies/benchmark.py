@@ -16,7 +16,7 @@ from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
 from nmfd.runs.tally import Tally
-from nmfd.runs.workers import Failure, Worker, attempt, ended, outcomes
+from nmfd.runs.workers import Failure, Source, Worker, attempt, ended, outcomes
 from nmfd.studies import plots
 from nmfd.studies.traffic_states import OutflowOf, model_outflow, remembered
 from nmfd.types import Plant, Trajectory
@@ -77,11 +77,13 @@ def perform(
     scenario: Scenario, controllers: Sequence[str], seeds: Sequence[int], plant: str, *, out: Path,
     policies: Mapping[str, Path] | None = None, noise: Noise | None = None, workers: int = 1,
     progress: Callable[[int, int, str], None] | None = None, renew: Callable[[str], None] | None = None,
+    source: Source | None = None,
 ) -> tuple[list[dict], list[tuple[tuple[str, int], Failure]]]:
     """Run what is not yet in the run folder `out`; returns all rows of its summary.csv, and the runs that failed.
 
     progress: called with the control intervals done and to do, and what is running
     renew: takes one line where the runs of a controller do not count any more because it changed; None: an InputError
+    source: does the runs elsewhere, instead of `workers` processes here
 
     Raises InputError, before anything is written, for a controller that cannot be made. Every finished run is kept,
     whatever happens to the others.
@@ -99,7 +101,8 @@ def perform(
         todo = [run for run in wanted if run not in folder.finished]
         failures = []
         work = partial(run_one, scenario=scenario, plant=plant, policies=policies, noise=noise)
-        for run, outcome in results(work, todo, workers, scenario.steps, progress, label=_label):
+        for run, outcome in results(
+                work, todo, workers, scenario.steps, progress, label=_label, source=source):
             if isinstance(outcome, Failure):
                 failures.append((run, outcome))
             else:
@@ -131,17 +134,19 @@ def _label(run: tuple[str, int]) -> str:
 
 def results(
     work: Callable, todo: Sequence[tuple], workers: int, steps: int,
-    progress: Callable[[int, int, str], None] | None, *, label: Callable[..., str],
+    progress: Callable[[int, int, str], None] | None, *, label: Callable[..., str], source: Source | None = None,
 ) -> Iterator[tuple]:
     """(run, result or Failure) of every run, in this process if there is one worker; those of controllers of the
     user's own in processes of their own.
 
     work(run), or work(run, progress=...) in this process, is one closed loop of `steps` control intervals; progress
-    as in `benchmark`, with the `label` of the run.
+    as in `benchmark`, with the `label` of the run; source: as in `perform`.
     """
     tally = Tally(progress, todo, steps=lambda run: steps, label=label)
-    if workers > 1:
-        for run, outcome in outcomes(work, todo, min(workers, len(todo)), group=_apart, look=tally.look):
+    if source or workers > 1:
+        found = source(work, todo) if source else outcomes(
+            work, todo, min(workers, len(todo)), group=_apart, look=tally.look)
+        for run, outcome in found:
             tally.end(run, failed=isinstance(outcome, Failure))
             yield run, outcome
         return

@@ -197,4 +197,4 @@ def write_fits(path: Path, fits: Sequence[RegionFit], found: Predictions | None)
                 row[f"held_out_{when}_{part}_rmse_share"] = (
                     float("nan") if found is None else float(getattr(found, part)[n, fit.region]))
         rows.append(row | {"ahead_s": float("nan") if found is None else found.ahead})
-    files.write_text(path, pd.DataFrame(rows).to_csv(index=False, float_format="%.6g"))
+    files.write_table(path, pd.DataFrame(rows), float_format="%.6g")

@@ -309,7 +309,7 @@ def _write(out: Path, found: Identified, clouds: Sequence[Sequence[dict[str, Poi
     out.mkdir(parents=True, exist_ok=True)
     bands = [mfd_bands.band([fit_quality.own_points(day) for day in days]) for days in clouds]
     mfd_bands.draw_mfds(out / "mfd.png", found.network, found.samples, bands, "days")
-    files.write_text(out / "samples.csv", found.intervals.to_csv(index=False, float_format="%.6g"))
+    files.write_table(out / "samples.csv", found.intervals, float_format="%.6g")
     fit_quality.write_fits(out / "fit.csv", found.fits, None)
     files.write_text(out / "identify.txt", found.text + "\n")
     files.write_text(out / "network.toml", schema_line(out) + text)
