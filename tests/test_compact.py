@@ -13,7 +13,8 @@ from nmfd.api import load_scenario
 from nmfd.controllers.dpc.compact import HELD, CompactPolicy, Numbers
 from nmfd.controllers.dpc.fallback import Guarded, statistics
 from nmfd.controllers.dpc.policy import Architecture, DpcController
-from nmfd.controllers.dpc.policy_file import load_policy
+from nmfd.controllers.dpc.policy_file import checkpoint, load_policy
+from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.types import Observation
@@ -128,6 +129,15 @@ def test_wrong_settings(tmp_path, table, expected):
         stream.write(f"\n[controllers.dpc-pcrg]\n{table}\n")
     done = nmfd("train", scenario, "--controller", "dpc-pcrg")
     assert done.exit_code == 2 and done.stderr.count("\n") == 1 and expected in done.stderr, done.stderr
+
+
+@pytest.mark.parametrize("compact", [(99,), (-1,), ("x",), (1.5,), 3, None])
+def test_damaged_files_are_one_line(network, tmp_path, compact):
+    content = checkpoint(policy(network), network, {})
+    content["architecture"]["compact"] = compact
+    torch.save(content, tmp_path / "a.pt")
+    with pytest.raises(InputError, match="is damaged or of another version"):
+        load_policy(tmp_path / "a.pt", network)
 
 
 def test_prices_are_in_the_run_and_go_where_the_guard_withdraws_the_split_ratios(network):

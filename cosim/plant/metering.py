@@ -17,7 +17,7 @@ from cosim.sumo.session import Session
 from cosim.sumo.trips import Trips
 from nmfd.arrays import PerPair, PerRegion
 
-KP, KI = 1.0, 0.3  # of the vehicles that are too many, those that are kept out in the next control interval [-]
+KP, KI = 1.0, 0.3  # of the vehicles too many, those that are kept out in the next control interval [-]; not tuned
 FILLING = 60.0     # s, in which the largest rate fills a region to its critical accumulation
 
 

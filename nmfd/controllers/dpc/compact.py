@@ -31,7 +31,7 @@ from nmfd.model import dynamics
 from nmfd.model.regional_model import RegionalModel
 from nmfd.tensors import PerPair, PerRegion, PerTurn
 
-DISPERSION = 60.0  # s: how differently drivers see the same ways; about what their own ways differ by in grid7
+DISPERSION = 60.0  # s: how differently drivers see the same ways; assumed, nobody has measured it
 HELD = 90.0        # s, a cycle of the signals: how fast a region may fill
 LONGEST = 20.0     # times as long as in free flow: the most that it takes in the model to leave a region
 

@@ -63,7 +63,10 @@ def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
             raise InputError(
                 f"{path}: network_hash: the policy was trained for network {content['network']!r} "
                 f"({content['network_hash']}), not for {network.name!r} ({network.hash}); train one with 'nmfd train'")
-        flags = {type(architecture.guidance), type(architecture.sparse), type(architecture.local)}
+        flags = {type(flag) for flag in (
+            architecture.guidance, architecture.sparse, architecture.local, architecture.metering)}
+        if not all(type(region) is int and 0 <= region < network.regions for region in architecture.compact):
+            raise KeyError("architecture")
         if not (0 < architecture.width <= WIDEST and 0 < architecture.layers <= DEEPEST and flags == {bool}):
             raise KeyError("architecture")
         policy = new_policy(network, architecture)
