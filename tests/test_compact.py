@@ -26,7 +26,8 @@ TABLE = """
 [controllers.dpc-pcrg]
 compact = true
 numbers = [1.0, 2.0, 0.0, {price}, 0.6, 0.0, 0.6, 1.5]
-steps = {steps}
+descend = {descend}
+steps = 5
 batch = 2
 learning_rate = 0.05
 """
@@ -102,10 +103,10 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
     scenario = tiny.write(tmp_path)
     text = (scenario / "scenario.toml").read_text()
     files = {}
-    for steps in (0, 5):
-        (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, steps=steps))
-        files[steps] = scenario / "dpc-pcrg.pt" if steps else tmp_path / "first.pt"
-        good(nmfd("train", scenario, "--controller", "dpc-pcrg", "--no-compile", "--out", files[steps]))
+    for descend in ("false", "true"):
+        (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend=descend))
+        files[descend] = scenario / "dpc-pcrg.pt" if descend == "true" else tmp_path / "first.pt"
+        good(nmfd("train", scenario, "--controller", "dpc-pcrg", "--no-compile", "--out", files[descend]))
     loaded = load_scenario(scenario)
     first, trained = (load_policy(file, loaded.network) for file in files.values())
     assert first[0].numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5])
@@ -122,6 +123,7 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
     ("compact = true\nlocal = true", "compact: begins with its numbers"),
     ("metering = true", "metering: only compact policies let trips wait"),
     ("steps = 0", "steps: expected a whole number from 1"),
+    ("descend = false", "descend: only a compact policy may stay as it begins"),
 ])
 def test_wrong_settings(tmp_path, table, expected):
     scenario = tiny.write(tmp_path)

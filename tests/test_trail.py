@@ -12,7 +12,7 @@ import trajectories
 from PIL import Image
 
 from nmfd.errors import InputError
-from nmfd.runs import files, frames, run_folder, trail
+from nmfd.runs import command, files, frames, run_folder, trail
 from nmfd.studies import plots
 
 ROOT = Path(__file__).parents[1]
@@ -53,7 +53,7 @@ def test_sessions_of_a_folder_are_in_its_tables(tmp_path):
     """A session that only went on is no other one; where it was written, and on how many processes, is not told."""
     def opened(seeds: int, *more: str) -> dict:
         runs = [("mine", seed) for seed in range(seeds)]
-        with (trail.called("nmfd", ["benchmark", "a city", "--seeds", str(seeds), *more]),
+        with (command.called("nmfd", ["benchmark", "a city", "--seeds", str(seeds), *more]),
               run_folder.open_folder(tmp_path / "out", configuration={"plant": "nmfd", "network_hash": "n"}, order=runs,
                                      controllers={"mine": {"policy_hash": "p", "source_hash": None}}) as folder):
             for seed in range(seeds):
@@ -64,9 +64,9 @@ def test_sessions_of_a_folder_are_in_its_tables(tmp_path):
         return shown(tmp_path / "out" / "summary.csv")
 
     found = opened(2, "--out", str(tmp_path), "--workers=3")
-    command = "nmfd benchmark 'a city' --seeds 2"
-    assert found["command"] == command and found["hashes"] == {".": {"network_hash": "n", "mine": {"policy_hash": "p"}}}
-    assert [(one["command"], one["seeds"]) for one in found["runs"]] == [(command, [0, 1])]
+    wanted = "nmfd benchmark 'a city' --seeds 2"
+    assert found["command"] == wanted and found["hashes"] == {".": {"network_hash": "n", "mine": {"policy_hash": "p"}}}
+    assert [(one["command"], one["seeds"]) for one in found["runs"]] == [(wanted, [0, 1])]
     session = run_folder.read_manifest(tmp_path / "out" / "manifest.json")["sessions"][0]
     assert all(found[key] == session[key] for key in trail.WRITER)
     assert opened(2, "--scheduler", "tls://there:1", "--scheduler-ca=ca.pem") == found

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from nmfd.controllers import registry
-from nmfd.controllers.dpc.compact import Numbers
 from nmfd.controllers.dpc.policy_file import read_policy_file
 from nmfd.model.network_file import NetworkTable
 from nmfd.model.scenario_file import ScenarioTable, read_tables
@@ -38,8 +37,7 @@ def policies() -> Rows:
         for file in sorted(folder.glob("dpc-*.pt")):
             content = read_policy_file(file)
             of, numbers = content["configuration"], content["weights"].get("numbers")
-            compact = "" if numbers is None else ": " + ", ".join(
-                f"{name} {value:.3g}" for name, value in zip(Numbers._fields, numbers.tolist(), strict=False))
+            compact = "" if numbers is None else f": {', '.join(f'{number:.3g}' for number in numbers.tolist())}"
             yield f"{folder.name}/{file.name}", (
                 f"{of['steps']} Adam steps, seed {of['seed']}, {of['validation_veh_s']:.4g} veh s in validation"
                 f"{compact}")

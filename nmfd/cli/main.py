@@ -145,7 +145,8 @@ def train(
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the policy; make it or choose another --out")
     default = compiled is None
-    compiled = chosen.steps >= training.WORTH_COMPILING if compiled is None else compiled
+    if compiled is None:
+        compiled = chosen.descend and chosen.steps >= training.WORTH_COMPILING
     if compiled and not rollout.can_compile(device):
         if not default:
             raise InputError("--compile: does not work here, most likely for want of a C++ compiler; install g++ or "

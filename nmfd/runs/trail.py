@@ -16,42 +16,21 @@ patterns of controllers whose rows cannot be made again, and why.
 
 import csv
 import json
-import re
-import shlex
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
+from nmfd.runs import command
 from nmfd.runs.provenance import provenance
 
 COLUMN = "trail"
 UNKNOWN = "unknown"
 WRITER = ("command", "commit", "dirty", "versions")
-# Options that change no result, and where there are paths that concern nobody.
-ELSEWHERE = re.compile(r"--(out|workers|scheduler(-ca|-cert|-key)?)(=.*)?")
-_called: list[str] = []
-
-
-@contextmanager
-def called(program: str, arguments: Sequence[str]) -> Iterator[None]:
-    """In here, this command is what makes all that is written."""
-    words, left = [program], iter(arguments)
-    for word in left:
-        if found := ELSEWHERE.fullmatch(word):
-            if found[3] is None:
-                next(left, None)
-        else:
-            words.append(word)
-    _called.append(shlex.join(words))
-    try:
-        yield
-    finally:
-        _called.pop()
 
 
 def session() -> dict:
     """Of this process: date, versions, commit, and the command that it was called by."""
-    return {**provenance(), "command": _called[-1] if _called else None}
+    return {**provenance(), "command": command.present()}
 
 
 def of(file: Path) -> dict:

@@ -40,7 +40,9 @@ class Training(Options):
         "metering (nmfd/controllers/dpc/compact.py)", None, unit="-")
     metering: bool = setting(
         "a compact policy lets trips wait where regions are full; for cities with +metering", False)
-    steps: int = whole("Adam steps; 0 leaves a compact policy as it begins", 400, low=0, high=MOST_STEPS)
+    descend: bool = setting(
+        "false leaves a compact policy as it begins: its numbers were chosen elsewhere, as by cosim tune", True)
+    steps: int = whole("Adam steps", 400, low=1, high=MOST_STEPS)
     batch: int = whole("rollouts per step", 16, low=1, high=100_000)
     learning_rate: float = setting(
         "of Adam at the start; falls to a tenth along a cosine", 1e-3, unit="-", gt=0.0, le=1.0)
@@ -82,8 +84,8 @@ class Training(Options):
             raise Problem("numbers", "expected eight numbers >= 0 of a compact policy; add compact = true, or omit it")
         if self.metering and not self.compact:
             raise Problem("metering", "only compact policies let trips wait; add compact = true, or omit it")
-        if not (self.steps or self.compact):
-            raise Problem("steps", "expected a whole number from 1, or a compact policy")
+        if not (self.descend or self.compact):
+            raise Problem("descend", "only a compact policy may stay as it begins; add compact = true, or omit it")
         return self
 
     def misfit(self, planning: "PlanningModel") -> Problem | None:

@@ -59,6 +59,10 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         raise InputError(
             f"{scenario.folder}/scenario.toml: controllers.{controller}.local: a local policy guides no routes; train "
             f"{name.replace('pcrg', 'pc')}, or omit it")
+    if not chosen.descend and steps is not None:
+        raise InputError(
+            f"--steps: {controller} stays as it begins (descend = false in {scenario.folder}/scenario.toml); omit one "
+            "of them")
     return chosen if steps is None else chosen.changed(steps=steps)
 
 
@@ -107,8 +111,10 @@ def train(
         if not anyway:
             check(scenario, controller)
         planning = planning_model(scenario, controller)
+        steps = chosen.steps if chosen.descend else 0
         configuration = {
-            "controller": controller, "scenario": planning.name, "seed": seed, "compiled": compiled, **vars(chosen)}
+            "controller": controller, "scenario": planning.name, "seed": seed, "compiled": compiled, **vars(chosen),
+            "steps": steps}
         torch.manual_seed(seed)
         generator = torch.Generator().manual_seed(seed)
         guidance = NAMES[controller.partition("+")[0]]
@@ -138,9 +144,9 @@ def train(
                 for done, trained, score in history:
                     if log:
                         log(int(done), trained, score)
-            for step in range(first, chosen.steps):
+            for step in range(first, steps):
                 for group in optimizer.param_groups:
-                    cosine = 0.5 * (1.0 + math.cos(math.pi * step / chosen.steps))
+                    cosine = 0.5 * (1.0 + math.cos(math.pi * step / steps))
                     group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
                 rollout.draw_model(chosen.batch, chosen.mfd_spread, generator, chosen.mfd_scale)
                 x, demand = rollout.random_start(
@@ -159,7 +165,7 @@ def train(
                 optimizer.step()
                 if isinstance(policy, CompactPolicy):
                     policy.bound()
-                last = step + 1 == chosen.steps
+                last = step + 1 == steps
                 if (step + 1) % VALIDATE_EVERY == 0 or last:
                     score = validate(policy, rollout, seed, chosen)
                     history.append([step + 1, math.exp(loss.item()), score])
@@ -170,10 +176,10 @@ def train(
                         _keep(policy, rollout, chosen, configuration, best, out)
                     if not last:
                         _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
-                reached((step + 1) / chosen.steps)
+                reached((step + 1) / steps)
                 if progress:
-                    progress(step + 1, chosen.steps, f"best {best:.4g} veh s")
-            if not chosen.steps:
+                    progress(step + 1, steps, f"best {best:.4g} veh s")
+            if not steps:  # as it begins
                 best = validate(policy, rollout, seed, chosen)
                 if log:
                     log(0, best, best)
@@ -182,7 +188,7 @@ def train(
                 _keep(policy, rollout, chosen, configuration, best, out)
             if not math.isfinite(best):
                 raise RunFailed(
-                    f"{controller}: every validation of {chosen.steps} steps diverged; lower the learning rate")
+                    f"{controller}: every validation of {steps} steps diverged; lower the learning rate")
             state_file.unlink(missing_ok=True)
         return out
 
