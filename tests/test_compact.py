@@ -107,10 +107,16 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
         (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend=descend))
         files[descend] = scenario / "dpc-pcrg.pt" if descend == "true" else tmp_path / "first.pt"
         good(nmfd("train", scenario, "--controller", "dpc-pcrg", "--no-compile", "--out", files[descend]))
+    (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend="false"))
+    refused = nmfd("train", scenario, "--controller", "dpc-pcrg", "--steps", 3)
+    assert refused.exit_code == 2 and refused.stderr.endswith(
+        f"--steps: dpc-pcrg stays as it begins (descend = false in {scenario}/scenario.toml); omit one of them\n")
+    (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend="true"))
     loaded = load_scenario(scenario)
     first, trained = (load_policy(file, loaded.network) for file in files.values())
     assert first[0].numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5])
     assert isinstance(trained[0], CompactPolicy) and (trained[0].numbers != first[0].numbers).any()
+    assert first[1]["configuration"]["steps"] == 0 and trained[1]["configuration"]["steps"] == 5
     assert trained[1]["configuration"]["validation_veh_s"] < first[1]["configuration"]["validation_veh_s"]
     good(nmfd("benchmark", scenario, "--controllers", "dpc-pcrg,dpc-pcrg-guarded", "--out",
               tmp_path / "out"))

@@ -14,6 +14,7 @@ from nmfd.controllers.dpc import rollout as rollout_module
 from nmfd.controllers.dpc import training
 from nmfd.controllers.dpc.options import RobustTraining
 from nmfd.controllers.dpc.policy import Architecture, Policy
+from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.errors import InputError, RunFailed
 from nmfd.model.planning import planning_model
@@ -328,6 +329,21 @@ def test_the_model_that_a_controller_is_trained_on_must_be_measured(scenario):
     shut = replace(scenario.network, controllable=np.zeros_like(scenario.network.adjacency, dtype=float))
     with pytest.raises(InputError, match="controllable: is 0 at every boundary.*dpc-pcrg all the same"):
         training.check(replace(scenario, network=shut), "dpc-pcrg")
+
+
+def test_nothing_is_trained_on_a_guess_unless_anyway(scenario, tmp_path):
+    city = replace(scenario, network=replace(scenario.network, placeholder=True))
+    with pytest.raises(InputError, match="placeholder: is true"):
+        training.train(city, "dpc-pc", seed=0, out=tmp_path / "a.pt", steps=1)
+    assert training.train(city, "dpc-pc", seed=0, out=tmp_path / "a.pt", steps=1, anyway=True).is_file()
+
+
+def test_a_policy_that_begins_as_no_control_is_nearly_that_after_a_step(scenario, tmp_path):
+    table = {"from_no_control": True, "width": 8, "batch": 2, "learning_rate": 1e-6}
+    chosen = replace(scenario, controller_options={"dpc-pcrg": table})
+    file = training.train(chosen, "dpc-pcrg", seed=0, out=tmp_path / "a.pt", steps=1)
+    perimeter, splits = load_policy(file, scenario.network)[0](torch.rand(2, 2, generator=torch.manual_seed(0)) * 100.0)
+    assert perimeter[0, 1] > 0.8 and np.allclose(splits.detach(), scenario.network.nominal_splits, atol=0.05)
 
 
 def test_a_model_of_its_own_counts(tmp_path):
