@@ -13,8 +13,7 @@ def check_strategy(name: str, scenario: Scenario, city: City) -> None:
     """InputError, in a line that begins with the strategy, unless it can run in this city."""
     try:
         chosen = settings(scenario).changed(**parse(name).overrides)
-        check_lanes(scenario, chosen)
-        check_metering(scenario, chosen)
+        check_settings(scenario, chosen)
         if chosen.signals != FIXED:
             signals_of(city, scenario, chosen)
     except InputError as error:
@@ -26,19 +25,15 @@ def signals_of(city: City, scenario: Scenario, chosen: Settings) -> CitySignals:
     return city_signals(city, chosen, own_files(scenario, chosen.additional))
 
 
-def check_metering(scenario: Scenario, chosen: Settings) -> None:
-    """InputError where the trips are not the scenario's own, to be held back one by one."""
-    if chosen.metering and chosen.routes:
-        raise InputError(
-            f"{scenario_file(scenario)}: sumo.metering: trips of route files (sumo.routes) cannot be made to wait, "
-            "only those drawn from the scenario's demand; omit it")
-
-
-def check_lanes(scenario: Scenario, chosen: Settings) -> None:
-    """InputError for what needs lanes where there are none."""
+def check_settings(scenario: Scenario, chosen: Settings) -> None:
+    """InputError for what needs lanes where there are none, and for trips that cannot be held back one by one."""
     for key, values, what in (("signals", PRESSURES, "counts vehicles lane by lane"),
                               ("measurement", (ESTIMATE,), "needs loop detectors on lanes")):
         if chosen.mesoscopic and (value := getattr(chosen, key)) in values:
             raise InputError(
                 f"{scenario_file(scenario)}: sumo.{key}: {value} {what}, but SUMO's mesoscopic model has no lanes; "
                 "omit it, or set mesoscopic = false (import the city without --mesoscopic)")
+    if chosen.metering and chosen.routes:
+        raise InputError(
+            f"{scenario_file(scenario)}: sumo.metering: trips of route files (sumo.routes) cannot be made to wait, "
+            "only those drawn from the scenario's demand; omit it")

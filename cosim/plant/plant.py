@@ -8,7 +8,7 @@ import numpy as np
 
 from cosim.plant.actuation import Actuation
 from cosim.plant.detectors import instruments, lay_out, probes
-from cosim.plant.feasible import check_lanes, check_metering, signals_of
+from cosim.plant.feasible import check_settings, signals_of
 from cosim.plant.guidance import Guide
 from cosim.plant.incidents import Incidents
 from cosim.plant.launch import Launch
@@ -54,8 +54,7 @@ class SumoPlant:
         self._scenario, self._planning = scenario, planning or planning_model(scenario)
         self._observer = observer
         self._settings = chosen = overrides or settings(scenario)
-        check_lanes(scenario, chosen)
-        check_metering(scenario, chosen)
+        check_settings(scenario, chosen)
         files = ensure_built(scenario.network)
         self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
         check_adjacency(self.city, scenario.network)

@@ -219,12 +219,12 @@ def checked(controls: object, network: RegionalModel, where: str) -> Controls:
                 f"{where}: perimeter[{i}, {h}]: expected a number in [{network.u_min:g}, {network.u_max:g}], got "
                 f"{perimeter[i, h]:g} instead; use numpy.clip")
     perimeter = np.where(network.adjacency, np.clip(perimeter, network.u_min, network.u_max), 0.0)
-    prices = _by_region(controls.prices, regions, MOST_PRICE, f"{where}: prices")
-    metering = _by_region(controls.metering, regions, MOST_RATE, f"{where}: metering")
+    unguided = Controls(
+        perimeter=perimeter, splits=None, status=controls.status, note=_text(controls.note),
+        prices=_by_region(controls.prices, regions, MOST_PRICE, f"{where}: prices"),
+        metering=_by_region(controls.metering, regions, MOST_RATE, f"{where}: metering"))
     if controls.splits is None:
-        return Controls(
-            perimeter=perimeter, splits=None, status=controls.status, note=_text(controls.note), prices=prices,
-            metering=metering)
+        return unguided
     splits = _array(controls.splits, (regions,) * 3, f"{where}: splits")
     allowed = network.split_mask
     if (wrong := np.argwhere((splits < -ROUNDING) | (~allowed & (splits > ROUNDING)))).size:
@@ -237,9 +237,7 @@ def checked(controls: object, network: RegionalModel, where: str) -> Controls:
     if (wrong := np.argwhere(allowed.any(axis=1) & (abs(sums - 1.0) > 100 * ROUNDING))).size:
         i, j = wrong[0]
         raise InputError(f"{where}: splits[{i}, :, {j}]: expected shares with sum 1, got {sums[i, j]:g} instead")
-    return Controls(
-        perimeter=perimeter, splits=splits / np.where(sums > 0, sums, 1.0)[:, None, :], status=controls.status,
-        note=_text(controls.note), prices=prices, metering=metering)
+    return replace(unguided, splits=splits / np.where(sums > 0, sums, 1.0)[:, None, :])
 
 
 def _by_region(asked: object, regions: int, most: float, where: str) -> PerRegion | None:

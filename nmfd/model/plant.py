@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from nmfd import ledger
+from nmfd import ledger, tensors
 from nmfd.arrays import PerRegion
 from nmfd.model import acyclic, dynamics
 from nmfd.model.scenario import Scenario
@@ -35,9 +35,7 @@ class NmfdPlant:
 
     def step(self, controls: Controls) -> State:
         """One control interval. LedgerError if vehicles appear or vanish."""
-        metering = None if controls.metering is None else torch.from_numpy(controls.metering)
-        demand, self._backlog = dynamics.admitted(
-            self._backlog, self._demand[self._k], metering, self._scenario.step)
+        demand, self._backlog = _admitted(self._backlog, self._demand[self._k], controls, self._scenario.step)
         splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
         self._x, ended = dynamics.advance_counted(
             self._parameters, self._x, demand, torch.from_numpy(controls.perimeter), torch.from_numpy(splits),
@@ -99,10 +97,9 @@ class AcyclicPlant:
     def step(self, controls: Controls) -> State:
         """One control interval. LedgerError if vehicles appear or vanish."""
         scenario, model = self._scenario, self._model
-        metering = None if controls.metering is None else torch.from_numpy(controls.metering)
-        admitted, self._backlog = dynamics.admitted(
-            self._backlog, torch.from_numpy(scenario.demand[self._k]), metering, scenario.step)
-        demand = admitted.numpy()
+        entering, self._backlog = _admitted(
+            self._backlog, torch.from_numpy(scenario.demand[self._k]), controls, scenario.step)
+        demand = entering.numpy()
         splits = scenario.network.nominal_splits if controls.splits is None else controls.splits
         theta, forced = acyclic.shares(model, splits)
         if forced.any():
@@ -131,3 +128,11 @@ class AcyclicPlant:
         return State(
             step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=self._backlog.numpy().copy(),
             completed=self._ended)
+
+
+def _admitted(
+    backlog: tensors.PerPair, demand: tensors.PerPair, controls: Controls, step: float,
+) -> tuple[tensors.PerPair, tensors.PerPair]:
+    """As dynamics.admitted, by what `controls` meter."""
+    metering = None if controls.metering is None else torch.from_numpy(controls.metering)
+    return dynamics.admitted(backlog, demand, metering, step)

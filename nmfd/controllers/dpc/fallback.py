@@ -244,13 +244,13 @@ class Guarded:
     def _predict(self, observation: Observation, controls: Controls) -> None:
         splits = self._own if controls.splits is None else torch.from_numpy(controls.splits).float()
         demand = self._demand[min(observation.step, len(self._demand) - 1)]
-        metering = None if controls.metering is None else torch.from_numpy(controls.metering).float()
         with torch.inference_mode():
-            entering, _ = dynamics.admitted(
-                torch.from_numpy(observation.backlog).float() * (metering is not None), demand, metering,
-                self._planning.step)
+            if controls.metering is not None:
+                demand, _ = dynamics.admitted(
+                    torch.from_numpy(observation.backlog).float(), demand, torch.from_numpy(controls.metering).float(),
+                    self._planning.step)
             x = self._advance(
-                torch.from_numpy(observation.accumulation).float(), entering,
+                torch.from_numpy(observation.accumulation).float(), demand,
                 torch.from_numpy(controls.perimeter).float(), splits)
         self._predicted = x.sum(-1).numpy().astype(float)
 

@@ -127,20 +127,22 @@ class Rollout:
 
     def states(
         self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None,
-    ) -> tuple[Demands, Demands, Demands]:
-        """The states (T, B, R, R) [veh] under `policy` from x (B, R, R), what it saw of them through the noise, and who
-        waited to enter, because it did not let them.
+    ) -> tuple[Demands, Demands, Float[torch.Tensor, "T B"]]:
+        """The states (T, B, R, R) [veh] under `policy` from x (B, R, R), what it saw of them through the noise, and how
+        many (T, B) [veh] waited to enter, because it did not let them.
 
         step: what to use instead of `self.step`, such as its compiled form
         """
         noise = torch.randn(demand.shape, generator=generator, dtype=self.dtype).to(self.device)
         noise *= self.planning.measurement_std
-        states, waiting = [x], [torch.zeros_like(x)]
+        states, waiting, backlog = [x], [x.new_zeros(len(x))], torch.zeros_like(x)
         for k in range(demand.shape[0] - 1):
-            entering, backlog = dynamics.admitted(
-                waiting[-1], demand[k], policy.metering(states[-1] + noise[k]), self.planning.step)
+            entering = demand[k]
+            if policy.architecture.metering:
+                entering, backlog = dynamics.admitted(
+                    backlog, entering, policy.metering(states[-1] + noise[k]), self.planning.step)
             states.append((step or self.step)(policy, states[-1], entering, noise[k]))
-            waiting.append(backlog)
+            waiting.append(backlog.sum((-2, -1)))
         exact = torch.stack(states)
         return exact, exact + noise, torch.stack(waiting)
 
@@ -150,7 +152,7 @@ class Rollout:
         """TTS (B,) [veh s] of rollouts from x (B, R, R) under `policy`, with detours and swings; arguments as `states`.
         """
         exact, seen, waiting = self.states(policy, x, demand, generator, step)
-        vehicles = (exact + waiting).sum((0, -2, -1))
+        vehicles = exact.sum((0, -2, -1)) + waiting.sum(0)
         if self.detour_cost and policy.architecture.guidance:
             vehicles = vehicles + self.detour_cost * self._diverted(exact, policy(seen)[1]).sum((0, -2, -1))
         swings = self.swing_cost * self._swings(policy(seen)[0]) if self.swing_cost else 0.0
