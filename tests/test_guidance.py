@@ -122,7 +122,7 @@ def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0):
     own[0, 1:, 2], own[1, 0, 2] = 0.5, 1.0
     splits[0, 1:, 2], splits[1, 0, 2] = (to_region_1, 1.0 - to_region_1), 1.0
     guide = Guide(session, city, own, compliance=1.0, most_detour=60.0, random=np.random.default_rng(0),
-                  ways_return=ways_return, period=period)
+                  ways_return=ways_return, period=period, lanes=False)
     guide.command(splits, None)
     return guide, splits, routes, road
 

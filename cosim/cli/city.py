@@ -10,7 +10,7 @@ from typing import Literal
 
 import click
 
-from cosim.cli.options import parsed_level
+from cosim.cli.options import RUNS, parsed_level
 from nmfd.cli.declared import declared
 from nmfd.cli.options import FILE, FOLDER, SCENARIO, SEED, out_option
 from nmfd.cli.progress import progress_line, resumable
@@ -27,9 +27,7 @@ from nmfd.runs import files
               help="Of a city with such signals or drivers: max-pressure, rerouting-30, ... as in a strategy's name.")
 @click.option("--network", "target", type=FOLDER, metavar="DIR",
               help="The folder whose network.toml is written, for one model. [default: the scenario's network]")
-@click.option("--runs", type=FOLDER, multiple=True, metavar="DIR",
-              help="Finished runs of the same city that the model is fitted to besides, a folder of cosim run or "
-              "evaluate: at a demand at which the loading runs lock, those under a gate say more. May be repeated.")
+@RUNS
 @out_option("identify", "Samples and pictures.")
 def identify(
     scenario: Path, levels: tuple[float, ...], seeds: int, workers: int, guided: bool | None, options: str | None,

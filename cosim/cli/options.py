@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from nmfd.cli.options import FILE
+from nmfd.cli.options import FILE, FOLDER
 from nmfd.errors import InputError
 
 if TYPE_CHECKING:  # heavy
@@ -22,6 +22,10 @@ CONTROLLER_HELP = (
 CONTROLLER = click.option("--controller", required=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
 POLICY = click.option(
     "--policy", type=FILE, metavar="FILE", help="Policy of a DPC controller, if not SCENARIO/NAME.pt.")
+RUNS = click.option(
+    "--runs", type=FOLDER, multiple=True, metavar="DIR",
+    help="Finished runs of the same city that the model is fitted to besides, a folder of cosim run or evaluate: at a "
+         "demand at which the loading runs lock, those under a gate say more. May be repeated.")
 REFERENCE = click.option(
     "--reference", metavar="NAME",
     help="Pair all controllers with this one too, besides no-control, or the first one if that is not there.")

@@ -1,4 +1,4 @@
-"""The commands tune and frontier of `cosim`: what many runs are searched for.
+"""The commands tune, improve and frontier of `cosim`: what many runs are searched for.
 
 Heavy modules are imported inside them: help takes 0.1 s instead of 3 s.
 """
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from cosim.cli.options import CONTROLLER, CONTROLLER_HELP, chosen_scheduler, scheduler_options, tell
+from cosim.cli.options import CONTROLLER, CONTROLLER_HELP, POLICY, RUNS, chosen_scheduler, scheduler_options, tell
 from nmfd.cli.declared import declared
 from nmfd.cli.options import (
     POLICIES,
@@ -28,7 +28,7 @@ from nmfd.runs.workers import cores
 @SCENARIO
 @CONTROLLER
 @click.option("--option", "knobs", required=True, multiple=True, metavar="KEY=LOW:HIGH",
-              help="An option of the controller and the range that is searched; KEY[0], KEY[1], ... for the numbers of "
+              help="An option of the controller and the range that is searched; KEY[0], KEY[1], ... for numbers of "
                    "a list. May be repeated, up to 20 numbers. One with which a policy is trained trains one for "
                    "every candidate.")
 @declared("cosim.evaluation.settings:Search", "candidates", "seeds", "first_seed", "demand", "search_seed")
@@ -71,6 +71,52 @@ def tune(
             order, workers=cores() if workers is None else workers, scheduler=cluster, progress=progress, tell=tell)
     click.echo(tuning.text(order, table))
     click.echo(f"Written to {order.out}: see tune.toml and tune.csv")
+
+
+@click.command()
+@SCENARIO
+@CONTROLLER
+@declared("cosim.evaluation.settings:Improvement", "rounds", "seeds", "first_seed", "demand", "descent")
+@declared("cosim.evaluation.settings:Improvement", "learning_rate", instead="that of the controller's training")
+@declared("cosim.evaluation.settings:Improvement", "iterations")
+@POLICY
+@RUNS
+@declared("cosim.evaluation.settings:Improvement", "workers", instead="one per core")
+@scheduler_options
+@STEPS
+@out_option("improve", "The folder.")
+def improve(
+    scenario: Path, controller: str, rounds: int, seeds: int, first_seed: int, demand: tuple[float, ...], descent: int,
+    learning_rate: float | None, iterations: int, policy: Path | None, runs: tuple[Path, ...], workers: int | None,
+    scheduler: str | None, scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None,
+    steps: int | None, out: Path | None,
+) -> None:
+    """Let a DPC policy learn from its own runs in the microsimulation.
+
+    Every round fits the regional model to all runs so far, descends from the best policy along its own runs, with what
+    the model did not foresee of them, and runs what comes of it on the same seeds. It is kept if the geometric mean
+    of the total time spent falls. Writes policy.pt, model/, improve.csv and improve.png. The same command goes on where
+    it was interrupted, and with more --rounds from where it ended.
+
+    \b
+    Example:
+      cosim improve grid7_peak --controller dpc-pcrg+max-pressure+guidance-period-60 --demand 1.6,2 --rounds 6
+    """
+    cluster = chosen_scheduler(workers, scheduler, scheduler_ca, scheduler_cert, scheduler_key)
+
+    from cosim.evaluation import improve as method  # heavy
+    from cosim.report import improve as picture
+
+    order = method.Improvement(
+        scenario=scenario, controller=controller, rounds=rounds, seeds=range(first_seed, first_seed + seeds),
+        levels=demand, descent=descent, learning_rate=learning_rate, iterations=iterations, policy=policy, runs=runs,
+        steps=steps, out=Path("runs") / f"{file_name(scenario.name)}-improve" if out is None else out)
+    with resumable("improve", order.out, "improve.csv") as progress:
+        table = method.improve(
+            order, workers=cores() if workers is None else workers, scheduler=cluster, progress=progress, tell=tell)
+        picture.draw(order.out / "improve.png", table, runs=len(order.seeds) * len(order.levels))
+    click.echo(method.text(order, table))
+    click.echo(f"Written to {order.out}: see policy.pt, model, improve.csv and improve.png")
 
 
 @click.command()

@@ -127,6 +127,11 @@ def perform(
     return failures
 
 
+def level_folder(folder: Path, level: float) -> Path:
+    """The run folder of a demand level, in the folder of a study."""
+    return folder / f"demand-{level:g}"
+
+
 def label(task: Task) -> str:
     """A task in words, for messages and progress."""
     demand = "" if task.demand_factor == 1.0 else f", demand times {task.demand_factor:g}"

@@ -8,7 +8,7 @@ runs lock, they alone show what a controlled city does under such a demand.
 
 import csv
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from nmfd.errors import InputError
 from nmfd.model import identification, mfd
 from nmfd.model.identification import Observed, observed_split_ratios
 from nmfd.model.model_file import network_toml, schema_line
-from nmfd.model.planning import GUIDED, GUIDING
+from nmfd.model.planning import GUIDED, GUIDING, PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
@@ -41,6 +41,8 @@ from nmfd.studies.fit_quality import (
     write_fits,
 )
 
+WINDOW = 5   # control intervals
+PRIOR = 5.0  # vehicles
 PATHS = ("recipe", "net", "regions")  # keys of [sumo] in network.toml
 
 
@@ -106,7 +108,7 @@ def identify(
     if not there.is_dir() or not os.access(there, os.W_OK):  # rather than after hours of loading
         raise InputError(f"--network: {there} is no folder that can be written to; choose another")
     first, second = loading.stages
-    more = [run for folder in loading.runs for run in _finished(folder, scenario)]
+    more = [run for folder in loading.runs for run in finished(folder, scenario)]
     found = _load(scenario, loading, first, {}, out, workers, _named(progress, "1 of 2"))
     network = static_model(loaded, found, guided=loading.guided)
     set_point = tuple(network.mfds[region].critical for region in loaded.protected)
@@ -120,9 +122,9 @@ def identify(
             if progress is not None:
                 progress(done, total, f"{what}, {note}")
 
-        return as_it_was(network, identification.fit(
-            network, [observed(result) for result in results], iterations=loading.iterations,
-            progress=tell if progress else None, **scheme), nearly_empty(samples))
+        return fitted_to(
+            network, [observed(result) for result in results], samples, loaded, iterations=loading.iterations,
+            progress=tell if progress else None)
 
     samples = samples_of(network, found)
     model = fitted(found, samples, "fitting")
@@ -175,7 +177,7 @@ def _load(
     return [experiment.read_run(folder, controller, task.seed) for folder, task in plan]
 
 
-def _finished(folder: Path, scenario: Path) -> list[Result]:
+def finished(folder: Path, scenario: Path) -> list[Result]:
     """All runs of a folder of `cosim run` or `cosim evaluate`. Raises InputError for runs of another city."""
     finished = results.read(folder, scenario)
     if finished.changed:
@@ -227,6 +229,28 @@ def observed(result: Result) -> Observed:
     return Observed(
         accumulation=trajectory.accumulation, demand=record["departures"] / trajectory.step,
         perimeter=trajectory.perimeter, splits=trajectory.splits, crossings=record["crossings"].sum(axis=3))
+
+
+def followed(network: RegionalModel, result: Result) -> Observed:
+    """A run as identification sees it with the split ratios that drivers followed instead of those that were commanded,
+    if any: counted over WINDOW control intervals, besides PRIOR vehicles that did as they were told."""
+    seen, crossings = observed(result), result.record["crossings"] * network.split_mask
+    total = np.cumsum(np.concatenate([np.zeros_like(crossings[:1]), crossings]), axis=0)
+    first = np.arange(len(crossings)) - WINDOW // 2
+    last = np.clip(first + WINDOW, 0, len(crossings))
+    counted = (total[last] - total[np.clip(first, 0, None)]) + PRIOR * seen.splits
+    sums = counted.sum(axis=2, keepdims=True)
+    return replace(seen, splits=np.where(sums > 0, counted / np.maximum(sums, 1e-9), seen.splits))
+
+
+def fitted_to(
+    network: RegionalModel, runs: Sequence[Observed], samples: Sequence[dict], scheme: Scenario | PlanningModel, *,
+    iterations: int, progress: Callable[[int, int, str], None] | None = None,
+) -> RegionalModel:
+    """`network` with the parameters that predict `runs` best, and as it was where hardly anybody drove."""
+    return as_it_was(network, identification.fit(
+        network, runs, iterations=iterations, progress=progress, step=scheme.step, substeps=scheme.substeps,
+        integrator=scheme.integrator), nearly_empty(samples))
 
 
 def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[int]) -> RegionalModel:

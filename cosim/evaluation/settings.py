@@ -48,6 +48,19 @@ class Search(Evaluation):
     population: int | None = whole("candidates per generation", None, low=2, high=1000)
 
 
+class Improvement(Evaluation):
+    """Of a policy by its own runs."""
+
+    seeds: int = whole("runs per round and demand level", 2, low=1, high=MOST)
+    first_seed: int = whole(
+        "the seeds are S to S + N - 1; those from 2000 on are for evaluations", FIRST_DEVELOPMENT, high=MOST_SEED)
+    rounds: int = whole("after round 0, which runs the policy as it is", 4, low=1, high=1000)
+    descent: int = whole("Adam steps of a round, half of them after every round that was not kept", 40, low=1,
+                         high=MOST)
+    learning_rate: float | None = setting("of Adam", None, gt=0.0, le=1.0)
+    iterations: int = whole("of the fit of the regional model; 0 leaves it as it is", 600, high=MOST)
+
+
 class Range(Evaluation):
     """Of the demand that controllers serve."""
 

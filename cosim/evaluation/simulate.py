@@ -60,6 +60,8 @@ FACTS = {
     "booked_intervals": "of a standstill that was not simulated any more",
     "removed_veh": "taken out before the end of their trips",
     "removed_waiting_veh": "of these, before they could enter",
+    "freed_veh": "vehicles that waited for each other on a junction with free streets behind it, and were set down",
+    "led_on_veh": "guided drivers who could not change lanes and went on where theirs led",
     "jumps": "vehicles that came into another region where no gateway leads there", **PRESSURE_FACTS}
 
 
@@ -185,6 +187,7 @@ def drive(
             "signals_left_alone": len(plant.other_signals), "booked_intervals": plant.booked,
             "removed_veh": int(record.removals.sum() + record.given_up.sum()),
             "removed_waiting_veh": int(record.given_up.sum()), "jumps": int(record.jumps.sum()),
+            **plant.helped(),
             **plant.pressure_facts()}
         check_whole(files)
     return Result(trajectory=trajectory, record=asdict(record), facts=row)

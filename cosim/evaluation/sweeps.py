@@ -64,7 +64,7 @@ class Sweep:
     def plan(self) -> list[tuple[Path, Task]]:
         """Every run with its run folder, seed by seed, so that whatever is finished compares like with like."""
         return [
-            (self.out / f"demand-{level:g}", Task(
+            (experiment.level_folder(self.out, level), Task(
                 scenario=self.scenario, controller=strategy, seed=seed, policy=self.policies.get(name),
                 steps=self.steps, demand_factor=level, time_limit=self.time_limit))
             for seed in self.seeds for level in self.levels for strategy, name in self.strategies().items()]

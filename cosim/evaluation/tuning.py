@@ -21,9 +21,9 @@ import cma
 import numpy as np
 import pandas as pd
 
-from cosim.evaluation import dask_cluster, experiment
+from cosim.evaluation import dask_cluster, experiment, scores
+from cosim.evaluation.scores import SCORE
 from cosim.evaluation.simulate import Task, scenario_of
-from cosim.evaluation.statistics import TTS
 from cosim.plant.strategy import configured, parse
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
@@ -33,7 +33,6 @@ from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, Source, ended, outcomes
 
-SCORE = "score_veh_s"
 NAME = re.compile(r"[a-z_]\w*(\[[0-9]\])?")  # of an option, or of one number of a list
 MOST = 20           # numbers to tune: with more, the runs that CMA-ES needs are beyond what a city allows
 DECADES = 1.0       # a range that spans more is searched in the logarithm
@@ -114,13 +113,20 @@ class Tuning:
                 found[key] = round(value) if key in whole else value
             else:
                 lists.setdefault(key, {})[index] = value
-        found |= {key: tuple(numbers[n] for n in sorted(numbers)) for key, numbers in lists.items()}
+        for key, numbers in lists.items():
+            kept = dict(enumerate(self.numbers(key)))
+            found[key] = tuple((kept | numbers)[n] for n in sorted(kept | numbers))
         return tuple(found.items())
+
+    def numbers(self, key: str) -> tuple[float, ...]:
+        """The numbers of a list as the scenario has them, or its default: those without a range stay so."""
+        value = _own(self).get(key, _default(parse(self.controller).controller, key))
+        return tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else ()
 
     def plan(self, candidate: int, options: tuple[tuple[str, object], ...]) -> list[tuple[Path, Task]]:
         """The runs of one candidate, each with its run folder."""
         return [
-            (self.folder(candidate) / f"demand-{level:g}", Task(
+            (experiment.level_folder(self.folder(candidate), level), Task(
                 scenario=self.scenario, controller=self.controller, seed=seed, policy=self.policy(candidate),
                 steps=self.steps, demand_factor=level, options=options))
             for seed in self.seeds for level in self.levels]
@@ -150,9 +156,11 @@ def check(order: Tuning) -> None:
         raise InputError(f"--option: expected 1 to {MOST} numbers to tune, got {len(names)} instead; add or omit some")
     places = [knob.place for knob in order.knobs]
     for key in {key for key, index in places if index is not None}:
-        if sorted(n for name, n in places if name == key and n is not None) != list(range(
-                sum(name == key for name, _ in places))):
-            raise InputError(f"--option: {key} needs one range for each number of its list: {key}[0], {key}[1], ...")
+        known = set(range(len(order.numbers(key)))) | {n for name, n in places if name == key}
+        if known != set(range(len(known))):
+            raise InputError(
+                f"--option: {key} needs a range for each number that the scenario's list does not have: {key}[0], "
+                f"{key}[1], ...; its list has {len(order.numbers(key))}")
     for point in ([0.0] * len(names), [1.0] * len(names)):
         scenario = scenario_of(order.plan(0, order.options(point))[0][1])
         variant = configured(order.controller, scenario.controller_options)
@@ -215,7 +223,7 @@ def text(order: Tuning, table: pd.DataFrame) -> str:
     lines = [{
         "candidate": name, **{knob.option: f"{row[knob.option]:.4g}" for knob in order.knobs},
         "mean TTS [veh s]": f"{row[SCORE]:.4g}",
-        **{f"at {level:g}": f"{np.mean([row[_column(level, seed)] for seed in order.seeds]):.4g}"
+        **{f"at {level:g}": f"{np.mean([row[scores.column(level, seed)] for seed in order.seeds]):.4g}"
            for level in order.levels}} for name, row in shown.items()]
     return text_table(lines, "mean TTS: geometric mean over all runs; at: arithmetic mean at that demand level")
 
@@ -232,10 +240,7 @@ def _search(order: Tuning) -> cma.CMAEvolutionStrategy:
 
 def _start(order: Tuning) -> list[float]:
     """The options of the scenario as shares of the ranges; the middle for those that it leaves to the controller."""
-    scenario = load_scenario(order.scenario)
-    controller, tables = parse(order.controller).controller, scenario.controller_options
-    own = {**tables.get(controller, {}), **tables.get(configured(order.controller, tables), {})}
-    point = []
+    controller, own, point = parse(order.controller).controller, _own(order), []
     for knob in order.knobs:
         key, index = knob.place
         value = own.get(key, _default(controller, key))
@@ -243,6 +248,13 @@ def _start(order: Tuning) -> list[float]:
             value = value[index] if index < len(value) else None
         point.append(knob.share(value) if isinstance(value, (int, float)) else 0.5)
     return point
+
+
+def _own(order: Tuning) -> dict[str, Any]:
+    """The options that the scenario gives the controller."""
+    tables = load_scenario(order.scenario).controller_options
+    return {**tables.get(parse(order.controller).controller, {}),
+            **tables.get(configured(order.controller, tables), {})}
 
 
 def _default(controller: str, key: str) -> object:
@@ -292,14 +304,8 @@ def _scored(
 
 
 def _row(order: Tuning, candidate: int, point: Sequence[float]) -> dict[str, Any]:
-    found: dict[str, float] = {}
-    for level in order.levels:
-        folder = order.folder(candidate) / f"demand-{level:g}"
-        rows = experiment.overview(folder).set_index("seed")[TTS] if (folder / "summary.csv").is_file() else {}
-        found |= {_column(level, seed): float(rows.get(seed, math.nan)) for seed in order.seeds}
-    values = np.array(list(found.values()))
-    score = float(np.exp(np.log(np.maximum(values, 1.0)).mean()))  # NaN if one is missing; a city may be empty
-    return {"candidate": candidate, SCORE: score, **_numbers(order, point), **found}
+    found = scores.totals(order.folder(candidate), order.levels, order.seeds)
+    return {"candidate": candidate, SCORE: scores.score(found.values()), **_numbers(order, point), **found}
 
 
 def _numbers(order: Tuning, point: Sequence[float]) -> dict[str, float]:
@@ -317,10 +323,6 @@ def _costs(rows: Sequence[Mapping[str, Any]]) -> list[float]:
     """What CMA-ES minimises: the logarithm of the score; one without is worse than all others."""
     costs = np.log([row[SCORE] for row in rows])
     return np.where(np.isnan(costs), np.nanmax(costs) + 1.0, costs).tolist()
-
-
-def _column(level: float, seed: int) -> str:
-    return f"tts_{level:g}_{seed}_veh_s"
 
 
 def _train(

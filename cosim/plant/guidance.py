@@ -32,6 +32,7 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
+from cosim.plant.lanes import Lanes
 from cosim.plant.meter import Event
 from cosim.plant.shortest_paths import Home, Moves, Ways
 from cosim.sumo.arrays import PerEdge
@@ -45,6 +46,7 @@ SPREAD = 0.15              # standard deviation of the logarithm of their travel
 SLOWEST = 0.1              # m/s; slower is as good as standing
 SHARE_PENALTY = 30.0       # s per vehicle that a region is behind its share
 SWITCHING_THRESHOLD = 0.3  # drivers keep their way if the best one does not save more than this share of its own time
+SOON = 10.0                # s after which they are asked again for whom it was too late to change lanes
 MEMORY = 0.9               # of the vehicles assigned before and of their wishes, per control interval
 
 
@@ -78,15 +80,18 @@ class Guide:
 
     realised: (R, R, R) [veh], [i, h, j] = vehicles sent from i to h on their way to j since the start, those who were
     asked several times as they were sent last
+    refused: ways that SUMO did not take; led_on: drivers who could not go where they were bound for (cosim.plant.lanes)
     """
 
     def __init__(
         self, session: Session, city: City, own: PerTurn, *, compliance: float, most_detour: float,
-        random: np.random.Generator, ways_return: bool = False, period: float = 0.0,
+        random: np.random.Generator, ways_return: bool = False, period: float = 0.0, lanes: bool = True,
     ):
-        """own: (R, R, R) [-], the drivers' own split ratios, which controllers mean as well"""
-        self._own = own
+        """own: (R, R, R) [-], the drivers' own split ratios, which controllers mean as well
+        lanes: whether vehicles are on lanes, as in the mesoscopic model they are not"""
+        self._own, self._lanes, self._late = own, Lanes(session) if lanes else None, False
         self._period = math.ceil(period / session.step_length - 1e-6) if period else 0  # simulation steps
+        self._soon = math.ceil(SOON / session.step_length - 1e-6)
         self._steps = self._interval = 0
         self._visits: dict[str, _Visit] = {}
         self._due: dict[int, list[_Visit]] = {}  # simulation step -> whom to ask again then
@@ -124,7 +129,7 @@ class Guide:
         self._guides, self._splits = False, own
         self._assigned, self._wished = np.zeros((2, *(city.regions,) * 3))
         self.realised = np.zeros((city.regions,) * 3, dtype=int)
-        self.refused = 0
+        self.refused = self.led_on = 0
 
     def command(self, splits: PerTurn | None, speed: PerEdge | None, prices: PerRegion | None = None) -> None:
         """Take over theta (R, R, R) [-] for the next control interval; None: no guidance.
@@ -162,8 +167,10 @@ class Guide:
                 self._ask(visit)
 
     def _ask(self, visit: _Visit) -> None:
-        """Guide a driver, unless they are on a junction or in the next region already: too late to turn."""
+        """Guide a driver, unless they are on a junction or in the next region already, or before the stop line on a
+        lane that does not lead there: too late to turn, and they are asked again soon."""
         event, target, after = visit.event, self._index[visit.event.edge], self._period
+        self._late = False
         try:
             here = self._index.get(self._session.road(event.vehicle))
         except REFUSALS:  # they have arrived
@@ -171,10 +178,14 @@ class Guide:
             return
         if here is None or self._region[here] != event.region:
             after = min(self._period, 1)
+        elif self._lanes and (way := self._lanes.way_out(event.vehicle, event.edge)):
+            self.led_on += self._session.set_route(event.vehicle, way)
         elif event.region == event.destination:
             self._guide_home(visit, here, target)
         else:
             self._guide_on(visit, here, target)
+        if self._late:
+            after = self._soon
         if after:
             self._visits[event.vehicle] = visit
             self._due.setdefault(self._steps + after, []).append(visit)
@@ -285,8 +296,12 @@ class Guide:
         return regions[min(left + 1, len(regions) - 1)]
 
     def _send(self, vehicle: str, way: list[int]) -> bool:
-        """Give a vehicle this way; counts the refusals."""
-        taken = self._session.set_route(vehicle, [self._city.edges[n] for n in way])
+        """Give a vehicle this way, unless it is too late to change lanes; counts what SUMO refuses."""
+        edges = [self._city.edges[n] for n in way]
+        if self._lanes and self._lanes.too_late(vehicle, edges):
+            self._late = True
+            return False
+        taken = self._session.set_route(vehicle, edges)
         self.refused += not taken
         return taken
 

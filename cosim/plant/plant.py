@@ -11,6 +11,7 @@ from cosim.plant.detectors import instruments, lay_out, probes
 from cosim.plant.feasible import check_settings, signals_of
 from cosim.plant.guidance import Guide
 from cosim.plant.incidents import Incidents
+from cosim.plant.junctions import Junctions
 from cosim.plant.launch import Launch
 from cosim.plant.meter import Meter
 from cosim.plant.metering import Metering
@@ -76,6 +77,7 @@ class SumoPlant:
         self._sensing = self._new_sensing(seed)
         self._guide = self._new_guide(seed)
         self._actuation = self._new_actuation()
+        self._junctions = None if self._settings.mesoscopic else Junctions(self.session, self.city)
         self._state = state = self._sensing.state(0)
         self._standstill = Standstill(len(self._launch.vehicles), self._scenario.step, self._scenario.steps)
         self.booked, self._facts = 0, TripFacts()
@@ -106,6 +108,8 @@ class SumoPlant:
         if self._metering:
             self._metering.command(controls.metering, self._state.accumulation.sum(axis=1))
         self._sensing.begin()
+        if self._junctions:
+            self._junctions.free()
         for _ in range(round(self._scenario.step / session.step_length)):
             self._actuation.play()
             if self._metering:
@@ -177,6 +181,10 @@ class SumoPlant:
     def pressure_facts(self) -> dict[str, float]:
         """What can be said of a run under max-pressure (max_pressure.FACTS); NaN of others."""
         return self._actuation.pressure_facts()
+
+    def helped(self) -> dict[str, int]:
+        """Vehicles that SUMO would have let stand for ever: columns of sumo.csv."""
+        return {"freed_veh": 0 if self._junctions is None else self._junctions.freed, "led_on_veh": self._guide.led_on}
 
     def leaks(self) -> list[Gateway]:
         """Gateways that no signal under perimeter control has: it does not reach them."""
@@ -253,7 +261,7 @@ class SumoPlant:
         return Guide(
             self.session, self.city, self._scenario.network.nominal_splits, compliance=chosen.compliance,
             most_detour=chosen.most_detour, ways_return=chosen.ways_return, period=chosen.guidance_period,
-            random=np.random.default_rng([seed, GUIDANCE]))
+            lanes=not chosen.mesoscopic, random=np.random.default_rng([seed, GUIDANCE]))
 
     def _new_actuation(self) -> Actuation:
         flows = self._launch.turning_flows() if self._settings.signals in PRESSURES else None

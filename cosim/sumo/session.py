@@ -220,6 +220,53 @@ class Session:
         """Where on its route a vehicle is."""
         return self._sumo.vehicle.getRouteIndex(vehicle)
 
+    def next_edges(self, vehicle: str) -> tuple[str, str | None]:
+        """The edge of its route that a vehicle is on, and the one after it, if any."""
+        edges, index = self._sumo.vehicle.getRoute(vehicle), self._sumo.vehicle.getRouteIndex(vehicle)
+        return edges[index], edges[index + 1] if index + 1 < len(edges) else None
+
+    def place(self, vehicle: str) -> tuple[str, float]:
+        """The lane that a vehicle is on, and where on it [m]."""
+        return self._sumo.vehicle.getLaneID(vehicle), self._sumo.vehicle.getLanePosition(vehicle)
+
+    def standing_time(self, vehicle: str) -> float:
+        """Since when a vehicle has not moved [s]."""
+        return self._sumo.vehicle.getWaitingTime(vehicle)
+
+    def lane(self, lane: str) -> tuple[float, frozenset[str]]:
+        """Length [m] of a lane, and the edges that it leads to."""
+        onward = {self._sumo.lane.getEdgeID(link[0]) for link in self._sumo.lane.getLinks(lane)}
+        return self._sumo.lane.getLength(lane), frozenset(onward)
+
+    def vehicle_length(self, vehicle: str) -> float:
+        """[m]"""
+        return self._sumo.vehicle.getLength(vehicle)
+
+    def next_lane(self, lane: str) -> str:
+        """What a lane on a junction leads to: a lane of the street behind it, or another one on the junction."""
+        return self._sumo.lane.getLinks(lane)[0][0]
+
+    def room(self, lane: str) -> float:
+        """How much of a lane is free at its beginning [m]."""
+        rear = [
+            self._sumo.vehicle.getLanePosition(vehicle) - self._sumo.vehicle.getLength(vehicle)
+            for vehicle in self._sumo.lane.getLastStepVehicleIDs(lane)]
+        return min(rear, default=self._sumo.lane.getLength(lane))
+
+    def set_down(self, vehicle: str, lane: str, position: float) -> bool:
+        """Put a vehicle at `position` [m] on a lane of its route; False where SUMO does not."""
+        try:
+            self._sumo.vehicle.moveTo(vehicle, lane, position)
+        except REFUSALS:
+            return False
+        return True
+
+    def fastest(self, edge: str, target: str) -> tuple[float, tuple[str, ...]]:
+        """The fastest way of a car from one edge to another on empty streets: how long it takes [s], and its edges, ()
+        where there is none."""
+        found = self._sumo.simulation.findRoute(edge, target)
+        return found.travelTime, tuple(found.edges)
+
     def emission_class(self, vehicle_type: str) -> str:
         """Of SUMO's emission model, as HBEFA4/PC_petrol_Euro-4."""
         return self._sumo.vehicletype.getEmissionClass(vehicle_type)

@@ -151,7 +151,10 @@ class Rollout:
     ) -> Levels:
         """TTS (B,) [veh s] of rollouts from x (B, R, R) under `policy`, with detours and swings; arguments as `states`.
         """
-        exact, seen, waiting = self.states(policy, x, demand, generator, step)
+        return self.cost(policy, *self.states(policy, x, demand, generator, step))
+
+    def cost(self, policy: Policy, exact: Demands, seen: Demands, waiting: Float[torch.Tensor, "T B"]) -> Levels:
+        """What the states that `states` returns cost, with detours and swings (B,) [veh s]."""
         vehicles = exact.sum((0, -2, -1)) + waiting.sum(0)
         if self.detour_cost and policy.architecture.guidance:
             vehicles = vehicles + self.detour_cost * self._diverted(exact, policy(seen)[1]).sum((0, -2, -1))

@@ -175,7 +175,7 @@ def train(
                         best = score
                         _keep(policy, rollout, chosen, configuration, best, out)
                     if not last:
-                        _write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
+                        write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
                 reached((step + 1) / steps)
                 if progress:
                     progress(step + 1, steps, f"best {best:.4g} veh s")
@@ -263,7 +263,7 @@ def _keep(
 ) -> None:
     """Write the policy to `out`, with its `score` in validation [veh s] and statistics of the states that it sees."""
     states = fallback.statistics(visited(policy, rollout, chosen, configuration["seed"]))
-    _write(checkpoint(policy, rollout.planning.network, {**configuration, "validation_veh_s": score}, states), out)
+    write(checkpoint(policy, rollout.planning.network, {**configuration, "validation_veh_s": score}, states), out)
 
 
 def _state(
@@ -298,7 +298,8 @@ def _restore(
         raise InputError(f"{state_file}: is damaged; remove it and train without --resume") from None
 
 
-def _write(content: dict, path: Path) -> None:
+def write(content: dict, path: Path) -> None:
+    """A checkpoint, or what a training needs to go on: the same content, the same bytes."""
     buffer = io.BytesIO()  # given a path, torch would write its name into the file: never the same bytes twice
     torch.save(content, buffer)
     with atomic(path) as temporary:

@@ -1,0 +1,55 @@
+"""Vehicles that wait for each other on a junction: freed where the streets behind it are, left where they are full."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from cosim.plant.junctions import GAP, STOOD, Junctions
+
+LENGTH, EDGES = 5.0, (":x_1", ":x_2", ":x_10", ":y_1", "a", "b")
+
+
+class Streets:
+    """A session: vehicles on junction x, since when they stand, and what is free of lanes a_0 and b_0 [m]."""
+
+    def __init__(self, standing, room):
+        self.standing, self.free, self.set_on = standing, room, {}
+        self.at = {"first": ":x_1_0", "second": ":x_2_0", "third": ":x_2_0"}
+
+    def halting(self, edge):
+        return len(self.vehicles_on(edge))
+
+    def vehicles_on(self, edge):
+        return [vehicle for vehicle in self.standing if self.at[vehicle].rpartition("_")[0] == edge]
+
+    def standing_time(self, vehicle):
+        return self.standing[vehicle]
+
+    def place(self, vehicle):
+        return self.at[vehicle], 1.0
+
+    def vehicle_length(self, vehicle):
+        return LENGTH
+
+    def next_lane(self, lane):
+        return {":x_1_0": "a_0", ":x_2_0": ":x_10_0", ":x_10_0": "b_0"}[lane]
+
+    def room(self, lane):
+        return self.free[lane]
+
+    def set_down(self, vehicle, lane, position):
+        self.set_on[vehicle] = lane, position
+        return True
+
+
+@pytest.mark.parametrize("standing, room, expected", [
+    ({"first": 130.0, "second": 150.0, "third": 200.0}, (50.0, 50.0), {"first": "a_0", "third": "b_0"}),  # one per lane
+    ({"first": 130.0, "second": 20.0}, (50.0, 0.0), {"first": "a_0"}),  # who has just come is not asked
+    ({"first": 130.0, "second": 130.0}, (50.0, 9.0), {}),  # one street behind is full: a real lock
+    ({"first": STOOD - 1.0}, (50.0, 50.0), {})])
+def test_vehicles_are_set_down_where_all_have_room(standing, room, expected):
+    streets = Streets(standing, dict(zip(("a_0", "b_0"), room, strict=True)))
+    junctions = Junctions(streets, SimpleNamespace(region_of=dict.fromkeys(EDGES, 0)))
+    junctions.free()
+    assert streets.set_on == {vehicle: (lane, LENGTH + GAP) for vehicle, lane in expected.items()}
+    assert junctions.freed == len(expected)

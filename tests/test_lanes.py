@@ -1,0 +1,112 @@
+"""Two leaders who wait for each other's lane block a street for ever; guided drivers go on instead."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_city
+
+from cosim.plant.guidance import Guide
+from cosim.plant.lanes import LEADER, NEAR, PATIENCE, Lanes
+from cosim.plant.meter import Event
+from cosim.sumo.net import City
+from cosim.sumo.session import Session
+
+NODES = """<nodes><node id="a" x="0" y="0"/><node id="b" x="300" y="0"/><node id="l" x="600" y="200"/>
+<node id="r" x="600" y="-200"/><node id="e" x="900" y="0"/></nodes>"""
+EDGES = """<edges><edge id="ab" from="a" to="b" numLanes="2"/>
+<edge id="bl" from="b" to="l"/><edge id="br" from="b" to="r"/>
+<edge id="le" from="l" to="e"/><edge id="re" from="r" to="e"/><edge id="lr" from="l" to="r"/>
+<edge id="rl" from="r" to="l"/></edges>"""
+# The right lane, 0, leads to the right only.
+CONNECTIONS = """<connections><connection from="ab" to="br" fromLane="0" toLane="0"/>
+<connection from="ab" to="bl" fromLane="1" toLane="0"/></connections>"""
+QUEUE = 12  # vehicles on each lane, all of whom want to be on the other one
+VEHICLE = '''<vehicle id="{way}{n}" depart="0" departLane="{lane}" departPos="{at}" departSpeed="0">
+<route edges="ab {edges}"/></vehicle>'''
+TARGETS = {"left": "le", "right": "re"}
+LEADERS = {f"{way}0": target for way, target in TARGETS.items()}
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("lanes")
+    files = {"nod": NODES, "edg": EDGES, "con": CONNECTIONS}
+    for kind, text in files.items():
+        (folder / f"{kind}.xml").write_text(text)
+    tiny_city.run("netconvert", "--node-files", folder / "nod.xml", "--edge-files", folder / "edg.xml",
+                  "--connection-files", folder / "con.xml", "--output-file", folder / "net.xml")
+    return folder
+
+
+@pytest.fixture
+def session(network, request):
+    """A queue on both lanes, each in that of the other, its leader at the given place [m], from the end if negative."""
+    routes = network / f"at{request.param}.rou.xml"
+    routes.write_text("<routes>" + "".join(
+        VEHICLE.format(way=way, n=n, lane=lane, at=request.param - 7.5 * n, edges=edges)
+        for n in range(QUEUE) for lane, (way, edges) in enumerate({"left": "bl le", "right": "br re"}.items())
+    ) + "</routes>")
+    session = Session(network / "net.xml", routes, seed=1)
+    session.step()
+    yield session
+    session.close()
+
+
+def drive(session, seconds):
+    """Whether all arrived within that time."""
+    ended = set()
+    for _ in range(seconds):
+        session.step()
+        ended |= set(session.arrived())
+    return len(ended) == QUEUE * len(TARGETS)
+
+
+@pytest.mark.parametrize("session", [-0.5], indirect=True)
+def test_they_block_the_street_for_ever_without(session):
+    assert not drive(session, 900)
+    assert all(session.standing_time(vehicle) > 800.0 for vehicle in LEADERS)
+
+
+@pytest.mark.parametrize("session", [-0.5], indirect=True)
+def test_with_a_way_out_each_goes_on_where_the_lane_leads(session):
+    lanes = Lanes(session)
+    assert not any(lanes.way_out(vehicle, target) for vehicle, target in LEADERS.items())  # they have just come
+    assert not drive(session, int(PATIENCE) + 20)
+    ways = {vehicle: lanes.way_out(vehicle, target) for vehicle, target in LEADERS.items()}
+    assert ways == {"left0": ["ab", "br", "rl", "le"], "right0": ["ab", "bl", "lr", "re"]}
+    for vehicle, way in ways.items():
+        assert session.set_route(vehicle, way)
+    assert not any(lanes.way_out(vehicle, target) for vehicle, target in LEADERS.items())  # they are in the right lane
+    for _ in range(60):
+        session.step()
+    assert not LEADERS.keys() & {vehicle for vehicle in session.running() if session.road(vehicle) == "ab"}
+
+
+@pytest.mark.parametrize("session, late", [(-0.5, True), (100, False)], indirect=["session"])
+def test_near_the_end_of_a_lane_it_is_too_late_for_others(session, late):
+    lanes = Lanes(session)
+    assert 0.5 < LEADER < NEAR < 200.0 - 12.0
+    assert lanes.too_late("left0", ["ab", "bl", "le"]) is late
+    assert not lanes.too_late("left0", ["ab", "br", "re"]) and not lanes.too_late("left0", ["ab"])
+
+
+@pytest.mark.parametrize("session", [-0.5], indirect=True)
+def test_guided_drivers_are_led_on(session):
+    after = {
+        "ab": ("bl", "br"), "bl": ("le", "lr"), "br": ("re", "rl"), "lr": ("re",), "rl": ("le",), "le": (), "re": ()}
+    of_all = {edge: 0 for edge in after}
+    city = City(
+        net_file=Path(), edges=tuple(after), region_of=of_all, length=dict.fromkeys(after, 300.0),
+        lanes=dict.fromkeys(after, 1), lane_ids={}, speed=dict.fromkeys(after, 13.9), gateways=(), signals={},
+        successors=after, regions=1, turn_time={(e, f): 0.0 for e, following in after.items() for f in following})
+    guide = Guide(session, city, np.zeros((1, 1, 1)), compliance=1.0, most_detour=60.0, period=60.0,
+                  random=np.random.default_rng(0))
+    guide.command(np.zeros((1, 1, 1)), None)
+    guide.apply([
+        Event(vehicle=vehicle, source=None, edge=TARGETS[vehicle.rstrip("0123456789")], region=0, destination=0)
+        for vehicle in session.running()])
+    for _ in range(1800):
+        session.step()
+        guide.apply([])
+    assert guide.led_on >= 2 and not session.running()
