@@ -19,7 +19,7 @@ from nmfd.types import Controls
 CRITICAL = np.array([100.0, 50.0])
 
 
-def metering(depart, origin, level=1.2):
+def metering(depart, origin, level=1.2, way=None):
     """Of trips to region 1, and who has begun: (time, vehicle, route)."""
     begun, count = [], len(depart)
     session = SimpleNamespace(time=0.0, step_length=1.0)
@@ -27,7 +27,7 @@ def metering(depart, origin, level=1.2):
     trips = Trips(
         depart=np.array(depart, dtype=float), origin=np.array(origin, dtype=int), destination=np.ones(count, dtype=int),
         routes=(("a", "b"),) * count, arrival=np.zeros(count))
-    return Metering(session, trips, CRITICAL, level=level, step=90.0), session, begun
+    return Metering(session, trips, CRITICAL, level=level, step=90.0, way=way), session, begun
 
 
 def played(meters, session, seconds):
@@ -47,6 +47,19 @@ def test_trips_begin_in_turn_at_the_rate_and_what_is_not_used_is_not_saved():
     assert meters.waited == 10.0 + 20.0 + 30.0
     played(meters, session, 55)
     assert [time for time, _, _ in begun[5:]] == [100.0, 110.0]
+
+
+def test_who_has_a_short_way_begins_first_where_that_is_asked_for():
+    meters, session, begun = metering([0.0] * 4 + [15.0], [0] * 5, way=np.array([9.0, 50.0, 20.0, 20.0, 1.0]))
+    meters.command(np.array([0.1, 0.0]), CRITICAL)
+    played(meters, session, 60)
+    assert [(time, vehicle) for time, vehicle, _ in begun] == [
+        (0.0, "v0"), (10.0, "v2"), (20.0, "v4"), (30.0, "v3"), (40.0, "v1")]
+
+
+def test_short_first_needs_metering(tmp_path):
+    line = error_line(cosim("run", "grid7_peak", "--controller", "no-control+short-first", "--out", tmp_path / "out"))
+    assert "metering_first" in line and "sumo.metering" in line and not (tmp_path / "out").exists()
 
 
 def test_without_a_command_regions_are_held_at_their_level():

@@ -19,9 +19,10 @@ REDUCED = {  # what is added; of an option that is there already the last counts
 NOT_RUN = {  # what takes long or needs more, and where it is tested
     "cosim watch": "test_watch.py", "cosim video": "test_video.py", "cosim tune": "test_tuning.py",
     "cosim improve": "test_improve.py", "cosim frontier": "test_tuning.py", "nmfd bound": "test_bound.py",
-    "nmfd robustness": "test_robustness.py", "nmfd scaling": "test_scaling.py", "nmfd ablation": "test_ablation.py",
-    "nmfd adaptation": "test_adaptation.py", "cosim compete": "test_compete.py", "cosim verify": "test_compete.py",
-    "cosim get": "test_get.py", "cosim demo": "test_demo.py", "nmfd identify": "test_measured.py"}
+    "nmfd value": "test_terminal.py", "nmfd robustness": "test_robustness.py", "nmfd scaling": "test_scaling.py",
+    "nmfd ablation": "test_ablation.py", "nmfd adaptation": "test_adaptation.py", "cosim compete": "test_compete.py",
+    "cosim verify": "test_compete.py", "cosim get": "test_get.py", "cosim demo": "test_demo.py",
+    "nmfd identify": "test_measured.py"}
 LONG = ("scenarios/grid7_peak", "networks/grid7", "scenarios/demo")  # whose loading runs and training take minutes
 DESCRIBED = {"scenarios/r100": """base = "../grid7_peak"
 [controllers."dpc-pc+rerouting-100"]

@@ -18,7 +18,7 @@ from cosim.plant.metering import Metering
 from cosim.plant.observer import Observer
 from cosim.plant.record import Record, Recorder
 from cosim.plant.sensing import Estimation, Sensing
-from cosim.plant.settings import ESTIMATE, PRESSURES, Settings, settings
+from cosim.plant.settings import ESTIMATE, PRESSURES, SHORT, Settings, settings
 from cosim.plant.standstill import Standstill
 from cosim.sumo.arrays import PerEdge, Points
 from cosim.sumo.build import ensure_built
@@ -241,9 +241,12 @@ class SumoPlant:
         chosen, network, trips = self._settings, self._planning.network, self._launch.trips
         if not chosen.metering or trips is None:
             return None
+        city, way = self.city, None
+        if chosen.metering_first == SHORT:
+            way = np.array([sum(city.length[edge] / city.speed[edge] for edge in route) for route in trips.routes])
         return Metering(
             self.session, trips, np.array([mfd.critical for mfd in network.mfds]), level=chosen.metering_level,
-            step=self._scenario.step)
+            step=self._scenario.step, way=way)
 
     def _new_sensing(self, seed: int) -> Sensing:
         chosen = self._settings

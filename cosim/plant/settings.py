@@ -14,10 +14,12 @@ if TYPE_CHECKING:  # at run time it would bring numpy, and the help of an option
 
 Signals = Literal["fixed", "webster", "actuated", "max-pressure", "max-pressure-cyclic"]
 Mode = Literal["hold-back", "redistribute"]
+First = Literal["due", "short"]
 SIGNALS, MODES = get_args(Signals), get_args(Mode)
 FIXED, WEBSTER, ACTUATED, MAX_PRESSURE, CYCLIC = SIGNALS
 PRESSURES = (MAX_PRESSURE, CYCLIC)
 HOLD_BACK, REDISTRIBUTE = MODES
+DUE, SHORT = get_args(First)
 EXACT, ESTIMATE = "exact", "estimate"
 FILES = ("routes", "background", "additional")
 
@@ -52,6 +54,8 @@ class SumoTable(config.Settings):
     metering_level: float = setting(
         "the accumulation that metering holds a region at without a command, in critical accumulations", 1.2, unit="-",
         gt=0.0, le=10.0)
+    metering_first: First = setting(
+        "who begins first of those who wait in a region: who is due first, or who has the shortest way to go", DUE)
     measurement: Literal["exact", "estimate"] = setting(
         "what controllers see: the exact state, or what detectors and probes tell", EXACT)
     detector_share: Share = setting("share of the links with loop detectors", 0.3)
@@ -78,6 +82,9 @@ class SumoTable(config.Settings):
         if self.measurement == ESTIMATE and self.detector_share == self.probe_share == 0:
             raise Problem("measurement", "\"estimate\" needs detectors or probes, but sumo.detector_share and "
                           "sumo.probe_share are both 0; raise one of them")
+        if self.metering_first == SHORT and not self.metering:
+            raise Problem("metering_first", "\"short\" says whom sumo.metering lets begin first; set that to true, or "
+                          "omit it")
         if self.max_green < self.min_green:
             raise Problem("max_green", f"expected {self.min_green:g} s, the sumo.min_green, or more, got "
                           f"{self.max_green:g} instead")

@@ -23,7 +23,8 @@ GUIDED = "guided"
 # Option -> (field of cosim.plant.settings.Settings, its value).
 _WORDS = {
     **{name: ("signals", name) for name in SIGNALS[1:]}, **{name: ("actuation", name) for name in MODES},
-    "estimate": ("measurement", "estimate"), "metering": ("metering", True), GUIDED: ("guided", True)}
+    "estimate": ("measurement", "estimate"), "metering": ("metering", True),
+    "short-first": ("metering_first", "short"), GUIDED: ("guided", True)}
 PERCENT, SECONDS = "percent", "seconds"
 # Option with a whole number -> (field of cosim.plant.settings.Settings, least, most, its unit).
 _NUMBERS = {
@@ -39,6 +40,7 @@ _TEXTS = {
     "hold-back": "green taken from a gateway is red for all",
     "redistribute": "green taken from a gateway goes to the other movements",
     "estimate": "the controller sees what loops and probe vehicles tell, not the truth",
+    "short-first": "of trips that wait, with +metering, those with a short way begin first",
     "metering": "trips wait outside where their region is full, or as the controller commands",
     GUIDED: "drivers are guided by travel times",
     "rerouting-N": "N percent of the drivers take another route by themselves, every minute",

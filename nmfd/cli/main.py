@@ -24,7 +24,7 @@ from nmfd.cli.options import (
     quoted,
 )
 from nmfd.cli.progress import progress_line, resumable
-from nmfd.cli.studies import ablation, adaptation, bound, robustness, scaling
+from nmfd.cli.studies import ablation, adaptation, bound, robustness, scaling, value
 from nmfd.errors import InputError
 
 
@@ -41,8 +41,9 @@ def main() -> None:
 
 @main.command()
 @SCENARIO
-@controllers_option("Which to run: no-control, route-guidance, pi-gating, greedy, mpc-pc, mpc-pcrg, probing-pc, "
-                     "probing-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, dpc-pcrg-robust, dpc-pc-guarded, "
+@controllers_option("Which to run: no-control, route-guidance, pi-gating, greedy, mpc-pc, mpc-pcrg, "
+                    "mpc-pc-terminal, mpc-pcrg-terminal, probing-pc, "
+                    "probing-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, dpc-pcrg-robust, dpc-pc-guarded, "
                     "dpc-pcrg-guarded, dpc-pc-online, dpc-pcrg-online, bound-pc, bound-pcrg, or file.py:Class "
                     "(see nmfd new-controller).")
 @declared("nmfd.studies.settings:Study", "seeds", "plant", "workers")
@@ -219,5 +220,5 @@ def _stamp(path: Path) -> int | None:
 
 
 for command in (
-        listing(), bound, robustness, adaptation, ablation, scaling, new_controller, export, identify):
+        listing(), bound, value, robustness, adaptation, ablation, scaling, new_controller, export, identify):
     main.add_command(command)

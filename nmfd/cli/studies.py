@@ -139,6 +139,44 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int, 
 
 
 @click.command()
+@SCENARIO
+@click.option("--controller", required=True, metavar="NAME", help="mpc-pc-terminal or mpc-pcrg-terminal.")
+@declared("nmfd.studies.settings:Value", "seed", "samples", "rounds", "steps")
+@click.option("--policy", type=FILE, metavar="FILE",
+              help="Of dpc-pc or dpc-pcrg, which take over after the horizon. [default: the scenario's own]")
+@click.option("--out", type=FILE, metavar="FILE", help="The file. [default: SCENARIO/NAME.npz]")
+def value(
+    scenario: Path, controller: str, seed: int, samples: int, rounds: int, steps: int, policy: Path | None,
+    out: Path | None,
+) -> None:
+    """Learn the terminal cost of MPC: what a DPC policy makes of the state at the end of its horizon.
+
+    With it a horizon of eight intervals is short-sighted no more. Learned from rollouts of the policy on the regional
+    model; the same seed gives the same numbers.
+
+    \b
+    Example:
+      nmfd value economic_mpc --controller mpc-pcrg-terminal
+    """
+    from nmfd.api import load_scenario  # heavy
+    from nmfd.controllers.mpc import terminal
+    from nmfd.runs import shipped
+    from nmfd.studies import terminal_cost as method
+
+    method.check(controller)
+    file = out or shipped.beside(
+        shipped.found(scenario, shipped.SCENARIO), f"{controller}.npz", "--out FILE", scenario=True)
+    if not file.parent.is_dir():
+        raise InputError(f"{file.parent}: no such folder for the value function; make it or choose another --out")
+    with progress_line(controller) as progress:
+        found = method.learn(
+            load_scenario(scenario), controller, seed=seed, samples=samples, rounds=rounds, steps=steps, policy=policy,
+            progress=progress)
+    terminal.write(found, file)
+    click.echo(f"Written to {file}")
+
+
+@click.command()
 @click.argument("what", type=click.Choice(["training", "horizon"]))
 @SCENARIO
 @declared("nmfd.studies.settings:Ablation", "seeds", "horizons", "plant", "workers")

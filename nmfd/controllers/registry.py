@@ -31,6 +31,25 @@ OWN = "own"  # the table in [controllers] that holds those of controllers of the
 _OWN = re.compile(r".+\.py:\w+(?=\+|$)")
 
 
+TERMINAL = {"mpc-pc-terminal": "dpc-pc", "mpc-pcrg-terminal": "dpc-pcrg"}  # whose value function they need
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """A file that a controller reads: what it is, the command of `nmfd` that makes it and what that does, and the end
+    of its name."""
+
+    text: str
+    command: str
+    verb: str
+    suffix: str
+
+
+POLICY = Kind(text="policy", command="train", verb="train", suffix="pt")
+PLAN = Kind(text="plan", command="bound", verb="compute", suffix="npz")
+VALUE = Kind(text="value function", command="value", verb="learn", suffix="npz")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Entry:
     """A controller that is built in.
@@ -38,7 +57,8 @@ class Entry:
     text: what it does, in a line
     make: of the planning model, and of the policy's file where there is one
     guides: whether it may guide routes
-    policy: whose policy it reads, "" for none
+    policy: whose file it reads, "" for none
+    reads: what that is
     declared: its options
     """
 
@@ -46,6 +66,7 @@ class Entry:
     make: Callable[..., Controller]
     guides: bool = False
     policy: str = ""
+    reads: Kind = POLICY
     declared: type[Options] = Options
 
 
@@ -62,6 +83,10 @@ _ENTRIES = {
     "mpc-pcrg": Entry(
         text="the same with route guidance", make=partial(mpc.EconomicMpc, guidance=True), guides=True,
         declared=mpc.Mpc),
+    **{name: Entry(
+        text=f"economic MPC, perimeter control{ALSO * guides}, with the value of {dpc} as terminal cost",
+        make=partial(mpc.load, guidance=guides), guides=guides, policy=name, reads=VALUE, declared=mpc.Mpc)
+       for (name, dpc), guides in zip(TERMINAL.items(), (False, True), strict=True)},
     "probing-pc": Entry(
         text="excitation for cosim identify, perimeter control", make=partial(Probing, guidance=False),
         declared=SetPoint),
@@ -86,7 +111,8 @@ _ENTRIES = {
         policy="dpc-pcrg", declared=Online),
     **{name: Entry(
         text=f"replays the best plan found with all demand known (nmfd bound), perimeter control{ALSO * guides}",
-        make=partial(open_loop.load, guidance=guides), guides=guides) for name, guides in open_loop.NAMES.items()},
+        make=partial(open_loop.load, guidance=guides), guides=guides, policy=name, reads=PLAN)
+       for name, guides in open_loop.NAMES.items()},
 }
 
 
@@ -97,7 +123,7 @@ def names() -> tuple[str, ...]:
 
 def policy_names() -> tuple[str, ...]:
     """The controllers that need a trained policy."""
-    return tuple(name for name, entry in _ENTRIES.items() if entry.policy)
+    return tuple(name for name, entry in _ENTRIES.items() if entry.policy and entry.reads is POLICY)
 
 
 def check(name: str) -> None:
@@ -180,26 +206,24 @@ def policy_path(name: str, scenario: Scenario, file: Path | None = None) -> Path
     """
     variant, name = name, split(name)[0]
     check(name)
-    planned = name in open_loop.NAMES
-    if is_own(name) or not (planned or _ENTRIES[name].policy):
+    if is_own(name) or not _ENTRIES[name].policy:
         if file is not None:
-            raise InputError(
-                f"{file}: controller {name} reads no policy; only {', '.join((*policy_names(), *open_loop.NAMES))} do: "
-                "omit it")
+            readers = (other for other, entry in _ENTRIES.items() if entry.policy)
+            raise InputError(f"{file}: controller {name} reads no policy; only {', '.join(readers)} do: omit it")
         return None
-    owner, (kind, verb, suffix) = _owner(variant), ("plan", "compute", "npz") if planned else ("policy", "train", "pt")
+    owner, kind = _owner(variant), _ENTRIES[name].reads
     if file is None:
         if scenario.folder is None:
             raise InputError(f"controller {name}: scenario {scenario.name} has no folder with policies; give a file")
-        path, out = scenario.folder / f"{owner}.{suffix}", ""
+        path, out = scenario.folder / f"{owner}.{kind.suffix}", ""
     else:
         path, out = shipped.found(file, shipped.SCENARIO), f" --out {file}"
     if not path.is_file():
         scenario_text = "SCENARIO" if scenario.folder is None else scenario.folder
         if scenario.folder is not None and shipped.installed(scenario.folder):
-            scenario_text, out = scenario.folder.name, out or f" --out {owner}.{suffix}, and give it with --policy"
-        command = f"nmfd {'bound' if planned else 'train'} {scenario_text} --controller {owner}{out}"
-        raise InputError(f"{path}: no such {kind} for {name}; {verb} one with: {command}")
+            scenario_text, out = scenario.folder.name, out or f" --out {owner}.{kind.suffix}, and give it with --policy"
+        command = f"nmfd {kind.command} {scenario_text} --controller {owner}{out}"
+        raise InputError(f"{path}: no such {kind.text} for {name}; {kind.verb} one with: {command}")
     return path
 
 

@@ -72,6 +72,15 @@ class Measured(Settings):
         le=1.0)
 
 
+class Value(Settings):
+    """Of MPC's terminal cost."""
+
+    seed: int = whole("of what is drawn", 0, high=2**31 - 1)
+    samples: int = whole("states per round, from each of which the policy is rolled out", 12_000, low=1, high=MOST)
+    rounds: int = whole("from the second on MPC has driven with what was learned before", 2, low=1, high=100)
+    steps: int = whole("Adam steps per round", 4000, low=1, high=MOST)
+
+
 class Bound(Settings):
     """Of the best plan for demand that is known."""
 

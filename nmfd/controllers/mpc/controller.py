@@ -1,16 +1,18 @@
 """Economic model predictive control: the least total time spent over a horizon of the regional model.
 
 As in Tumu et al.: perimeter control alone ("mpc-pc") or with route guidance ("mpc-pcrg"), the demand known ahead,
-nothing assumed beyond the horizon. Not as there: single shooting, so that only the controls are unknown, with exact
-gradients by the adjoint method (edge_model), and projected gradients (projected_gradient). Every control is bounded or
-in a simplex and acts linearly on the model, so that nearly all of them end at a bound; finding out which takes a few
-gradients, while an interior-point method factorises the whole horizon some twenty times.
+nothing assumed beyond the horizon, unless a terminal cost says what comes ("mpc-pc-terminal", terminal.py). Not as
+there: single shooting, so that only the controls are unknown, with exact gradients by the adjoint method (edge_model),
+and projected gradients (projected_gradient). Every control is bounded or in a simplex and acts linearly on the model,
+so that nearly all of them end at a bound; finding out which takes a few gradients, while an interior-point method
+factorises the whole horizon some twenty times.
 """
 
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -21,8 +23,10 @@ from nmfd.controllers.mpc import edge_model
 from nmfd.controllers.mpc.edge_model import Decision, Demands, PerCell, Plan, Turns
 from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.mpc.projected_gradient import AT_REST, TIME_LIMIT, Late, Minimum, minimise
+from nmfd.controllers.mpc.terminal import Terminal, read
 from nmfd.controllers.options import Options, options
 from nmfd.controllers.pi_gating import PiGating
+from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.config import Problem, setting, whole
@@ -34,6 +38,10 @@ ROUNDING = 0.005    # of the smallest jam accumulation: over which the solver se
 TOLERANCE = 1e-6
 ACCEPTABLE = 1e-5
 FAILED = Status.SOLVER_FAILURE | Status.FALLBACK
+# With a terminal cost, which is no more exact than that, the same sums count what lies beyond the horizon as well: a
+# hundredth of it changes the benchmark's total time spent by 0.1 %, and takes ten times as long.
+COARSE = 1e-4
+TERMINAL = "-terminal"  # behind the name
 IN_TIME = 0.9       # share of the deadline that the solver has; the rest is for what becomes of its plan
 FEW = 5.0           # veh: added to the vehicles that a control decides on, where these scale the solver's steps
 
@@ -140,9 +148,11 @@ class EconomicMpc:
     count as 0.
     """
 
-    def __init__(self, planning: PlanningModel, *, guidance: bool):
-        """InputError for a wrong option."""
-        self.name = "mpc-pcrg" if guidance else "mpc-pc"
+    def __init__(self, planning: PlanningModel, *, guidance: bool, terminal: Terminal | None = None):
+        """terminal: what comes after the horizon. InputError for a wrong option."""
+        self.name = ("mpc-pcrg" if guidance else "mpc-pc") + (TERMINAL if terminal else "")
+        self._terminal = terminal
+        self._beyond: Callable[[PerCell], tuple[float, PerCell]] | None = None
         self.options = options(Mpc, planning, self.name)
         network, horizon = planning.network, self.options.horizon
         used = np.flatnonzero(planning.destinations)
@@ -150,7 +160,7 @@ class EconomicMpc:
         self._used = used if len(used) else np.arange(network.regions)
         self._demand, self._step, self._steps = planning.forecast, planning.step, planning.steps
         # With one Euler step per interval, the last controls move vehicles that the horizon does not see arrive.
-        blind = planning.integrator == "euler" and planning.substeps == 1
+        blind = planning.integrator == "euler" and planning.substeps == 1 and terminal is None
         self._moves = min(horizon - 1 if blind else horizon, self.options.control_horizon or horizon)
         self._model = edge_model.build(network, self._used, guidance=guidance)
         rounded = replace(self._model, rounding=ROUNDING * min(mfd.jam for mfd in network.mfds))
@@ -162,7 +172,11 @@ class EconomicMpc:
         self._open = self.admissible.open(self._moves)
         self._gating = PiGating(planning) if planning.protected else None
         self.deadline = self.options.time_limit or planning.step  # s, per decision
-        self._ipopt = None
+        self._ipopt, self._tolerance = None, TOLERANCE if terminal is None else COARSE
+        if terminal is not None and self.options.solver == "ipopt":
+            raise InputError(
+                f"{planning.where}: controllers.{self.name}.solver: ipopt knows no terminal cost; omit it, or use "
+                f"{self.name.removesuffix(TERMINAL)}")
         if self.options.solver == "ipopt":
             self._ipopt = Ipopt(
                 planning, guidance=guidance, horizon=horizon, iterations=self.options.max_iterations,
@@ -177,6 +191,7 @@ class EconomicMpc:
     def act(self, observation: Observation) -> Controls:
         deadline = time.perf_counter() + IN_TIME * self.deadline
         start, demand = self.forecast(observation)
+        self._look_beyond(observation.step + self.options.horizon)
         last = np.concatenate([self._plan[1:], self._plan[-1:]]) if self._left else self._open
         try:
             if self._left and self._cheaper(self._open, last, start, demand, deadline):
@@ -196,8 +211,13 @@ class EconomicMpc:
 
     def _cheaper(self, plan: Plan, than: Plan, start: PerCell, demand: Demands, deadline: float) -> bool:
         """Whether `plan` costs less, by the exact model. Raises Late."""
-        return self._exact(start, demand, plan, deadline=deadline)[0] < self._exact(
-            start, demand, than, deadline=deadline)[0]
+        return self._exact(start, demand, plan, deadline=deadline, beyond=self._beyond)[0] < self._exact(
+            start, demand, than, deadline=deadline, beyond=self._beyond)[0]
+
+    def _look_beyond(self, step: int) -> None:
+        """The horizon ends at the beginning of interval `step`."""
+        if self._terminal is not None:
+            self._beyond = partial(self._terminal, step=step)
 
     def _without(self, observation: Observation, last: Plan, reason: str) -> Controls:
         """The controls of an interval for which no plan was found."""
@@ -243,12 +263,12 @@ class EconomicMpc:
         if self.fault == "solver-late":
             return Minimum(point=plan, value=np.inf, gap=np.inf, evaluations=0, reason=TIME_LIMIT)
         objective = _diverging if self.fault == "solver-diverges" else partial(
-            self._rounded, start, demand, deadline=deadline)
+            self._rounded, start, demand, deadline=deadline, beyond=self._beyond)
         if self._ipopt is not None and self.fault is None:
             return self._by_ipopt(self._ipopt, start, demand)
         return minimise(
             objective, self.admissible.project, self.admissible.gap, plan,
-            metric=(self._affected(start, demand, plan, deadline=deadline) + FEW) ** 2, tolerance=TOLERANCE,
+            metric=(self._affected(start, demand, plan, deadline=deadline) + FEW) ** 2, tolerance=self._tolerance,
             iterations=self.options.max_iterations, seconds=deadline - time.perf_counter())
 
     def _by_ipopt(self, solver: Ipopt, start: PerCell, demand: Demands) -> Minimum:
@@ -267,3 +287,9 @@ class EconomicMpc:
 
 def _diverging(plan: Plan) -> tuple[float, Plan]:
     return np.nan, np.full_like(plan, np.nan)
+
+
+def load(path: Path, planning: PlanningModel, *, guidance: bool) -> EconomicMpc:
+    """MPC with the terminal cost in the file `path`. InputError if it is none of this model."""
+    name = ("mpc-pcrg" if guidance else "mpc-pc") + TERMINAL
+    return EconomicMpc(planning, guidance=guidance, terminal=read(path, planning, name))

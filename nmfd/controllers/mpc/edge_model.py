@@ -8,6 +8,7 @@ cost of two more rollouts.
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -199,12 +200,14 @@ def pull_advance(
 def vehicle_steps(
     model: Turns, start: PerCell, demand: Demands, plan: Plan, step: float, *, substeps: int = 1,
     integrator: str = "euler", gradient: bool = False, deadline: float = math.inf,
+    beyond: Callable[[PerCell], tuple[float, PerCell]] | None = None,
 ) -> tuple[float, Plan | None]:
     """Vehicles in the network, summed over the ends of H control intervals of `step` [s], and its gradient.
 
     start: (C,) [veh]; demand: (H, C) [veh/s]
     plan: (K, E + V) [-], u of the edges and theta of the turns in every interval; the last stays in force
     deadline: by time.perf_counter [s]
+    beyond: what the state at the end costs besides, in vehicles and intervals, and its gradient
     The gradient (K, E + V) is None unless asked for. Raises Late.
     """
     interval, edges = _intervals(plan, len(demand), substeps), len(model.edges)
@@ -217,9 +220,11 @@ def vehicle_steps(
             tape.append(records)
         if (node + 1) % substeps == 0:
             total += float(x.sum())
+    more, adjoint = (0.0, np.zeros_like(x)) if beyond is None else beyond(x)
+    total += more
     if not gradient:
         return total, None
-    of_plan, adjoint = np.zeros_like(plan), np.zeros_like(x)
+    of_plan = np.zeros_like(plan)
     for node, k in reversed(list(enumerate(interval))):
         _look(deadline)
         if (node + 1) % substeps == 0:

@@ -1,0 +1,137 @@
+"""MPC's terminal cost: its derivatives, what MPC gains by it, its file."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import error_line, good, nmfd
+
+from nmfd import closed_loop
+from nmfd.api import load_scenario
+from nmfd.controllers import registry
+from nmfd.controllers.mpc import edge_model, terminal
+from nmfd.controllers.mpc.controller import EconomicMpc
+from nmfd.errors import InputError
+from nmfd.model.planning import planning_model
+from nmfd.model.plant import NmfdPlant
+from nmfd.studies import terminal_cost
+
+NAME = "mpc-pc-terminal"
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return load_scenario("economic_mpc")
+
+
+@pytest.fixture(scope="module")
+def learned(scenario):
+    """Not much, but something."""
+    return terminal_cost.learn(scenario, NAME, seed=0, samples=256, rounds=1, steps=150)
+
+
+def crowded(scenario, seed=0):
+    """Cells (C,) [veh]."""
+    planning = planning_model(scenario)
+    return np.random.default_rng(seed).uniform(0.0, 400.0, planning.network.regions * planning.destinations.sum())
+
+
+def test_the_slope_is_that_of_the_value(scenario, learned):
+    x = crowded(scenario)
+    for step in (3, 120, 239):
+        value, slope = learned(x, step)
+        for cell in range(0, len(x), 5):
+            moved = x.copy()
+            moved[cell] += 1e-3
+            assert (learned(moved, step)[0] - value) / 1e-3 == pytest.approx(slope[cell], rel=1e-3, abs=1e-4)
+    assert learned(x, 240)[0] == learned(x, 300)[0] == 0.0 and not learned(x, 240)[1].any()
+
+
+def test_more_vehicles_cost_more_and_the_later_the_less(scenario, learned):
+    x = crowded(scenario)
+    values = [learned(share * x, step)[0] for share, step in ((1.5, 60), (1.0, 60), (0.5, 60), (0.5, 230))]
+    assert values == sorted(values, reverse=True)
+
+
+def test_the_plan_descends_on_both_sums(scenario, learned):
+    """The gradient of edge_model with what lies beyond, by finite differences."""
+    planning = planning_model(scenario, NAME)
+    mpc = EconomicMpc(planning, guidance=False, terminal=learned)
+    model = edge_model.build(planning.network, np.flatnonzero(planning.destinations), guidance=False)
+    start, demand = crowded(scenario), planning.forecast[:8][:, :, planning.destinations].reshape(8, -1)
+    plan = 0.8 * mpc.admissible.open(8)
+
+    def total(plan, **chosen):
+        return edge_model.vehicle_steps(
+            model, start, demand, plan, planning.step, beyond=lambda x: learned(x, 100), **chosen)
+
+    without = edge_model.vehicle_steps(model, start, demand, plan, planning.step)[0]
+    value, slope = total(plan, gradient=True)
+    assert value > without
+    for k, edge in ((0, 0), (4, 7), (7, 11)):
+        moved = plan.copy()
+        moved[k, edge] += 1e-4
+        assert (total(moved)[0] - value) / 1e-4 == pytest.approx(slope[k, edge], rel=1e-3, abs=1e-2)
+    assert slope[7].any(), "the last controls matter"
+
+
+def test_mpc_looks_beyond_its_horizon(scenario, learned):
+    """Even with what little was learned here."""
+    planning = planning_model(scenario, NAME)
+    plain, far = (
+        closed_loop.run(NmfdPlant(scenario), EconomicMpc(planning, guidance=False, terminal=known), scenario, seed=1)
+        for known in (None, learned))
+    assert far.accumulation.sum() < 0.9 * plain.accumulation.sum()
+    assert (plain.controller, far.controller) == ("mpc-pc", NAME) and not far.status.any()
+
+
+@pytest.mark.parametrize("name, most", [("mpc-pc-terminal", 8.787e7), ("mpc-pcrg-terminal", 5.475e7)])
+def test_the_committed_ones_come_within_five_percent_of_the_bound(scenario, name, most):
+    run = closed_loop.run(NmfdPlant(scenario), registry.make(name, scenario), scenario, seed=1)
+    assert most < 30.0 * run.accumulation[:-1].sum() < 1.05 * most
+
+
+def test_the_same_seed_learns_the_same_and_the_file_keeps_it(scenario, learned, tmp_path):
+    again = terminal_cost.learn(scenario, NAME, seed=0, samples=256, rounds=1, steps=150)
+    other = terminal_cost.learn(scenario, NAME, seed=1, samples=256, rounds=1, steps=150)
+    x, planning = crowded(scenario), planning_model(scenario)
+    assert again(x, 50)[0] == learned(x, 50)[0] != other(x, 50)[0]
+    terminal.write(learned, tmp_path / "value.npz")
+    read = terminal.read(tmp_path / "value.npz", planning, NAME)
+    np.testing.assert_allclose(read(x, 50)[1], learned(x, 50)[1])
+    for wrong, expected in ((replace(planning, network=replace(planning.network, u_min=0.2)), "network_hash"),
+                            (replace(planning, forecast=planning.forecast + 1.0), "other destinations")):
+        with pytest.raises(InputError, match=expected):
+            terminal.read(tmp_path / "value.npz", wrong, NAME)
+    with pytest.raises(InputError, match="of mpc-pc-terminal, not of mpc-pcrg-terminal"):
+        terminal.read(tmp_path / "value.npz", planning, "mpc-pcrg-terminal")
+    (tmp_path / "value.npz").write_bytes(b"PK nothing")
+    with pytest.raises(InputError, match="is no value function; make one with 'nmfd value'"):
+        terminal.read(tmp_path / "value.npz", planning, NAME)
+
+
+def test_the_command_writes_what_the_benchmark_reads(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = good(nmfd("value", "economic_mpc", "--controller", NAME, "--samples", "128", "--rounds", "2", "--steps", "2",
+                     "--out", "value.npz"))
+    assert "Written to value.npz" in said
+    said = good(nmfd("benchmark", "economic_mpc", "--controllers", NAME, "--seeds", "1", "--policy",
+                     f"{NAME}=value.npz", "--out", "out"))
+    assert NAME in said
+
+
+@pytest.mark.parametrize("arguments, expected", [
+    (["value", "economic_mpc", "--controller", "dpc-pc"], "has no terminal cost; choose mpc-pc-terminal or"),
+    (["value", "economic_mpc", "--controller", NAME, "--policy", "none.pt"], "none.pt: no such policy"),
+    (["value", "economic_mpc", "--controller", NAME, "--out", "no/value.npz"], "no such folder for the value function"),
+    (["benchmark", "economic_mpc_figure4", "--controllers", NAME], "learn one with: nmfd value")])
+def test_one_line_for_what_cannot_be(tmp_path, monkeypatch, arguments, expected):
+    monkeypatch.chdir(tmp_path)
+    assert expected in error_line(nmfd(*arguments), "nmfd") and not list(Path().glob("**/*.npz"))
+
+
+def test_ipopt_knows_none(scenario, learned):
+    planning = replace(planning_model(scenario, NAME), controller_options={NAME: {"solver": "ipopt"}})
+    with pytest.raises(InputError, match="ipopt knows no terminal cost"):
+        EconomicMpc(planning, guidance=False, terminal=learned)
