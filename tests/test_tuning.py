@@ -87,6 +87,13 @@ def test_the_best_options_are_found_and_written(city, tmp_path, runs):
     assert written == {"set_point": [best["set_point[0]"]], "kp": best["kp"]}
 
 
+def test_numbers_of_a_list_without_a_range_stay_as_they_are(city, tmp_path):
+    tuned = tuning.Tuning(
+        scenario=city, controller="dpc-pcrg+max-pressure+guidance-period-60", candidates=1, seeds=(1000,), out=tmp_path,
+        knobs=(tuning.knob("numbers[3]=2:12"), tuning.knob("numbers[6]=1:2")))
+    assert dict(tuned.options((0.5, 0.0)))["numbers"] == (9.0, 1.0, 0.0, 7.0, 0.6, 0.5, 1.0, 1.2)
+
+
 @pytest.mark.slow
 def test_an_interrupted_search_goes_on_as_if_it_had_not_been(city, tmp_path, runs):
     tasks, _ = runs

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pandas as pd
+from matplotlib.ticker import MaxNLocator
 
 from cosim.evaluation.scores import SCORE
 from nmfd.studies import plots
@@ -21,6 +22,7 @@ def draw(path: Path, table: pd.DataFrame, *, runs: int) -> Path:
     ax.axhline(0.0, color="#777777", linestyle="--", linewidth=1.0)
     ax.set_xlabel("runs in SUMO [-]")
     ax.set_ylabel("total time spent, geometric mean over\nseeds and levels, against round 0 [%]")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.spines[["top", "right"]].set_visible(False)
     plots.legend_below(drawing, [ax], columns=3)
     return plots.save(drawing, path)
