@@ -84,10 +84,21 @@ class Improvement:
         return [(experiment.level_folder(self.folder(number), level), self.task(number, level, seed))
                 for seed in self.seeds for level in self.levels]
 
+    @property
+    def variant(self) -> str:
+        """The controller whose options and policy the strategy uses."""
+        return configured(self.controller, scenario_of(self.task(0)).controller_options)
+
     def planning(self, number: int) -> PlanningModel:
         """What the policy of a round knows."""
-        scenario = scenario_of(self.task(number))
-        return planning_model(scenario, configured(self.controller, scenario.controller_options))
+        return planning_model(scenario_of(self.task(number)), self.variant)
+
+    def file(self, number: int) -> Path:
+        """The policy that is run in a round. InputError if there is none."""
+        task = self.task(number)
+        found = registry.policy_path(self.variant, scenario_of(task), task.policy)
+        assert found is not None  # every DPC controller has one
+        return found
 
     def results(self, number: int) -> list[Result]:
         """The finished runs of a round."""
@@ -101,9 +112,8 @@ def check(order: Improvement) -> None:
             f"--controller: {order.controller!r} has no policy that learns; choose one of "
             f"{', '.join(training.NAMES)}, with what else the city does")
     scenario = scenario_of(order.task(0))
-    variant = configured(order.controller, scenario.controller_options)
-    training.settings(scenario, variant)
-    registry.verify(variant, scenario, policy=order.policy)
+    training.settings(scenario, order.variant)
+    registry.verify(order.variant, scenario, policy=order.policy)
 
 
 def improve(
@@ -198,13 +208,11 @@ def _fit(order: Improvement, folder: Path, runs: Sequence[Result], progress: exp
 
 def _descend(order: Improvement, number: int, begin: int, steps: int) -> list[float]:
     """Write the policy of a round, from that of round `begin` along its runs; TTS of the replays before every step."""
-    old, planning = order.planning(begin), order.planning(number)
-    first = registry.policy_path(_variant(order), scenario_of(order.task(begin)), order.task(begin).policy)
-    assert first is not None  # `check` has seen it
-    began, content = policy_file.load_policy(first, old.network)
+    planning = order.planning(number)
+    began, content = policy_file.load_policy(order.file(begin), order.planning(begin).network)
     policy = policy_file.new_policy(planning.network, began.architecture)
     policy.load_state_dict(began.state_dict())
-    chosen = training.settings(scenario_of(order.task(begin)), _variant(order))
+    chosen = training.settings(scenario_of(order.task(begin)), order.variant)
     rollout = Rollout(planning, detour_cost=chosen.detour_cost, swing_cost=chosen.swing_cost)
     results = order.results(begin)
     with one_thread():
@@ -220,10 +228,6 @@ def _descend(order: Improvement, number: int, begin: int, steps: int) -> list[fl
         policy, planning.network, configuration, fallback.statistics(states.reshape(len(states), -1))),
         order.folder(number) / "policy.pt")
     return path
-
-
-def _variant(order: Improvement) -> str:
-    return configured(order.controller, scenario_of(order.task(0)).controller_options)
 
 
 def _run(result: Result, *, waits: bool) -> Run:
@@ -244,11 +248,8 @@ def _row(order: Improvement, rows: Sequence[dict], about: dict[str, float]) -> d
 
 def _publish(order: Improvement, number: int) -> None:
     """The best policy and its model, where they are looked for."""
-    task = order.task(number)
-    policy = registry.policy_path(_variant(order), scenario_of(task), task.policy)
-    assert policy is not None  # `check` has seen it
     with files.atomic(order.out / "policy.pt") as temporary:
-        shutil.copyfile(policy, temporary)
+        shutil.copyfile(order.file(number), temporary)
     planning = order.planning(number)
     (order.out / "model").mkdir(exist_ok=True)
     files.write_text(order.out / "model" / "network.toml", network_toml(
@@ -260,5 +261,6 @@ def _configuration(order: Improvement) -> dict[str, object]:
     return {
         "improve": order.controller, "scenario": scenario_of(order.task(0)).name, "seeds": list(order.seeds),
         "levels": list(order.levels), "descent": order.descent, "learning_rate": order.learning_rate,
-        "iterations": order.iterations, "policy": None if order.policy is None else str(order.policy),
+        "iterations": order.iterations, "policy_hash": files.file_hash(order.file(0)),
+        "model_hash": order.planning(0).network.hash,
         "runs": [str(folder) for folder in order.runs], "steps": order.steps}
