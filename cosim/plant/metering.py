@@ -5,11 +5,9 @@ Gates move a queue; what cannot stand inside must stand outside. The trips of a 
 beforehand, but one by one when they may begin: on the same routes, with the same ids and by the same seed as without
 metering. Who waits is in the backlog and in the total time spent.
 
-Without a command, PI control of the accumulation of every region (velocity form, as in ALINEA and as nmfd's PI gating),
-from the rate b_i at which trips did begin in the last control interval: from the commanded one, which nobody used while
-nobody waited, it would come down much too late.
+Without a command, PI control of the accumulation of every region (velocity form, as in ALINEA and as nmfd's PI gating):
 
-    r_i(k) = clip(b_i(k-1) + (KP (n_i(k-1) - n_i(k)) + KI (level n_cr,i - n_i(k))) / dt,  0, n_cr,i / FILLING)
+    r_i(k) = clip(r_i(k-1) + (KP (n_i(k-1) - n_i(k)) + KI (level n_cr,i - n_i(k))) / dt,  0, n_cr,i / FILLING)
 """
 
 import heapq
@@ -41,7 +39,6 @@ class Metering:
         self._due, self.waited = 0, 0.0
         self._rate, self._credit = self._most.copy(), np.ones(len(critical))
         self._before: PerRegion | None = None
-        self._begun = self._most * step  # in the last control interval
 
     def command(self, rate: PerRegion | None, accumulation: PerRegion) -> None:
         """rate: (R,) [veh/s], the most trips that may begin in each region; None: by PI control of `accumulation`
@@ -51,8 +48,8 @@ class Metering:
         else:
             before = accumulation if self._before is None else self._before
             change = KP * (before - accumulation) + KI * (self._set_point - accumulation)
-            self._rate = np.clip((self._begun + change) / self._interval, 0.0, self._most)
-        self._before, self._begun = accumulation, np.zeros_like(accumulation)
+            self._rate = np.clip(self._rate + change / self._interval, 0.0, self._most)
+        self._before = accumulation
 
     def play(self) -> None:
         """Let begin who is due and may."""
@@ -66,7 +63,6 @@ class Metering:
         for region, queue in enumerate(self._queues):
             while queue and self._credit[region] >= 1.0 - 1e-9:
                 self._credit[region] -= 1.0
-                self._begun[region] += 1.0
                 _, trip = heapq.heappop(queue)
                 self._session.begin_trip(f"v{trip}", f"r{trip}", self._trips.arrival[trip])
                 self.waited += now - depart[trip]
