@@ -34,6 +34,7 @@ CONTROLLER_COLOURS = {
     "route-guidance": "#8c6d31", "probing-pc": "#bcbd22", "probing-pcrg": "#637939",
     "dpc-pc-guarded": "#c9a0dc", "dpc-pcrg-guarded": "#6a3d9a", "bound-pc": "#9aa33c", "bound-pcrg": "#4d6600",
     "dpc-pc-online": "#f4a3c8", "dpc-pcrg-online": "#c2407e", "greedy": "#2e8b57",
+    "mpc-pc-terminal": "#7fd1c7", "mpc-pcrg-terminal": "#00695c",
 }
 CITY_COLOURS = {  # what a city may do without a regional controller
     "webster": "#00838f", "actuated": "#7e57c2", "max-pressure": "#009e73", "rerouting-30": "#7f7f7f",
