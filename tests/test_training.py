@@ -181,6 +181,27 @@ def test_compilation_is_tried_out_where_there_is_a_compiler(monkeypatch):
     assert not rollout_module.can_compile()
 
 
+def test_what_one_rollout_costs_does_not_depend_on_the_others(generator):
+    """With detours, each by itself; and the states are those of the step that is asked for."""
+    city = load_scenario("economic_mpc")
+    planning = planning_model(replace(city, steps=6, demand=city.demand[:6], measurement_std=0.0))
+    rollout = Rollout(planning, detour_cost=200.0)
+    policy = Policy(planning.network, Architecture(width=4, guidance=True)).requires_grad_(False)
+    x, demand = rollout.random_start(3, 0.5, 1.0, generator, (0.8, 1.2))
+    asked = []
+
+    def step(*arguments):
+        asked.append(arguments)
+        return rollout.step(*arguments)
+
+    def cost(chosen):
+        return rollout.total_time_spent(policy, x[chosen], demand[:, chosen], generator, step).tolist()
+
+    together = cost(slice(0, 3))
+    assert len(asked) == len(demand) - 1
+    assert len(set(together)) == 3 and together == pytest.approx([cost([n])[0] for n in range(3)])
+
+
 def test_the_total_time_spent_is_that_of_the_states(scenario, generator):
     """Vehicles at every beginning of an interval, times its length."""
     rollout, policy = Rollout(planning_model(scenario), dtype=torch.float32), made(scenario)
