@@ -36,8 +36,8 @@ class Lanes:
         if self._session.standing_time(vehicle) < PATIENCE:
             return []
         left, onward = self._left(vehicle)
-        here, after = self._session.next_edges(vehicle)
-        if left > LEADER or after is None or after in onward:
+        here, *after = self._session.route(vehicle)[self._session.route_index(vehicle):]
+        if left > LEADER or not after or after[0] in onward:
             return []
         ways = [(time, way) for time, way in (self._session.fastest(edge, target) for edge in sorted(onward)) if way]
         return [here, *min(ways)[1]] if ways else []

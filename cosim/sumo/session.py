@@ -220,11 +220,6 @@ class Session:
         """Where on its route a vehicle is."""
         return self._sumo.vehicle.getRouteIndex(vehicle)
 
-    def next_edges(self, vehicle: str) -> tuple[str, str | None]:
-        """The edge of its route that a vehicle is on, and the one after it, if any."""
-        edges, index = self._sumo.vehicle.getRoute(vehicle), self._sumo.vehicle.getRouteIndex(vehicle)
-        return edges[index], edges[index + 1] if index + 1 < len(edges) else None
-
     def place(self, vehicle: str) -> tuple[str, float]:
         """The lane that a vehicle is on, and where on it [m]."""
         return self._sumo.vehicle.getLaneID(vehicle), self._sumo.vehicle.getLanePosition(vehicle)

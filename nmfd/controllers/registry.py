@@ -84,9 +84,10 @@ _ENTRIES = {
         text="the same with route guidance", make=partial(mpc.EconomicMpc, guidance=True), guides=True,
         declared=mpc.Mpc),
     **{name: Entry(
-        text=f"economic MPC, perimeter control{ALSO * guides}, with the value of {dpc} as terminal cost",
-        make=partial(mpc.load, guidance=guides), guides=guides, policy=name, reads=VALUE, declared=mpc.Mpc)
-       for (name, dpc), guides in zip(TERMINAL.items(), (False, True), strict=True)},
+        text=f"economic MPC, perimeter control{ALSO * training.NAMES[dpc]}, with the value of {dpc} as terminal cost",
+        make=partial(mpc.load, guidance=training.NAMES[dpc]), guides=training.NAMES[dpc], policy=name, reads=VALUE,
+        declared=mpc.Mpc)
+       for name, dpc in TERMINAL.items()},
     "probing-pc": Entry(
         text="excitation for cosim identify, perimeter control", make=partial(Probing, guidance=False),
         declared=SetPoint),

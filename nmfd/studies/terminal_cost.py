@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float
 
 from nmfd import closed_loop
+from nmfd.arrays import StatesOverTime
 from nmfd.controllers import registry
 from nmfd.controllers.dpc.policy import DpcController, Policy
 from nmfd.controllers.dpc.policy_file import load_policy
@@ -63,6 +64,11 @@ def learn(
         after.requires_grad_(False)
         rollout, found, terminal = Rollout(planning), list[Batch](), None
         city, total = replace(scenario, network=planning.network), rounds * (samples + steps)
+
+        def driven(driver: Controller) -> StatesOverTime:
+            return closed_loop.run(NmfdPlant(city), driver, city, seed=seed).accumulation[:-1]
+
+        both = [driven(DpcController(after)), driven(EconomicMpc(planning, guidance=guidance))]
         for number in range(rounds):
             begin = number * (samples + steps)
 
@@ -70,9 +76,11 @@ def learn(
                 if progress:
                     progress(begin + done, total, f"round {number + 1} of {rounds}: {note}")
 
-            visited = torch.tensor(np.stack([
-                closed_loop.run(NmfdPlant(city), driver, city, seed=seed).accumulation[:-1]
-                for driver in _drivers(planning, after, guidance, terminal)]), dtype=rollout.dtype)
+            if terminal is not None:  # twice as often as the others
+                own = 2 * [driven(EconomicMpc(planning, guidance=guidance, terminal=terminal))]
+            else:
+                own = [driven(NoControl(planning)), *([driven(PiGating(planning))] if planning.protected else [])]
+            visited = torch.tensor(np.stack(both + own), dtype=rollout.dtype)
             seen = 0
             while seen < samples:
                 found.append(_sampled(rollout, after, visited, generator))
@@ -87,16 +95,6 @@ def check(controller: str) -> None:
     """InputError for a controller without a terminal cost."""
     if controller not in registry.TERMINAL:
         raise InputError(f"--controller: {controller!r} has no terminal cost; choose {' or '.join(registry.TERMINAL)}")
-
-
-def _drivers(
-    planning: PlanningModel, policy: Policy, guidance: bool, terminal: Terminal | None,
-) -> list[Controller]:
-    """Whose states are sampled."""
-    both: list[Controller] = [DpcController(policy), EconomicMpc(planning, guidance=guidance)]
-    if terminal is not None:  # twice as often as the others
-        return both + [EconomicMpc(planning, guidance=guidance, terminal=terminal)] * 2
-    return [*both, NoControl(planning), *([PiGating(planning)] if planning.protected else [])]
 
 
 def _sampled(rollout: Rollout, policy: Policy, visited: Demands, generator: torch.Generator) -> Batch:

@@ -20,7 +20,6 @@ from nmfd.arrays import PairsOverTime, StatesOverTime
 from nmfd.controllers.dpc.compact import CompactPolicy
 from nmfd.controllers.dpc.policy import Policy
 from nmfd.controllers.dpc.rollout import Demands, Levels, Rollout, States
-from nmfd.model import dynamics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,9 +63,8 @@ class Replays:
 
     def _next(self, policy: Policy, x: States, backlog: States, demand: States) -> tuple[States, States]:
         """State and backlog (B, R, R) [veh] that the model foresees one control interval later."""
-        if policy.architecture.metering:
-            demand, backlog = dynamics.admitted(backlog, demand, policy.metering(x), self._rollout.planning.step)
-        return self._rollout.step(policy, x, demand, torch.zeros_like(x)), backlog
+        entering, backlog = self._rollout.entering(policy, x, demand, backlog)
+        return self._rollout.step(policy, x, entering, torch.zeros_like(x)), backlog
 
 
 def descend(

@@ -125,6 +125,13 @@ class Rollout:
             self.parameters, x, demand, perimeter, self.nominal_splits if splits is None else splits,
             self.planning.step, integrator=self.planning.integrator, substeps=self.planning.substeps)
 
+    def entering(self, policy: Policy, seen: States, demand: States, backlog: States) -> tuple[States, States]:
+        """The demand (B, R, R) [veh/s] that a policy lets enter where it has `seen` the states, and the backlog
+        (B, R, R) [veh] after it."""
+        if not policy.architecture.metering:
+            return demand, backlog
+        return dynamics.admitted(backlog, demand, policy.metering(seen), self.planning.step)
+
     def states(
         self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None,
     ) -> tuple[Demands, Demands, Float[torch.Tensor, "T B"]]:
@@ -137,10 +144,7 @@ class Rollout:
         noise *= self.planning.measurement_std
         states, waiting, backlog = [x], [x.new_zeros(len(x))], torch.zeros_like(x)
         for k in range(demand.shape[0] - 1):
-            entering = demand[k]
-            if policy.architecture.metering:
-                entering, backlog = dynamics.admitted(
-                    backlog, entering, policy.metering(states[-1] + noise[k]), self.planning.step)
+            entering, backlog = self.entering(policy, states[-1] + noise[k], demand[k], backlog)
             states.append((step or self.step)(policy, states[-1], entering, noise[k]))
             waiting.append(backlog.sum((-2, -1)))
         exact = torch.stack(states)

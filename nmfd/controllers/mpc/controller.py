@@ -150,7 +150,7 @@ class EconomicMpc:
 
     def __init__(self, planning: PlanningModel, *, guidance: bool, terminal: Terminal | None = None):
         """terminal: what comes after the horizon. InputError for a wrong option."""
-        self.name = ("mpc-pcrg" if guidance else "mpc-pc") + (TERMINAL if terminal else "")
+        self.name = _name(guidance, terminal is not None)
         self._terminal = terminal
         self._beyond: Callable[[PerCell], tuple[float, PerCell]] | None = None
         self.options = options(Mpc, planning, self.name)
@@ -291,5 +291,8 @@ def _diverging(plan: Plan) -> tuple[float, Plan]:
 
 def load(path: Path, planning: PlanningModel, *, guidance: bool) -> EconomicMpc:
     """MPC with the terminal cost in the file `path`. InputError if it is none of this model."""
-    name = ("mpc-pcrg" if guidance else "mpc-pc") + TERMINAL
-    return EconomicMpc(planning, guidance=guidance, terminal=read(path, planning, name))
+    return EconomicMpc(planning, guidance=guidance, terminal=read(path, planning, _name(guidance, terminal=True)))
+
+
+def _name(guidance: bool, terminal: bool) -> str:
+    return ("mpc-pcrg" if guidance else "mpc-pc") + TERMINAL * terminal
