@@ -79,11 +79,14 @@ def test_remote_gives_the_reason(tmp_path):
     assert "nowhere: no such folder here" in outcome.reason and "\n" not in outcome.reason
 
 
-def test_no_scheduler_answers(peak, tmp_path, monkeypatch):
+@pytest.mark.parametrize("command, chosen", [
+    ("sweep", ("--controllers", "no-control")), ("frontier", ("--controllers", "no-control")),
+    ("identify", ("--own",))])
+def test_no_scheduler_answers(peak, tmp_path, monkeypatch, command, chosen):
     pytest.importorskip("distributed", reason="the extra dask is not installed")
     monkeypatch.setattr("cosim.evaluation.dask_cluster.PATIENCE", 0.5)
     for address in ("tcp://127.0.0.1:9", "nonsense://x"):
-        done = cosim("sweep", peak, "--controllers", "no-control", "--scheduler", address, "--out", tmp_path / "out")
+        done = cosim(command, peak, *chosen, "--scheduler", address, "--out", tmp_path / "out")
         assert done.exit_code == 2 and "no Dask scheduler answers at" in done.stderr, done.output + str(done.exception)
         assert done.stderr.count("\n") == 1 and not (tmp_path / "out").exists()
 

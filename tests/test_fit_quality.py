@@ -97,9 +97,10 @@ def test_every_table_of_predictions_has_persistence():
     still = np.full((3, 2), 0.25)[:2]
     one = prediction_error.ModelError(
         demand=1.0, controller="x", runs=1, model=None, critical=np.ones(2), most=np.ones(2), ahead=900.0,
-        errors=0.5 * still, persistence=still)
+        errors=0.5 * still, corrected=0.4 * still, persistence=still)
     line = prediction_error.foresight_table([one]).splitlines()
     assert line[0].count("if nothing changed") == 2 and line[1].count("25.0 %") == 2
+    assert line[0].count("corrected") == 2 and line[1].count("10.0 %") == 2
     simulated = np.array([0.0, 3.0, 3.0])
     row = model_validation._row(0, "a", 10.0, simulated, np.zeros(3), np.zeros(2))
     assert row["persistence_rmse_veh"] == pytest.approx(np.sqrt(6.0))

@@ -10,17 +10,20 @@ from typing import Literal
 
 import click
 
-from cosim.cli.options import RUNS, parsed_level
+from cosim.cli.options import RUNS, chosen_scheduler, parsed_level, scheduler_options, tell
 from nmfd.cli.declared import declared
 from nmfd.cli.options import FILE, FOLDER, SCENARIO, SEED, out_option
 from nmfd.cli.progress import progress_line, resumable
 from nmfd.errors import InputError
 from nmfd.runs import files
+from nmfd.runs.workers import cores
 
 
 @click.command()
 @SCENARIO
-@declared("cosim.evaluation.settings:Identification", "levels", "seeds", "workers", "iterations")
+@declared("cosim.evaluation.settings:Identification", "levels", "seeds", "iterations")
+@declared("cosim.evaluation.settings:Identification", "workers", instead="one per core")
+@scheduler_options
 @click.option("--guided/--own", default=None,
               help="Only the model of guided drivers, or only that of drivers who go their own ways. [default: both]")
 @click.option("--with", "options", metavar="OPTION[+...]",
@@ -30,8 +33,9 @@ from nmfd.runs import files
 @RUNS
 @out_option("identify", "Samples and pictures.")
 def identify(
-    scenario: Path, levels: tuple[float, ...], seeds: int, workers: int, guided: bool | None, options: str | None,
-    target: Path | None, iterations: int, runs: tuple[Path, ...], out: Path | None,
+    scenario: Path, levels: tuple[float, ...], seeds: int, workers: int | None, scheduler: str | None,
+    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, guided: bool | None,
+    options: str | None, target: Path | None, iterations: int, runs: tuple[Path, ...], out: Path | None,
 ) -> None:
     """Fit the regional model and the drivers' own split ratios of a SUMO city; writes a network.toml.
 
@@ -54,6 +58,7 @@ def identify(
     """
     if runs and guided is None and not options:
         raise InputError("--runs: fits one model; say which, by --guided, --own or --with")
+    cluster = chosen_scheduler(workers, scheduler, scheduler_ca, scheduler_cert, scheduler_key)
 
     from cosim.evaluation import identify  # heavy
     from cosim.importing import find
@@ -71,7 +76,9 @@ def identify(
             levels=levels, seeds=range(1000, 1000 + seeds), guided=guide,
             options=options.split("+") if options else (), network=target, iterations=iterations, runs=runs)
         with resumable("identify", folder) as progress:
-            text = identify.identify(scenario, loading, out=folder, workers=workers, progress=progress)
+            text = identify.identify(
+                scenario, loading, out=folder, workers=cores() if workers is None else workers, scheduler=cluster,
+                progress=progress, tell=tell)
         if both:
             click.echo("Drivers who are guided:" if guide else "Drivers who go their own ways:")
         click.echo(text)

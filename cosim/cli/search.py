@@ -127,11 +127,13 @@ def improve(
               help="Run every controller at every level, also beyond one at which it served all trips with no seed.")
 @POLICIES
 @declared("cosim.evaluation.settings:Range", "workers", instead="one per core")
+@scheduler_options
 @STEPS
 @out_option("frontier", "The folder.")
 def frontier(
     scenario: Path, controllers: str, demand: tuple[float, ...], seeds: int, first_seed: int, everything: bool,
-    policies: tuple[str, ...], workers: int | None, steps: int | None, out: Path | None,
+    policies: tuple[str, ...], workers: int | None, scheduler: str | None, scheduler_ca: Path | None,
+    scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None, out: Path | None,
 ) -> None:
     """Find up to which demand every controller serves all trips: a picture, frontier.png, and a table.
 
@@ -146,6 +148,7 @@ def frontier(
 
     names = controller_names(controllers, scenario, policies=policies, check=parse, ready=ready)
     files = policy_files(policies, names)
+    cluster = chosen_scheduler(workers, scheduler, scheduler_ca, scheduler_cert, scheduler_key)
 
     from cosim.evaluation import evaluate  # heavy
     from cosim.evaluation import frontier as method
@@ -158,8 +161,8 @@ def frontier(
         out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-frontier" if out is None else out)
     with resumable("frontier", order.out) as progress:
         table, failures = method.frontier(
-            order, everything=everything, workers=cores() if workers is None else workers, progress=progress,
-            tell=tell)
+            order, everything=everything, workers=cores() if workers is None else workers, scheduler=cluster,
+            progress=progress, tell=tell)
         picture.draw(order.out / "frontier.png", table)
     click.echo(method.text(table))
     click.echo(f"Written to {order.out}: see frontier.png and frontier.md")

@@ -45,7 +45,7 @@ class Loading:
 
 def load(network: RegionalModel, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> Loading:
     """What some runs were like."""
-    critical = np.array([mfd.critical for mfd in network.mfds])
+    critical = network.critical
     states = [trajectory.accumulation.sum(axis=2) / critical for trajectory in trajectories]
     started, came = np.zeros(network.regions), np.zeros(network.regions)
     for record in records:

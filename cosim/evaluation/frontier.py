@@ -16,7 +16,7 @@ from dataclasses import replace
 import pandas as pd
 from scipy.stats import binomtest
 
-from cosim.evaluation import experiment
+from cosim.evaluation import dask_cluster, experiment
 from cosim.evaluation.evaluate import Evaluation, all_runs, check_folder
 from cosim.evaluation.statistics import TTS
 from nmfd.runs import files, trail
@@ -32,20 +32,24 @@ CAPTION = (
 
 
 def frontier(
-    order: Evaluation, *, everything: bool = False, workers: int = 1, progress: experiment.Progress | None = None,
+    order: Evaluation, *, everything: bool = False, workers: int = 1,
+    scheduler: dask_cluster.Scheduler | str | None = None, progress: experiment.Progress | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Run what is not there yet, from the lowest level up; returns the table of frontier.csv and a line per failed run.
 
-    everything: every strategy at every level. The table is of all runs in the folder. Raises InputError, and RunFailed
+    everything: every strategy at every level; scheduler: a Dask scheduler or its address, whose workers do the runs
+    instead of `workers` processes here. The table is of all runs in the folder. Raises InputError, and RunFailed
     if no run went well.
     """
     check_folder(order.out)
     failed: list[str] = []
+    source = dask_cluster.source(scheduler, tell)
     left = list(order.controllers)
     for level in sorted(order.levels):
         here = replace(order, levels=(level,), controllers=tuple(left))
-        failures = experiment.perform(here.plan(), workers=workers, fresh=True, progress=progress, tell=tell)
+        failures = experiment.perform(
+            here.plan(), workers=workers, fresh=True, source=source, progress=progress, tell=tell)
         rows = all_runs(order)
         if failures and rows.empty:
             raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])

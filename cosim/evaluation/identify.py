@@ -10,11 +10,12 @@ import csv
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from cosim.evaluation import experiment, results, verdict
+from cosim.evaluation import dask_cluster, experiment, results, verdict
 from cosim.evaluation.model_validation import outflow_samples
 from cosim.evaluation.simulate import Result, Task
 from cosim.sumo.arrays import Points
@@ -29,7 +30,7 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
 from nmfd.runs.tables import wrapped
-from nmfd.runs.workers import ended
+from nmfd.runs.workers import Source, ended
 from nmfd.studies import mfd_bands
 from nmfd.studies.fit_quality import (
     fit_table,
@@ -87,14 +88,16 @@ def without_model(scenario: Scenario) -> bool:
 
 def identify(
     scenario: Path, loading: Loading, *, out: Path, workers: int = 1,
-    progress: experiment.Progress | None = None,
+    scheduler: dask_cluster.Scheduler | str | None = None, progress: experiment.Progress | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> str:
     """Load the city of `scenario`, fit its regional model, and write the network.toml of `loading`.
 
     Samples, pictures, fit.csv and the loading runs go to `out`, one run folder per level. Returns the fit as a table,
     with what is doubtful about it, and whether perimeter control can help (verdict.txt beside network.toml). Raises
     InputError for a network that does not come from a folder, RunFailed if a loading run failed. Loading runs are kept:
-    the same call goes on where it was interrupted, and gives the same model.
+    the same call goes on where it was interrupted, and gives the same model. scheduler: a Dask scheduler or its
+    address, whose workers do them instead of `workers` processes here; tell: takes a line when it is lost.
     """
     loaded = load_scenario(scenario)
     target, own = loading.target(loaded), network_folder(loaded.network)
@@ -109,22 +112,24 @@ def identify(
         raise InputError(f"--network: {there} is no folder that can be written to; choose another")
     first, second = loading.stages
     more = [run for folder in loading.runs for run in finished(folder, scenario)]
-    found = _load(scenario, loading, first, {}, out, workers, _named(progress, "1 of 2"))
+    loads = partial(_load, scenario, loading, out=out, workers=workers, source=dask_cluster.source(scheduler, tell))
+    found = loads(first, {}, progress=_named(progress, "1 of 2"))
     network = static_model(loaded, found, guided=loading.guided)
     set_point = tuple(network.mfds[region].critical for region in loaded.protected)
-    found += _load(scenario, loading, second, {"set_point": set_point}, out, workers, _named(progress, "2 of 2"))
+    found += loads(second, {"set_point": set_point}, progress=_named(progress, "2 of 2"))
     held_out = [result for result in found if len(loading.seeds) > 1 and result.trajectory.seed == loading.seeds[-1]]
     found += more
     scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
     def fitted(results: Sequence[Result], samples: Sequence[dict], what: str) -> RegionalModel:
-        def tell(done: int, total: int, note: str) -> None:
+        def fitting(done: int, total: int, note: str) -> None:
             if progress is not None:
                 progress(done, total, f"{what}, {note}")
 
-        return fitted_to(
-            network, [observed(result) for result in results], samples, loaded, iterations=loading.iterations,
-            progress=tell if progress else None)
+        runs = [observed(result) for result in results]
+        model = fitted_to(
+            network, runs, samples, loaded, iterations=loading.iterations, progress=fitting if progress else None)
+        return identification.fit_disturbance(model, runs, iterations=loading.iterations // 4, **scheme)
 
     samples = samples_of(network, found)
     model = fitted(found, samples, "fitting")
@@ -163,15 +168,15 @@ def _named(progress: experiment.Progress | None, what: str) -> experiment.Progre
 
 
 def _load(
-    scenario: Path, loading: Loading, controller: str, options: dict, out: Path, workers: int,
-    progress: experiment.Progress | None,
+    scenario: Path, loading: Loading, controller: str, options: dict, *, out: Path, workers: int,
+    source: Source | None, progress: experiment.Progress | None,
 ) -> list[Result]:
     """The loading runs of one controller at all levels, those that are kept or new ones."""
     plan = [
         (out / f"level-{level:g}", Task(
             scenario=scenario, controller=controller, seed=seed, demand_factor=level, options=tuple(options.items())))
         for level in loading.levels for seed in loading.seeds]
-    failures = experiment.perform(plan, workers=workers, progress=progress, tell=lambda line: None)
+    failures = experiment.perform(plan, workers=workers, source=source, progress=progress, tell=lambda line: None)
     if failures:
         raise ended([(experiment.label(task), failure) for task, failure in failures])
     return [experiment.read_run(folder, controller, task.seed) for folder, task in plan]

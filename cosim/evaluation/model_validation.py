@@ -87,7 +87,7 @@ def errors(scenario: Scenario, result: Result, predicted: Trajectory) -> list[di
     simulated = result.trajectory.accumulation.sum(-1)
     whole = predicted.accumulation.sum(-1) - simulated
     ahead = predict_next(scenario, result) - simulated[1:]
-    critical = np.array([m.critical for m in scenario.network.mfds])
+    critical = scenario.network.critical
     rows = [
         _row(i, scenario.network.region_names[i], critical[i], simulated[:, i], whole[:, i], ahead[:, i])
         for i in range(scenario.network.regions)]

@@ -23,10 +23,12 @@ from nmfd.studies import fit_quality
 
 COLUMNS = (
     "demand", "controller", "runs", "model", "region", "critical_veh", "most_share", "next_interval_rmse_share",
-    "next_interval_persistence_rmse_share", "ahead_s", "ahead_rmse_share", "ahead_persistence_rmse_share")
+    "next_interval_corrected_rmse_share", "next_interval_persistence_rmse_share", "ahead_s", "ahead_rmse_share",
+    "ahead_corrected_rmse_share", "ahead_persistence_rmse_share")
 CAPTION = (
     "RMSE of the predicted accumulation, predicted from every recorded state under the recorded departures and "
-    "controls, as a share of the region's critical accumulation, mean of the regions; if nothing changed: of the "
+    f"controls, as a share of the region's critical accumulation, mean of the regions; {fit_quality.CORRECTED}; if "
+    "nothing changed: of the "
     "prediction that every region keeps what it holds; most: the largest accumulation "
     "of any region in any of the runs, as a share of its critical one")
 
@@ -37,7 +39,8 @@ class ModelError:
 
     model: the folder of its network; critical: (R,) [veh]; most: (R,) [-], the largest accumulation in the runs, as a
     share of the critical one; errors: (2, R) [-], RMSE one control interval and `ahead` [s] ahead, as such a share;
-    persistence: (2, R) [-], the same if nothing changed
+    corrected: (2, R) [-], the same with the model's disturbance, NaN without; persistence: (2, R) [-], if nothing
+    changed
     """
 
     demand: float
@@ -48,6 +51,7 @@ class ModelError:
     most: PerRegion
     ahead: float
     errors: Float[np.ndarray, "2 R"]
+    corrected: Float[np.ndarray, "2 R"]
     persistence: Float[np.ndarray, "2 R"]
 
 
@@ -70,12 +74,12 @@ def _of(
     seen = [observed(result) for result in results]
     found = fit_quality.predictions(network, seen, {
         "step": scenario.step, "substeps": scenario.substeps, "integrator": scenario.integrator})
-    critical = np.array([curve.critical for curve in network.mfds])
+    critical = network.critical
     return ModelError(
         demand=demand, controller=controller, runs=len(results), critical=critical,
         model=network.folder and Path(os.path.normpath(network.folder)),
         most=np.max([run.accumulation.sum(axis=2).max(axis=0) for run in seen], axis=0) / critical,
-        ahead=found.ahead, errors=found.model, persistence=found.persistence)
+        ahead=found.ahead, errors=found.model, corrected=found.corrected, persistence=found.persistence)
 
 
 def foresight_table(foresights: Sequence[ModelError]) -> str:
@@ -84,8 +88,10 @@ def foresight_table(foresights: Sequence[ModelError]) -> str:
         "demand": f"{one.demand:g}", "controller": one.controller, "runs": one.runs,
         "model": one.model.name if one.model else "", "most": f"{one.most.max():.1f}",
         "next interval": f"{100 * one.errors[0].mean():.1f} %",
+        "corrected": fit_quality.percent(one.corrected[0].mean()),
         "if nothing changed": f"{100 * one.persistence[0].mean():.1f} %",
         "later": f"{100 * one.errors[1].mean():.1f} % ({one.ahead:g} s)",
+        "corrected ": fit_quality.percent(one.corrected[1].mean()),
         "if nothing changed ": f"{100 * one.persistence[1].mean():.1f} %"} for one in foresights], CAPTION)
 
 
@@ -93,7 +99,7 @@ def write_foresights(path: Path, foresights: Sequence[ModelError]) -> None:
     """COLUMNS as a table, one row per strategy, demand level and region."""
     rows = [
         (one.demand, one.controller, one.runs, one.model, region, one.critical[region], one.most[region],
-         one.errors[0, region], one.persistence[0, region], one.ahead, one.errors[1, region],
-         one.persistence[1, region])
+         one.errors[0, region], one.corrected[0, region], one.persistence[0, region], one.ahead,
+         one.errors[1, region], one.corrected[1, region], one.persistence[1, region])
         for one in foresights for region in range(len(one.critical))]
     files.write_table(path, pd.DataFrame(rows, columns=COLUMNS), float_format="%.6g")

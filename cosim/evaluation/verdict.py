@@ -19,7 +19,7 @@ def of_runs(network: RegionalModel, results: Sequence[Result]) -> Verdict:
     """Of the city of `network`, by runs in which no gateway was closed."""
     built = ensure_built(network)
     city = load_city(built.net_file, built.regions_csv, network.regions)
-    critical = np.array([mfd.critical for mfd in network.mfds])
+    critical = network.critical
     most = np.max([result.trajectory.accumulation.sum(axis=2).max(axis=0) for result in results], axis=0) / critical
     started = np.sum([result.record["departures"].sum(axis=(0, 2)) for result in results], axis=0)
     where = f"in {len(results)} loading run{'s' * (len(results) > 1)} under {results[0].trajectory.controller}"

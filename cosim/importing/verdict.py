@@ -34,7 +34,7 @@ def of_import(
     for (way, _), vehicles in baseline.ways.items():
         if way:
             started[regions[way[0]]] += vehicles
-    critical = np.array([mfd.critical for mfd in network.mfds])
+    critical = network.critical
     return authority.verdict(
         network, boundaries, most=held.max(axis=0) / critical, started=started, where="in the run without control")
 

@@ -245,7 +245,7 @@ class SumoPlant:
         if chosen.metering_first == SHORT:
             way = np.array([sum(city.length[edge] / city.speed[edge] for edge in route) for route in trips.routes])
         return Metering(
-            self.session, trips, np.array([mfd.critical for mfd in network.mfds]), level=chosen.metering_level,
+            self.session, trips, network.critical, level=chosen.metering_level,
             step=self._scenario.step, way=way)
 
     def _new_sensing(self, seed: int) -> Sensing:

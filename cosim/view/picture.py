@@ -90,7 +90,7 @@ class CityPicture:
             outlines=rings_round(shapes, np.ones(len(shapes), dtype=bool), region, BLOCKS),
             places=np.stack([middles[region == r].mean(axis=0) for r in range(city.regions)]),
             gates=_gates(city, dict(zip(city.edges, shapes, strict=True))),
-            critical=np.array([mfd.critical for mfd in network.mfds]),
+            critical=network.critical,
             curves=[_curve(mfd.critical, mfd.jam, mfd.outflow) for mfd in network.mfds],
             step=scenario.step, steps=scenario.steps, low=network.u_min, high=network.u_max)
 

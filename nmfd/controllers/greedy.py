@@ -18,7 +18,7 @@ class Greedy:
 
     def __init__(self, planning: PlanningModel):
         network = planning.network
-        self._critical = np.array([mfd.critical for mfd in network.mfds])
+        self._critical = network.critical
         self._jam = np.array([mfd.jam for mfd in network.mfds])
         self._open = np.where(network.adjacency, network.u_max, 0.0)
         self._closed = np.where(network.adjacency, network.u_min, 0.0)

@@ -17,10 +17,11 @@ import torch
 from jaxtyping import Float, Real
 
 from nmfd.arrays import PairsOverTime, StatesOverTime, TurnsOverTime
-from nmfd.model import dynamics
+from nmfd.model import disturbance, dynamics
+from nmfd.model.disturbance import LOOK, Disturbance
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
-from nmfd.tensors import PerPair
+from nmfd.tensors import PerPair, PerRegion
 from nmfd.threads import one_thread
 
 HORIZON = 10         # control intervals
@@ -125,7 +126,7 @@ def fit(
         model = _Model(network, runs, step, substeps / step)
         horizon = min(HORIZON, max(len(run.demand) for run in runs))
         data, scheme = windows(runs, horizon), {"step": step, "substeps": substeps, "integrator": integrator}
-        scale = torch.tensor([mfd.critical for mfd in network.mfds], dtype=torch.float32)
+        scale = torch.tensor(network.critical, dtype=torch.float32)
         off_diagonal = 1.0 - torch.eye(network.regions)
         optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
         for iteration in range(iterations):
@@ -140,6 +141,49 @@ def fit(
             if progress:
                 progress(iteration + 1, iterations, f"misfit {loss.item():.3f}")
         return _network(network, model, runs, off_diagonal)
+
+
+def fit_disturbance(
+    network: RegionalModel, runs: Sequence[Observed], *, step: float, substeps: int = 1, integrator: str = "euler",
+    iterations: int = ITERATIONS // 4, seed: int = 0,
+) -> RegionalModel:
+    """`network` with the disturbance (nmfd.model.disturbance) that corrects its predictions of `runs` best; as it is
+    where no run is long enough."""
+    horizon = min(HORIZON, max(len(run.demand) for run in runs) - LOOK)
+    if horizon < 1:
+        return network
+    with one_thread():
+        generator = torch.Generator().manual_seed(seed)
+        free = torch.nn.Parameter(torch.tensor([1.0, 1.0, 2.0, 0.5]))
+        p = dynamics.parameters(network, dtype=torch.float32)
+        scale = torch.tensor(network.critical, dtype=torch.float32)
+        data, scheme = windows(runs, horizon + LOOK), {"step": step, "substeps": substeps, "integrator": integrator}
+        optimizer = torch.optim.Adam([free], lr=LEARNING_RATE)
+        for _ in range(iterations):
+            chosen = torch.randint(len(data[0]), (min(BATCH, len(data[0])),), generator=generator)
+            part = [values[chosen] for values in data]
+            loss = _misfit(p, corrected(_law(free), p, part, scale, scheme), scale, scheme)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        return replace(network, disturbance=Disturbance(*(float(value) for value in _law(free.detach()))))
+
+
+def _law(free: torch.Tensor) -> Disturbance:
+    """Of four free numbers."""
+    return Disturbance(torch.sigmoid(free[0]), torch.sigmoid(free[1]), free[2], free[3])
+
+
+def corrected(
+    law: Disturbance, p: dynamics.Parameters, data: Sequence[torch.Tensor], critical: PerRegion,
+    scheme: Mapping[str, Any],
+) -> list[torch.Tensor]:
+    """`windows` without their first LOOK intervals, whose innovations correct the demand of the others."""
+    foreseen, step = dynamics.advance(p, *(part[:, :LOOK] for part in data), **scheme), scheme["step"]
+    estimate = disturbance.estimated(law, (data[0][:, 1:LOOK + 1] - foreseen) / step)
+    observed, demand, perimeter, splits = (part[:, LOOK:] for part in data)
+    added = disturbance.ahead(law, estimate, observed[:, 0], critical, demand.shape[1], step)
+    return [observed, demand + added, perimeter, splits]
 
 
 def windows(runs: Sequence[Observed], horizon: int) -> list[torch.Tensor]:
@@ -191,16 +235,22 @@ def _network(
 
 def prediction_errors(
     network: RegionalModel, runs: Sequence[Observed], intervals: int, *, step: float, substeps: int = 1,
-    integrator: str = "euler",
+    integrator: str = "euler", law: Disturbance | None = None,
 ) -> Float[np.ndarray, "N R"]:
-    """(N, R) [veh]: predicted minus observed accumulation, `intervals` ahead of every observed state of `runs`."""
+    """(N, R) [veh]: predicted minus observed accumulation, `intervals` ahead of every observed state of `runs`.
+
+    law: corrected by this disturbance, from every state with LOOK intervals before it
+    """
     p = dynamics.parameters(network, dtype=torch.float32)
-    observed, demand, perimeter, splits = windows(runs, intervals)
-    x = observed[:, 0]
+    scheme: dict = {"step": step, "substeps": substeps, "integrator": integrator}
     with torch.no_grad():
+        data = windows(runs, intervals + (0 if law is None else LOOK))
+        if law is not None:
+            data = corrected(law, p, data, torch.tensor(network.critical, dtype=torch.float32), scheme)
+        observed, demand, perimeter, splits = data
+        x = observed[:, 0]
         for k in range(intervals):
-            x = dynamics.advance(
-                p, x, demand[:, k], perimeter[:, k], splits[:, k], step, substeps=substeps, integrator=integrator)
+            x = dynamics.advance(p, x, demand[:, k], perimeter[:, k], splits[:, k], **scheme)
     return (x - observed[:, -1]).sum(-1).numpy()
 
 
@@ -214,7 +264,7 @@ def prediction_shares(
 ) -> Float[np.ndarray, "L R"]:
     """(len(intervals), R) [-]: RMSE of `prediction_errors`, as a share of the critical accumulation."""
     errors = [prediction_errors(network, runs, n, **scheme) for n in intervals]
-    return np.sqrt([(error**2).mean(axis=0) for error in errors]) / [curve.critical for curve in network.mfds]
+    return np.sqrt([(error**2).mean(axis=0) for error in errors]) / network.critical
 
 
 def persistence_shares(
@@ -225,4 +275,4 @@ def persistence_shares(
     for n in intervals:
         states = [run.accumulation.sum(axis=2) for run in runs if len(run.demand) >= n]
         errors.append(np.concatenate([state[:-n] - state[n:] for state in states]))
-    return np.sqrt([(error**2).mean(axis=0) for error in errors]) / [curve.critical for curve in network.mfds]
+    return np.sqrt([(error**2).mean(axis=0) for error in errors]) / network.critical

@@ -24,6 +24,9 @@ def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) 
     out.write(f"# {comment}\nname = {quoted(network.name)}\n")
     out.write("placeholder = true\n\n" if network.placeholder else "\n")
     out.write(f"[perimeter]\nmin = {network.u_min:g}\nmax = {network.u_max:g}\n")
+    if network.disturbance is not None:
+        law = network.disturbance._asdict().items()
+        out.write("\n[disturbance]\n" + "".join(f"{key} = {value:.4g}\n" for key, value in law))
     if sumo:
         out.write("\n[sumo]\n" + "".join(f"{key} = {quoted(value)}\n" for key, value in sumo.items()))
     for region in range(network.regions):

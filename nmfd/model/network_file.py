@@ -4,6 +4,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
+from nmfd.model.disturbance import Disturbance
 from nmfd.model.mfd import Mfd
 from nmfd.runs import config
 from nmfd.runs.config import Problem, Regions, Rows, Settings, Share, got, setting
@@ -92,6 +93,21 @@ class SplitsTable(Settings):
     share: Annotated[config.Numbers, Field(min_length=1)] = setting("of the drivers, for each of next; sum 1", unit="-")
 
 
+class DisturbanceTable(Settings):
+    """How what the model got wrong lately says what it will get wrong next (nmfd.model.disturbance)."""
+
+    gain: float = setting("how much of it is believed", unit="-", ge=0.0, le=2.0)
+    memory: Share = setting("weight of an interval beside that of the next one")
+    fade_critical: float = setting(
+        "logit of how much of it is left after an interval, in a region at its critical accumulation", unit="-")
+    fade_slope: float = setting("how much that rises per critical accumulation", unit="-")
+
+    @property
+    def law(self) -> Disturbance:
+        """The numbers."""
+        return Disturbance(**vars(self))
+
+
 class NetworkTable(Settings):
     """The regional model of a city."""
 
@@ -102,6 +118,8 @@ class NetworkTable(Settings):
     mfd: MfdTable | None = setting("of every region without one of its own", None)
     regions: Rows[RegionTable] = setting("one table per region", min_length=1)
     observed_split_ratios: Rows[SplitsTable] = setting("one table per region and destination", ())
+    disturbance: DisturbanceTable | None = setting(
+        "for predictions that are offset-free; cosim identify finds it", None)
     sumo: dict[str, Any] = setting("the city to simulate, for cosim", {})
 
     def mfd_of(self, row: RegionTable) -> Mfd:

@@ -12,6 +12,7 @@ from scipy.sparse import csgraph, csr_array
 
 from nmfd.arrays import Adjacency, Hops, PerPair, PerRegion, PerTurn, Positions, TurnMask
 from nmfd.errors import InputError
+from nmfd.model.disturbance import Disturbance
 from nmfd.model.mfd import Mfd
 from nmfd.model.network_file import NetworkTable, RegionTable
 from nmfd.runs import config, shipped
@@ -42,6 +43,7 @@ class RegionalModel:
         share of the flow that wishes to pass, however little that is
     storage: (R,) [veh], the accumulation that leaves no room for vehicles from other regions; with `capacity`
     controllable: (R, R) [-], [i, h]: share of the flow from i to h that passes signals under control; None if unknown
+    disturbance: how what the model got wrong lately says what it will get wrong; None if unknown
     placeholder: whether the MFDs are a guess that no run has measured
     doubts: of every region, what is doubtful about its fit; () if unknown
     folder: where network.toml was, or None
@@ -59,6 +61,7 @@ class RegionalModel:
     capacity: PerPair | None = None
     storage: PerRegion | None = None
     controllable: PerPair | None = None
+    disturbance: Disturbance | None = None
     placeholder: bool = False
     doubts: tuple[tuple[str, ...], ...] = ()
     folder: Path | None = None
@@ -67,6 +70,11 @@ class RegionalModel:
     def regions(self) -> int:
         """R."""
         return len(self.region_names)
+
+    @property
+    def critical(self) -> PerRegion:
+        """(R,) [veh]: the critical accumulations."""
+        return np.array([mfd.critical for mfd in self.mfds])
 
     @cached_property
     def hops(self) -> Hops:
@@ -161,6 +169,7 @@ def load_network(folder: Path | str) -> RegionalModel:
         exit_rates=None if rows[0].exit_rates is None else np.array([row.exit_rates for row in rows]),
         capacity=capacity, storage=None if rows[0].storage is None else np.array([row.storage for row in rows]),
         controllable=controllable, placeholder=table.placeholder, folder=folder,
+        disturbance=None if table.disturbance is None else table.disturbance.law,
         doubts=tuple(row.doubts for row in rows) if any(row.doubts for row in rows) else ())
     _check_ways(network, path)
     return network

@@ -41,7 +41,7 @@ class Interface:
         self._network = network
         chosen = np.arange(network.regions) if regions is None else np.array(regions)
         self._chosen, self._all = chosen, regions is None
-        self._critical = np.array([mfd.critical for mfd in network.mfds])
+        self._critical = network.critical
         mine = np.isin(np.arange(network.regions), chosen)
         self._boundaries = np.nonzero(network.adjacency & mine[:, None])
         choice = network.split_mask & (network.split_mask.sum(axis=1, keepdims=True) > 1) & mine[:, None, None]
@@ -143,7 +143,7 @@ class Episode:
         """What the city is in."""
         if self._drawing is None:
             network = self.scenario.network
-            critical = np.array([mfd.critical for mfd in network.mfds])
+            critical = network.critical
             places, streets = self._shown() if self._shown else (network.positions, ())
             self._drawing = CityDrawing(places, network.adjacency, critical, streets)
         state = self._state

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from nmfd.arrays import Points, StatesOverTime
 from nmfd.model import identification
+from nmfd.model.disturbance import LOOK
 from nmfd.model.identification import Observed
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files
@@ -21,6 +22,7 @@ BINS = 12        # of accumulation, for the hysteresis
 EXPLAINED = 0.3  # R2: below, the curve says hardly more than the mean outflow
 FALL = 0.05      # of the largest outflow: if it falls less up to the jam accumulation, it does not fall
 AHEAD = 900.0    # s, of the longer prediction that is judged
+CORRECTED = "corrected: by what the model got wrong in the control intervals just before"
 FEW, POOR, SHORT, ENDLESS, ALONE = "few samples", "R2", "not reached", "no falling branch", "one seed"
 MEANINGS = {  # beginning of a doubt -> what it means, and what would help
     FEW: f"fewer than {SAMPLES} samples, the MFD stays what it was before; higher --levels would load the region",
@@ -155,21 +157,26 @@ def meanings(doubts: Sequence[str], known: Mapping[str, str] = MEANINGS) -> list
 
 @dataclass(frozen=True, kw_only=True)
 class Predictions:
-    """RMSE as shares of the critical accumulation, (2, R): one control interval and `ahead` [s] ahead, of the model and
+    """RMSE as shares of the critical accumulation, (2, R): one control interval and `ahead` [s] ahead, of the model, of
+    the model corrected by its disturbance (nmfd.model.disturbance), NaN where it has none or no run is long enough, and
     of persistence, which says that nothing changes."""
 
     step: float
     ahead: float
     model: Float[np.ndarray, "2 R"]
+    corrected: Float[np.ndarray, "2 R"]
     persistence: Float[np.ndarray, "2 R"]
 
 
 def predictions(network: RegionalModel, runs: Sequence[Observed], scheme: dict) -> Predictions:
     """Of `network` in `runs`. scheme: step, substeps and integrator"""
     intervals = identification.intervals_within(AHEAD, scheme["step"], runs)
+    model, law = identification.prediction_shares(network, runs, (1, intervals), **scheme), network.disturbance
+    long_enough = law is not None and max(len(run.demand) for run in runs) >= intervals + LOOK
     return Predictions(
-        step=scheme["step"], ahead=intervals * scheme["step"],
-        model=identification.prediction_shares(network, runs, (1, intervals), **scheme),
+        step=scheme["step"], ahead=intervals * scheme["step"], model=model,
+        corrected=identification.prediction_shares(network, runs, (1, intervals), law=law, **scheme)
+        if long_enough else np.full_like(model, np.nan),
         persistence=identification.persistence_shares(network, runs, (1, intervals)))
 
 
@@ -177,14 +184,19 @@ def prediction_table(network: RegionalModel, held_out: Sequence[Observed], schem
     """RMSE of the accumulation one control interval and AHEAD seconds ahead, in runs that the fit did not see."""
     found = predictions(network, held_out, scheme)
     heads = [f"{ahead:g} s ahead" for ahead in (found.step, found.ahead)]
-    columns = np.stack([found.model[0], found.persistence[0], found.model[1], found.persistence[1]], axis=1)
+    columns = np.stack([part[n] for n in (0, 1) for part in (found.model, found.corrected, found.persistence)], axis=1)
     names = [f"{region} {name}" for region, name in enumerate(network.region_names)]
     return text_table(
-        [dict(zip(("region", heads[0], "if nothing changed", heads[1], "if nothing changed "),
-                  (name, *(f"{100 * value:.1f} %" for value in row)), strict=True))
+        [dict(zip(("region", heads[0], "corrected", "if nothing changed", heads[1], "corrected ",
+                   "if nothing changed "), (name, *map(percent, row)), strict=True))
          for name, row in zip([*names, "mean"], [*columns, columns.mean(axis=0)], strict=True)],
         "RMSE of the accumulation in percent of the critical one, in the runs of the last seed, by a fit without them; "
-        "if nothing changed: of the prediction that every region keeps what it holds")
+        f"{CORRECTED}; if nothing changed: of the prediction that every region keeps what it holds")
+
+
+def percent(share: float) -> str:
+    """As text; "-" where it is unknown."""
+    return "-" if np.isnan(share) else f"{100 * share:.1f} %"
 
 
 def write_fits(path: Path, fits: Sequence[RegionFit], found: Predictions | None) -> None:
@@ -192,7 +204,7 @@ def write_fits(path: Path, fits: Sequence[RegionFit], found: Predictions | None)
     rows = []
     for fit in fits:
         row = asdict(fit) | {"doubts": "; ".join(fit.doubts)}
-        for part in ("model", "persistence"):
+        for part in ("model", "corrected", "persistence"):
             for n, when in enumerate(("next_interval", "ahead")):
                 row[f"held_out_{when}_{part}_rmse_share"] = (
                     float("nan") if found is None else float(getattr(found, part)[n, fit.region]))
