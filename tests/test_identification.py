@@ -159,6 +159,31 @@ def test_shares_are_errors_over_the_critical_accumulation(scenario, runs):
     assert (shares[1] > shares[0]).all() and shares[0].min() > 0.0
 
 
+def test_that_nothing_changes_is_a_prediction_too(scenario, runs):
+    """One vehicle more in every interval, and one run that is too short for two intervals."""
+    growing = np.zeros((5, 7, 7))
+    growing[:, 2, 4] = np.arange(5.0)
+    run = Observed(**{**vars(first_of(runs[0], 4)), "accumulation": growing})
+    shares = identification.persistence_shares(scenario.network, [run, first_of(run, 1)], (1, 2))
+    expected = np.zeros((2, 7))
+    expected[:, 2] = np.array([1.0, 2.0]) / scenario.network.critical[2]
+    np.testing.assert_allclose(shares, expected)
+
+
+@pytest.mark.parametrize("by_origin", [True, False])
+def test_what_a_fit_makes_small(scenario, runs, by_origin):
+    """Errors that cancel out in their regions count by destination only; far ones linearly."""
+    p, scheme = dynamics.parameters(scenario.network, dtype=torch.float32), {"step": 30.0}
+    observed, *rest = identification.windows(runs[:1], 2)
+    missed, scale = torch.zeros(7, 7), torch.full((7,), 50.0)
+    missed[1, 3], missed[(1, 5) if by_origin else (5, 3)] = 100.0, -100.0
+    wrong = observed.clone()
+    wrong[:, 1:] += missed
+    far = (2.0 - 0.5 * identification.OUTLIER) * 2.0  # two errors of twice the scale
+    found = identification._misfit(p, [wrong, *rest], scale, scheme)
+    assert found == pytest.approx(identification.BY_DESTINATION * far / 49 + (0.0 if by_origin else far / 7), rel=1e-3)
+
+
 def test_the_sign_of_a_prediction_error(scenario, runs):
     """Predicted minus observed: who lets nobody out predicts too many vehicles."""
     stuck = replace(scenario.network, mfds=tuple(

@@ -8,7 +8,7 @@ Identification, 1999, ch. 7; output error over a finite horizon).
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -201,13 +201,22 @@ def _misfit(
     p: dynamics.Parameters, data: Sequence[torch.Tensor], scale: torch.Tensor, scheme: Mapping[str, Any],
 ) -> torch.Tensor:
     """The mean Huber loss of the errors of x_i and x_ij over the horizon, in units of `scale` (R,) [veh]."""
+    total, horizon = torch.zeros(()), data[1].shape[1]
+    for k, x in enumerate(_foreseen(p, data, scheme), start=1):
+        error = (x - data[0][:, k]) / scale.unsqueeze(-1)
+        total = total + _huber(error.sum(-1)) + BY_DESTINATION * _huber(error)
+    return total / horizon
+
+
+def _foreseen(
+    p: dynamics.Parameters, data: Sequence[torch.Tensor], scheme: Mapping[str, Any],
+) -> Iterator[torch.Tensor]:
+    """(N, R, R) [veh] after every interval of `windows`, from their first states on."""
     observed, demand, perimeter, splits = data
-    x, total = observed[:, 0], 0.0
+    x = observed[:, 0]
     for k in range(demand.shape[1]):
         x = dynamics.advance(p, x, demand[:, k], perimeter[:, k], splits[:, k], **scheme)
-        error = (x - observed[:, k + 1]) / scale.unsqueeze(-1)
-        total = total + _huber(error.sum(-1)) + BY_DESTINATION * _huber(error)
-    return total / demand.shape[1]
+        yield x
 
 
 def _huber(error: torch.Tensor) -> torch.Tensor:
@@ -247,11 +256,8 @@ def prediction_errors(
         data = windows(runs, intervals + (0 if law is None else LOOK))
         if law is not None:
             data = corrected(law, p, data, torch.tensor(network.critical, dtype=torch.float32), scheme)
-        observed, demand, perimeter, splits = data
-        x = observed[:, 0]
-        for k in range(intervals):
-            x = dynamics.advance(p, x, demand[:, k], perimeter[:, k], splits[:, k], **scheme)
-    return (x - observed[:, -1]).sum(-1).numpy()
+        *_, last = _foreseen(p, data, scheme)
+    return (last - data[0][:, -1]).sum(-1).numpy()
 
 
 def intervals_within(ahead: float, step: float, runs: Sequence[Observed]) -> int:
@@ -263,16 +269,17 @@ def prediction_shares(
     network: RegionalModel, runs: Sequence[Observed], intervals: Sequence[int], **scheme: Any,
 ) -> Float[np.ndarray, "L R"]:
     """(len(intervals), R) [-]: RMSE of `prediction_errors`, as a share of the critical accumulation."""
-    errors = [prediction_errors(network, runs, n, **scheme) for n in intervals]
-    return np.sqrt([(error**2).mean(axis=0) for error in errors]) / network.critical
+    return _shares(network, [prediction_errors(network, runs, n, **scheme) for n in intervals])
 
 
 def persistence_shares(
     network: RegionalModel, runs: Sequence[Observed], intervals: Sequence[int],
 ) -> Float[np.ndarray, "L R"]:
     """(len(intervals), R) [-]: as `prediction_shares`, of the prediction that nothing changes."""
-    errors = []
-    for n in intervals:
-        states = [run.accumulation.sum(axis=2) for run in runs if len(run.demand) >= n]
-        errors.append(np.concatenate([state[:-n] - state[n:] for state in states]))
+    states = [run.accumulation.sum(axis=2) for run in runs]
+    return _shares(network, [np.concatenate([state[:-n] - state[n:] for state in states]) for n in intervals])
+
+
+def _shares(network: RegionalModel, errors: Sequence[Float[np.ndarray, "_ R"]]) -> Float[np.ndarray, "L R"]:
+    """(len(errors), R) [-]: root mean squares, as a share of the critical accumulation."""
     return np.sqrt([(error**2).mean(axis=0) for error in errors]) / network.critical
