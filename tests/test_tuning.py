@@ -15,7 +15,7 @@ from cosim.cli.main import main
 from cosim.evaluation import experiment, frontier, tuning
 from cosim.evaluation.simulate import FACTS, Result
 from nmfd.errors import InputError
-from nmfd.runs import config
+from nmfd.runs import config, trail
 from nmfd.runs.workers import Failure
 
 ROOT = Path(__file__).parents[1]
@@ -189,6 +189,42 @@ def test_the_frontier_ends_where_nobody_is_served(city, tmp_path, demanded):
     kept = len(demanded)
     assert CliRunner().invoke(main, [*arguments, "--everything"]).exit_code == 0
     assert demanded[kept:] == [("max-pressure", 2.0)] * 4
+
+
+def test_rows_of_an_earlier_table_count_too(city, tmp_path, demanded):
+    """Of runs that are not kept any more: not run again where they are asked for, and named in the trail."""
+    def invoke(name, demand, *more):
+        return CliRunner().invoke(main, [
+            "frontier", str(city), "--controllers", "pi-gating", "--demand", demand, "--seeds", "4", "--steps", "1",
+            "--out", str(tmp_path / name), *more])
+
+    assert invoke("before", "1").exit_code == 0
+    before = tmp_path / "before" / "runs.csv"
+    done = invoke("after", "1.5", "--earlier", str(before))
+    assert done.exit_code == 0, done.output + str(done.exception)
+    before.unlink()  # a copy is kept
+    assert invoke("after", "2").exit_code == 0
+    table = pd.read_csv(tmp_path / "after" / "frontier.csv")
+    assert table["demand"].to_list() == [1.0, 1.5, 2.0] and table["served_runs"].to_list() == [4, 2, 4]
+    assert len(pd.read_csv(tmp_path / "after" / "runs.csv")) == 12 and len(demanded) == 12
+    found = trail.read(tmp_path / "after" / "frontier.csv")
+    assert {place for place in found["hashes"]} == {"demand-1", "demand-1.5", "demand-2"}
+    (kept,) = (tmp_path / "after" / "earlier").iterdir()
+    assert found["runs"] == [*trail.of_runs(tmp_path / "after")["runs"], *trail.read(kept)["runs"]]
+
+
+@pytest.mark.parametrize("old, new, said", [
+    ('""demand_hash"":""', '""demand_hash"":""0', "demand-1 demand_hash (0"),
+    ("demand,controller", "level,controller", "is no table of runs")])
+def test_a_table_of_other_runs_is_refused(city, tmp_path, demanded, old, new, said):
+    arguments = ["frontier", str(city), "--controllers", "pi-gating", "--demand", "1", "--seeds", "1", "--steps", "1",
+                 "--out", str(tmp_path / "out")]
+    assert CliRunner().invoke(main, arguments).exit_code == 0
+    other = tmp_path / "other.csv"
+    other.write_text((tmp_path / "out" / "runs.csv").read_text().replace(old, new))
+    done = CliRunner().invoke(main, [*arguments, "--earlier", str(other)])
+    assert done.exit_code == 2 and f"{other}: " in done.output and said in done.output
+    assert not (tmp_path / "out" / "earlier").exists()
 
 
 def test_the_interval_of_a_share_is_never_empty():

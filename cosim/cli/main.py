@@ -12,7 +12,7 @@ from cosim.cli.city import identify, import_
 from cosim.cli.compete import compete
 from cosim.cli.demo import demo
 from cosim.cli.get import get
-from cosim.cli.options import CONTROLLER_HELP, REFERENCE, chosen_scheduler, scheduler_options, tell
+from cosim.cli.options import CONTROLLER_HELP, EARLIER, REFERENCE, chosen_scheduler, scheduler_options, tell
 from cosim.cli.reference import reference
 from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
@@ -53,6 +53,7 @@ def main() -> None:
 @controllers_option("Separated by commas. " + CONTROLLER_HELP)
 @declared("cosim.evaluation.settings:Evaluation", "seeds", "first_seed", "demand")
 @REFERENCE
+@EARLIER
 @POLICIES
 @declared("cosim.evaluation.settings:Evaluation", "workers", instead="one per core")
 @scheduler_options
@@ -61,9 +62,9 @@ def main() -> None:
 @out_option("evaluate", "The folder.")
 def evaluate(
     scenario: Path, controllers: str, seeds: int, first_seed: int, demand: tuple[float, ...], reference: str | None,
-    policies: tuple[str, ...], workers: int | None, scheduler: str | None, scheduler_ca: Path | None,
-    scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None, own_time_limit: float | None,
-    out: Path | None,
+    earlier: tuple[Path, ...], policies: tuple[str, ...], workers: int | None, scheduler: str | None,
+    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None,
+    own_time_limit: float | None, out: Path | None,
 ) -> None:
     """Compare controllers in the microsimulation over seeds and demand levels; print and write tables, draw figures.
 
@@ -90,14 +91,14 @@ def evaluate(
     chosen = evaluate.Evaluation(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
         levels=demand, steps=steps, policies=files, reference=reference, time_limit=own_time_limit,
-        out=Path("runs") / f"{file_name(loaded.name)}-evaluate" if out is None else out)
+        earlier=earlier, out=Path("runs") / f"{file_name(loaded.name)}-evaluate" if out is None else out)
     workers = cores() if workers is None else workers
     with resumable("evaluate", chosen.out) as progress:
         table, failures = evaluate.evaluate(
             chosen, workers=workers, scheduler=cluster, progress=progress, tell=tell)
         if len(table):
             pictures.draw_all(
-                chosen.out, evaluate.level_folders(chosen.out), loaded, evaluate.all_runs(chosen))
+                chosen.out, evaluate.level_folders(chosen.out), loaded, evaluate.kept_runs(chosen))
     if len(table):
         click.echo(statistics.text(table, reference))
         click.echo(f"Written to {chosen.out}: see evaluate.md, pairs.csv and the pictures")

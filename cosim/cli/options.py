@@ -26,6 +26,10 @@ RUNS = click.option(
     "--runs", type=FOLDER, multiple=True, metavar="DIR",
     help="Finished runs of the same city that the model is fitted to besides, a folder of cosim run or evaluate: at a "
          "demand at which the loading runs lock, those under a gate say more. May be repeated.")
+EARLIER = click.option(
+    "--earlier", type=FILE, multiple=True, metavar="FILE",
+    help="The runs.csv of an earlier evaluation or frontier of the same city whose runs are not kept any more: its "
+         "rows are in the tables too. May be repeated.")
 REFERENCE = click.option(
     "--reference", metavar="NAME",
     help="Pair all controllers with this one too, besides no-control, or the first one if that is not there.")

@@ -7,7 +7,16 @@ from pathlib import Path
 
 import click
 
-from cosim.cli.options import CONTROLLER, CONTROLLER_HELP, POLICY, RUNS, chosen_scheduler, scheduler_options, tell
+from cosim.cli.options import (
+    CONTROLLER,
+    CONTROLLER_HELP,
+    EARLIER,
+    POLICY,
+    RUNS,
+    chosen_scheduler,
+    scheduler_options,
+    tell,
+)
 from nmfd.cli.declared import declared
 from nmfd.cli.options import (
     POLICIES,
@@ -126,14 +135,16 @@ def improve(
 @click.option("--everything", is_flag=True,
               help="Run every controller at every level, also beyond one at which it served all trips with no seed.")
 @POLICIES
+@EARLIER
 @declared("cosim.evaluation.settings:Range", "workers", instead="one per core")
 @scheduler_options
 @STEPS
 @out_option("frontier", "The folder.")
 def frontier(
     scenario: Path, controllers: str, demand: tuple[float, ...], seeds: int, first_seed: int, everything: bool,
-    policies: tuple[str, ...], workers: int | None, scheduler: str | None, scheduler_ca: Path | None,
-    scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None, out: Path | None,
+    policies: tuple[str, ...], earlier: tuple[Path, ...], workers: int | None, scheduler: str | None,
+    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None,
+    out: Path | None,
 ) -> None:
     """Find up to which demand every controller serves all trips: a picture, frontier.png, and a table.
 
@@ -157,7 +168,7 @@ def frontier(
 
     order = evaluate.Evaluation(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
-        levels=demand, steps=steps, policies=files,
+        levels=demand, steps=steps, policies=files, earlier=earlier,
         out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-frontier" if out is None else out)
     with resumable("frontier", order.out) as progress:
         table, failures = method.frontier(

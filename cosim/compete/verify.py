@@ -24,6 +24,7 @@ from cosim.compete import entry, run, task_set
 from cosim.compete.asked import Asked
 from cosim.compete.entry import Entry
 from cosim.evaluation import evaluate, experiment, results
+from cosim.evaluation.earlier import KEYS
 from cosim.evaluation.simulate import Task
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
@@ -39,8 +40,6 @@ ROUNDING = 1e-9  # as a share: what sums in another order may come to
 CLOCK = (  # columns and metrics that are wall times, or depend on them
     "evaluation_time_s", "control_step_ms_median", "control_step_ms_max", "late_decisions", "wall_time_s",
     "sumo_time_s", "overhead_share", "setup_time_s", "decision_ms_median", "decision_ms_max", "notes")
-
-KEYS = {"demand": float, "controller": str, "seed": int}  # of runs.csv
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,7 @@
 """The evaluation: controllers x seeds x demand levels in SUMO, paired by seed, with tables.
 
     <folder>/demand-<level>/    the run folder of a demand level (cosim.evaluation.experiment)
+    <folder>/earlier/           tables whose rows are in these (cosim.evaluation.earlier)
     <folder>/evaluate.md, evaluate.csv, pairs.csv, runs.csv    the tables (statistics), new after every run; in the
         first,  at the end, why (explain)
     what is drawn of a level lies in its folder, what is drawn across levels here (cosim.report.pictures)
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from cosim.evaluation import dask_cluster, experiment, explain, statistics
+from cosim.evaluation import dask_cluster, earlier, experiment, explain, statistics
 from cosim.evaluation.simulate import Task
 from nmfd.api import load_scenario
 from nmfd.errors import InputError, did_you_mean
@@ -26,7 +27,7 @@ class Evaluation:
     """scenario: its folder; controllers: strategies; levels: multiples of the scenario's demand; steps: control
     intervals, all if None; policies: controller -> file instead of the scenario's own; reference: a controller to
     pair with, besides no control; time_limit: of controllers of the user's own, instead of the scenario's; out: the
-    folder of the evaluation."""
+    folder of the evaluation; earlier: tables whose rows are added to it."""
 
     scenario: Path
     controllers: tuple[str, ...]
@@ -37,6 +38,7 @@ class Evaluation:
     policies: Mapping[str, Path] = field(default_factory=dict)
     time_limit: float | None = None
     reference: str | None = None
+    earlier: tuple[Path, ...] = ()
 
     def plan(self) -> list[tuple[Path, Task]]:
         """Every run with its run folder, seed by seed, so that whatever is finished compares like with like."""
@@ -58,6 +60,7 @@ def evaluate(
     """
     out = evaluation.out
     check_folder(out)
+    earlier.add(out, evaluation.earlier)
     known = {*evaluation.controllers, *all_runs(evaluation)["controller"]}
     if evaluation.reference is not None and evaluation.reference not in known:
         raise InputError(
@@ -71,7 +74,7 @@ def evaluate(
     if len(rows):
         table = statistics.write_tables(out, rows, evaluation.reference)
         scenario = load_scenario(evaluation.scenario)
-        why = explain.text(level_folders(out), scenario.network, rows)
+        why = explain.text(level_folders(out), scenario.network, kept_runs(evaluation))
         remarks = "".join(f"- {line}\n" for line in experiment.remarks(rows))
         files.write_text(
             out / "evaluate.md", "\n".join(filter(None, (
@@ -96,16 +99,22 @@ def level_folders(out: Path) -> dict[float, Path]:
     return dict(sorted(found.items()))
 
 
-def all_runs(evaluation: Evaluation) -> pd.DataFrame:
+def kept_runs(evaluation: Evaluation) -> pd.DataFrame:
     """`experiment.overview` of every demand level, with a column demand; controllers in the order asked for."""
     parts = []
     for level, folder in level_folders(evaluation.out).items():
         rows = experiment.overview(folder)
         rows.insert(0, "demand", level)
         parts.append(rows)
-    if not parts:
-        return pd.DataFrame(columns=["demand", "controller", "seed"])
-    rows = pd.concat(parts, ignore_index=True)
+    return _ordered(evaluation, pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=[*earlier.KEYS]))
+
+
+def all_runs(evaluation: Evaluation) -> pd.DataFrame:
+    """`kept_runs` and the rows of earlier tables."""
+    return _ordered(evaluation, earlier.joined(evaluation.out, kept_runs(evaluation)))
+
+
+def _ordered(evaluation: Evaluation, rows: pd.DataFrame) -> pd.DataFrame:
     names = list(dict.fromkeys([*evaluation.controllers, *rows["controller"]]))
     return rows.sort_values(
         ["demand", "controller", "seed"], ignore_index=True,

@@ -16,7 +16,7 @@ from dataclasses import replace
 import pandas as pd
 from scipy.stats import binomtest
 
-from cosim.evaluation import dask_cluster, experiment
+from cosim.evaluation import dask_cluster, earlier, experiment
 from cosim.evaluation.evaluate import Evaluation, all_runs, check_folder
 from cosim.evaluation.statistics import TTS
 from nmfd.runs import files, trail
@@ -43,6 +43,7 @@ def frontier(
     if no run went well.
     """
     check_folder(order.out)
+    earlier.add(order.out, order.earlier)
     failed: list[str] = []
     source = dask_cluster.source(scheduler, tell)
     left = list(order.controllers)

@@ -26,6 +26,7 @@ from nmfd.runs.provenance import provenance
 COLUMN = "trail"
 UNKNOWN = "unknown"
 WRITER = ("command", "commit", "dirty", "versions")
+EARLIER = "earlier"  # the folder beside a table that has tables whose rows are in it
 
 
 def session() -> dict:
@@ -34,19 +35,38 @@ def session() -> dict:
 
 
 def of(file: Path) -> dict:
-    """That of a file which is written now: beside the manifest of its runs, or above the folders of several levels."""
+    """That of a file which is written now: beside the manifest of its runs, or above the folders of several levels and
+    beside earlier tables."""
     here = session()
-    trail: dict = {key: here[key] for key in WRITER}
-    places = [file.parent] if (file.parent / "manifest.json").is_file() else sorted(file.parent.glob("demand-*"))
+    found = {key: here[key] for key in WRITER} | of_runs(file.parent)
+    for table in earlier(file.parent):
+        before = read(table)
+        for one in before.get("runs", ()):
+            _add(found.setdefault("runs", []), one)
+        for place, hashes in before.get("hashes", {}).items():
+            there = found.setdefault("hashes", {})
+            there[place] = {**hashes, **there.get(place, {})}
+    return found
+
+
+def of_runs(folder: Path) -> dict:
+    """`runs` and `hashes` of a run folder, or of those of several levels."""
+    found: dict = {}
+    places = [folder] if (folder / "manifest.json").is_file() else sorted(folder.glob("demand-*"))
     for place in places:
         with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):  # others complain of a manifest
             manifest = json.loads((place / "manifest.json").read_text(encoding="utf-8"))
             for one in manifest["sessions"]:
-                _add(trail.setdefault("runs", []), one)
+                _add(found.setdefault("runs", []), one)
             hashes = {**_hashes(manifest["configuration"]), **{
-                name: found for name, about in manifest["controllers"].items() if (found := _hashes(about))}}
-            trail.setdefault("hashes", {})[place.name if place != file.parent else "."] = hashes
-    return trail
+                name: about for name, of in manifest["controllers"].items() if (about := _hashes(of))}}
+            found.setdefault("hashes", {})[place.name if place != folder else "."] = hashes
+    return found
+
+
+def earlier(folder: Path) -> list[Path]:
+    """Tables whose runs are not there any more (cosim.evaluation.earlier)."""
+    return sorted((folder / EARLIER).glob("*.csv"))
 
 
 def _add(runs: list[dict], one: Mapping) -> None:

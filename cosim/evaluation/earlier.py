@@ -1,0 +1,64 @@
+"""Tables of earlier evaluations whose run folders are not there any more, beside the runs that are.
+
+    <folder>/earlier/<hash>.csv    copies of their runs.csv, with their trails
+
+Their rows stand in the tables as if their runs lay in the folder; what is drawn or explained of runs is without them.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from nmfd.errors import InputError
+from nmfd.runs import files, trail
+
+KEYS = {"demand": float, "controller": str, "seed": int}  # of runs.csv
+
+
+def add(out: Path, tables: Sequence[Path]) -> None:
+    """Copy tables to `out`. InputError for what is no table of runs, or of others than those that are there."""
+    for table in tables:
+        _read(table)
+        _check(out, table)
+        (out / trail.EARLIER).mkdir(parents=True, exist_ok=True)
+        files.write_text(
+            out / trail.EARLIER / f"{files.file_hash(table)}.csv", table.read_text(encoding="utf-8"))
+
+
+def joined(out: Path, rows: pd.DataFrame) -> pd.DataFrame:
+    """`rows`, of the runs in `out`, and those of earlier tables there that were not run again. Raises InputError."""
+    parts = [rows]
+    for table in trail.earlier(out):
+        _check(out, table)
+        parts.append(_read(table))
+    filled = [part for part in parts if len(part)]
+    return pd.concat(filled, ignore_index=True).drop_duplicates([*KEYS], ignore_index=True) if filled else rows
+
+
+def _read(table: Path) -> pd.DataFrame:
+    files.check_file(table)
+    try:
+        return pd.read_csv(table).drop(columns=trail.COLUMN, errors="ignore").astype(KEYS)
+    except (OSError, ValueError, KeyError) as error:  # pandas' own errors are ValueErrors
+        raise InputError(f"{table}: is no table of runs ({error}); give the runs.csv of an evaluation") from None
+
+
+def _check(out: Path, table: Path) -> None:
+    """InputError for runs of another city, demand or controller than those in `out`."""
+    here = _hashes(trail.of_runs(out))
+    for key, value in _hashes(trail.read(table)).items():
+        if here.get(key, value) != value:
+            raise InputError(
+                f"{table}: its runs are of another {' '.join(key)} ({value}) than those in {out} ({here[key]}); choose "
+                "another folder with --out")
+
+
+def _hashes(found: Mapping) -> dict[tuple[str, ...], str]:
+    """(run folder, controller, hash), or without controller, -> value; of a trail."""
+    values: dict[tuple[str, ...], str] = {}
+    for place, about in found.get("hashes", {}).items():
+        for key, value in about.items():
+            values.update({(place, key, name): each for name, each in value.items()} if isinstance(value, Mapping)
+                          else {(place, key): value})
+    return values
