@@ -12,7 +12,8 @@ STEPS = ["--steps", 2]
 REDUCED = {  # what is added; of an option that is there already the last counts. The city is tiny_city
     "nmfd benchmark": ["--seeds", 1], "nmfd train": ["--steps", 1, "--no-compile", "--anyway"], "nmfd show": [],
     "nmfd new-controller": [], "nmfd export": [],
-    "cosim run": STEPS, "cosim compare": [], "cosim report": [], "cosim evaluate": [*STEPS, "--seeds", 1, "--demand", 1],
+    "cosim run": STEPS, "cosim compare": [], "cosim report": [],
+    "cosim evaluate": [*STEPS, "--seeds", 1, "--demand", 1],
     "cosim sweep": ["--steps", 1, "--seeds", 1, "--compliance", 100],
     "cosim import": ["--regions", 3, "--no-run", "--method", "geometric"],
     "cosim identify": ["--levels", 6, "--seeds", 1, "--own", "--iterations", 10], "cosim list": [], "nmfd list": []}
