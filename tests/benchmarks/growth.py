@@ -43,7 +43,8 @@ def streets(side: int, file: Path) -> None:
     """A grid of side x side junctions."""
     subprocess.run(
         [Path(sumo.SUMO_HOME) / "bin" / "netgenerate", "--grid", "--grid.number", str(side), "--grid.length",
-         str(BLOCK), "--default.lanenumber", "2", "--tls.guess", "--tls.guess.threshold", "100", "--no-turnarounds", "-o", file],
+         str(BLOCK), "--default.lanenumber", "2", "--tls.guess", "--tls.guess.threshold", "100", "--no-turnarounds",
+         "-o", file],
         check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
