@@ -18,8 +18,8 @@ from nmfd.runs import shipped
 PLACEHOLDERS = (
     "runs", "networks/mycity", "scenarios/mycity", "mycity", "city.", "mine", "scenarios/mine", "networks/mine",
     "counts.csv", "detectors.csv", "regions.csv", "about.csv", "dpc-pcrg.onnx", "bologna/", "ingolstadt21/",
-    "luxembourg/", "networks/ingolstadt", "scenarios/r100", "FILE", "NAME",
-    "build/", "SCENARIO", "DIR")
+    "luxembourg/", "networks/ingolstadt", "scenarios/r100", "left.net.xml", "networks/left",
+    "scenarios/left", "FILE", "NAME", "build/", "SCENARIO", "DIR")
 SUFFIXES = r"py|md|toml|csv|png|txt|json|nc|npz|pt|onnx|xml|gz|parquet|css|js|j2|ipynb|html|mp4|log|tmp|lock"
 PATH = re.compile(rf"(?:\.?[\w+=-]+/)*\.?[\w.+-]*\w\.(?:{SUFFIXES})|(?:\.?[\w+-]+/)+[\w+-]*")
 PYTHON = re.compile(r"(?:nmfd|cosim)(?:\.\w+)+")
