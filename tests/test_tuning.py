@@ -213,6 +213,22 @@ def test_rows_of_an_earlier_table_count_too(city, tmp_path, demanded):
     assert found["runs"] == [*trail.of_runs(tmp_path / "after")["runs"], *trail.read(kept)["runs"]]
 
 
+def test_what_was_run_again_may_be_another_one(city, tmp_path, demanded):
+    """Then only what the others depend on must be the same."""
+    def invoke(name, controllers, *more):
+        return CliRunner().invoke(main, [
+            "frontier", str(city), "--controllers", controllers, "--demand", "1", "--seeds", "1", "--steps", "1",
+            "--out", str(tmp_path / name), *more])
+
+    assert invoke("before", "pi-gating,max-pressure").exit_code == 0
+    before = tmp_path / "before" / "runs.csv"
+    before.write_text(before.read_text().replace('""model_hash"":""', '""model_hash"":""0'))
+    assert invoke("after", "pi-gating").exit_code == 0
+    done = invoke("after", "pi-gating", "--earlier", str(before))
+    assert done.exit_code == 0, done.output
+    assert set(pd.read_csv(tmp_path / "after" / "frontier.csv")["controller"]) == {"pi-gating", "max-pressure"}
+
+
 @pytest.mark.parametrize("old, new, said", [
     ('""demand_hash"":""', '""demand_hash"":""0', "demand-1 demand_hash (0"),
     ("demand,controller", "level,controller", "is no table of runs")])

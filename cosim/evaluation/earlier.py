@@ -16,11 +16,10 @@ from nmfd.runs import files, trail
 KEYS = {"demand": float, "controller": str, "seed": int}  # of runs.csv
 
 
-def add(out: Path, tables: Sequence[Path]) -> None:
-    """Copy tables to `out`. InputError for what is no table of runs, or of others than those that are there."""
+def add(out: Path, tables: Sequence[Path], rows: pd.DataFrame) -> None:
+    """Copy tables to `out`. rows: of the runs there. InputError for what is no table of runs, or does not fit them."""
     for table in tables:
-        _read(table)
-        _check(out, table)
+        _left(out, table, rows)
         (out / trail.EARLIER).mkdir(parents=True, exist_ok=True)
         files.write_text(
             out / trail.EARLIER / f"{files.file_hash(table)}.csv", table.read_text(encoding="utf-8"))
@@ -28,12 +27,26 @@ def add(out: Path, tables: Sequence[Path]) -> None:
 
 def joined(out: Path, rows: pd.DataFrame) -> pd.DataFrame:
     """`rows`, of the runs in `out`, and those of earlier tables there that were not run again. Raises InputError."""
-    parts = [rows]
     for table in trail.earlier(out):
-        _check(out, table)
-        parts.append(_read(table))
-    filled = [part for part in parts if len(part)]
-    return pd.concat(filled, ignore_index=True).drop_duplicates([*KEYS], ignore_index=True) if filled else rows
+        left = _left(out, table, rows)
+        rows = pd.concat([part for part in (rows, left) if len(part)] or [rows], ignore_index=True)
+    return rows
+
+
+def _left(out: Path, table: Path, rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows of `table` that are not in `rows`. InputError for runs of another city, demand or controller than those
+    in `out`."""
+    found = _read(table)
+    keys, known = (pd.MultiIndex.from_frame(frame[[*KEYS]]) for frame in (found, rows))
+    left = found[~keys.isin(known)]
+    used = {(f"demand-{level:g}", name) for level, name in zip(left["demand"], left["controller"], strict=True)}
+    here = _hashes(trail.of_runs(out))
+    for key, value in _hashes(trail.read(table)).items():
+        if here.get(key, value) != value and (len(key) == 2 or key[:2] in used):
+            raise InputError(
+                f"{table}: its runs are of another {' '.join(key)} ({value}) than those in {out} ({here[key]}); choose "
+                "another folder with --out")
+    return left
 
 
 def _read(table: Path) -> pd.DataFrame:
@@ -42,16 +55,6 @@ def _read(table: Path) -> pd.DataFrame:
         return pd.read_csv(table).drop(columns=trail.COLUMN, errors="ignore").astype(KEYS)
     except (OSError, ValueError, KeyError) as error:  # pandas' own errors are ValueErrors
         raise InputError(f"{table}: is no table of runs ({error}); give the runs.csv of an evaluation") from None
-
-
-def _check(out: Path, table: Path) -> None:
-    """InputError for runs of another city, demand or controller than those in `out`."""
-    here = _hashes(trail.of_runs(out))
-    for key, value in _hashes(trail.read(table)).items():
-        if here.get(key, value) != value:
-            raise InputError(
-                f"{table}: its runs are of another {' '.join(key)} ({value}) than those in {out} ({here[key]}); choose "
-                "another folder with --out")
 
 
 def _hashes(found: Mapping) -> dict[tuple[str, ...], str]:

@@ -60,7 +60,7 @@ def evaluate(
     """
     out = evaluation.out
     check_folder(out)
-    earlier.add(out, evaluation.earlier)
+    earlier.add(out, evaluation.earlier, kept_runs(evaluation))
     known = {*evaluation.controllers, *all_runs(evaluation)["controller"]}
     if evaluation.reference is not None and evaluation.reference not in known:
         raise InputError(

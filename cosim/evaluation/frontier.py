@@ -17,7 +17,7 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from cosim.evaluation import dask_cluster, earlier, experiment
-from cosim.evaluation.evaluate import Evaluation, all_runs, check_folder
+from cosim.evaluation.evaluate import Evaluation, all_runs, check_folder, kept_runs
 from cosim.evaluation.statistics import TTS
 from nmfd.runs import files, trail
 from nmfd.runs.tables import markdown_table, text_table
@@ -43,7 +43,7 @@ def frontier(
     if no run went well.
     """
     check_folder(order.out)
-    earlier.add(order.out, order.earlier)
+    earlier.add(order.out, order.earlier, kept_runs(order))
     failed: list[str] = []
     source = dask_cluster.source(scheduler, tell)
     left = list(order.controllers)
