@@ -129,3 +129,16 @@ def test_a_published_table_has_its_numbers_still():
     with (ROOT / "scenarios" / "bologna" / "reference" / "runs.csv").open(newline="", encoding="utf-8") as stream:
         row = next(csv.DictReader(stream))
     assert row["total_time_spent_veh_s"] == "5848920.0" and row["programmed_intergreen_share"] == ""
+
+
+def test_an_older_table_says_how_its_rows_were_made(tmp_path):
+    """Also where that is known from a README only: as a run of its own, not as one of the table that it is in now."""
+    unknown = dict.fromkeys(("commit", "dirty", "versions"), "unknown")
+    before = {"command": "unknown", **unknown, "readme": ["cosim evaluate city"], "not_again": {"a*": "older"}}
+    (tmp_path / trail.EARLIER).mkdir()
+    pd.DataFrame({"seed": [1], "trail": [json.dumps(before)]}).to_csv(tmp_path / trail.EARLIER / "b.csv", index=False)
+    found = trail.of(tmp_path / "runs.csv")
+    assert found["commit"] != "unknown" and "readme" not in found
+    assert found["runs"] == [{"command": "cosim evaluate city", **unknown, "seeds": []}]
+    assert found["not_again"] == {"a*": "older"}
+    assert trail.commands(found) == [("cosim evaluate city", found["runs"][0])]

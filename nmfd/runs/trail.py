@@ -41,8 +41,11 @@ def of(file: Path) -> dict:
     found = {key: here[key] for key in WRITER} | of_runs(file.parent)
     for table in earlier(file.parent):
         before = read(table)
-        for one in before.get("runs", ()):
+        by_readme = ({**before, "command": command} for command in before.get("readme", ()))
+        for one in (*before.get("runs", ()), *by_readme):
             _add(found.setdefault("runs", []), one)
+        if "not_again" in before:
+            found["not_again"] = before["not_again"] | found.get("not_again", {})
         for place, hashes in before.get("hashes", {}).items():
             there = found.setdefault("hashes", {})
             there[place] = {**hashes, **there.get(place, {})}
