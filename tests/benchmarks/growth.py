@@ -130,7 +130,7 @@ def main() -> None:
     chosen = parser.parse_args()
     chosen.out.mkdir(parents=True, exist_ok=True)
     rows: list[dict] = []
-    with command.called("python tests/benchmarks/growth.py", sys.argv[1:]):
+    with command.called("python", ["tests/benchmarks/growth.py", *sys.argv[1:]]):
         for count in map(int, chosen.vehicles.split(",")):
             rows += measured(count)
             write_table(chosen.out / "growth.csv", pd.DataFrame(rows))
