@@ -192,7 +192,7 @@ def test_the_frontier_ends_where_nobody_is_served(city, tmp_path, demanded):
 
 
 def test_rows_of_an_earlier_table_count_too(city, tmp_path, demanded):
-    """Of runs that are not kept any more: not run again where they are asked for, and named in the trail."""
+    """Of runs that are not kept any more; they are named in the trail."""
     def invoke(name, demand, *more):
         return CliRunner().invoke(main, [
             "frontier", str(city), "--controllers", "pi-gating", "--demand", demand, "--seeds", "4", "--steps", "1",

@@ -16,7 +16,7 @@ from nmfd.cli.options import FILE, FOLDER, SCENARIO, SEED, out_option
 from nmfd.cli.progress import progress_line, resumable
 from nmfd.errors import InputError
 from nmfd.runs import files
-from nmfd.runs.workers import cores
+from nmfd.runs.workers import at_a_time
 
 
 @click.command()
@@ -77,7 +77,7 @@ def identify(
             options=options.split("+") if options else (), network=target, iterations=iterations, runs=runs)
         with resumable("identify", folder) as progress:
             text = identify.identify(
-                scenario, loading, out=folder, workers=cores() if workers is None else workers, scheduler=cluster,
+                scenario, loading, out=folder, workers=at_a_time(workers), scheduler=cluster,
                 progress=progress, tell=tell)
         if both:
             click.echo("Drivers who are guided:" if guide else "Drivers who go their own ways:")

@@ -14,7 +14,7 @@ from nmfd.cli.options import FOLDER
 from nmfd.cli.progress import resumable
 from nmfd.errors import InputError
 from nmfd.runs.files import file_name
-from nmfd.runs.workers import cores
+from nmfd.runs.workers import at_a_time
 
 if TYPE_CHECKING:
     from cosim.evaluation.dask_cluster import Scheduler
@@ -58,7 +58,7 @@ def compete(
         _table(tables, out)
         return
     cluster = chosen_scheduler(workers, scheduler, scheduler_ca, scheduler_cert, scheduler_key)
-    _run(controllers, tasks, only, cores() if workers is None else workers, cluster, out)
+    _run(controllers, tasks, only, at_a_time(workers), cluster, out)
 
 
 def _run(

@@ -34,7 +34,7 @@ from nmfd.cli.options import (
 from nmfd.cli.progress import resumable
 from nmfd.errors import RunFailed
 from nmfd.runs.files import file_name
-from nmfd.runs.workers import cores
+from nmfd.runs.workers import at_a_time
 
 
 @click.group(name="cosim", cls=Commands)
@@ -92,7 +92,7 @@ def evaluate(
         scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
         levels=demand, steps=steps, policies=files, reference=reference, time_limit=own_time_limit,
         earlier=earlier, out=Path("runs") / f"{file_name(loaded.name)}-evaluate" if out is None else out)
-    workers = cores() if workers is None else workers
+    workers = at_a_time(workers)
     with resumable("evaluate", chosen.out) as progress:
         table, failures = evaluate.evaluate(
             chosen, workers=workers, scheduler=cluster, progress=progress, tell=tell)
@@ -148,7 +148,7 @@ def sweep(
         levels=demand, compliance=tuple(share / 100 for share in compliance or ()), steps=steps,
         policies=files, time_limit=own_time_limit,
         out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
-    workers = cores() if workers is None else workers
+    workers = at_a_time(workers)
     with resumable("sweep", order.out) as progress:
         rows = sweeps.sweep(order, workers=workers, scheduler=cluster, progress=progress, tell=tell)
     click.echo(sweeps.text(rows))

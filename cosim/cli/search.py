@@ -30,7 +30,7 @@ from nmfd.cli.options import (
 from nmfd.cli.progress import resumable
 from nmfd.errors import RunFailed
 from nmfd.runs.files import file_name
-from nmfd.runs.workers import cores
+from nmfd.runs.workers import at_a_time
 
 
 @click.command()
@@ -77,7 +77,7 @@ def tune(
         out=Path("runs") / f"{file_name(scenario.name)}-tune" if out is None else out)
     with resumable("tune", order.out, "tune.csv") as progress:
         table = tuning.tune(
-            order, workers=cores() if workers is None else workers, scheduler=cluster, progress=progress, tell=tell)
+            order, workers=at_a_time(workers), scheduler=cluster, progress=progress, tell=tell)
     click.echo(tuning.text(order, table))
     click.echo(f"Written to {order.out}: see tune.toml and tune.csv")
 
@@ -122,7 +122,7 @@ def improve(
         steps=steps, out=Path("runs") / f"{file_name(scenario.name)}-improve" if out is None else out)
     with resumable("improve", order.out, "improve.csv") as progress:
         table = method.improve(
-            order, workers=cores() if workers is None else workers, scheduler=cluster, progress=progress, tell=tell)
+            order, workers=at_a_time(workers), scheduler=cluster, progress=progress, tell=tell)
         picture.draw(order.out / "improve.png", table, runs=len(order.seeds) * len(order.levels))
     click.echo(method.text(order, table))
     click.echo(f"Written to {order.out}: see policy.pt, model, improve.csv and improve.png")
@@ -172,7 +172,7 @@ def frontier(
         out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-frontier" if out is None else out)
     with resumable("frontier", order.out) as progress:
         table, failures = method.frontier(
-            order, everything=everything, workers=cores() if workers is None else workers, scheduler=cluster,
+            order, everything=everything, workers=at_a_time(workers), scheduler=cluster,
             progress=progress, tell=tell)
         picture.draw(order.out / "frontier.png", table)
     click.echo(method.text(table))

@@ -36,7 +36,7 @@ def joined(out: Path, rows: pd.DataFrame) -> pd.DataFrame:
 def _left(out: Path, table: Path, rows: pd.DataFrame) -> pd.DataFrame:
     """The rows of `table` that are not in `rows`. InputError for runs of another city, demand or controller than those
     in `out`."""
-    found = _read(table)
+    found = files.read_table(table, KEYS, "give the runs.csv of an evaluation")
     keys, known = (pd.MultiIndex.from_frame(frame[[*KEYS]]) for frame in (found, rows))
     left = found[~keys.isin(known)]
     used = {(f"demand-{level:g}", name) for level, name in zip(left["demand"], left["controller"], strict=True)}
@@ -47,14 +47,6 @@ def _left(out: Path, table: Path, rows: pd.DataFrame) -> pd.DataFrame:
                 f"{table}: its runs are of another {' '.join(key)} ({value}) than those in {out} ({here[key]}); choose "
                 "another folder with --out")
     return left
-
-
-def _read(table: Path) -> pd.DataFrame:
-    files.check_file(table)
-    try:
-        return pd.read_csv(table).drop(columns=trail.COLUMN, errors="ignore").astype(KEYS)
-    except (OSError, ValueError, KeyError) as error:  # pandas' own errors are ValueErrors
-        raise InputError(f"{table}: is no table of runs ({error}); give the runs.csv of an evaluation") from None
 
 
 def _hashes(found: Mapping) -> dict[tuple[str, ...], str]:

@@ -25,13 +25,12 @@ from cosim.sumo.net import check_adjacency, load_city
 from cosim.sumo.signals import HELD, read_signals
 from cosim.sumo.xml_files import read_xml
 from nmfd.controllers import registry
-from nmfd.errors import InputError
 from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.quantities import quantities, variables
-from nmfd.runs import run_folder, trail
-from nmfd.runs.files import check_file, file_hash, write_table
+from nmfd.runs import run_folder
+from nmfd.runs.files import file_hash, read_table, write_table
 from nmfd.runs.tables import text_table
 from nmfd.runs.tally import Progress, Tally
 from nmfd.runs.workers import Failure, Source, attempt, ended, outcomes
@@ -278,15 +277,7 @@ def overview(folder: Path) -> pd.DataFrame:
 
 def read_facts(path: Path) -> pd.DataFrame:
     """The rows of sumo.csv, with NaN for what an older version did not record. Raises InputError."""
-    check_file(path, "delete the folder and run again")
-    try:
-        rows = pd.read_csv(path).drop(columns=trail.COLUMN, errors="ignore")
-        rows = rows.reindex(columns=[*rows.columns, *(name for name in FACTS if name not in rows.columns)])
-        return rows.astype({"controller": str, "seed": int})
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; delete the folder and run again") from None
-    except (OSError, ValueError, KeyError) as error:  # pandas' own errors are ValueErrors
-        raise InputError(f"{path}: is no table of runs ({error}); delete the folder and run again") from None
+    return read_table(path, {"controller": str, "seed": int}, "delete the folder and run again", columns=FACTS)
 
 
 def overview_table(rows: pd.DataFrame) -> str:

@@ -120,6 +120,24 @@ def write_table(path: Path, frame: "pd.DataFrame", **options: str) -> None:
     write_text(path, frame.to_csv(index=False, **options))
 
 
+def read_table(
+    path: Path, types: Mapping[str, type], remedy: str, columns: Collection[str] = (),
+) -> "pd.DataFrame":
+    """A table of runs as `write_table` wrote it, without its trail. types: of some columns; columns: those to be added,
+    with NaN, where an older version did not write them. Raises InputError."""
+    import pandas as pd  # heavy
+
+    check_file(path, remedy)
+    try:
+        rows = pd.read_csv(path).drop(columns=trail.COLUMN, errors="ignore")
+        missing = [name for name in columns if name not in rows.columns]
+        return rows.reindex(columns=[*rows.columns, *missing]).astype(types)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {remedy}") from None
+    except (OSError, ValueError, KeyError) as error:  # pandas' own errors are ValueErrors
+        raise InputError(f"{path}: is no table of runs ({error}); {remedy}") from None
+
+
 def write_rows(path: Path, columns: Mapping[str, type], rows: Sequence[Mapping]) -> None:
     """`rows` as a csv file with `columns` and their trail (nmfd.runs.trail), atomically."""
     with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:

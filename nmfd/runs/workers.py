@@ -53,6 +53,11 @@ def cores() -> int:
     return len(mine.cpu_affinity()) if hasattr(mine, "cpu_affinity") else os.cpu_count() or 1  # not on macOS
 
 
+def at_a_time(workers: int | None) -> int:
+    """How many runs go on side by side: as many as asked for, or one per core."""
+    return cores() if workers is None else workers
+
+
 def attempt(function: Callable, task: Any) -> Any:
     """`function(task)`, or the Failure that it ended in."""
     try:
