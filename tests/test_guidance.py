@@ -8,6 +8,7 @@ from unittest.mock import Mock
 import libsumo
 import numpy as np
 import pytest
+from streets import seen
 
 from cosim.plant.guidance import Guide, shifted
 from cosim.plant.meter import Event
@@ -30,14 +31,14 @@ def city():
 def ways(city):
     """Out of region 0."""
     first, second, turn, time = city
-    inside, back = (Moves(first, second, turn, allowed=(REGION == 0) ^ outside, reverse=outside)
+    inside, back = (Moves(first, second, allowed=(REGION == 0) ^ outside, reverse=outside)
                     for outside in (False, True))
-    gates = sorted({(int(REGION[b]), int(a), int(b)) for a, b in zip(first, second, strict=True)
+    gates = sorted({(int(REGION[b]), int(a), int(b), n) for n, (a, b) in enumerate(zip(first, second, strict=True))
                     if REGION[a] == 0 and REGION[b] != 0})
-    following, gate, entry = np.array(gates).T
-    return Ways(gate, entry, following, inside=inside, outside=back, time=time,
-                reached=back.leading_to(back.number[entry]), ahead=back.ahead(back.number[entry], 0.8 * time)
-                ), gate, entry
+    following, gate, entry, move = np.array(gates).T
+    return Ways(gate, entry, move, following, inside=inside, outside=back, time=time, turns=turn,
+                reached=back.leading_to(back.number[entry]),
+                ahead=back.ahead(back.number[entry], 0.8 * time, 0.7 * turn)), gate, entry
 
 
 def least(city, allowed):
@@ -61,7 +62,8 @@ def test_the_searches_find_the_least_times_up_to_a_limit(city, ways):
     for most in (60.0, np.inf, 150.0):  # a wider search may come later, a narrower one may use it
         for here in range(10):
             for target in range(10, EDGES):
-                exact = inside[here, gate] + city[3][entry] + outside[entry, target]
+                over = [turns[move] for move in zip(gate.tolist(), entry.tolist(), strict=True)]
+                exact = inside[here, gate] + over + city[3][entry] + outside[entry, target]
                 cost, reached = found.cost(here, target, most)
                 np.testing.assert_array_equal(reached, np.isfinite(exact))
                 np.testing.assert_allclose(cost[exact <= most], exact[exact <= most])
@@ -72,8 +74,7 @@ def test_the_searches_find_the_least_times_up_to_a_limit(city, ways):
                     assert way[0] == here and way[-1] == target
                     crossing = way.index(int(entry[g]))
                     assert way[crossing - 1] == gate[g] and (REGION[way[crossing:]] != 0).all()
-                    takes = city[3][way[1:]].sum() + sum(
-                        turns[move] for move in zip(way[:-1], way[1:], strict=True) if move != (gate[g], entry[g]))
+                    takes = city[3][way[1:]].sum() + sum(turns[move] for move in zip(way[:-1], way[1:], strict=True))
                     assert takes == pytest.approx(exact[g])
     assert cut > 100
 
@@ -81,7 +82,7 @@ def test_the_searches_find_the_least_times_up_to_a_limit(city, ways):
 def test_ways_home_are_the_fastest_up_to_a_limit(city):
     first, second, turn, time = city
     exact = least(city, np.full(EDGES, True))
-    home = Home(Moves(first, second, turn, allowed=np.full(EDGES, True), reverse=True), time)
+    home = Home(Moves(first, second, allowed=np.full(EDGES, True), reverse=True), time, turn)
     turns = {(int(a), int(b)): extra for a, b, extra in zip(first, second, turn, strict=True)}
     for most in (60.0, np.inf, 100.0):
         for here in range(EDGES):
@@ -162,7 +163,7 @@ def test_drivers_are_asked_again_where_they_are():
     for period, asked in ((0.0, 99), (2.5, 3), (6.0, 6)):
         guide, splits, routes, _ = crossroads(tuple("ambt"), ways_return=True, period=period)
         guide.apply([DRIVER])
-        guide.command(splits, np.array([np.nan, np.nan, 0.1, np.nan, np.nan]))  # m/s on a, b, m, s, t
+        guide.command(splits, seen([np.nan, np.nan, 0.1, np.nan, np.nan]))  # m/s on a, b, m, s, t
         for step in range(1, 9):
             guide.apply([])
             assert "".join(routes["driver"]) == ("ast" if step >= asked else "ambt")
@@ -172,7 +173,7 @@ def test_drivers_are_asked_again_where_they_are():
 def test_on_a_junction_it_is_too_late_and_who_arrived_is_not_asked():
     guide, splits, routes, road = crossroads(tuple("ambt"), ways_return=True, period=2.0)
     guide.apply([DRIVER])
-    guide.command(splits, np.array([np.nan, np.nan, 0.1, np.nan, np.nan]))
+    guide.command(splits, seen([np.nan, np.nan, 0.1, np.nan, np.nan]))
     road.side_effect = [":junction", ":junction", "a", libsumo.TraCIException("not known")]
     for expected in ("ambt", "ambt", "ambt", "ast", "ast", "ast", "ast", "ast", "ast"):
         guide.apply([])

@@ -13,12 +13,12 @@ flows without it (measured on grid7). Instead everybody takes the next region th
 regions that are behind their share; the bonus grows until the shares are met, by those who lose least.
 
 A guided vehicle in region i bound for edge d takes the fastest way inside i to a gateway i -> h, and from there to d
-without coming back to i, at the travel times of the last control interval (smoothed), as its group of drivers sees
-them. In h it is guided again, and in the region of d it is sent there on the fastest way. With a period it is asked
-again where it is, every so often as long as it stays in i: in a city that congests, the fastest way when it came may
-be a standing one soon. Nobody is sent on a detour that takes much longer, whatever theta says, and nobody leaves the
-way that they are on for a small gain: everybody who changes his way makes the travel times that the others were told
-wrong.
+without coming back to i, at the travel times of late (`travel_times`), as its group of drivers sees them. In h it is
+guided again, and in the region of d it is sent there on the fastest way. With a period it is asked again where it is,
+every so often as long as it stays in i: in a city that congests, the fastest way when it came may be a standing one
+soon. Nobody is sent on a detour that takes much longer, whatever theta says, and nobody leaves the way that they are on
+for a small gain: everybody who changes his way makes the travel times that the others were told wrong. What is small
+grows with the delay: 2 % where a fifth of the time is delay, 30 % where it is most of it and times change fastest.
 
 Where the boundaries of the regions are ragged, a main road may leave i and come back. With `ways_return` the fastest
 way of all is open to everybody, wherever it leads, and counts for the region that it enters when it leaves i for good;
@@ -34,20 +34,21 @@ import numpy as np
 
 from cosim.plant.lanes import Lanes
 from cosim.plant.meter import Event
+from cosim.plant.sampling import StreetMeans
 from cosim.plant.shortest_paths import Home, Moves, Ways
+from cosim.plant.travel_times import TravelTimes
 from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
 from nmfd.arrays import PerRegion, PerTurn
 
-SMOOTHING = 0.5            # weight of the newest travel times
-DRIVER_CLASSES = 4         # groups of drivers who see different travel times: were all sent one way, it would jam
-SPREAD = 0.15              # standard deviation of the logarithm of their travel times
-SLOWEST = 0.1              # m/s; slower is as good as standing
-SHARE_PENALTY = 30.0       # s per vehicle that a region is behind its share
-SWITCHING_THRESHOLD = 0.3  # drivers keep their way if the best one does not save more than this share of its own time
-SOON = 10.0                # s after which they are asked again for whom it was too late to change lanes
-MEMORY = 0.9               # of the vehicles assigned before and of their wishes, per control interval
+DRIVER_CLASSES = 4          # groups of drivers who see different travel times: were all sent one way, it would jam
+SPREAD = 0.05               # standard deviation of the logarithm of their travel times
+SHARE_PENALTY = 30.0        # s per vehicle that a region is behind its share
+SWITCHING_THRESHOLD = 0.6   # drivers keep their way if the best one saves less than this share of the delay on theirs,
+                            # times the share that the delay has in the time of their way
+SOON = 10.0                 # s after which they are asked again for whom it was too late to change lanes
+MEMORY = 0.9                # of the vehicles assigned before and of their wishes, per control interval
 
 
 def shifted(wish: Sequence[float], own: Sequence[float], theta: Sequence[float]) -> list[float]:
@@ -71,6 +72,18 @@ class _Visit:
     taste: int
     following: int | None = None
     interval: int = 0
+
+
+@dataclass(frozen=True)
+class _Present:
+    """A driver's present way from where they are: way, edges, None where it uses roads closed to cars; takes [s] from
+    the end of the first, infinite if that is not where they are asked; delay: [s], of these; bound: whether a search
+    would find it: by known moves and, unless ways may return, out of the region and never back."""
+
+    way: list[int] | None
+    takes: float = math.inf
+    delay: float = math.inf
+    bound: bool = False
 
 
 class Guide:
@@ -99,26 +112,22 @@ class Guide:
         self._session, self._city, self._compliance, self._random = session, city, compliance, random
         self._index = {edge: n for n, edge in enumerate(city.edges)}
         self._region = [city.region_of[edge] for edge in city.edges]
-        moves = [(e, f) for e, after in city.successors.items() for f in after]
-        first, second = np.array([(self._index[e], self._index[f]) for e, f in moves]).T
-        turn = np.array([city.turn_time[move] for move in moves])
-        self._turn_time = dict(zip(zip(first.tolist(), second.tolist(), strict=True), turn.tolist(), strict=True))
+        self._times = times = TravelTimes(city)
+        self._move = {move: n for n, move in enumerate(zip(times.first.tolist(), times.second.tolist(), strict=True))}
         here = [np.array(self._region) == region for region in range(city.regions)]
         self._within, within_back, self._without_back = (
-            [Moves(first, second, turn, allowed=allowed ^ outside, reverse=reverse) for allowed in here]
+            [Moves(times.first, times.second, allowed=allowed ^ outside, reverse=reverse) for allowed in here]
             for outside, reverse in ((False, False), (False, True), (True, True)))
         self._ways_return = ways_return
         if ways_return:
-            within_back = [Moves(first, second, turn, allowed=np.full(len(city.edges), True), reverse=True)]
+            within_back = [Moves(times.first, times.second, allowed=np.full(len(city.edges), True), reverse=True)]
         self._homeward = within_back  # by region, or one for all
+        ends = [(self._index[g.from_edge], self._index[g.to_edge], g) for g in city.gateways]
         self._gateways = [
-            np.array([(self._index[g.from_edge], self._index[g.to_edge], g.target)
-                      for g in city.gateways if g.source == region], dtype=int).reshape(-1, 3).T
+            np.array([(first, second, self._move[first, second], g.target) for first, second, g in ends
+                      if g.source == region], dtype=int).reshape(-1, 4).T
             for region in range(city.regions)]
         self._taste = np.exp(SPREAD * random.standard_normal((DRIVER_CLASSES, len(city.edges))))
-        self._length = np.array([city.length[edge] for edge in city.edges])
-        self._free = self._length / np.array([city.speed[edge] for edge in city.edges])
-        self._measured = self._free.copy()
         self._prices: PerRegion | None = None
         self._told: dict[int | None, PerEdge] = {}  # region without a price, None for all with theirs -> (E,) [s]
         self._reached: dict[int, np.ndarray] = {}
@@ -131,11 +140,10 @@ class Guide:
         self.realised = np.zeros((city.regions,) * 3, dtype=int)
         self.refused = self.led_on = 0
 
-    def command(self, splits: PerTurn | None, speed: PerEdge | None, prices: PerRegion | None = None) -> None:
+    def command(self, splits: PerTurn | None, seen: StreetMeans | None, prices: PerRegion | None = None) -> None:
         """Take over theta (R, R, R) [-] for the next control interval; None: no guidance.
 
-        speed: (E,) [m/s] of the city's edges, the mean over the last interval and NaN on empty ones; None: as before.
-        A mean, because the speed at one instant is that of a red or a green signal, every time the same one.
+        seen: in the last interval; None: nothing new
         prices: (R,) [-], by how much longer than they take drivers are told that the ways through each region take,
             unless it is the one that they are bound for
         """
@@ -143,9 +151,8 @@ class Guide:
         if splits is not None:
             self._splits = splits
             self._interval += 1
-            if speed is not None:
-                now = np.where(np.isnan(speed), self._free, self._length / np.maximum(speed, SLOWEST))
-                self._measured += SMOOTHING * (np.maximum(now, self._free) - self._measured)
+            if seen is not None:
+                self._times.learn(seen)
             self._told, self._prices = {}, prices
             self._ways, self._homes = {}, {}
             self._assigned *= MEMORY
@@ -193,10 +200,9 @@ class Guide:
     def _guide_home(self, visit: _Visit, here: int, target: int) -> None:
         """The fastest way inside the region of destination; if ways may return, the fastest of all."""
         event, home = visit.event, self._home(visit.event.region, visit.taste, visit.event.destination)
-        present = self._present(event.vehicle)
-        takes, bound = self._takes(present, here, home.time)
-        cost = home.cost(here, target, takes + 1.0 if bound else np.inf)
-        if here == target or not np.isfinite(cost) or self._keeps(present, here, takes, cost):
+        present = self._present(event.vehicle, here, home.time)
+        cost = home.cost(here, target, present.takes + 1.0 if present.bound else np.inf)
+        if here == target or not np.isfinite(cost) or self._keeps(present, cost):
             return
         self._send(event.vehicle, home.route(here, target))
 
@@ -204,9 +210,9 @@ class Guide:
         """The next region, and the fastest way through it."""
         event, ways = visit.event, self._ways_from(
             visit.event.region, visit.taste, visit.event.destination)
-        present = self._present(event.vehicle)
-        takes, bound = self._takes(present, here, ways.time)
-        cost, reached = ways.cost(here, target, self._most_detour + takes + 1.0 if bound else np.inf)
+        present = self._present(event.vehicle, here, ways.time)
+        cost, reached = ways.cost(
+            here, target, self._most_detour + present.takes + 1.0 if present.bound else np.inf)
         # Plain numbers from here on: there are a handful of next regions, too few for arrays to pay.
         least, open_ways = (
             best.reduceat(values, ways.begins).tolist()
@@ -215,7 +221,7 @@ class Guide:
         returning = None  # the next region of the fastest way of all, where that is one that comes back
         if self._ways_return:
             home = self._home(event.region, visit.taste, event.destination)
-            of_all = home.cost(here, target, takes + 1.0 if bound else np.inf)
+            of_all = home.cost(here, target, present.takes + 1.0 if present.bound else np.inf)
             if of_all < fastest:
                 way, fastest = home.route(here, target), of_all
                 returning = int(np.searchsorted(ways.neighbours, self._next_region(way)))
@@ -241,7 +247,7 @@ class Guide:
             for c, share, sent, good in zip(least, shares, assigned, allowed, strict=True)]
         n = price.index(min(price))
         following = int(ways.neighbours[n])
-        if not self._keeps(present, here, takes, least[n], following):
+        if not self._keeps(present, least[n], following):
             if n != returning:
                 way = ways.route(here, int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]])), target)
             if not self._send(event.vehicle, way):
@@ -254,39 +260,34 @@ class Guide:
         self._assigned[event.region, following, event.destination] += 1.0
         visit.following, visit.interval = following, self._interval
 
-    def _present(self, vehicle: str) -> list[int] | None:
-        """The edges of the driver's present way from where they are; None where it uses roads closed to cars."""
+    def _present(self, vehicle: str, here: int, time: PerEdge) -> _Present:
+        """The driver's, who is asked on edge `here`, at `time` (E,) [s]."""
         route = self._session.route(vehicle)[self._session.route_index(vehicle):]
         way = [number for edge in route if (number := self._index.get(edge)) is not None]
-        return way if len(way) == len(route) else None
-
-    def _takes(self, present: list[int] | None, here: int, time: PerEdge) -> tuple[float, bool]:
-        """[s] from the end of edge `here` to the end of the present way, if it begins there, at `time` (E,) [s]; and
-        whether it is a way that a search would find: by known moves and, unless ways may return, out of the region of
-        `here` and never back."""
-        if present is None or present[0] != here:
-            return np.inf, False
-        turns = list(map(self._turn_time.get, pairwise(present)))
-        known, regions = None not in turns, self._regions(present)
+        if len(way) < len(route):
+            return _Present(None)
+        if way[0] != here:
+            return _Present(way)
+        moves = [self._move.get(move) for move in pairwise(way)]
+        known, regions = [move for move in moves if move is not None], self._regions(way)
         back = not self._ways_return and regions.count(regions[0]) > 1
-        return time[present[1:]].sum() + sum(turns if known else filter(None, turns)), known and not back
+        times, ahead = self._times, way[1:]
+        takes = time[ahead].sum() + times.turns[known].sum()
+        free = times.free[ahead].sum() + times.free_turns[known].sum()
+        return _Present(way, takes, max(takes - free, 0.0), len(known) == len(moves) and not back)
 
     def _regions(self, way: list[int]) -> list[int]:
         """The regions that a way leads through, one after the other."""
         return [region for region, _ in groupby(map(self._region.__getitem__, way))]
 
-    def _keeps(self, present: list[int] | None, here: int, takes: float, cost: float,
-               following: int | None = None) -> bool:
-        """Whether the driver's present way, which takes `takes` [s], is about as good as one of `cost` [s], and leads
-        into the region `following` next, if that is given; so it is where the way uses roads that are closed to
-        cars."""
-        if present is None:
+    def _keeps(self, present: _Present, cost: float, following: int | None = None) -> bool:
+        """Whether the driver's present way is about as good as one of `cost` [s], and leads into the region `following`
+        next, if that is given; so it is where the way uses roads that are closed to cars."""
+        if present.way is None:
             return True
-        if present[0] != here:
+        if math.isinf(present.takes) or following is not None and self._next_region(present.way) != following:
             return False
-        if following is not None and self._next_region(present) != following:
-            return False
-        return takes <= (1.0 + SWITCHING_THRESHOLD) * cost
+        return present.takes <= cost + SWITCHING_THRESHOLD * present.delay**2 / max(present.takes, 1e-9)
 
     def _next_region(self, way: list[int]) -> int:
         """The region that a way enters first, or, if ways may return, when it leaves its own for good; its own if it
@@ -312,14 +313,14 @@ class Guide:
         if free not in self._told:
             prices = np.zeros(self._city.regions) if self._prices is None else self._prices.copy()
             prices[[] if free is None else free] = 0.0
-            self._told[free] = self._measured * (1.0 + prices)[self._region]
+            self._told[free] = self._times.edges * (1.0 + prices)[self._region]
         return free, self._told[free]
 
     def _home(self, region: int, taste: int, destination: int) -> "Home":
         free, time = self._bound_for(destination)
         key = 0 if self._ways_return else region, taste, free
         if key not in self._homes:
-            self._homes[key] = Home(self._homeward[key[0]], time * self._taste[taste])
+            self._homes[key] = Home(self._homeward[key[0]], time * self._taste[taste], self._times.turns)
         return self._homes[key]
 
     def _ways_from(self, region: int, taste: int, destination: int) -> "Ways":
@@ -331,9 +332,10 @@ class Guide:
             if region not in self._reached:
                 self._reached[region] = outside.leading_to(entries)
             if (region, taste) not in self._ahead:
-                self._ahead[region, taste] = outside.ahead(entries, self._free * self._taste[taste])
+                self._ahead[region, taste] = outside.ahead(
+                    entries, self._times.free * self._taste[taste], self._times.free_turns)
             self._ways[key] = Ways(
                 *self._gateways[region], inside=self._within[region], outside=outside,
                 reached=self._reached[region], ahead=self._ahead[region, taste],
-                time=time * self._taste[taste])
+                time=time * self._taste[taste], turns=self._times.turns)
         return self._ways[key]

@@ -97,14 +97,14 @@ class SumoPlant:
     def _drive(self, controls: Controls) -> State:
         session, streets = self.session, self._sensing.streets
         end = session.time + self._scenario.step
-        vehicles, speed = (None, None) if streets is None else (streets.vehicles, streets.speed)
+        vehicles = None if streets is None else streets.vehicles
         for source, target, share in self._observer.orders(self._k) if self._observer else ():
             self._incidents.hold(source, target, share)
         self._incidents.begin(self._k)
         network = self._scenario.network
         self._actuation.command(
             self._incidents.gated(controls.perimeter, network.u_min, network.u_max), vehicles)
-        self._guide.command(self._splits(controls), speed, controls.prices)
+        self._guide.command(self._splits(controls), streets, controls.prices)
         if self._metering:
             self._metering.command(controls.metering, self._state.accumulation.sum(axis=1))
         self._sensing.begin()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Real
 
-from cosim.sumo.arrays import EdgeMask, PerEdge, PerGateway
+from cosim.sumo.arrays import EdgeMask, PerEdge, PerGateway, PerInside
 from cosim.sumo.net import City
 from cosim.sumo.session import Session
 from nmfd.arrays import PerRegion
@@ -17,18 +17,23 @@ EVERY = 10.0  # s, between two samples
 class StreetMeans:
     """Means over the samples of one control interval.
 
+    duration: [s], of the interval
     vehicles: (E,) [veh], by the city's edges; speed: (E,) [m/s], that routing goes by (`Session.speeds`), NaN
     where there were no vehicles, 0 on closed streets
     accumulation: (R,) [veh]; production: (R,) [veh m/s]
     queue, queue_max: (G,) [veh] halting on the edge before a gateway, mean and largest
+    crossing: (I,) [veh] on the internal edges of `City.inside`; crossed: (I,) [veh/s], how many got over them
     """
 
+    duration: float
     vehicles: PerEdge
     speed: PerEdge
     accumulation: PerRegion
     production: PerRegion
     queue: PerGateway
     queue_max: Real[np.ndarray, " G"]
+    crossing: PerInside
+    crossed: PerInside
 
 
 def samples_apart(seconds: float, session: Session, steps: int) -> int:
@@ -44,8 +49,10 @@ class StreetSampler:
         self._session, self._city = session, city
         self._number = {edge: n for n, edge in enumerate(city.edges)}
         self._region = np.array([city.region_of[edge] for edge in city.edges])
+        self._inside = {edge: n for n, edge in enumerate(city.inside)}
         self._upstream = sorted({g.from_edge for g in city.gateways})  # gateways may share the edge before them
         self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in city.gateways], dtype=int)
+        self._end = session.time
         self._begin()
 
     @property
@@ -56,12 +63,19 @@ class StreetSampler:
     def _begin(self) -> None:
         # Sums over the samples: n, n v, and n times the speed that routing goes by.
         self._vehicles, self._metres, self._routed = np.zeros((3, len(self._city.edges)))
+        self._crossing, self._crossed = np.zeros((2, len(self._inside)))
         self._queues: list[list[int]] = []
 
     def sample(self) -> None:
         """Take one sample."""
-        counts, speeds, routing = self.present()
+        streets, crossed = self.travelled()
+        counts, speeds, routing = self._on(streets)
         self._last = counts, speeds
+        for edge in crossed:
+            if count := self._session.vehicle_count(edge):
+                n, (speed, _) = self._inside[edge], self._session.speeds(edge)
+                self._crossing[n] += count
+                self._crossed[n] += count * speed / self._city.inside[edge]
         self._vehicles, self._metres = self._vehicles + counts, self._metres + counts * speeds
         self._routed += counts * routing
         self._queues.append([self._session.halting(edge) for edge in self._upstream])
@@ -76,25 +90,30 @@ class StreetSampler:
         production, accumulation = (
             np.bincount(self._region, amount, self._city.regions) / samples for amount in (metres, vehicles))
         mean, largest = (queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))
+        crossing, crossed = self._crossing / samples, self._crossed / samples
         self._begin()
+        begun, self._end = self._end, self._session.time
         return StreetMeans(
-            vehicles=vehicles / samples, speed=speed, accumulation=accumulation, production=production, queue=mean,
-            queue_max=largest)
+            duration=self._end - begun, vehicles=vehicles / samples, speed=speed, accumulation=accumulation,
+            production=production, queue=mean, queue_max=largest, crossing=crossing, crossed=crossed)
 
     def present(self) -> tuple[PerEdge, PerEdge, PerEdge]:
         """Vehicles (E,) [veh], their mean speed (E,) [m/s], and that which routing goes by, by edge, now."""
+        return self._on(self.travelled()[0])
+
+    def _on(self, travelled: list[int]) -> tuple[PerEdge, PerEdge, PerEdge]:
         count, speeds_of, edges = self._session.vehicle_count, self._session.speeds, self._city.edges
         counts, speeds, routing = np.zeros((3, len(edges)))
-        travelled = self.travelled()
         counts[travelled] = [count(edges[n]) for n in travelled]
         for n in np.flatnonzero(counts):
             speeds[n], routing[n] = speeds_of(edges[n])
         return counts, speeds, routing
 
-    def travelled(self) -> list[int]:
-        """Numbers of edges, among them all that have vehicles: a large city has more edges than vehicles under way."""
+    def travelled(self) -> tuple[list[int], list[str]]:
+        """Numbers of edges, and internal edges, among them all that have vehicles: a large city has more edges than
+        vehicles under way."""
         vehicles = self._session.running()
         if 2 * len(vehicles) > len(self._city.edges):
-            return list(range(len(self._city.edges)))
-        roads = set(map(self._session.road, vehicles))  # some may be junctions, or closed to cars
-        return [self._number[road] for road in roads & self._number.keys()]
+            return list(range(len(self._city.edges))), list(self._inside)
+        roads = set(map(self._session.road, vehicles))  # some may be closed to cars
+        return [self._number[road] for road in roads & self._number.keys()], sorted(roads & self._inside.keys())

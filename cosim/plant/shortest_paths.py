@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from cosim.sumo.arrays import EdgeMask, GatewayMask, PerEdge, PerGateway
+from cosim.sumo.arrays import EdgeMask, GatewayMask, MoveEnds, PerEdge, PerGateway, PerMove
 
 FAR = 1e9  # s, longer than any way
 
@@ -16,26 +16,25 @@ class Moves:
     number: edge -> its node, -1 for edges that are not allowed
     """
 
-    def __init__(
-        self, first: Int[np.ndarray, " M"], second: Int[np.ndarray, " M"], turn: Float[np.ndarray, " M"], *,
-        allowed: EdgeMask, reverse: bool,
-    ):
-        """turn: [s], the time of a move; allowed: (E,), edges"""
+    def __init__(self, first: MoveEnds, second: MoveEnds, *, allowed: EdgeMask, reverse: bool):
+        """first, second: (M,), numbers of edges; allowed: (E,), edges"""
         self.edges = np.flatnonzero(allowed)
         self.number = np.full(len(allowed), -1)
         self.number[self.edges] = np.arange(len(self.edges))
         rows, columns = (self.number[part] for part in ((second, first) if reverse else (first, second)))
         kept = np.flatnonzero(allowed[first] & allowed[second])
         kept = kept[np.lexsort((columns[kept], rows[kept]))]
-        self._second, self._turn, self._columns = second[kept], turn[kept], columns[kept].astype(np.int32)
+        self._kept, self._second, self._columns = kept, second[kept], columns[kept].astype(np.int32)
         self._begins = np.searchsorted(rows[kept], np.arange(len(self.edges) + 1)).astype(np.int32)
         self._ids = self.edges.tolist()
 
-    def costing(self, time: PerEdge, ahead: Float[np.ndarray, " nodes"] | None = None) -> csr_array:
-        """A move costs the time of the turn and `time` (E,) [s] of the edge that it leads to; less the time by which
-        it comes nearer, of `ahead` (nodes,) [s], if that is given: then a search from t finds cost + ahead - ahead[t],
-        and what leads astray last (A*)."""
-        cost = np.maximum(time[self._second] + self._turn, 1e-3)
+    def costing(
+        self, time: PerEdge, turns: PerMove, ahead: Float[np.ndarray, " nodes"] | None = None,
+    ) -> csr_array:
+        """A move costs its own time, of `turns` (M,) [s], and `time` (E,) [s] of the edge that it leads to; less the
+        time by which it comes nearer, of `ahead` (nodes,) [s], if that is given: then a search from t finds cost +
+        ahead - ahead[t], and what leads astray last (A*)."""
+        cost = np.maximum(time[self._second] + turns[self._kept], 1e-3)
         if ahead is not None:
             cost += ahead[self._columns] - np.repeat(ahead, np.diff(self._begins))
         return csr_array((cost, self._columns, self._begins), shape=(len(self.edges),) * 2)
@@ -49,10 +48,12 @@ class Moves:
         _, once, which = np.unique(part[nodes], return_index=True, return_inverse=True)
         return np.isfinite(dijkstra(moves.T.tocsr(), indices=nodes[once], unweighted=True)).T[:, which]
 
-    def ahead(self, nodes: Int[np.ndarray, " G"], time: PerEdge) -> Float[np.ndarray, " nodes"]:
-        """(all nodes,) [s]: hardly less than the time from each to the nearest of `nodes` (G,) at `time` (E,) [s], and
-        FAR where none can be reached."""
-        least = dijkstra(self.costing(time).T.tocsr(), indices=nodes, min_only=True)
+    def ahead(
+        self, nodes: Int[np.ndarray, " G"], time: PerEdge, turns: PerMove,
+    ) -> Float[np.ndarray, " nodes"]:
+        """(all nodes,) [s]: hardly less than the time from each to the nearest of `nodes` (G,) at `time` (E,) [s] and
+        `turns` (M,) [s], and FAR where none can be reached."""
+        least = dijkstra(self.costing(time, turns).T.tocsr(), indices=nodes, min_only=True)
         return np.where(np.isfinite(least), (1.0 - 1e-6) * least, FAR)  # less, for no move may cost nothing
 
     def path(self, before: Int[np.ndarray, " nodes"], first: int, last: int) -> list[int]:
@@ -67,9 +68,9 @@ class Moves:
 class Home:
     """Fastest ways to single edges by `moves`, searched back from them when somebody first goes there."""
 
-    def __init__(self, moves: Moves, time: PerEdge):
-        """time: (E,) [s]"""
-        self.time, self._moves, self._costs = time, moves, moves.costing(time)
+    def __init__(self, moves: Moves, time: PerEdge, turns: PerMove):
+        """time: (E,) [s]; turns: (M,) [s]"""
+        self.time, self._moves, self._costs = time, moves, moves.costing(time, turns)
         self._found: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
 
     def cost(self, here: int, target: int, most: float) -> float:
@@ -95,18 +96,20 @@ class Ways:
     """
 
     def __init__(
-        self, first: Int[np.ndarray, " G"], second: Int[np.ndarray, " G"], next_region: Int[np.ndarray, " G"], *,
-        inside: Moves, outside: Moves, reached: Bool[np.ndarray, "nodes G"], ahead: Float[np.ndarray, " nodes"],
-        time: PerEdge,
+        self, first: Int[np.ndarray, " G"], second: Int[np.ndarray, " G"], move: Int[np.ndarray, " G"],
+        next_region: Int[np.ndarray, " G"], *, inside: Moves, outside: Moves, reached: Bool[np.ndarray, "nodes G"],
+        ahead: Float[np.ndarray, " nodes"], time: PerEdge, turns: PerMove,
     ):
-        """first, second, next_region: (G,), the last in rising order; inside: moves in the region; outside: those
-        elsewhere, back; reached: (nodes of `outside`, G), which edges can be reached from second[g]; ahead: (nodes of
-        `outside`,) [s], to the nearest second[g] at times that are no more than `time` (E,) [s]"""
+        """first, second, move, next_region: (G,), the number of each gateway's move, and the last in rising order;
+        inside: moves in the region; outside: those elsewhere, back; reached: (nodes of `outside`, G), which edges can
+        be reached from second[g]; ahead: (nodes of `outside`,) [s], to the nearest second[g] at times that are no more
+        than `time` (E,) [s] and `turns` (M,) [s]"""
         self.time, self._inside, self._outside, self._reached, self._ahead = time, inside, outside, reached, ahead
-        self._first, self._second, self._entering = inside.number[first], outside.number[second], time[second]
+        self._first, self._second, self._entering = (
+            inside.number[first], outside.number[second], turns[move] + time[second])
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))
-        self._costs = inside.costing(time), outside.costing(time, ahead)
+        self._costs = inside.costing(time, turns), outside.costing(time, turns, ahead)
         self._there: dict[int, tuple[np.ndarray, np.ndarray, float, np.ndarray]] = {}
         self._onward: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
 

@@ -1,7 +1,7 @@
 """The shapes of a city's arrays, for annotations, beside those of nmfd.arrays; units are said where they are used.
 
-E edges, G gateways, R regions, T control intervals, N trips. One letter is one number within a call or an object.
-Checked while testing (tests/conftest.py).
+E edges, G gateways, I internal edges of turns over junctions, M moves from edge to edge, R regions, T control
+intervals, N trips. One letter is one number within a call or an object. Checked while testing (tests/conftest.py).
 """
 
 import numpy as np
@@ -12,6 +12,9 @@ from nmfd.arrays import Points as Points  # as there
 PerEdge = Float[np.ndarray, " E"]
 EdgeMask = Bool[np.ndarray, " E"]
 EdgeNumbers = Int[np.ndarray, " E"]
+PerInside = Float[np.ndarray, " I"]
+PerMove = Float[np.ndarray, " M"]
+MoveEnds = Int[np.ndarray, " M"]
 PerGateway = Float[np.ndarray, " G"]
 GatewayMask = Bool[np.ndarray, " G"]
 PerTrip = Float[np.ndarray, " N"]

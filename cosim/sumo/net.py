@@ -3,8 +3,8 @@
 import csv
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +49,9 @@ class City:
     length [m], lanes, speed [m/s]: by normal edge
     lane_ids: normal edge -> its lanes for cars
     successors: normal edge -> the edges that follow, sorted
-    turn_time: (from_edge, to_edge) -> free-flow time on the junction between them [s]
+    turn_time: (from_edge, to_edge) -> free-flow time on the junction between them [s], as far as where a turn waits
+    over: (from_edge, to_edge) -> the internal edges of this turn, in order; none where the net has none
+    inside: internal edge of a turn -> its length [m], sorted
     gateways: sorted by source, target, from_edge, to_edge
     signals: edge -> the signal at its end, as far as it has links for cars
     """
@@ -66,6 +68,8 @@ class City:
     turn_time: Mapping[tuple[str, str], float]
     gateways: tuple[Gateway, ...]
     signals: Mapping[str, str]
+    over: Mapping[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
+    inside: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,8 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
             f"{regions_csv}: region {min(empty)} has no edges; every region from 0 to {regions - 1} needs one")
     links = [c for c in connections if (c.source, c.lane) in cars and (c.target, c.to_lane) in cars]
     turns = sorted({(c.source, c.target) for c in links})
-    times = {(c.source, c.target): internal[c.via.rpartition("_")[0]] if c.via else 0.0 for c in links}
+    times = {(c.source, c.target): internal[c.via.rpartition("_")[0]][0] if c.via else 0.0 for c in links}
+    over = _turns_over_junctions(links, connections)
     successors: dict[str, list[str]] = {edge: [] for edge in edges}
     for source, target in turns:
         successors[source].append(target)
@@ -116,7 +121,9 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
         lane_ids={e: tuple(lane for _, _, lane in lanes_of[e]) for e in edges},
         speed={e: max(speed for _, speed, _ in lanes_of[e]) for e in edges},
         successors={edge: tuple(after) for edge, after in successors.items()}, turn_time=times, gateways=gateways,
-        signals={c.source: c.signal for c in links if c.signal})
+        signals={c.source: c.signal for c in links if c.signal}, over=over,
+        inside={edge: internal[edge][1] for edge in sorted({edge for way in over.values() for edge in way})
+                if internal[edge][1] > 0.0})
 
 
 def check_adjacency(city: City, network: RegionalModel) -> None:
@@ -156,11 +163,13 @@ def edge_shapes(city: City) -> list[Points]:
 
 
 def _read_net(path: Path) -> tuple[
-        dict[str, list[tuple[float, float, str]]], set[tuple[str, int]], dict[str, float], list[_Connection]]:
-    """(edge -> [(length, speed, id) of each car lane], the car lanes, internal edge -> free-flow time [s], links)."""
+        dict[str, list[tuple[float, float, str]]], set[tuple[str, int]], dict[str, tuple[float, float]],
+        list[_Connection]]:
+    """(edge -> [(length, speed, id) of each car lane], the car lanes, internal edge -> (free-flow time [s],
+    length [m]), links)."""
     cars: set[tuple[str, int]] = set()
     lanes_of: dict[str, list[tuple[float, float, str]]] = {}
-    internal: dict[str, float] = {}
+    internal: dict[str, tuple[float, float]] = {}
     connections: list[_Connection] = []
     try:
         with opened(path) as stream:
@@ -175,7 +184,7 @@ def _read_net(path: Path) -> tuple[
                                  for lane in element.iter("lane") if for_cars(lane)}
                     else:
                         internal[attribute(element, "id")] = max(
-                            (length / speed for length, speed, _ in lanes), default=0.0)
+                            ((length / speed, length) for length, speed, _ in lanes), default=(0.0, 0.0))
                     element.clear()
                 elif element.tag == "connection":
                     connections.append(_Connection(
@@ -237,7 +246,7 @@ def _read_regions(path: Path, regions: int) -> dict[str, int]:
 
 
 def _internal_regions(
-    connections: Sequence[_Connection], region_of: Mapping[str, int], internal: Mapping[str, float],
+    connections: Sequence[_Connection], region_of: Mapping[str, int], internal: Collection[str],
 ) -> dict[str, int]:
     """Internal edge -> region of the edge it leads to; crossings and walking areas, without cars, that of any edge of
     their junction."""
@@ -254,6 +263,24 @@ def _internal_regions(
     for edge, region in regions.items():
         of_junction.setdefault(edge.rpartition("_")[0], region)
     return {edge: regions.get(edge, of_junction.get(edge.rpartition("_")[0], 0)) for edge in internal}
+
+
+def _turns_over_junctions(
+    links: Sequence[_Connection], connections: Sequence[_Connection],
+) -> dict[tuple[str, str], tuple[str, ...]]:
+    """(from_edge, to_edge) -> the internal edges in between, of the last of several links: where a turn waits in the
+    middle of a junction, it goes over two."""
+    onward = {(c.source, c.lane): c.via for c in connections if c.source.startswith(":")}
+    over: dict[tuple[str, str], tuple[str, ...]] = {}
+    for link in links:
+        way, via = [], link.via
+        while via:
+            edge, _, lane = via.rpartition("_")
+            way.append(edge)
+            via = onward.get((edge, int(lane)))
+        if way:
+            over[link.source, link.target] = tuple(way)
+    return over
 
 
 def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gateway, ...]:
