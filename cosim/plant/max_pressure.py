@@ -23,6 +23,7 @@ these and the SOON seconds that follow. Without that it loses against fixed time
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
+from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -300,8 +301,9 @@ class Approaches:
         return red * (red >= MAX_RED - 1e-6)
 
 
+@lru_cache(maxsize=4096)  # a city shows the same states all day long
 def _green(state: str) -> np.ndarray:
-    """(K,) bool"""
+    """(K,) bool, not to be written to"""
     return np.isin(list(state), list(GREEN))
 
 
