@@ -229,6 +229,27 @@ def test_what_was_run_again_may_be_another_one(city, tmp_path, demanded):
     assert set(pd.read_csv(tmp_path / "after" / "frontier.csv")["controller"]) == {"pi-gating", "max-pressure"}
 
 
+@pytest.mark.parametrize("first", ["5", "7"])
+def test_of_a_run_in_two_tables_the_first_one_counts(city, tmp_path, demanded, first):
+    def invoke(name, controller, *more):
+        return CliRunner().invoke(main, [
+            "frontier", str(city), "--controllers", controller, "--demand", "1", "--seeds", "1", "--steps", "1",
+            "--out", str(tmp_path / name), *more])
+
+    assert invoke("before", "pi-gating").exit_code == 0
+    made = (tmp_path / "before" / "runs.csv").read_text()
+    assert made.count("1000000.0") == 1
+    tables = [tmp_path / f"{n}.csv" for n in ("5", "7")]
+    for table in tables:
+        table.write_text(made.replace("1000000.0", f"{table.stem}000000.0"))
+    tables.sort(key=lambda table: table.stem != first)
+    for again in (tables, tables[::-1]):  # a second time they are there already
+        done = invoke("after", "max-pressure", *(word for table in again for word in ("--earlier", str(table))))
+        assert done.exit_code == 0, done.output
+        table = pd.read_csv(tmp_path / "after" / "runs.csv").set_index("controller")["total_time_spent_veh_s"]
+        assert table.to_dict() == {"max-pressure": 1e6, "pi-gating": float(first) * 1e6}
+
+
 @pytest.mark.parametrize("old, new, said", [
     ('""demand_hash"":""', '""demand_hash"":""0', "demand-1 demand_hash (0"),
     ("demand,controller", "level,controller", "is no table of runs")])

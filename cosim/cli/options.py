@@ -29,7 +29,7 @@ RUNS = click.option(
 EARLIER = click.option(
     "--earlier", type=FILE, multiple=True, metavar="FILE",
     help="The runs.csv of an earlier evaluation or frontier of the same city whose runs are not kept any more: its "
-         "rows are in the tables too. May be repeated.")
+         "rows are in the tables too. May be repeated: of a run in several, the first one counts.")
 REFERENCE = click.option(
     "--reference", metavar="NAME",
     help="Pair all controllers with this one too, besides no-control, or the first one if that is not there.")

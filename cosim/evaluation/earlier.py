@@ -1,8 +1,9 @@
 """Tables of earlier evaluations whose run folders are not there any more, beside the runs that are.
 
-    <folder>/earlier/<hash>.csv    copies of their runs.csv, with their trails
+    <folder>/earlier/<n>-<hash>.csv    copies of their runs.csv, with their trails, in the order in which they came
 
 Their rows stand in the tables as if their runs lay in the folder; what is drawn or explained of runs is without them.
+Of a run that is in several tables, the row of the one that came first counts.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,9 +21,11 @@ def add(out: Path, tables: Sequence[Path], rows: pd.DataFrame) -> None:
     """Copy tables to `out`. rows: of the runs there. InputError for what is no table of runs, or does not fit them."""
     for table in tables:
         _left(out, table, rows)
-        (out / trail.EARLIER).mkdir(parents=True, exist_ok=True)
-        files.write_text(
-            out / trail.EARLIER / f"{files.file_hash(table)}.csv", table.read_text(encoding="utf-8"))
+        known, name = trail.earlier(out), f"{files.file_hash(table)}.csv"
+        if not any(copy.name.endswith(name) for copy in known):
+            (out / trail.EARLIER).mkdir(parents=True, exist_ok=True)
+            files.write_text(
+                out / trail.EARLIER / f"{len(known):03d}-{name}", table.read_text(encoding="utf-8"))
 
 
 def joined(out: Path, rows: pd.DataFrame) -> pd.DataFrame:

@@ -68,7 +68,7 @@ def of_runs(folder: Path) -> dict:
 
 
 def earlier(folder: Path) -> list[Path]:
-    """Tables whose runs are not there any more (cosim.evaluation.earlier)."""
+    """Tables whose runs are not there any more, in the order in which they came (cosim.evaluation.earlier)."""
     return sorted((folder / EARLIER).glob("*.csv"))
 
 
