@@ -6,6 +6,10 @@ import numpy as np
 
 from cosim.plant.sampling import StreetMeans
 
+# Of a session: nobody stands, or is near the end of a lane.
+FAR_FROM_THE_END = {
+    "standing_time": lambda vehicle: 0.0, "place": lambda vehicle: ("lane", 0.0),
+    "lane": lambda lane: (1e9, frozenset())}
 MANY = 1e5  # veh: so many that nothing else counts
 
 

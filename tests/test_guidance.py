@@ -8,7 +8,7 @@ from unittest.mock import Mock
 import libsumo
 import numpy as np
 import pytest
-from streets import seen
+from streets import FAR_FROM_THE_END, seen
 
 from cosim.plant.guidance import Guide, shifted
 from cosim.plant.meter import Event
@@ -36,7 +36,7 @@ def ways(city):
     gates = sorted({(int(REGION[b]), int(a), int(b), n) for n, (a, b) in enumerate(zip(first, second, strict=True))
                     if REGION[a] == 0 and REGION[b] != 0})
     following, gate, entry, move = np.array(gates).T
-    return Ways(gate, entry, move, following, inside=inside, outside=back, time=time, turns=turn,
+    return Ways(gate, entry, following, inside=inside, outside=back, time=time, turns=turn, crossing=turn[move],
                 reached=back.leading_to(back.number[entry]),
                 ahead=back.ahead(back.number[entry], 0.8 * time, 0.7 * turn)), gate, entry
 
@@ -117,13 +117,13 @@ def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0):
             for e, f in moves if REGION_OF[e] != REGION_OF[f]), key=lambda g: (g.source, g.target))))
     routes, road = {"driver": route}, Mock(side_effect=lambda vehicle: routes[vehicle][0])
     session = SimpleNamespace(
-        road=road, route=routes.get, route_index=lambda vehicle: 0, step_length=1.0,
+        road=road, route=routes.get, route_index=lambda vehicle: 0, step_length=1.0, **FAR_FROM_THE_END,
         set_route=lambda vehicle, way: routes.update({vehicle: tuple(way)}) or True)
     own, splits = np.zeros((2, 3, 3, 3))
     own[0, 1:, 2], own[1, 0, 2] = 0.5, 1.0
     splits[0, 1:, 2], splits[1, 0, 2] = (to_region_1, 1.0 - to_region_1), 1.0
     guide = Guide(session, city, own, compliance=1.0, most_detour=60.0, random=np.random.default_rng(0),
-                  ways_return=ways_return, period=period, lanes=False)
+                  ways_return=ways_return, period=period)
     guide.command(splits, None)
     return guide, splits, routes, road
 

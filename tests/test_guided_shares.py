@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from streets import seen
+from streets import FAR_FROM_THE_END, seen
 
 from cosim.evaluation.simulate import drive
 from cosim.plant import guidance
@@ -27,12 +27,13 @@ HOMEWARD = Event(vehicle="x", source=None, region=3, destination=3, edge="v")
 @pytest.fixture(autouse=True)
 def everybody_sees_the_same_times(monkeypatch):
     monkeypatch.setattr(guidance, "SPREAD", 0.0)
+    monkeypatch.setattr(guidance, "MESO_SPREAD", 0.0)
 
 
 class Town:
     """A guide of drivers on s, bound for t: by a it takes `through_a` [s] more than the last edge, by b `through_b`."""
 
-    def __init__(self, *, through_a, through_b, theta, own=0.5, most_detour=1e9, compliance=1.0, seed=0):
+    def __init__(self, *, through_a, through_b, theta, own=0.5, most_detour=1e9, compliance=1.0, seed=0, lanes=True):
         length = dict.fromkeys(EDGES, 10.0) | {"a": through_a, "b": through_b, "u": 5.0}
         city = City(
             net_file=Path(), regions=4, region_of=REGION_OF, edges=EDGES, length=length,
@@ -49,9 +50,9 @@ class Town:
             shares[1, 3, 3] = shares[2, 3, 3] = 1.0
         session = SimpleNamespace(
             road=lambda vehicle: self.routes[vehicle][0], route=self.routes.get, route_index=lambda vehicle: 0,
-            step_length=1.0, set_route=self._set_route)
+            step_length=1.0, set_route=self._set_route, **FAR_FROM_THE_END)
         self.guide = Guide(session, city, self.shares[0], compliance=compliance, most_detour=most_detour,
-                           random=np.random.default_rng(seed), lanes=False)
+                           random=np.random.default_rng(seed), lanes=lanes)
         self.command()
 
     def _set_route(self, vehicle, way):
@@ -184,6 +185,17 @@ def test_the_more_delay_the_more_another_way_must_save(present, at_v, best):
     town.routes["x"] = ("t", present, "v")
     town.guide.apply([HOMEWARD])
     assert town.routes["x"] == ("t", "u" if best else present, "v")
+
+
+@pytest.mark.parametrize("at_v, best", [(16.0, False), (4.0, True)])
+def test_in_the_mesoscopic_model_another_way_must_save_a_share_of_its_own_time(at_v, best):
+    """v takes 13 s, the mean of now and before: 25 s by t2 and 20 by u, 1.25 times. Or t2 takes 22 s: 34 and 17 s."""
+    town = Town(through_a=30.0, through_b=90.0, theta=0.5, lanes=False)
+    town.command(t2=10.0 / (34.0 if best else 10.0), v=10.0 / at_v)
+    assert town.guide._times.edges[EDGES.index("t2")] == pytest.approx(22.0 if best else 10.0)  # smoothed: half of it
+    town.routes["x"] = ("t", "t2", "v")
+    town.guide.apply([HOMEWARD])
+    assert town.routes["x"] == ("t", "u" if best else "t2", "v")
 
 
 class _Gate:

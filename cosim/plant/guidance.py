@@ -44,9 +44,11 @@ from nmfd.arrays import PerRegion, PerTurn
 
 DRIVER_CLASSES = 4          # groups of drivers who see different travel times: were all sent one way, it would jam
 SPREAD = 0.05               # standard deviation of the logarithm of their travel times
+MESO_SPREAD = 0.15          # the same in the mesoscopic model
 SHARE_PENALTY = 30.0        # s per vehicle that a region is behind its share
 SWITCHING_THRESHOLD = 0.6   # drivers keep their way if the best one saves less than this share of the delay on theirs,
                             # times the share that the delay has in the time of their way
+MESO_THRESHOLD = 0.3        # in the mesoscopic model: if it saves less than this share of its own time
 SOON = 10.0                 # s after which they are asked again for whom it was too late to change lanes
 MEMORY = 0.9                # of the vehicles assigned before and of their wishes, per control interval
 
@@ -112,7 +114,7 @@ class Guide:
         self._session, self._city, self._compliance, self._random = session, city, compliance, random
         self._index = {edge: n for n, edge in enumerate(city.edges)}
         self._region = [city.region_of[edge] for edge in city.edges]
-        self._times = times = TravelTimes(city)
+        self._times = times = TravelTimes(city, lanes=lanes)
         self._move = {move: n for n, move in enumerate(zip(times.first.tolist(), times.second.tolist(), strict=True))}
         here = [np.array(self._region) == region for region in range(city.regions)]
         self._within, within_back, self._without_back = (
@@ -127,7 +129,8 @@ class Guide:
             np.array([(first, second, self._move[first, second], g.target) for first, second, g in ends
                       if g.source == region], dtype=int).reshape(-1, 4).T
             for region in range(city.regions)]
-        self._taste = np.exp(SPREAD * random.standard_normal((DRIVER_CLASSES, len(city.edges))))
+        spread = SPREAD if lanes else MESO_SPREAD
+        self._taste = np.exp(spread * random.standard_normal((DRIVER_CLASSES, len(city.edges))))
         self._prices: PerRegion | None = None
         self._told: dict[int | None, PerEdge] = {}  # region without a price, None for all with theirs -> (E,) [s]
         self._reached: dict[int, np.ndarray] = {}
@@ -287,6 +290,8 @@ class Guide:
             return True
         if math.isinf(present.takes) or following is not None and self._next_region(present.way) != following:
             return False
+        if not self._lanes:
+            return present.takes <= (1.0 + MESO_THRESHOLD) * cost
         return present.takes <= cost + SWITCHING_THRESHOLD * present.delay**2 / max(present.takes, 1e-9)
 
     def _next_region(self, way: list[int]) -> int:
@@ -334,8 +339,10 @@ class Guide:
             if (region, taste) not in self._ahead:
                 self._ahead[region, taste] = outside.ahead(
                     entries, self._times.free * self._taste[taste], self._times.free_turns)
+            first, second, move, following = self._gateways[region]
             self._ways[key] = Ways(
-                *self._gateways[region], inside=self._within[region], outside=outside,
+                first, second, following, inside=self._within[region], outside=outside,
+                crossing=self._times.turns[move] if self._lanes else np.zeros(len(move)),
                 reached=self._reached[region], ahead=self._ahead[region, taste],
                 time=time * self._taste[taste], turns=self._times.turns)
         return self._ways[key]

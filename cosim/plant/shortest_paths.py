@@ -96,17 +96,17 @@ class Ways:
     """
 
     def __init__(
-        self, first: Int[np.ndarray, " G"], second: Int[np.ndarray, " G"], move: Int[np.ndarray, " G"],
-        next_region: Int[np.ndarray, " G"], *, inside: Moves, outside: Moves, reached: Bool[np.ndarray, "nodes G"],
+        self, first: Int[np.ndarray, " G"], second: Int[np.ndarray, " G"], next_region: Int[np.ndarray, " G"], *,
+        inside: Moves, outside: Moves, crossing: PerGateway, reached: Bool[np.ndarray, "nodes G"],
         ahead: Float[np.ndarray, " nodes"], time: PerEdge, turns: PerMove,
     ):
-        """first, second, move, next_region: (G,), the number of each gateway's move, and the last in rising order;
-        inside: moves in the region; outside: those elsewhere, back; reached: (nodes of `outside`, G), which edges can
-        be reached from second[g]; ahead: (nodes of `outside`,) [s], to the nearest second[g] at times that are no more
+        """first, second, next_region: (G,), the last in rising order; inside: moves in the region; outside: those
+        elsewhere, back; crossing: (G,) [s], over each gateway; reached: (nodes of `outside`, G), which edges can be
+        reached from second[g]; ahead: (nodes of `outside`,) [s], to the nearest second[g] at times that are no more
         than `time` (E,) [s] and `turns` (M,) [s]"""
         self.time, self._inside, self._outside, self._reached, self._ahead = time, inside, outside, reached, ahead
         self._first, self._second, self._entering = (
-            inside.number[first], outside.number[second], turns[move] + time[second])
+            inside.number[first], outside.number[second], crossing + time[second])
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))
         self._costs = inside.costing(time, turns), outside.costing(time, turns, ahead)
