@@ -12,6 +12,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from itertools import chain
 from pathlib import Path
 
 from cosim.compete import entry, metrics
@@ -86,8 +87,7 @@ def compete(
         books = _Books(order, scenarios, worlds)
         for task in tasks:
             if task.plant != SUMO:
-                for name in order.controllers:
-                    _regional(books, task, name, workers=workers, progress=progress, tell=tell, source=source)
+                _regional(books, task, workers=workers, progress=progress, tell=tell, source=source)
         _in_sumo(books, [task for task in tasks if task.plant == SUMO], workers=workers, progress=progress,
                  tell=tell, source=source)
         return books.write()
@@ -200,19 +200,31 @@ class _Books:
 
 
 def _regional(
-    books: _Books, task: TaskTable, name: str, *, workers: int, progress: Progress | None, tell: Tell | None,
+    books: _Books, task: TaskTable, *, workers: int, progress: Progress | None, tell: Tell | None,
     source: Source | None,
 ) -> None:
-    """The runs of one controller on a regional model."""
-    books.begin(name, task)
+    """The runs of all controllers on a regional model."""
+    scenario, out = books.scenarios[task.id], books.order.out / task.id
+
+    def check(name: str) -> None:
+        registry.verify(strategy(name, task), scenario)
+
+    entrants: dict[str, list[str]] = {}
+    for name in _able(books, task, check):
+        entrants.setdefault(strategy(name, task), []).append(name)  # two entries may come to the same
+    if not entrants:
+        books.write()
+        return
     try:
         _, failures = benchmark.perform(
-            books.scenarios[task.id], [strategy(name, task)], task.seeds, task.plant, out=books.order.out / task.id,
-            noise=noise_of(task), workers=workers, progress=progress, renew=tell or _silent, source=source)
-        for (_, seed), failure in failures:
-            books.fail(name, task, failure.reason, [seed])
+            scenario, list(entrants), task.seeds, task.plant, out=out, noise=noise_of(task), workers=workers,
+            progress=progress, renew=tell or _silent, source=source)
+        for (called, seed), failure in failures:
+            for name in entrants[called]:
+                books.fail(name, task, failure.reason, [seed])
     except InputError as error:
-        books.fail(name, task, str(error), task.seeds)
+        for name in chain.from_iterable(entrants.values()):
+            books.fail(name, task, str(error), task.seeds)
     finally:
         books.write()
 
@@ -225,7 +237,10 @@ def _in_sumo(
     entrants: dict[Task, list[tuple[str, TaskTable]]] = {}
     plan: list[tuple[Path, Task]] = []
     for task in tasks:
-        able = _able(books, task)
+        def check(name: str, task: TaskTable = task) -> None:
+            experiment.shared_configuration([_task(books, task, name, task.seeds[0])])
+
+        able = _able(books, task, check)
         for seed in task.seeds:
             for name in able:
                 one = _task(books, task, name, seed)
@@ -243,13 +258,13 @@ def _in_sumo(
         source=source)
 
 
-def _able(books: _Books, task: TaskTable) -> list[str]:
-    """The controllers that can be made for a task; the others have failed in it."""
+def _able(books: _Books, task: TaskTable, check: Callable[[str], object]) -> list[str]:
+    """The controllers that can be made for a task, in which `check` finds nothing wrong; the others fail in it."""
     found = []
     for name in books.order.controllers:
         books.begin(name, task)
         try:
-            experiment.shared_configuration([_task(books, task, name, task.seeds[0])])
+            check(name)
             found.append(name)
         except InputError as error:
             books.fail(name, task, str(error), task.seeds)
