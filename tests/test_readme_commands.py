@@ -19,7 +19,8 @@ REDUCED = {  # what is added; of an option that is there already the last counts
     "cosim identify": ["--levels", 6, "--seeds", 1, "--own", "--iterations", 10], "cosim list": [], "nmfd list": []}
 NOT_RUN = {  # what takes long or needs more, and where it is tested
     "cosim watch": "test_watch.py", "cosim video": "test_video.py", "cosim tune": "test_tuning.py",
-    "cosim improve": "test_improve.py", "cosim frontier": "test_tuning.py", "nmfd bound": "test_bound.py",
+    "cosim improve": "test_improve.py", "cosim frontier": "test_tuning.py",
+    "cosim bound": "test_schedules.py", "nmfd bound": "test_bound.py",
     "nmfd value": "test_terminal.py", "nmfd robustness": "test_robustness.py", "nmfd scaling": "test_scaling.py",
     "nmfd ablation": "test_ablation.py", "nmfd adaptation": "test_adaptation.py", "cosim compete": "test_compete.py",
     "cosim verify": "test_compete.py", "cosim get": "test_get.py", "cosim demo": "test_demo.py",

@@ -8,12 +8,11 @@ import copies
 import numpy as np
 import pandas as pd
 import pytest
-import trajectories
 from click.testing import CliRunner
+from trajectories import in_city
 
 from cosim.cli.main import main
 from cosim.evaluation import experiment, frontier, tuning
-from cosim.evaluation.simulate import FACTS, Result
 from nmfd.errors import InputError
 from nmfd.runs import config, trail
 from nmfd.runs.workers import Failure
@@ -35,19 +34,6 @@ def read_once(monkeypatch):
     monkeypatch.setattr(experiment, "check_strategy", lambda *_: None)
 
 
-def result(task, tts: float, completed: int = TRIPS) -> Result:
-    """A run whose total time spent is `tts` [veh s]."""
-    accumulation = np.zeros((2, 7, 7))
-    accumulation[0, 0, 0] = tts / 90.0
-    trajectory = trajectories.made(
-        controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=accumulation,
-        backlog=np.zeros((2, 7, 7)), completed=np.array([0.0, completed]), perimeter=np.ones((1, 7, 7)),
-        splits=np.zeros((1, 7, 7, 7)), decision_time=np.zeros(1), wall_time=1.0)
-    facts = {name: 0 for name in FACTS} | {
-        "outside_training": "", "controller": task.controller, "seed": task.seed, "trips": TRIPS}
-    return Result(trajectory=trajectory, record=trajectories.record(1, regions=7), facts=facts)
-
-
 @pytest.fixture
 def runs(monkeypatch):
     """The tasks that are run; their total time spent is lowest at set point 300 and kp 2."""
@@ -58,8 +44,8 @@ def runs(monkeypatch):
             tasks.append(task)
             options = dict(task.options)
             away = (options["set_point"][0] - 300.0) ** 2 / 1e4 + math.log(options["kp"] / 2.0) ** 2
-            yield task, Failure("SUMO fell over") if len(tasks) in failing else result(
-                task, 1e6 * task.demand_factor * (1.0 + task.seed / 1e4) * (1.0 + away))
+            yield task, Failure("SUMO fell over") if len(tasks) in failing else in_city(
+                task, 1e6 * task.demand_factor * (1.0 + task.seed / 1e4) * (1.0 + away), TRIPS, TRIPS)
 
     monkeypatch.setattr(experiment, "outcomes", outcomes)
     return tasks, failing
@@ -140,7 +126,7 @@ def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_pat
     def outcomes(function, todo, workers, *, fresh, group=None, look=None):
         for task in todo:
             seen.append(task.policy)
-            yield task, result(task, 1e6 * dict(task.options)["mfd_scale"])
+            yield task, in_city(task, 1e6 * dict(task.options)["mfd_scale"], TRIPS, TRIPS)
 
     monkeypatch.setattr(experiment, "outcomes", outcomes)
     monkeypatch.setattr(tuning, "outcomes", lambda function, todo, workers, look: [
@@ -166,7 +152,7 @@ def demanded(monkeypatch):
         for task in todo:
             tasks.append((task.controller, task.demand_factor))
             served = task.seed - 1000 < SERVED[task.controller][task.demand_factor]
-            yield task, result(task, 1e6 * task.demand_factor, TRIPS - (not served))
+            yield task, in_city(task, 1e6 * task.demand_factor, TRIPS, TRIPS - (not served))
 
     monkeypatch.setattr(experiment, "outcomes", outcomes)
     return tasks

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from cosim.evaluation.simulate import FACTS, Result, Task
 from cosim.plant.record import Record
 from nmfd.quantities import quantities
 from nmfd.types import Status, Trajectory
@@ -31,3 +32,16 @@ def trajectory(controller="no-control", seed=0, steps=4):
         splits=rng.random((steps, 2, 2, 2)), decision_time=rng.random(steps), note=("",) * (steps - 1) + ("no",),
         status=np.array([0] * (steps - 1) + [(Status.SOLVER_FAILURE | Status.FALLBACK).value]),
         wall_time=1.0)
+
+
+def in_city(task: Task, tts: float, trips: int, completed: int) -> Result:
+    """A run of one interval in a city of seven regions; tts: its total time spent [veh s]."""
+    accumulation = np.zeros((2, 7, 7))
+    accumulation[0, 0, 0] = tts / 90.0
+    run = made(
+        controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=accumulation,
+        backlog=np.zeros((2, 7, 7)), completed=np.array([0.0, completed]), perimeter=np.ones((1, 7, 7)),
+        splits=np.zeros((1, 7, 7, 7)), decision_time=np.zeros(1), wall_time=1.0)
+    facts = {name: 0 for name in FACTS} | {
+        "outside_training": "", "controller": task.controller, "seed": task.seed, "trips": trips}
+    return Result(trajectory=run, record=record(1, regions=7), facts=facts)

@@ -16,7 +16,7 @@ from cosim.cli.options import CONTROLLER_HELP, EARLIER, REFERENCE, chosen_schedu
 from cosim.cli.reference import reference
 from cosim.cli.report import report, video, watch
 from cosim.cli.run import compare, run
-from cosim.cli.search import frontier, improve, tune
+from cosim.cli.search import bound, frontier, improve, tune
 from cosim.cli.verify import verify
 from nmfd.cli.about import about, listing
 from nmfd.cli.declared import declared
@@ -159,5 +159,5 @@ def sweep(
 
 for command in (
         demo, listing("cosim.plant.strategy:options"), run, compare, report, video, watch, identify, import_, get,
-        reference, tune, improve, frontier, compete, verify):
+        reference, tune, improve, bound, frontier, compete, verify):
     main.add_command(command)

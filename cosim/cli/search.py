@@ -1,4 +1,4 @@
-"""The commands tune, improve and frontier of `cosim`: what many runs are searched for.
+"""The commands tune, improve, bound and frontier of `cosim`: what many runs are searched for.
 
 Heavy modules are imported inside them: help takes 0.1 s instead of 3 s.
 """
@@ -126,6 +126,48 @@ def improve(
         picture.draw(order.out / "improve.png", table, runs=len(order.seeds) * len(order.levels))
     click.echo(method.text(order, table))
     click.echo(f"Written to {order.out}: see policy.pt, model, improve.csv and improve.png")
+
+
+@click.command()
+@SCENARIO
+@CONTROLLER
+@click.option("--against", metavar="NAME[+...]",
+              help="A rival, which is run with the same seeds: how much of what the bound saves against it the "
+                   "controller saves as well.")
+@declared("cosim.evaluation.settings:Bound", "candidates", "knots", "seeds", "first_seed", "demand", "search_seed")
+@declared("cosim.evaluation.settings:Bound", "workers", instead="one per core")
+@scheduler_options
+@STEPS
+@out_option("bound", "The folder.")
+def bound(
+    scenario: Path, controller: str, against: str | None, candidates: int, knots: int, seeds: int, first_seed: int,
+    demand: tuple[float, ...], search_seed: int, workers: int | None, scheduler: str | None,
+    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None,
+    out: Path | None,
+) -> None:
+    """See how much there is to win: the best that a controller could have done, had it known the day.
+
+    For every seed and demand level, schedules over the horizon are added to what the controller commands, its gates,
+    prices and rates of metering, and searched by CMA-ES on that very run. It is no limit, but what a short search
+    found; luck is part of it. Writes bound.csv and the searches. The same command goes on where it was interrupted, and
+    with more --candidates from where it ended.
+
+    \b
+    Example:
+      cosim bound grid7_peak --controller dpc-pcrg+max-pressure+guidance-period-60 --demand 1.6 --candidates 60
+    """
+    cluster = chosen_scheduler(workers, scheduler, scheduler_ca, scheduler_cert, scheduler_key)
+
+    from cosim.evaluation import bound as method  # heavy
+
+    order = method.Bound(
+        scenario=scenario, controller=controller, against=against, candidates=candidates, knots=knots,
+        seeds=range(first_seed, first_seed + seeds), levels=demand, search_seed=search_seed, steps=steps,
+        out=Path("runs") / f"{file_name(scenario.name)}-bound" if out is None else out)
+    with resumable("bound", order.out, "bound.csv") as progress:
+        table = method.bound(order, workers=at_a_time(workers), scheduler=cluster, progress=progress, tell=tell)
+    click.echo(method.text(order, table))
+    click.echo(f"Written to {order.out}: see bound.csv")
 
 
 @click.command()

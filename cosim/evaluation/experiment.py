@@ -171,8 +171,10 @@ def shared_configuration(tasks: Sequence[Task]) -> tuple[dict, dict]:
     InputError for a city or controller that cannot be made."""
     first = tasks[0]
     scenario = scenario_of(first)
-    controllers = {task.controller: dependencies(task.controller, scenario_of(task), task.policy)
-                   for task in {task.controller: task for task in tasks}.values()}
+    controllers = {
+        task.controller: dependencies(task.controller, scenario_of(task), task.policy) | (
+            {"schedule": [list(channel) for channel in task.schedule]} if task.schedule else {})
+        for task in {task.controller: task for task in tasks}.values()}
     chosen = settings(scenario)
     files = ensure_built(scenario.network)
     city = load_city(files.net_file, files.regions_csv, scenario.network.regions)

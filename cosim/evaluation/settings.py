@@ -48,6 +48,18 @@ class Search(Evaluation):
     population: int | None = whole("candidates per generation", None, low=2, high=1000)
 
 
+class Bound(Evaluation):
+    """Of the room that is left to a controller."""
+
+    seeds: int = whole("each has a search of its own", 2, low=1, high=MOST)
+    first_seed: int = whole(
+        "the seeds are S to S + N - 1; those from 2000 on are for evaluations", FIRST_DEVELOPMENT, high=MOST_SEED)
+    candidates: int = whole(
+        "schedules per seed and demand level, the first without any; each takes one run", 60, low=2, high=MOST)
+    knots: int = whole("numbers of every channel of a schedule, evenly over the horizon", 6, low=1, high=10)
+    search_seed: int = whole("of CMA-ES", 0, high=MOST_SEED)
+
+
 class Improvement(Evaluation):
     """Of a policy by its own runs."""
 

@@ -76,7 +76,8 @@ class Knob:
 class Tuning:
     """scenario: its folder; controller: a strategy; candidates: how many are tried, the first with the options of the
     scenario; seeds, levels: of the runs of each; search_seed: of CMA-ES, and of policies that are trained; population:
-    candidates per generation, by the rule of CMA-ES if None; steps: control intervals, all if None; out: the folder."""
+    candidates per generation, by the rule of CMA-ES if None; steps: control intervals, all if None; out: the folder;
+    first_step: standard deviation of the first generation, as a share of every range."""
 
     scenario: Path
     controller: str
@@ -88,11 +89,20 @@ class Tuning:
     search_seed: int = 0
     population: int | None = None
     steps: int | None = None
+    first_step: float = FIRST_STEP
 
     @property
     def trains(self) -> bool:
         """Whether every candidate is a policy of its own."""
         return parse(self.controller).controller in training.NAMES
+
+    @property
+    def configuration(self) -> dict[str, object]:
+        """What the folder is for."""
+        return {
+            "tune": self.controller, "scenario": load_scenario(self.scenario).name, "seeds": list(self.seeds),
+            "options": {knob.option: [knob.low, knob.high] for knob in self.knobs}, "levels": list(self.levels),
+            "search_seed": self.search_seed, "population": self.population, "steps": self.steps}
 
     def folder(self, candidate: int) -> Path:
         """Of one candidate."""
@@ -182,22 +192,32 @@ def tune(
     Raises InputError, and RunFailed if none of a generation could be scored.
     """
     check(order)
-    source = dask_cluster.source(scheduler, tell)
-    search, rows = _search(order), list[dict[str, object]]()
+    return search(
+        order, workers=workers, source=dask_cluster.source(scheduler, tell), progress=progress, tell=tell,
+        kept=lambda table: files.write_text(order.out / "tune.toml", toml(order, table)))
+
+
+def search(
+    order: Tuning, *, workers: int, source: Source | None = None, progress: experiment.Progress | None = None,
+    tell: Callable[[str], None] | None = None, kept: Callable[[pd.DataFrame], object] | None = None,
+) -> pd.DataFrame:
+    """What `tune` does once the order was checked. kept: takes the table after every generation."""
+    algorithm, rows = _search(order), list[dict[str, object]]()
     file = order.out / "tune.csv"
     with run_folder.manifest(
-            order.out, configuration=_configuration(order), results=file,
+            order.out, configuration=order.configuration, results=file,
             session={"scenario_folder": str(order.scenario), "workers": workers}):
         points = [_start(order)]
         while points:
             found = _scored(order, points, len(rows), workers, source, progress, tell)
             rows += found
             files.write_table(file, pd.DataFrame(rows))
-            files.write_text(order.out / "tune.toml", toml(order, pd.DataFrame(rows)))
-            if len(rows) > 1 and len(points) == search.popsize:
-                search.tell(points, _costs(found))
+            if kept:
+                kept(pd.DataFrame(rows))
+            if len(rows) > 1 and len(points) == algorithm.popsize:
+                algorithm.tell(points, _costs(found))
             left = order.candidates - len(rows)
-            points = search.ask()[:left] if left > 0 else []
+            points = algorithm.ask()[:left] if left > 0 else []
     return pd.DataFrame(rows)
 
 
@@ -235,7 +255,7 @@ def _search(order: Tuning) -> cma.CMAEvolutionStrategy:
               "verbose": -9, "maxfevals": math.inf, "CMA_diagonal": False}
     if order.population is not None:
         chosen["popsize"] = order.population
-    return cma.CMAEvolutionStrategy(_start(order), FIRST_STEP, chosen)
+    return cma.CMAEvolutionStrategy(_start(order), order.first_step, chosen)
 
 
 def _start(order: Tuning) -> list[float]:
@@ -268,14 +288,6 @@ def _whole_options(controller: str) -> set[str]:
     """The options that are whole numbers."""
     declared = registry.declarations().get(controller)
     return {key for key, field in declared.model_fields.items() if field.annotation is int} if declared else set()
-
-
-def _configuration(order: Tuning) -> dict[str, object]:
-    """What the folder is for."""
-    return {
-        "tune": order.controller, "scenario": load_scenario(order.scenario).name, "seeds": list(order.seeds),
-        "options": {knob.option: [knob.low, knob.high] for knob in order.knobs}, "levels": list(order.levels),
-        "search_seed": order.search_seed, "population": order.population, "steps": order.steps}
 
 
 def _scored(
