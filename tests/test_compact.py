@@ -1,4 +1,4 @@
-"""Policies of eight numbers: what they command, and that they are trained, kept and watched as the others."""
+"""Policies of nine numbers at most: what they command, and that they are trained, kept and watched as the others."""
 
 from dataclasses import replace
 
@@ -73,6 +73,45 @@ def test_gates_and_prices_are_those_of_the_formula(network):
     assert (controls.prices > 0.0).any() and (controls.prices == 0.0).any()
 
 
+def test_the_integral_moves_the_gate_until_the_region_is_at_its_set_point(network):
+    """Of u = u_min + (u_max - u_min) s(4 w) with nothing else, w by hand: up to 1 and no further, and from 0 anew."""
+    critical = network.mfds[CENTRE].critical
+    x = np.zeros((network.regions,) * 2)
+    controller = DpcController(policy(network, Numbers(set_point=0.8, gain=0.0, integral=0.5), guidance=False))
+    into = int(np.flatnonzero(network.adjacency[:, CENTRE])[0])
+
+    def gate(full: float) -> float:
+        x[CENTRE, CENTRE] = full * critical
+        u = controller.act(Observation(step=0, time=0.0, accumulation=x, backlog=0.0 * x)).perimeter
+        assert u[CENTRE, into] == pytest.approx(network.u_max)
+        return np.log((u[into, CENTRE] - network.u_min) / (network.u_max - u[into, CENTRE])) / 4.0
+
+    w = 0.0
+    for full in (1.2, 1.0, 0.8, 0.8, 0.4, 3.2, 0.7):
+        w = np.clip(w + 0.5 * (0.8 - full), -1.0, 1.0)
+        assert gate(full) == pytest.approx(w, abs=1e-4)
+    controller.reset()
+    assert gate(0.6) == pytest.approx(0.1, abs=1e-4)
+
+
+def test_a_policy_of_before_the_integral_is_read_as_it_was(network, tmp_path):
+    """The last of the numbers has its default; others that are missing are a damaged file."""
+    scenario = load_scenario("economic_mpc")
+    made, file = policy(network), tmp_path / "dpc-pcrg.pt"
+    x = torch.from_numpy(crowded(network)).float()
+    for kept, read in ((8, True), (7, False)):
+        content = checkpoint(made, scenario.network, {})
+        content["weights"]["numbers"] = content["weights"]["numbers"][:kept]
+        torch.save(content, file)
+        if not read:
+            with pytest.raises(InputError, match="damaged"):
+                load_policy(file, scenario.network)
+            continue
+        found, _ = load_policy(file, scenario.network)
+        torch.testing.assert_close(found(x)[0], made(x)[0])
+        assert found.integrate(x, None) is None and found.numbers[-1] == 0.0
+
+
 def test_the_regional_model_sends_fewer_through_a_dear_region_and_nobody_where_there_is_no_way(network):
     x = torch.from_numpy(crowded(network)).float()
     own = network.nominal_splits
@@ -94,7 +133,8 @@ def test_every_number_has_a_gradient_and_perimeter_control_alone_has_no_prices(n
     perimeter, splits = made(x)
     ((perimeter * torch.rand_like(perimeter)).sum() + (splits * torch.rand_like(splits)).sum()
      + made.metering(x).sum()).backward()
-    assert (made.numbers.grad.abs() > 0.0).all()
+    assert (made.numbers.grad[:-1].abs() > 0.0).all()
+    assert made.numbers.grad[-1] == 0.0  # of the integral, which no rollout has
     alone = policy(network, guidance=False)
     assert alone.prices(x) is None and alone(x)[1] is None
 
@@ -114,7 +154,7 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
     (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend="true"))
     loaded = load_scenario(scenario)
     first, trained = (load_policy(file, loaded.network) for file in files.values())
-    assert first[0].numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5])
+    assert first[0].numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5, 0.0])
     assert isinstance(trained[0], CompactPolicy) and (trained[0].numbers != first[0].numbers).any()
     assert first[1]["configuration"]["steps"] == 0 and trained[1]["configuration"]["steps"] == 5
     assert trained[1]["configuration"]["validation_veh_s"] < first[1]["configuration"]["validation_veh_s"]
@@ -123,9 +163,9 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
 
 
 @pytest.mark.parametrize("table, expected", [
-    ("numbers = [1.0, 2.0, 0.0, 1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected eight numbers >= 0 of a compact policy"),
+    ("numbers = [1.0, 2.0, 0.0, 1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected 8 or 9 numbers >= 0 of a compact policy"),
     ("compact = true\nnumbers = [1.0]", "numbers: "),
-    ("compact = true\nnumbers = [1.0, 2.0, 0.0, -1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected eight numbers >= 0"),
+    ("compact = true\nnumbers = [1.0, 2.0, 0.0, -1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected 8 or 9 numbers >= 0"),
     ("compact = true\nlocal = true", "compact: begins with its numbers"),
     ("metering = true", "metering: only compact policies let trips wait"),
     ("steps = 0", "steps: expected a whole number from 1"),

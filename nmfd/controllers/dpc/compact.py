@@ -3,12 +3,16 @@
 With z_i = n_i / n_cr,i, how full region i is in critical accumulations, the entries h -> p of every protected region p,
 and the prices of all ways through p, are
 
-    u_hp = u_min + (u_max - u_min) s(4 (gain (set_point - z_p) + relief max(z_h - 1, 0)))        s(x) = 1 / (1 + e^-x)
+    u_hp = u_min + (u_max - u_min) s(4 (gain (set_point - z_p) + relief max(z_h - 1, 0) + w_p))    s(x) = 1 / (1 + e^-x)
     c_p  = price max(z_p - price_from, 0)
 
 and every other entry is open; the prices of the other regions are elsewhere max(z_i - elsewhere_from, 0). `relief`
 opens a gate for a region that is beyond its own critical accumulation. Where trips can be made to wait,
 n_cr,i max(metering - z_i, 0) / HELD may begin in region i per second.
+
+w_p is integral action, as a PI gate has it: it grows by integral (set_point - z_p) in every control interval, from 0
+and between -1 and 1, beyond which s is saturated. It takes up what the regional model does not know, so that there is
+none in rollouts of that model (w_p = 0): `integral` is chosen in SUMO (`cosim tune`), and training leaves it alone.
 
 Guided drivers who are bound for elsewhere are told that a way through region i takes 1 + c_i times as long as it does
 (nmfd.types.Controls). What they make of it in the regional model is a logit over the next regions, around their own
@@ -20,7 +24,8 @@ t_hj the mean time that it takes to leave h on the way to j, so that e_hj is wha
 the policy differentiable: it is trained as the others are (`training`).
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -33,11 +38,13 @@ from nmfd.tensors import PerPair, PerRegion, PerTurn
 
 DISPERSION = 60.0  # s: how differently drivers see the same ways; assumed, nobody has measured it
 HELD = 90.0        # s, a cycle of the signals: how fast a region may fill
+OLDER = 8          # numbers of policies that were made before there was an integral
 LONGEST = 20.0     # times as long as in free flow: the most that it takes in the model to leave a region
 
 
 class Numbers(NamedTuple):
-    """What a compact policy consists of, in this order; see above. `metering` counts where it lets trips wait."""
+    """What a compact policy consists of, in this order; see above. `metering` counts where it lets trips wait; older
+    policies have no `integral`."""
 
     set_point: float = 1.0
     gain: float = 2.0
@@ -47,12 +54,13 @@ class Numbers(NamedTuple):
     elsewhere: float = 0.0
     elsewhere_from: float = 0.6
     metering: float = 1.5
+    integral: float = 0.0
 
 
 class CompactPolicy(Policy):
     """The policy of these numbers, for the protected regions `architecture.compact`.
 
-    numbers: (8,) [-], `Numbers`
+    numbers: (9,) [-], `Numbers`
     """
 
     def _build(self, network: RegionalModel) -> None:
@@ -63,15 +71,30 @@ class CompactPolicy(Policy):
         self._model = dynamics.parameters(network, dtype=torch.float32)
         self._hops = int(network.hops.max())
 
-    def listed(self, x: PerPair) -> tuple[PerPair, PerTurn | None]:
-        """Perimeter and splits of the states x."""
+    def begin_with(self, numbers: Sequence[float]) -> None:
+        """Set the first of `Numbers` to these, and the others to their defaults."""
+        with torch.no_grad():
+            self.numbers.copy_(torch.tensor(Numbers(*numbers)))
+
+    def listed(self, x: PerPair, integrated: PerRegion | None = None) -> tuple[PerPair, PerTurn | None]:
+        """Perimeter and splits of the states x; integrated: (..., R) [-], w, 0 if None."""
         numbers, full = self._read(), self._full(x)
         want = numbers.gain * (numbers.set_point - full).unsqueeze(-2) + numbers.relief * (
             full - 1.0).clamp(min=0.0).unsqueeze(-1)
+        if integrated is not None:
+            want = want + integrated.unsqueeze(-2)
         share = torch.where(self.held, torch.sigmoid(4.0 * want), torch.ones_like(want))
         perimeter = (self.u_min + (self.u_max - self.u_min) * share) * self.adjacency
         prices = self.prices(x)
         return perimeter, None if prices is None else self._answer(x.to(self.scale.dtype), prices)
+
+    def integrate(self, x: PerPair, integrated: PerRegion | None) -> PerRegion | None:
+        """(..., R) [-], w after states x, before which it was `integrated`."""
+        numbers = self._read()
+        if not numbers.integral:
+            return None
+        step = numbers.integral * (numbers.set_point - self._full(x))
+        return (step if integrated is None else integrated + step).clamp(-1.0, 1.0)
 
     def prices(self, x: PerPair) -> PerRegion | None:
         """(..., R) [-], of the ways through each region in the states x."""
@@ -92,6 +115,13 @@ class CompactPolicy(Policy):
         """Set numbers that fell below 0 to 0."""
         with torch.no_grad():
             self.numbers.clamp_(min=0.0)
+
+    def _load_from_state_dict(self, state_dict: dict, prefix: str, *others: Any) -> None:
+        """Of an older file, what it does not have has its default."""
+        kept = state_dict.get(f"{prefix}numbers")
+        if isinstance(kept, torch.Tensor) and kept.shape == (OLDER,):
+            state_dict[f"{prefix}numbers"] = torch.tensor(Numbers(*kept.tolist()))
+        super()._load_from_state_dict(state_dict, prefix, *others)
 
     def _read(self) -> Numbers:
         return Numbers(*self.numbers.clamp(min=0.0))

@@ -44,7 +44,7 @@ def export(policy_file: Path, out: Path, scenario_folder: Path | None = None) ->
     policy, _ = load_policy(policy_file, planning.network)
     if policy.architecture.compact:
         raise InputError(
-            f"{policy_file}: is a compact policy, whose eight numbers need no graph: 'nmfd list policies' shows them, "
+            f"{policy_file}: is a compact policy, whose few numbers need no graph: 'nmfd list policies' shows them, "
             "and nmfd/controllers/dpc/compact.py what they mean; choose a policy that is a network")
     policy.eval()
     with atomic(out) as temporary:

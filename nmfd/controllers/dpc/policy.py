@@ -132,9 +132,12 @@ class Policy(nn.Module):
         return perimeter, splits
 
     def listed(
-        self, x: PerPair,
+        self, x: PerPair, integrated: PerRegion | None = None,
     ) -> tuple[Float[torch.Tensor, "*#B R D"], Float[torch.Tensor, "*#B R D R"] | None]:
-        """Perimeter (..., R, D) and splits (..., R, D, R) towards the regions `onward` (R, D); all D = R if dense."""
+        """Perimeter (..., R, D) and splits (..., R, D, R) towards the regions `onward` (R, D); all D = R if dense.
+
+        integrated: (..., R) [-], what `integrate` has come to; None, as in rollouts, for nothing
+        """
         shape = self.onward.shape
         hidden = self.backbone(self._around(x) if self.architecture.local else (x / self.scale).flatten(-2))
         open_share = torch.sigmoid(self.perimeter_decoder(hidden)).reshape(*x.shape[:-2], *shape)
@@ -143,6 +146,10 @@ class Policy(nn.Module):
             return perimeter, None
         logits = self.splits_decoder(hidden).unflatten(-1, (*shape, self.regions)) + self.split_bias
         return perimeter, torch.softmax(logits, dim=-2) * self.split_mask
+
+    def integrate(self, x: PerPair, integrated: PerRegion | None) -> PerRegion | None:
+        """(..., R) [-], of a policy with integral action what that has come to, with states x after `integrated`."""
+        return None
 
     def prices(self, x: PerPair) -> PerRegion | None:
         """(..., R) [-] of the ways through each region, of a policy that brings its split ratios about by prices."""
@@ -180,15 +187,17 @@ class DpcController:
         self.fault: str | None = None  # injected (nmfd.faults)
         self._onward = policy.onward.numpy() if policy.architecture.listed else None
         self._u_max = self._full(policy.u_max * policy.adjacency.numpy())
+        self.reset()
 
     def reset(self, seed: int = 0) -> None:
-        pass
+        self._integrated: PerRegion | None = None
 
     def act(self, observation: Observation) -> Controls:
         with torch.inference_mode():
             seen = observation.accumulation  # of which a local policy needs the sums only, and no copy
             x = torch.from_numpy(seen if self._policy.architecture.local else seen.astype(np.float32))
-            perimeter, splits = self._policy.listed(x)
+            self._integrated = self._policy.integrate(x, self._integrated)
+            perimeter, splits = self._policy.listed(x, self._integrated)
             prices, metering = (
                 None if asked is None else asked.numpy().astype(float)
                 for asked in (self._policy.prices(x), self._policy.metering(x)))

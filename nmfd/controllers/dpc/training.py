@@ -123,8 +123,7 @@ def train(
             local=chosen.local, compact=planning.protected if chosen.compact else (), metering=chosen.metering)
         policy = new_policy(planning.network, architecture)
         if chosen.numbers and isinstance(policy, CompactPolicy):
-            with torch.no_grad():
-                policy.numbers.copy_(torch.tensor(chosen.numbers))
+            policy.begin_with(chosen.numbers)
         if chosen.from_no_control:
             begin_as_no_control(policy, planning.network)
         device = "cpu" if chosen.compact else device
