@@ -23,6 +23,7 @@ from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.runs import config
 from nmfd.runs.workers import Watch
+from nmfd.studies import benchmark
 
 TASKS = """
 name = "mine"
@@ -149,6 +150,36 @@ def test_it_goes_on_and_a_changed_controller_is_run_again(place, monkeypatch):
     assert changed.outcome("noisy").depends_on != first.outcome("noisy").depends_on
     assert changed.outcome("noisy").runs[0].metrics[TTS] > first.outcome("noisy").runs[0].metrics[TTS]
     assert entry.read(Path("out") / "mine.py%3AMine.json") == changed
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("plant", ["acyclic", "nmfd"])
+def test_an_entry_counts_without_its_run_folder_while_it_is_of_the_same(place, monkeypatch, plant):
+    """What is missing of it alone is run, elsewhere; of a changed controller everything."""
+    calls, made = itertools.count(), []
+    monkeypatch.setattr(run, "provenance", lambda: {"date": str(next(calls)), "versions": {"torch": "2"}})
+    monkeypatch.setattr(benchmark, "run_one", lambda task, run_one=benchmark.run_one, **others: (
+        made.append(task), run_one(task, **others))[1])
+    Path("mine.toml").write_text(TASKS.replace('"acyclic"', f'"{plant}"'), encoding="utf-8")
+    Path("mine.py").write_text(tiny.CONTROLLER, encoding="utf-8")
+    name = "mine.py:Mine"
+    first = competed(name, only="nominal")[name]
+    assert len(made) == 5
+    part = first.changed(tasks=tuple(
+        one.changed(runs=one.runs[:3]) if one.task == "nominal" else one for one in first.tasks))
+    Path("elsewhere").mkdir()
+    entry.write(entry.path(Path("elsewhere"), name), part)
+    again = competed(name, out="elsewhere")[name]
+    assert made[5:] == [(name, 4), (name, 5), (name, 0)] and not again.missing
+    runs = again.outcome("nominal").runs
+    assert [one.metrics[TTS] for one in runs] == [one.metrics[TTS] for one in first.outcome("nominal").runs]
+    assert [again.sessions[one.session]["date"] for one in runs] == ["0", "0", "0", "1", "1"]
+    assert again.outcome("nominal").depends_on == first.outcome("nominal").depends_on
+    assert competed(name, out="elsewhere")[name] == again and len(made) == 8
+    shutil.rmtree("elsewhere/nominal")
+    Path("mine.py").write_text(tiny.CONTROLLER.replace("0.5", "0.125"), encoding="utf-8")
+    changed = competed(name, out="elsewhere", only="noisy")[name]
+    assert changed.missing == ("nominal",) and not changed.outcome("nominal").runs
 
 
 def test_what_is_run_for_an_entry():

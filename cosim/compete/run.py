@@ -4,9 +4,11 @@
     <folder>/<task>/              the run folder of a task, of all controllers: nmfd.runs.run_folder
 
 Runs are made and kept by nmfd.studies.benchmark and cosim.evaluation.experiment. What is wrong with one controller ends
-up in its own entry; the others go on.
+up in its own entry; the others go on. An entry that is there counts without the run folders, too, as long as the task
+and all that the controller depends on are what they were: so entries grow over sessions and machines.
 """
 
+import json
 import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
@@ -101,6 +103,7 @@ class _Books:
     scenarios: Mapping[str, Scenario]
     worlds: Mapping[str, str]
     failed: dict[Key, str] = field(default_factory=dict)
+    _depends: dict[tuple[str, str], dict] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._session = provenance()
@@ -132,6 +135,29 @@ class _Books:
         """Book runs that failed; where this package lies is nobody's business."""
         told = reason.replace(f"{shipped.root()}{os.sep}", "")
         self.failed |= {(name, task.id, seed): told for seed in seeds}
+
+    def depends(self, name: str, task: TaskTable) -> dict:
+        """What the runs of a controller in a task depend on now. InputError for one that cannot be made."""
+        if (key := (name, task.id)) not in self._depends:
+            called = strategy(name, task)
+            _, found = experiment.shared_configuration([_task(self, task, name, task.seeds[0])]) if (
+                task.plant == SUMO) else benchmark.configuration(self.scenarios[task.id], [called], task.plant, {})
+            self._depends[key] = json.loads(json.dumps(found[called]))
+        return self._depends[key]
+
+    def held(self, name: str, task: TaskTable) -> dict[int, Run]:
+        """Seed -> run that the entry has from before, and that is not in the run folder."""
+        before = self._before[name]
+        old = before.outcome(task.id) if before else None
+        if old is None or not old.runs or old.world != self.worlds[task.id]:
+            return {}
+        try:
+            if old.depends_on != self.depends(name, task):
+                return {}
+        except InputError:
+            return {}
+        there = self._there[task.id]
+        return {run.seed: run for run in old.runs if (strategy(name, task), run.seed) not in there}
 
     def begin(self, name: str, task: TaskTable) -> None:
         """Failed runs are tried again."""
@@ -174,10 +200,15 @@ class _Books:
         if any(depends.get(key) != value for key, value in self._source[name].items()):
             rows = {}  # of the file as it was before
         known = {run.seed: run for run in old.runs} if old and old.depends_on == depends else {}
+        held = self.held(name, task)
+        if held and not depends:
+            depends = self.depends(name, task)
         runs, failed = [], []
         for seed in task.seeds:
             row, kept = rows.get((called, seed)), known.get(seed)
-            if row is None:
+            if row is None and seed in held:
+                runs.append(held[seed])
+            elif row is None:
                 if (reason := self.failed.get((name, task.id, seed))) is not None:
                     failed.append(Failure(seed=seed, reason=reason))
             elif (longest := row["control_step_ms_max"] / 1e3) > task.time_limit:
@@ -218,7 +249,8 @@ def _regional(
     try:
         _, failures = benchmark.perform(
             scenario, list(entrants), task.seeds, task.plant, out=out, noise=noise_of(task), workers=workers,
-            progress=progress, renew=tell or _silent, source=source)
+            progress=progress, renew=tell or _silent, source=source,
+            omit={(called, seed) for called, names in entrants.items() for seed in books.held(names[0], task)})
         for (called, seed), failure in failures:
             for name in entrants[called]:
                 books.fail(name, task, failure.reason, [seed])
@@ -243,6 +275,8 @@ def _in_sumo(
         able = _able(books, task, check)
         for seed in task.seeds:
             for name in able:
+                if seed in books.held(name, task):
+                    continue
                 one = _task(books, task, name, seed)
                 if one not in entrants:  # two entries may come to the same
                     plan.append((books.order.out / task.id, one))

@@ -2,7 +2,7 @@
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -77,13 +77,14 @@ def perform(
     scenario: Scenario, controllers: Sequence[str], seeds: Sequence[int], plant: str, *, out: Path,
     policies: Mapping[str, Path] | None = None, noise: Noise | None = None, workers: int = 1,
     progress: Callable[[int, int, str], None] | None = None, renew: Callable[[str], None] | None = None,
-    source: Source | None = None,
+    source: Source | None = None, omit: Collection[tuple[str, int]] = (),
 ) -> tuple[list[dict], list[tuple[tuple[str, int], Failure]]]:
     """Run what is not yet in the run folder `out`; returns all rows of its summary.csv, and the runs that failed.
 
     progress: called with the control intervals done and to do, and what is running
     renew: takes one line where the runs of a controller do not count any more because it changed; None: an InputError
     source: does the runs elsewhere, instead of `workers` processes here
+    omit: controllers and seeds that are not run
 
     Raises InputError, before anything is written, for a controller that cannot be made. Every finished run is kept,
     whatever happens to the others.
@@ -98,7 +99,7 @@ def perform(
     session = {"scenario_folder": str(scenario.folder), "workers": workers}
     with run_folder.open_folder(
             out, configuration=common, controllers=settings, order=wanted, session=session, renew=renew) as folder:
-        todo = [run for run in wanted if run not in folder.finished]
+        todo = [run for run in wanted if run not in folder.finished and run not in omit]
         failures = []
         work = partial(run_one, scenario=scenario, plant=plant, policies=policies, noise=noise)
         for run, outcome in results(
