@@ -12,7 +12,7 @@ from streets import FAR_FROM_THE_END, seen
 
 from cosim.plant.guidance import Guide, shifted
 from cosim.plant.meter import Event
-from cosim.plant.shortest_paths import Home, Moves, Ways
+from cosim.plant.shortest_paths import FEWEST_KEPT, MOST_KEPT, Home, Moves, Searches, Ways
 from cosim.sumo.net import City, Gateway
 
 EDGES, REGION = 40, np.repeat([0, 1, 2, 3], 10)
@@ -27,9 +27,9 @@ def city():
     return first, second, random.uniform(0.0, 3.0, len(pairs)), random.uniform(5.0, 60.0, EDGES)
 
 
-@pytest.fixture(scope="module")
-def ways(city):
-    """Out of region 0."""
+@pytest.fixture(scope="module", params=[MOST_KEPT, 1])
+def ways(city, request):
+    """Out of region 0, with all trees kept or hardly any."""
     first, second, turn, time = city
     inside, back = (Moves(first, second, allowed=(REGION == 0) ^ outside, reverse=outside)
                     for outside in (False, True))
@@ -38,7 +38,8 @@ def ways(city):
     following, gate, entry, move = np.array(gates).T
     return Ways(gate, entry, following, inside=inside, outside=back, time=time, turns=turn, crossing=turn[move],
                 reached=back.leading_to(back.number[entry]),
-                ahead=back.ahead(back.number[entry], 0.8 * time, 0.7 * turn)), gate, entry
+                ahead=back.ahead(back.number[entry], 0.8 * time, 0.7 * turn), searches=Searches(request.param)
+                ), gate, entry
 
 
 def least(city, allowed):
@@ -79,10 +80,11 @@ def test_the_searches_find_the_least_times_up_to_a_limit(city, ways):
     assert cut > 100
 
 
-def test_ways_home_are_the_fastest_up_to_a_limit(city):
+@pytest.mark.parametrize("kept", [MOST_KEPT, 1])
+def test_ways_home_are_the_fastest_up_to_a_limit(city, kept):
     first, second, turn, time = city
     exact = least(city, np.full(EDGES, True))
-    home = Home(Moves(first, second, allowed=np.full(EDGES, True), reverse=True), time, turn)
+    home = Home(Moves(first, second, allowed=np.full(EDGES, True), reverse=True), time, turn, Searches(kept))
     turns = {(int(a), int(b)): extra for a, b, extra in zip(first, second, turn, strict=True)}
     for most in (60.0, np.inf, 100.0):
         for here in range(EDGES):
@@ -94,6 +96,21 @@ def test_ways_home_are_the_fastest_up_to_a_limit(city):
                     assert (way[0], way[-1]) == (here, target)
                     assert sum(turns[move] + time[move[1]] for move in zip(way[:-1], way[1:], strict=True)) == (
                         pytest.approx(expected))
+
+
+def test_of_the_trees_the_one_not_asked_for_longest_goes_first():
+    searches, mine, others = Searches(most=100), object(), object()
+    for begin in range(10):
+        assert searches.put(mine, begin, (begin,), 10) == (begin,)
+    assert searches.get(others, 3) is None and all(searches.get(mine, begin) for begin in (0, *range(2, 10)))
+    searches.put(others, 3, ("x",), 10)
+    assert searches.get(mine, 1) is None and searches.get(mine, 0) == (0,) and searches.get(others, 3) == ("x",)
+    searches.put(mine, 0, ("new",), 5)  # instead of the old one, whose nodes count no more
+    searches.put(mine, 11, ("y",), 5)
+    assert searches.get(mine, 2) == (2,) and searches.get(mine, 0) == ("new",)
+    searches.put(mine, 12, ("large",), 1000)
+    left = [begin for begin in range(13) if searches.get(mine, begin)]
+    assert len(left) + bool(searches.get(others, 3)) == FEWEST_KEPT and left[-2:] == [11, 12]
 
 
 # A main road a m b t of 10 s each, of which m is in another region, and the side street s of `side` s from a to t.

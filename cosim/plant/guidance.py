@@ -35,7 +35,7 @@ import numpy as np
 from cosim.plant.lanes import Lanes
 from cosim.plant.meter import Event
 from cosim.plant.sampling import StreetMeans
-from cosim.plant.shortest_paths import Home, Moves, Ways
+from cosim.plant.shortest_paths import Home, Moves, Searches, Ways
 from cosim.plant.travel_times import TravelTimes
 from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
@@ -138,6 +138,7 @@ class Guide:
         # By region, taste and region without a price.
         self._ways: dict[tuple[int, int, int | None], Ways] = {}
         self._homes: dict[tuple[int, int, int | None], Home] = {}
+        self._searches = Searches()
         self._guides, self._splits = False, own
         self._assigned, self._wished = np.zeros((2, *(city.regions,) * 3))
         self.realised = np.zeros((city.regions,) * 3, dtype=int)
@@ -157,7 +158,7 @@ class Guide:
             if seen is not None:
                 self._times.learn(seen)
             self._told, self._prices = {}, prices
-            self._ways, self._homes = {}, {}
+            self._ways, self._homes, self._searches = {}, {}, Searches()
             self._assigned *= MEMORY
             self._wished *= MEMORY
 
@@ -325,7 +326,8 @@ class Guide:
         free, time = self._bound_for(destination)
         key = 0 if self._ways_return else region, taste, free
         if key not in self._homes:
-            self._homes[key] = Home(self._homeward[key[0]], time * self._taste[taste], self._times.turns)
+            self._homes[key] = Home(
+                self._homeward[key[0]], time * self._taste[taste], self._times.turns, self._searches)
         return self._homes[key]
 
     def _ways_from(self, region: int, taste: int, destination: int) -> "Ways":
@@ -344,5 +346,5 @@ class Guide:
                 first, second, following, inside=self._within[region], outside=outside,
                 crossing=self._times.turns[move] if self._lanes else np.zeros(len(move)),
                 reached=self._reached[region], ahead=self._ahead[region, taste],
-                time=time * self._taste[taste], turns=self._times.turns)
+                time=time * self._taste[taste], turns=self._times.turns, searches=self._searches)
         return self._ways[key]

@@ -1,5 +1,8 @@
 """Searches for fastest ways in a city of regions, at given travel times."""
 
+from collections import OrderedDict
+from typing import Any
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
@@ -7,7 +10,9 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from cosim.sumo.arrays import EdgeMask, GatewayMask, MoveEnds, PerEdge, PerGateway, PerMove
 
-FAR = 1e9  # s, longer than any way
+FAR = 1e9               # s, longer than any way
+MOST_KEPT = 20_000_000  # nodes of the trees that are kept, of 4 to 12 bytes each
+FEWEST_KEPT = 8         # trees, however large the city: those that a decision needs at once
 
 
 class Moves:
@@ -65,26 +70,57 @@ class Moves:
         return way
 
 
+class Searches:
+    """Trees of fastest ways, by where they begin, of one owner or several: of all together `most` nodes are kept, and
+    the tree that was not asked for longest goes first. Without a limit guidance keeps thousands of them, of 0.2 MB each
+    in a city of 17,000 edges.
+    """
+
+    def __init__(self, most: int = MOST_KEPT):
+        self._most, self._nodes = most, 0
+        self._trees: OrderedDict[tuple[object, int], tuple[tuple, int]] = OrderedDict()
+
+    def get(self, owner: object, begin: int) -> tuple[Any, ...] | None:
+        """What `owner` put there for `begin`, if it is still there."""
+        if (found := self._trees.get((owner, begin))) is None:
+            return None
+        self._trees.move_to_end((owner, begin))
+        return found[0]
+
+    def put(self, owner: object, begin: int, tree: tuple, nodes: int) -> tuple[Any, ...]:
+        """Keep it, instead of what was there, and at least the newest FEWEST_KEPT; returns it."""
+        _, before = self._trees.pop((owner, begin), (None, 0))
+        self._trees[owner, begin] = tree, nodes
+        self._nodes += nodes - before
+        while self._nodes > self._most and len(self._trees) > FEWEST_KEPT:
+            _, (_, gone) = self._trees.popitem(last=False)
+            self._nodes -= gone
+        return tree
+
+
 class Home:
     """Fastest ways to single edges by `moves`, searched back from them when somebody first goes there."""
 
-    def __init__(self, moves: Moves, time: PerEdge, turns: PerMove):
+    def __init__(self, moves: Moves, time: PerEdge, turns: PerMove, searches: Searches):
         """time: (E,) [s]; turns: (M,) [s]"""
         self.time, self._moves, self._costs = time, moves, moves.costing(time, turns)
-        self._found: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
+        self._searches = searches
 
     def cost(self, here: int, target: int, most: float) -> float:
         """[s] from the end of edge `here` to the end of edge `target`, infinite if it is more than `most`."""
-        if target not in self._found or self._found[target][0] < most:
-            self._found[target] = most, *dijkstra(
+        found = self._searches.get(self, target)
+        if found is None or found[0] < most:
+            cost, before = dijkstra(
                 self._costs, indices=self._moves.number[target], return_predecessors=True, limit=most)
-        cost = self._found[target][1][self._moves.number[here]]
+            found = self._searches.put(self, target, (most, cost, before), len(cost))
+        cost = found[1][self._moves.number[here]]
         return float(cost) if cost <= most else np.inf
 
     def route(self, here: int, target: int) -> list[int]:
-        """The edges from `here` to `target`, whose cost was asked for."""
-        number = self._moves.number
-        return self._moves.path(self._found[target][2], int(number[here]), int(number[target]))
+        """The edges from `here` to `target`, whose cost was asked for just now."""
+        number, found = self._moves.number, self._searches.get(self, target)
+        assert found is not None  # it was asked for
+        return self._moves.path(found[2], int(number[here]), int(number[target]))
 
 
 class Ways:
@@ -98,7 +134,7 @@ class Ways:
     def __init__(
         self, first: Int[np.ndarray, " G"], second: Int[np.ndarray, " G"], next_region: Int[np.ndarray, " G"], *,
         inside: Moves, outside: Moves, crossing: PerGateway, reached: Bool[np.ndarray, "nodes G"],
-        ahead: Float[np.ndarray, " nodes"], time: PerEdge, turns: PerMove,
+        ahead: Float[np.ndarray, " nodes"], time: PerEdge, turns: PerMove, searches: Searches,
     ):
         """first, second, next_region: (G,), the last in rising order; inside: moves in the region; outside: those
         elsewhere, back; crossing: (G,) [s], over each gateway; reached: (nodes of `outside`, G), which edges can be
@@ -110,28 +146,32 @@ class Ways:
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))
         self._costs = inside.costing(time, turns), outside.costing(time, turns, ahead)
-        self._there: dict[int, tuple[np.ndarray, np.ndarray, float, np.ndarray]] = {}
-        self._onward: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
+        self._searches, self._from_here, self._to_there = searches, object(), object()
 
     def cost(self, here: int, target: int, most: float) -> tuple[PerGateway, GatewayMask]:
         """(G,) [s] from the end of edge `here` to the end of edge `target`, infinite if it is more than `most`, and
         (G,) bool, whether there is a way at all."""
-        if here not in self._there:
+        found = self._searches.get(self._from_here, here)
+        if found is None:
             cost, before = dijkstra(self._costs[0], indices=self._inside.number[here], return_predecessors=True)
             there = cost[self._first] + self._entering
-            self._there[here] = there, np.isfinite(there), float(there.min(initial=np.inf)), before
-        (there, leads_out, nearest, _), last = self._there[here], int(self._outside.number[target])
+            found = self._searches.put(self._from_here, here, (
+                there, np.isfinite(there), float(there.min(initial=np.inf)), before), len(before))
+        (there, leads_out, nearest, _), last = found, int(self._outside.number[target])
         if nearest == np.inf:
             return there, leads_out
         left = max(most - min(nearest, most) - self._ahead[last], 0.0)
-        if target not in self._onward or self._onward[target][0] < left:
+        onward = self._searches.get(self._to_there, target)
+        if onward is None or onward[0] < left:
             cost, after = dijkstra(self._costs[1], indices=last, return_predecessors=True, limit=left)
-            self._onward[target] = left, cost[self._second] + self._ahead[last], after
-        return there + self._onward[target][1], leads_out & self._reached[last]
+            onward = self._searches.put(
+                self._to_there, target, (left, cost[self._second] + self._ahead[last], after), len(after))
+        return there + onward[1], leads_out & self._reached[last]
 
     def route(self, here: int, gateway: int, target: int) -> list[int]:
-        """The edges from `here` to `target` through `gateway`, whose cost was asked for."""
-        to_gateway = self._inside.path(
-            self._there[here][-1], int(self._first[gateway]), int(self._inside.number[here]))
+        """The edges from `here` to `target` through `gateway`, whose cost was asked for just now."""
+        there, onward = self._searches.get(self._from_here, here), self._searches.get(self._to_there, target)
+        assert there is not None and onward is not None  # they were asked for
+        to_gateway = self._inside.path(there[-1], int(self._first[gateway]), int(self._inside.number[here]))
         return to_gateway[::-1] + self._outside.path(
-            self._onward[target][2], int(self._second[gateway]), int(self._outside.number[target]))
+            onward[2], int(self._second[gateway]), int(self._outside.number[target]))
