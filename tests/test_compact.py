@@ -73,25 +73,31 @@ def test_gates_and_prices_are_those_of_the_formula(network):
     assert (controls.prices > 0.0).any() and (controls.prices == 0.0).any()
 
 
-def test_the_integral_moves_the_gate_until_the_region_is_at_its_set_point(network):
-    """Of u = u_min + (u_max - u_min) s(4 w) with nothing else, w by hand: up to 1 and no further, and from 0 anew."""
-    critical = network.mfds[CENTRE].critical
-    x = np.zeros((network.regions,) * 2)
-    controller = DpcController(policy(network, Numbers(set_point=0.8, gain=0.0, integral=0.5), guidance=False))
-    into = int(np.flatnonzero(network.adjacency[:, CENTRE])[0])
-
-    def gate(full: float) -> float:
-        x[CENTRE, CENTRE] = full * critical
-        u = controller.act(Observation(step=0, time=0.0, accumulation=x, backlog=0.0 * x)).perimeter
-        assert u[CENTRE, into] == pytest.approx(network.u_max)
-        return np.log((u[into, CENTRE] - network.u_min) / (network.u_max - u[into, CENTRE])) / 4.0
-
-    w = 0.0
-    for full in (1.2, 1.0, 0.8, 0.8, 0.4, 3.2, 0.7):
-        w = np.clip(w + 0.5 * (0.8 - full), -1.0, 1.0)
-        assert gate(full) == pytest.approx(w, abs=1e-4)
+def test_with_an_integral_the_gate_is_a_pi_gate_in_velocity_form(network):
+    """v by hand: it begins open, and does not wind up where it is; relief comes on top."""
+    numbers = Numbers(set_point=0.8, gain=1.5, relief=0.5, integral=0.3)
+    critical = [mfd.critical for mfd in network.mfds]
+    controller, before = DpcController(policy(network, numbers, guidance=False)), int(
+        np.flatnonzero(network.adjacency[:, CENTRE])[0])
+    v, error, x = 1.0, None, np.zeros((network.regions,) * 2)
+    x[before, before] = 1.4 * critical[before]
+    seen = []
+    for k, full in enumerate((0.2, 0.7, 0.9, 1.0, 0.8, 0.8, 0.4, 3.2, 0.7)):
+        x[CENTRE, CENTRE] = full * critical[CENTRE]
+        u = controller.act(Observation(step=k, time=0.0, accumulation=x, backlog=0.0 * x)).perimeter
+        last, error = 0.8 - full if error is None else error, 0.8 - full
+        v = np.clip(v + 1.5 * (error - last) + 0.3 * error, -1.0, 1.0)
+        for region in np.flatnonzero(network.adjacency[:, CENTRE]):
+            share = 1.0 / (1.0 + np.exp(-4.0 * (v + (0.5 * 0.4 if region == before else 0.0))))
+            expected = network.u_min + (network.u_max - network.u_min) * share
+            assert u[region, CENTRE] == pytest.approx(expected, abs=1e-5)
+        assert u[CENTRE, before] == pytest.approx(network.u_max)
+        seen.append(v)
+    assert max(seen) == 1.0 and min(seen) == -1.0 and seen[2] < 0.0  # closing at once, after all that time open
     controller.reset()
-    assert gate(0.6) == pytest.approx(0.1, abs=1e-4)
+    x[CENTRE, CENTRE] = 0.8 * critical[CENTRE]
+    u = controller.act(Observation(step=0, time=0.0, accumulation=x, backlog=0.0 * x)).perimeter
+    assert u[:, CENTRE].max() > network.u_min + (network.u_max - network.u_min) / (1.0 + np.exp(-3.9))
 
 
 def test_a_policy_of_before_the_integral_is_read_as_it_was(network, tmp_path):
@@ -109,7 +115,7 @@ def test_a_policy_of_before_the_integral_is_read_as_it_was(network, tmp_path):
             continue
         found, _ = load_policy(file, scenario.network)
         torch.testing.assert_close(found(x)[0], made(x)[0])
-        assert found.integrate(x, None) is None and found.numbers[-1] == 0.0
+        assert found.remember(x, None) is None and found.numbers[-1] == 0.0
 
 
 def test_the_regional_model_sends_fewer_through_a_dear_region_and_nobody_where_there_is_no_way(network):

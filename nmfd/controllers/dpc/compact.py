@@ -3,16 +3,19 @@
 With z_i = n_i / n_cr,i, how full region i is in critical accumulations, the entries h -> p of every protected region p,
 and the prices of all ways through p, are
 
-    u_hp = u_min + (u_max - u_min) s(4 (gain (set_point - z_p) + relief max(z_h - 1, 0) + w_p))    s(x) = 1 / (1 + e^-x)
-    c_p  = price max(z_p - price_from, 0)
+    u_hp = u_min + (u_max - u_min) s(4 (v_p + relief max(z_h - 1, 0))),    v_p = gain e_p,    e_p = set_point - z_p
+    c_p  = price max(z_p - price_from, 0)                                  s(x) = 1 / (1 + e^-x)
 
 and every other entry is open; the prices of the other regions are elsewhere max(z_i - elsewhere_from, 0). `relief`
 opens a gate for a region that is beyond its own critical accumulation. Where trips can be made to wait,
 n_cr,i max(metering - z_i, 0) / HELD may begin in region i per second.
 
-w_p is integral action, as a PI gate has it: it grows by integral (set_point - z_p) in every control interval, from 0
-and between -1 and 1, beyond which s is saturated. It takes up what the regional model does not know, so that there is
-none in rollouts of that model (w_p = 0): `integral` is chosen in SUMO (`cosim tune`), and training leaves it alone.
+With `integral` the gate is the PI gate of nmfd.controllers.pi_gating, in velocity form: it begins open, v_p = 1, and
+
+    v_p(k) = clip(v_p(k-1) + gain (e_p(k) - e_p(k-1)) + integral e_p(k), -1, 1),
+
+beyond which s is saturated. That takes up what the regional model does not know, so that there is none of it in
+rollouts of that model: `integral` is chosen in SUMO (`cosim tune`), and training leaves it alone.
 
 Guided drivers who are bound for elsewhere are told that a way through region i takes 1 + c_i times as long as it does
 (nmfd.types.Controls). What they make of it in the regional model is a logit over the next regions, around their own
@@ -31,7 +34,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from nmfd.controllers.dpc.policy import Policy
+from nmfd.controllers.dpc.policy import Memory, Policy
 from nmfd.model import dynamics
 from nmfd.model.regional_model import RegionalModel
 from nmfd.tensors import PerPair, PerRegion, PerTurn
@@ -76,25 +79,25 @@ class CompactPolicy(Policy):
         with torch.no_grad():
             self.numbers.copy_(torch.tensor(Numbers(*numbers)))
 
-    def listed(self, x: PerPair, integrated: PerRegion | None = None) -> tuple[PerPair, PerTurn | None]:
-        """Perimeter and splits of the states x; integrated: (..., R) [-], w, 0 if None."""
+    def listed(self, x: PerPair, memory: Memory | None = None) -> tuple[PerPair, PerTurn | None]:
+        """Perimeter and splits of the states x; memory: what `remember` made of them."""
         numbers, full = self._read(), self._full(x)
-        want = numbers.gain * (numbers.set_point - full).unsqueeze(-2) + numbers.relief * (
-            full - 1.0).clamp(min=0.0).unsqueeze(-1)
-        if integrated is not None:
-            want = want + integrated.unsqueeze(-2)
+        gate = numbers.gain * (numbers.set_point - full) if memory is None else memory[..., 0, :]
+        want = gate.unsqueeze(-2) + numbers.relief * (full - 1.0).clamp(min=0.0).unsqueeze(-1)
         share = torch.where(self.held, torch.sigmoid(4.0 * want), torch.ones_like(want))
         perimeter = (self.u_min + (self.u_max - self.u_min) * share) * self.adjacency
         prices = self.prices(x)
         return perimeter, None if prices is None else self._answer(x.to(self.scale.dtype), prices)
 
-    def integrate(self, x: PerPair, integrated: PerRegion | None) -> PerRegion | None:
-        """(..., R) [-], w after states x, before which it was `integrated`."""
+    def remember(self, x: PerPair, memory: Memory | None) -> Memory | None:
+        """v and e after states x, where they were `memory` before; None without integral action."""
         numbers = self._read()
         if not numbers.integral:
             return None
-        step = numbers.integral * (numbers.set_point - self._full(x))
-        return (step if integrated is None else integrated + step).clamp(-1.0, 1.0)
+        error = numbers.set_point - self._full(x)
+        v, before = (torch.ones_like(error), error) if memory is None else memory.unbind(-2)
+        v = v + numbers.gain * (error - before) + numbers.integral * error
+        return torch.stack([v.clamp(-1.0, 1.0), error], dim=-2)
 
     def prices(self, x: PerPair) -> PerRegion | None:
         """(..., R) [-], of the ways through each region in the states x."""

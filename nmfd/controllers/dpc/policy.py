@@ -20,6 +20,7 @@ from nmfd.tensors import PerPair, PerRegion, PerTurn
 from nmfd.types import Controls, Observation, Status
 
 FEATURES = 6  # of a boundary, that a local policy sees
+Memory = Float[torch.Tensor, "*#B N R"]  # N numbers per region
 
 
 class SoftExponential(nn.Module):
@@ -132,11 +133,11 @@ class Policy(nn.Module):
         return perimeter, splits
 
     def listed(
-        self, x: PerPair, integrated: PerRegion | None = None,
+        self, x: PerPair, memory: Memory | None = None,
     ) -> tuple[Float[torch.Tensor, "*#B R D"], Float[torch.Tensor, "*#B R D R"] | None]:
         """Perimeter (..., R, D) and splits (..., R, D, R) towards the regions `onward` (R, D); all D = R if dense.
 
-        integrated: (..., R) [-], what `integrate` has come to; None, as in rollouts, for nothing
+        memory: what `remember` made of x; None, as in rollouts, for nothing
         """
         shape = self.onward.shape
         hidden = self.backbone(self._around(x) if self.architecture.local else (x / self.scale).flatten(-2))
@@ -147,8 +148,8 @@ class Policy(nn.Module):
         logits = self.splits_decoder(hidden).unflatten(-1, (*shape, self.regions)) + self.split_bias
         return perimeter, torch.softmax(logits, dim=-2) * self.split_mask
 
-    def integrate(self, x: PerPair, integrated: PerRegion | None) -> PerRegion | None:
-        """(..., R) [-], of a policy with integral action what that has come to, with states x after `integrated`."""
+    def remember(self, x: PerPair, memory: Memory | None) -> Memory | None:
+        """What a policy that remembers knows after states x, where it was `memory` before; None where it begins."""
         return None
 
     def prices(self, x: PerPair) -> PerRegion | None:
@@ -190,14 +191,14 @@ class DpcController:
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
-        self._integrated: PerRegion | None = None
+        self._memory: Memory | None = None
 
     def act(self, observation: Observation) -> Controls:
         with torch.inference_mode():
             seen = observation.accumulation  # of which a local policy needs the sums only, and no copy
             x = torch.from_numpy(seen if self._policy.architecture.local else seen.astype(np.float32))
-            self._integrated = self._policy.integrate(x, self._integrated)
-            perimeter, splits = self._policy.listed(x, self._integrated)
+            self._memory = self._policy.remember(x, self._memory)
+            perimeter, splits = self._policy.listed(x, self._memory)
             prices, metering = (
                 None if asked is None else asked.numpy().astype(float)
                 for asked in (self._policy.prices(x), self._policy.metering(x)))
