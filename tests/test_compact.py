@@ -14,6 +14,7 @@ from nmfd.controllers.dpc.compact import HELD, CompactPolicy, Numbers
 from nmfd.controllers.dpc.fallback import Guarded, statistics
 from nmfd.controllers.dpc.policy import Architecture, DpcController
 from nmfd.controllers.dpc.policy_file import checkpoint, load_policy
+from nmfd.controllers.pi_gating import PiGating
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
@@ -73,31 +74,32 @@ def test_gates_and_prices_are_those_of_the_formula(network):
     assert (controls.prices > 0.0).any() and (controls.prices == 0.0).any()
 
 
-def test_with_an_integral_the_gate_is_a_pi_gate_in_velocity_form(network):
-    """v by hand: it begins open, and does not wind up where it is; relief comes on top."""
-    numbers = Numbers(set_point=0.8, gain=1.5, relief=0.5, integral=0.3)
-    critical = [mfd.critical for mfd in network.mfds]
-    controller, before = DpcController(policy(network, numbers, guidance=False)), int(
-        np.flatnonzero(network.adjacency[:, CENTRE])[0])
-    v, error, x = 1.0, None, np.zeros((network.regions,) * 2)
-    x[before, before] = 1.4 * critical[before]
-    seen = []
-    for k, full in enumerate((0.2, 0.7, 0.9, 1.0, 0.8, 0.8, 0.4, 3.2, 0.7)):
-        x[CENTRE, CENTRE] = full * critical[CENTRE]
-        u = controller.act(Observation(step=k, time=0.0, accumulation=x, backlog=0.0 * x)).perimeter
-        last, error = 0.8 - full if error is None else error, 0.8 - full
-        v = np.clip(v + 1.5 * (error - last) + 0.3 * error, -1.0, 1.0)
-        for region in np.flatnonzero(network.adjacency[:, CENTRE]):
-            share = 1.0 / (1.0 + np.exp(-4.0 * (v + (0.5 * 0.4 if region == before else 0.0))))
-            expected = network.u_min + (network.u_max - network.u_min) * share
-            assert u[region, CENTRE] == pytest.approx(expected, abs=1e-5)
-        assert u[CENTRE, before] == pytest.approx(network.u_max)
-        seen.append(v)
-    assert max(seen) == 1.0 and min(seen) == -1.0 and seen[2] < 0.0  # closing at once, after all that time open
-    controller.reset()
-    x[CENTRE, CENTRE] = 0.8 * critical[CENTRE]
-    u = controller.act(Observation(step=0, time=0.0, accumulation=x, backlog=0.0 * x)).perimeter
-    assert u[:, CENTRE].max() > network.u_min + (network.u_max - network.u_min) / (1.0 + np.exp(-3.9))
+def test_with_an_integral_it_contains_the_pi_gate_and_relief_comes_on_top(network):
+    scenario = load_scenario("economic_mpc")
+    critical, span, ki = network.mfds[CENTRE].critical, network.u_max - network.u_min, 0.005
+    planning = replace(planning_model(scenario), protected=(CENTRE,), controller_options={
+        "pi-gating": {"set_point": [0.8 * critical], "kp": 1.2, "ki": ki}})
+    gate = PiGating(planning)
+    numbers = Numbers(set_point=0.8, gain=1.2 / span, integral=ki * planning.step / span)
+    alone, relieved = (
+        DpcController(policy(network, numbers._replace(relief=relief), guidance=False)) for relief in (0.0, 0.25))
+    before = int(np.flatnonzero(network.adjacency[:, CENTRE])[0])
+    x, seen = np.zeros((network.regions,) * 2), []
+    x[before, before] = 1.4 * network.mfds[before].critical
+    for seed in range(2):
+        for controller in (gate, alone, relieved):
+            controller.reset(seed)
+        for k, full in enumerate((0.2, 0.7, 0.9, 1.0, 0.8, 0.8, 0.4, 3.2, 3.0, 0.7)):
+            x[CENTRE, CENTRE] = full * critical
+            expected, found, more = (
+                controller.act(Observation(step=k, time=0.0, accumulation=x, backlog=0.0 * x)).perimeter
+                for controller in (gate, alone, relieved))
+            np.testing.assert_allclose(found, expected, atol=1e-5)
+            np.testing.assert_allclose(np.delete(more, before, axis=0), np.delete(expected, before, axis=0), atol=1e-5)
+            assert more[before, CENTRE] == pytest.approx(
+                min(expected[before, CENTRE] + 0.25 * 0.4 * span, network.u_max), abs=1e-5)
+            seen.append(expected[before, CENTRE])
+    assert max(seen) == network.u_max and min(seen) == network.u_min and len(set(seen)) >= 5
 
 
 def test_a_policy_of_before_the_integral_is_read_as_it_was(network, tmp_path):

@@ -10,12 +10,14 @@ and every other entry is open; the prices of the other regions are elsewhere max
 opens a gate for a region that is beyond its own critical accumulation. Where trips can be made to wait,
 n_cr,i max(metering - z_i, 0) / HELD may begin in region i per second.
 
-With `integral` the gate is the PI gate of nmfd.controllers.pi_gating, in velocity form: it begins open, v_p = 1, and
+With `integral` the gate is the PI gate of nmfd.controllers.pi_gating, which begins open, v_p = 1/2, with relief on top:
 
-    v_p(k) = clip(v_p(k-1) + gain (e_p(k) - e_p(k-1)) + integral e_p(k), -1, 1),
+    v_p(k) = clip(v_p(k-1) + gain (e_p(k) - e_p(k-1)) + integral e_p(k), -1/2, 1/2)
+    u_hp = u_min + (u_max - u_min) clip(1/2 + v_p + relief max(z_h - 1, 0), 0, 1).
 
-beyond which s is saturated. That takes up what the regional model does not know, so that there is none of it in
-rollouts of that model: `integral` is chosen in SUMO (`cosim tune`), and training leaves it alone.
+That takes up what the regional model does not know, so that there is none of it in rollouts of that model: `integral`
+is chosen in SUMO (`cosim tune`), and training leaves it alone. Of s instead of the straight line, which closes later as
+the region fills, grid7 with 30 % rerouting drivers locked where the PI gate held it.
 
 Guided drivers who are bound for elsewhere are told that a way through region i takes 1 + c_i times as long as it does
 (nmfd.types.Controls). What they make of it in the regional model is a logit over the next regions, around their own
@@ -84,7 +86,8 @@ class CompactPolicy(Policy):
         numbers, full = self._read(), self._full(x)
         gate = numbers.gain * (numbers.set_point - full) if memory is None else memory[..., 0, :]
         want = gate.unsqueeze(-2) + numbers.relief * (full - 1.0).clamp(min=0.0).unsqueeze(-1)
-        share = torch.where(self.held, torch.sigmoid(4.0 * want), torch.ones_like(want))
+        share = torch.sigmoid(4.0 * want) if memory is None else (0.5 + want).clamp(0.0, 1.0)
+        share = torch.where(self.held, share, torch.ones_like(want))
         perimeter = (self.u_min + (self.u_max - self.u_min) * share) * self.adjacency
         prices = self.prices(x)
         return perimeter, None if prices is None else self._answer(x.to(self.scale.dtype), prices)
@@ -95,9 +98,9 @@ class CompactPolicy(Policy):
         if not numbers.integral:
             return None
         error = numbers.set_point - self._full(x)
-        v, before = (torch.ones_like(error), error) if memory is None else memory.unbind(-2)
+        v, before = (torch.full_like(error, 0.5), error) if memory is None else memory.unbind(-2)
         v = v + numbers.gain * (error - before) + numbers.integral * error
-        return torch.stack([v.clamp(-1.0, 1.0), error], dim=-2)
+        return torch.stack([v.clamp(-0.5, 0.5), error], dim=-2)
 
     def prices(self, x: PerPair) -> PerRegion | None:
         """(..., R) [-], of the ways through each region in the states x."""
