@@ -1,5 +1,6 @@
 """The searches of route guidance against all ways there are, in a small random city."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from streets import FAR_FROM_THE_END, seen
 
-from cosim.plant.guidance import Guide, shifted
+from cosim.plant.guidance import Guide, _Present, shifted
 from cosim.plant.meter import Event
 from cosim.plant.shortest_paths import FEWEST_KEPT, MOST_KEPT, Home, Moves, Searches, Ways
 from cosim.sumo.net import City, Gateway
@@ -121,7 +122,7 @@ AFTER = {"a": ("m", "s"), "b": ("t",), "m": ("b",), "s": ("t",), "t": ()}
 DRIVER = Event(vehicle="driver", source=None, region=0, destination=2, edge="t")
 
 
-def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0):
+def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0, lanes=True):
     """A guide, its commands, the routes of the drivers, and where they are, which is at their routes' first edges."""
     moves = [(e, f) for e, after in AFTER.items() for f in after]
     edges = tuple(sorted(AFTER))
@@ -140,7 +141,7 @@ def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0):
     own[0, 1:, 2], own[1, 0, 2] = 0.5, 1.0
     splits[0, 1:, 2], splits[1, 0, 2] = (to_region_1, 1.0 - to_region_1), 1.0
     guide = Guide(session, city, own, compliance=1.0, most_detour=60.0, random=np.random.default_rng(0),
-                  ways_return=ways_return, period=period)
+                  ways_return=ways_return, period=period, lanes=lanes)
     guide.command(splits, None)
     return guide, splits, routes, road
 
@@ -155,7 +156,8 @@ def guided(route, **chosen):
 @pytest.mark.parametrize("route", ["ambt", "ast"])
 def test_a_main_road_that_leaves_the_region_and_comes_back_is_open_to_all(route):
     assert guided(tuple(route), ways_return=True) == ("ambt", 2)  # he leaves region 0 for good by b t
-    assert guided(tuple(route), ways_return=False) == ("ast", 2)
+    for side in (40.0, 200.0):  # however much longer
+        assert guided(tuple(route), ways_return=False, side=side) == ("ast", 2)
 
 
 def test_ways_that_return_are_taken_where_they_are_faster_and_no_command_for_the_next_region_closes_them():
@@ -175,6 +177,20 @@ def test_prices_lengthen_the_ways_through_a_region_and_go_when_none_are_commande
         assert "".join(routes["driver"]) == way
 
 
+def test_who_is_bound_for_a_region_does_not_see_its_price():
+    guide, splits, routes, _ = crossroads(tuple("ast"), ways_return=True)
+    guide.command(splits, None, np.array([0.0, 0.0, 9.0]))
+    guide.apply([DRIVER])
+    assert "".join(routes["driver"]) == "ambt"  # 20 s less; t itself is in region 2, and takes the same both ways
+
+
+def test_without_lanes_a_way_is_kept_unless_another_one_saves_its_share():
+    """In the mesoscopic model 30 % of the other one's time, whatever the delay; and never where nobody is."""
+    guide, *_ = crossroads(tuple("ambt"), ways_return=True, lanes=False)
+    for takes, kept in ((39.0, True), (52.0, True), (52.1, False), (math.inf, False)):
+        assert guide._keeps(_Present([0, 2, 1, 4], takes, 20.0, True), 40.0) == kept
+
+
 def test_drivers_are_asked_again_where_they_are():
     """On his way over m, which comes to a stand, a driver turns into the side street if he is asked in time."""
     for period, asked in ((0.0, 99), (2.5, 3), (6.0, 6)):
@@ -185,6 +201,8 @@ def test_drivers_are_asked_again_where_they_are():
             guide.apply([])
             assert "".join(routes["driver"]) == ("ast" if step >= asked else "ambt")
             assert guide.realised.sum() == guide.realised[0, 2, 2] == 1
+        # Of the region that he was told before nothing is left, although a control interval has passed.
+        assert guide._assigned[0, 2, 2] == pytest.approx(1.0 if asked < 9 else 0.9)
 
 
 def test_on_a_junction_it_is_too_late_and_who_arrived_is_not_asked():
