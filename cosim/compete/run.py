@@ -104,6 +104,7 @@ class _Books:
     worlds: Mapping[str, str]
     failed: dict[Key, str] = field(default_factory=dict)
     _depends: dict[tuple[str, str], dict] = field(default_factory=dict)
+    _held: dict[tuple[str, str], dict[int, Run]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._session = provenance()
@@ -139,14 +140,22 @@ class _Books:
     def depends(self, name: str, task: TaskTable) -> dict:
         """What the runs of a controller in a task depend on now. InputError for one that cannot be made."""
         if (key := (name, task.id)) not in self._depends:
-            called = strategy(name, task)
-            _, found = experiment.shared_configuration([_task(self, task, name, task.seeds[0])]) if (
-                task.plant == SUMO) else benchmark.configuration(self.scenarios[task.id], [called], task.plant, {})
+            called, scenario = strategy(name, task), self.scenarios[task.id]
+            if task.plant == SUMO:
+                _, found = experiment.shared_configuration([_task(self, task, name, task.seeds[0])])
+            else:
+                registry.verify(called, scenario)
+                _, found = benchmark.configuration(scenario, [called], task.plant, {})
             self._depends[key] = json.loads(json.dumps(found[called]))
         return self._depends[key]
 
     def held(self, name: str, task: TaskTable) -> dict[int, Run]:
         """Seed -> run that the entry has from before, and that is not in the run folder."""
+        if (key := (name, task.id)) not in self._held:
+            self._held[key] = self._still_good(name, task)
+        return self._held[key]
+
+    def _still_good(self, name: str, task: TaskTable) -> dict[int, Run]:
         before = self._before[name]
         old = before.outcome(task.id) if before else None
         if old is None or not old.runs or old.world != self.worlds[task.id]:
@@ -201,7 +210,7 @@ class _Books:
             rows = {}  # of the file as it was before
         known = {run.seed: run for run in old.runs} if old and old.depends_on == depends else {}
         held = self.held(name, task)
-        if held and not depends:
+        if held and not depends:  # it has no run folder
             depends = self.depends(name, task)
         runs, failed = [], []
         for seed in task.seeds:
@@ -235,21 +244,16 @@ def _regional(
     source: Source | None,
 ) -> None:
     """The runs of all controllers on a regional model."""
-    scenario, out = books.scenarios[task.id], books.order.out / task.id
-
-    def check(name: str) -> None:
-        registry.verify(strategy(name, task), scenario)
-
     entrants: dict[str, list[str]] = {}
-    for name in _able(books, task, check):
+    for name in _able(books, task):
         entrants.setdefault(strategy(name, task), []).append(name)  # two entries may come to the same
     if not entrants:
         books.write()
         return
     try:
         _, failures = benchmark.perform(
-            scenario, list(entrants), task.seeds, task.plant, out=out, noise=noise_of(task), workers=workers,
-            progress=progress, renew=tell or _silent, source=source,
+            books.scenarios[task.id], list(entrants), task.seeds, task.plant, out=books.order.out / task.id,
+            noise=noise_of(task), workers=workers, progress=progress, renew=tell or _silent, source=source,
             omit={(called, seed) for called, names in entrants.items() for seed in books.held(names[0], task)})
         for (called, seed), failure in failures:
             for name in entrants[called]:
@@ -269,10 +273,7 @@ def _in_sumo(
     entrants: dict[Task, list[tuple[str, TaskTable]]] = {}
     plan: list[tuple[Path, Task]] = []
     for task in tasks:
-        def check(name: str, task: TaskTable = task) -> None:
-            experiment.shared_configuration([_task(books, task, name, task.seeds[0])])
-
-        able = _able(books, task, check)
+        able = _able(books, task)
         for seed in task.seeds:
             for name in able:
                 if seed in books.held(name, task):
@@ -292,13 +293,13 @@ def _in_sumo(
         source=source)
 
 
-def _able(books: _Books, task: TaskTable, check: Callable[[str], object]) -> list[str]:
-    """The controllers that can be made for a task, in which `check` finds nothing wrong; the others fail in it."""
+def _able(books: _Books, task: TaskTable) -> list[str]:
+    """The controllers that can be made for a task; the others have failed in it."""
     found = []
     for name in books.order.controllers:
         books.begin(name, task)
         try:
-            check(name)
+            books.depends(name, task)
             found.append(name)
         except InputError as error:
             books.fail(name, task, str(error), task.seeds)

@@ -13,16 +13,17 @@ and not what the best possible is, for the search is short and the schedules are
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pandas as pd
 
 from cosim.evaluation import dask_cluster, experiment, tuning
 from cosim.evaluation.scores import SCORE
-from cosim.evaluation.simulate import Task, scenario_of
+from cosim.evaluation.simulate import Task
 from cosim.evaluation.statistics import TTS
 from cosim.plant.strategy import configured
+from nmfd.api import load_scenario
 from nmfd.controllers import registry
 from nmfd.controllers.scheduled import CHANNELS, channels
 from nmfd.errors import InputError
@@ -59,7 +60,7 @@ class Bound:
     @property
     def channels(self) -> tuple[str, ...]:
         """What of the controller has a schedule. InputError for a controller that cannot be made."""
-        scenario = scenario_of(Task(scenario=self.scenario, controller=self.controller, seed=0))
+        scenario = load_scenario(self.scenario)
         variant = configured(self.controller, scenario.controller_options)
         if registry.is_own(registry.split(variant)[0]):
             raise InputError(
@@ -100,10 +101,8 @@ class Search(tuning.Tuning):
 
     def plan(self, candidate: int, options: tuple[tuple[str, object], ...]) -> list[tuple[Path, Task]]:
         """The run of one candidate, whose first one is the controller itself."""
-        return [(folder, Task(
-            scenario=task.scenario, controller=task.controller, seed=task.seed, steps=task.steps,
-            demand_factor=task.demand_factor, schedule=task.options if candidate else ()))  # type: ignore[arg-type]
-            for folder, task in super().plan(candidate, options)]
+        return [(folder, replace(task, options=(), schedule=task.options if candidate else ()))  # type: ignore[arg-type]
+                for folder, task in super().plan(candidate, options)]
 
 
 def check(order: Bound) -> tuple[str, ...]:
@@ -118,7 +117,7 @@ def check(order: Bound) -> tuple[str, ...]:
             f"--knots: expected at most {tuning.MOST // len(used)}, for {order.controller} has {len(used)} channels "
             f"({', '.join(used)}) and a search {tuning.MOST} numbers at most, got {order.knots} instead")
     if order.against is not None:
-        scenario = scenario_of(order.rivals()[0][1])
+        scenario = load_scenario(order.scenario)
         registry.verify(configured(order.against, scenario.controller_options), scenario)
     return used
 
@@ -197,6 +196,6 @@ def _configuration(order: Bound, used: Sequence[str]) -> dict[str, object]:
     """What the folder is for."""
     return {
         "bound": order.controller, "against": order.against,
-        "scenario": scenario_of(Task(scenario=order.scenario, controller=order.controller, seed=0)).name,
+        "scenario": load_scenario(order.scenario).name,
         "seeds": list(order.seeds), "levels": list(order.levels), "channels": list(used), "knots": order.knots,
         "search_seed": order.search_seed, "steps": order.steps}
