@@ -74,6 +74,7 @@ def test_replayed_under_its_own_policy_a_run_is_the_run(scenario, metering):
     assert not np.allclose(Replays(Rollout(believed(scenario)), made, runs).total_time_spent(other).tolist(), spent)
 
 
+@pytest.mark.slow
 def test_what_descends_along_runs_of_the_city_is_better_in_the_city(scenario):
     made = policy(scenario.network, set_point=0.3, gain=3.0)  # a gate that closes much too early
     runs, spent = zip(*(driven(scenario, made, level) for level in (0.8, 1.2)), strict=True)
@@ -153,6 +154,7 @@ def order(city, out, *, rounds=3, **others):
         **{"levels": (1.0, 1.6), "descent": 6, "learning_rate": 0.1, "iterations": 5, "steps": 30, **others})
 
 
+@pytest.mark.slow
 def test_the_best_policy_is_kept_and_an_interrupted_improvement_goes_on(city, tmp_path, runs):
     tasks, failing = runs
     whole = improve.improve(order(city, tmp_path / "whole"))

@@ -133,6 +133,7 @@ LETHAL = {
 }
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_or_hangs_costs_its_own_run(tmp_path, scenario, monkeypatch):
     monkeypatch.setattr("nmfd.runs.workers.GRACE", 0.2)
     monkeypatch.setattr("nmfd.runs.workers.LEAVE", 1.0)

@@ -214,6 +214,7 @@ def double_or_trouble(task):
     return 2 * task if task < 3 else 1 / 0
 
 
+@pytest.mark.slow
 def test_workers_give_every_outcome_and_name_what_failed():
     outcomes = dict(workers.outcomes(double_or_trouble, [1, "die", 3, 2], workers=2))
     assert {task: outcomes[task] for task in (1, 2)} == {1: 2, 2: 4}
@@ -274,6 +275,7 @@ def half_way(task):
     return task
 
 
+@pytest.mark.slow
 def test_who_waits_for_workers_sees_how_far_they_are():
     seen, told = [], []
     tally = Tally(lambda *what: told.append(what), [1, 2], steps=lambda run: 10 * run, label=lambda run: f"run {run}",

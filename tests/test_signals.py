@@ -157,7 +157,7 @@ def test_perimeter_control_over_max_pressure(driven):
     assert flows[1] < 0.6 * flows[0]
 
 
-@pytest.mark.parametrize("signals", ["fixed", "max-pressure"])
+@pytest.mark.parametrize("signals", ["fixed", pytest.param("max-pressure", marks=pytest.mark.slow)])
 def test_queue_override(city, driven, signals):
     """Closed gateways open where the edge before them is full, in the next interval, and nowhere else."""
     _, _, record, _ = driven(0.1, signals=signals, queue_override=0.3)
