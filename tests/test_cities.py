@@ -58,6 +58,7 @@ def test_demos_of_sumo(tmp_path, name, expected):
         assert not list((tmp_path / "networks").glob("*")) and not list((tmp_path / "scenarios").glob("*"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REAL)
 def test_real_cities(tmp_path, name):
     source, count = REAL[name]

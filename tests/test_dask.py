@@ -153,6 +153,7 @@ def test_who_is_trusted_is_said(address, warned):
         f"--scheduler-{what}", "here.csr"))), "no Dask scheduler answers"),
     (("--scheduler-key", "here.key"), "--scheduler: missing")])
 def test_mistakes_with_certificates(peak, tmp_path, certificates, monkeypatch, arguments, expected):
+    pytest.importorskip("distributed", reason="the extra dask is not installed")
     monkeypatch.chdir(certificates)
     done = cosim("sweep", peak, "--controllers", "no-control", *arguments, "--out", tmp_path / "out")
     assert done.exit_code == 2 and expected in done.stderr and done.stderr.count("\n") == 1, done.output

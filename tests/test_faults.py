@@ -441,7 +441,9 @@ def sizes(city, tmp_path_factory):
     return {file.name.split(".")[1]: file.stat().st_size for file in out.glob("*.xml*")}
 
 
-@pytest.mark.parametrize("kind, share", [("tripinfo", 0.9), ("edgedata", 0.9), ("emission", 0.9), ("tripinfo", 0.001)])
+@pytest.mark.parametrize("kind, share", [
+    ("tripinfo", 0.9), pytest.param("edgedata", 0.9, marks=pytest.mark.slow),
+    pytest.param("emission", 0.9, marks=pytest.mark.slow), ("tripinfo", 0.001)])
 def test_a_disk_that_is_full_before_sumo_has_written_all(city, sizes, tmp_path, kind, share):
     """SUMO says nothing of it, and its files are looked at; or it ends its process (emission). Once even what it reads
     cannot be written."""

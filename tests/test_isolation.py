@@ -58,7 +58,7 @@ def written(folder: Path, ruins: bool) -> str:
     return f"{path}:Vandal"
 
 
-@pytest.mark.parametrize("plant", ["nmfd", "acyclic"])
+@pytest.mark.parametrize("plant", ["nmfd", pytest.param("acyclic", marks=pytest.mark.slow)])
 def test_a_controller_that_writes_into_everything_changes_nobodys_result(tmp_path, plant):
     scenario = nmfd.load_scenario(tiny.write(tmp_path))
     alone = {name: nmfd.run(scenario, name, plant=plant) for name in ("no-control", "pi-gating")}

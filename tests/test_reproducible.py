@@ -41,6 +41,7 @@ def test_benchmarks(tmp_path):
     assert arrays(tmp_path / "a") == arrays(tmp_path / "b") and len(arrays(tmp_path / "a")) == 2
 
 
+@pytest.mark.slow
 def test_trainings(tmp_path):
     command = ("train", tiny.write(tmp_path), "--controller", "dpc-pcrg", "--steps", 4, "--device", "cpu", "--out")
     here("nmfd", *command, tmp_path / "a.pt")

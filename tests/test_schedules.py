@@ -161,6 +161,7 @@ def test_every_seed_has_a_search_that_begins_with_the_controller_itself(city, tm
     assert "room" in told and f"{table['used_pct'].iloc[0]:.0f} %" in told
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_with_more_candidates_as_if_it_had_not_ended(city, tmp_path, runs):
     whole = bound.bound(order(city, tmp_path / "whole", candidates=8))
     done = len(runs)
