@@ -9,8 +9,7 @@ import trajectories
 
 from cosim.evaluation import evaluate, experiment, statistics
 from cosim.evaluation.simulate import FACTS, Result, scenario_of
-from cosim.sumo.build import ensure_built
-from cosim.sumo.net import load_city
+from cosim.sumo.net import city_of
 from nmfd.api import load_scenario
 from nmfd.runs.run_folder import COLUMNS
 
@@ -57,8 +56,7 @@ def result(task, city) -> Result:
 def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1.0,)) -> Path:
     """An evaluation whose runs are made up."""
     scenario = load_scenario(SCENARIO)
-    files = ensure_built(scenario.network)
-    city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
+    city = city_of(scenario.network)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(experiment, "outcomes", lambda function, todo, workers, **_: (
             (task, result(task, city)) for task in todo))

@@ -17,8 +17,7 @@ from cosim.evaluation.run_metrics import regional_outflow
 from cosim.evaluation.simulate import drive
 from cosim.plant.settings import settings
 from cosim.plant.strategy import parse
-from cosim.sumo.build import ensure_built
-from cosim.sumo.net import City, edge_shapes, load_city
+from cosim.sumo.net import City, city_of, edge_shapes
 from nmfd.api import controller
 from nmfd.model import mfd
 from nmfd.model.scenario import Scenario
@@ -51,8 +50,7 @@ def simulated(
 
     Two loops on every lane: somewhere along it (MIDDLE, drawn by lot), and at the stop line. Days are kept in `folder`.
     """
-    files = ensure_built(scenario.network)
-    city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
+    city = city_of(scenario.network)
     detectors, period = _detectors(city, np.random.default_rng(0)), intervals * scenario.step
     days, truths = [], []
     for seed in seeds:

@@ -17,8 +17,7 @@ from nmfd.api import load_scenario
 def made(monkeypatch):
     """Runs that are made up, on another city, without pictures; the addresses that a browser was to open."""
     scenario, opened = load_scenario(made_up.SCENARIO), []
-    files = made_up.ensure_built(scenario.network)
-    city = made_up.load_city(files.net_file, files.regions_csv, scenario.network.regions)
+    city = made_up.city_of(scenario.network)
     monkeypatch.setattr(demo, "SCENARIO", made_up.SCENARIO)
     monkeypatch.setattr(experiment, "outcomes", lambda function, todo, workers, **_: (
         (task, made_up.result(task, city)) for task in todo))

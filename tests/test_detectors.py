@@ -13,8 +13,7 @@ from cosim.plant.detectors import instruments, lay_out, probes
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import Settings, settings
 from cosim.plant.strategy import planning_of
-from cosim.sumo.build import ensure_built
-from cosim.sumo.net import load_city
+from cosim.sumo.net import city_of
 from nmfd import closed_loop
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
@@ -38,8 +37,7 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def city(scenario):
-    files = ensure_built(scenario.network)
-    return load_city(files.net_file, files.regions_csv, scenario.network.regions)
+    return city_of(scenario.network)
 
 
 def drive(scenario, **overrides):

@@ -19,8 +19,7 @@ from tornado.httputil import HTTPHeaders, HTTPServerRequest, RequestStartLine
 from tornado.ioloop import IOLoop
 
 from cosim.evaluation.simulate import Task, scenario_of, simulate
-from cosim.sumo.build import ensure_built
-from cosim.sumo.net import load_city
+from cosim.sumo.net import city_of
 from cosim.view import city_map, picture, replay, run
 from cosim.view import server as server_module
 from cosim.view.budget import SAVED, SHARE, Budget
@@ -47,9 +46,7 @@ def task(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def city(task):
-    network = scenario_of(task).network
-    files = ensure_built(network)
-    return load_city(files.net_file, files.regions_csv, network.regions)
+    return city_of(scenario_of(task).network)
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,7 @@ import tiny_city
 from commands import call, good
 
 from cosim.evaluation.simulate import Task, scenario_of
-from cosim.sumo.build import ensure_built
-from cosim.sumo.net import load_city
+from cosim.sumo.net import city_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 EVIL = "<script>alert(1)</script>"
@@ -133,8 +132,7 @@ def test_the_page_lives(scenario, browser, width):
 
         page.wait_for_function(f"before => ({TEXT})() !== before", arg=page.evaluate(TEXT), timeout=20_000)
         network = scenario_of(Task(scenario=scenario, controller="no-control", seed=3)).network
-        files = ensure_built(network)
-        assert page.evaluate(EDGES) == len(load_city(files.net_file, files.regions_csv, network.regions).edges)
+        assert page.evaluate(EDGES) == len(city_of(network).edges)
         press("Pause")
         page.get_by_role("button", name="Go on").wait_for()
         page.wait_for_timeout(1500)

@@ -7,8 +7,7 @@ import numpy as np
 import pandas as pd
 
 from cosim.evaluation.simulate import Result
-from cosim.sumo.build import ensure_built
-from cosim.sumo.net import City, load_city
+from cosim.sumo.net import City, city_of
 from nmfd.model import authority
 from nmfd.model.authority import Boundaries, Verdict
 from nmfd.model.regional_model import RegionalModel
@@ -17,13 +16,12 @@ from nmfd.runs import files
 
 def of_runs(network: RegionalModel, results: Sequence[Result]) -> Verdict:
     """Of the city of `network`, by runs in which no gateway was closed."""
-    built = ensure_built(network)
-    city = load_city(built.net_file, built.regions_csv, network.regions)
     critical = network.critical
     most = np.max([result.trajectory.accumulation.sum(axis=2).max(axis=0) for result in results], axis=0) / critical
     started = np.sum([result.record["departures"].sum(axis=(0, 2)) for result in results], axis=0)
     where = f"in {len(results)} loading run{'s' * (len(results) > 1)} under {results[0].trajectory.controller}"
-    return authority.verdict(network, boundaries(city, results), most=most, started=started.astype(float), where=where)
+    seen = boundaries(city_of(network), results)
+    return authority.verdict(network, seen, most=most, started=started.astype(float), where=where)
 
 
 def boundaries(city: City, results: Sequence[Result]) -> Boundaries:

@@ -21,8 +21,7 @@ from cosim.plant.sensing import Estimation, Sensing
 from cosim.plant.settings import ESTIMATE, PRESSURES, SHORT, Settings, settings
 from cosim.plant.standstill import Standstill
 from cosim.sumo.arrays import PerEdge, Points
-from cosim.sumo.build import ensure_built
-from cosim.sumo.net import City, Gateway, check_adjacency, edge_shapes, load_city
+from cosim.sumo.net import City, Gateway, check_adjacency, city_of, edge_shapes
 from cosim.sumo.session import Session, Window
 from cosim.sumo.tripinfo import TripFacts, TripReader
 from nmfd.arrays import PerRegion, PerTurn, Positions
@@ -56,8 +55,7 @@ class SumoPlant:
         self._observer = observer
         self._settings = chosen = overrides or settings(scenario)
         check_settings(scenario, chosen)
-        files = ensure_built(scenario.network)
-        self.city: City = load_city(files.net_file, files.regions_csv, scenario.network.regions)
+        self.city: City = city_of(scenario.network)
         check_adjacency(self.city, scenario.network)
         self._layout = lay_out(self.city, chosen.detector_share)
         self._instruments = instruments(self.city, self._layout, chosen.probe_share)

@@ -103,7 +103,7 @@ class City:
 
     @cached_property
     def _city(self) -> net.City:
-        return net.load_city(self._files.net_file, self._files.regions_csv, self.network.regions)
+        return net.city_of(self.network)
 
     @cached_property
     def _streets(self) -> Streets:

@@ -9,8 +9,7 @@ import pandas as pd
 from cosim.evaluation import experiment, model_validation, statistics
 from cosim.evaluation.simulate import Result
 from cosim.report import figures
-from cosim.sumo.build import ensure_built
-from cosim.sumo.net import City, load_city
+from cosim.sumo.net import City, city_of
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
@@ -185,8 +184,7 @@ def demand_levels(path: Path, rows: pd.DataFrame) -> None:
 
 def draw_all(out: Path, folders: Mapping[float, Path], scenario: Scenario, rows: pd.DataFrame) -> None:
     """The pictures of every demand level in its folder, and those across levels in `out`."""
-    files = ensure_built(scenario.network)
-    city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
+    city = city_of(scenario.network)
     for level, folder in folders.items():
         draw(folder, scenario, city, rows[rows["demand"] == level])
     if len(folders) > 1:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cosim.sumo.arrays import PerEdge, Points
+from cosim.sumo.build import ensure_built
 from cosim.sumo.xml_files import BROKEN, attribute, opened
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
@@ -81,6 +82,12 @@ class _Connection:
     link: int
     lane: int
     to_lane: int
+
+
+def city_of(network: RegionalModel) -> City:
+    """The city that `network` is the model of, built first if need be; raises InputError as `load_city` does."""
+    files = ensure_built(network)
+    return load_city(files.net_file, files.regions_csv, network.regions)
 
 
 def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:

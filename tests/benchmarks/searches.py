@@ -22,20 +22,12 @@ from scipy.sparse.csgraph import dijkstra
 
 from cosim.plant.shortest_paths import Moves
 from cosim.plant.travel_times import TravelTimes
-from cosim.sumo import build
-from cosim.sumo.net import City, edge_shapes, load_city
+from cosim.sumo.net import city_of, edge_shapes
 from nmfd.api import load_scenario
 
 LIMIT, GATEWAYS, ROUNDS = 270.0, 30, 3
 
 Search = Callable[[int], object]  # from a node
-
-
-def city_of(scenario: str) -> City:
-    """The city of a scenario."""
-    loaded = load_scenario(scenario)
-    files = build.ensure_built(loaded.network)
-    return load_city(files.net_file, files.regions_csv, loaded.network.regions)
 
 
 def with_scipy(costs: csr_array, limit: float = np.inf) -> Callable[[], Search]:
@@ -128,7 +120,7 @@ def main() -> None:
     parser.add_argument("--scenario", default="luxembourg")
     parser.add_argument("--searches", type=int, default=200)
     asked = parser.parse_args()
-    city = city_of(asked.scenario)
+    city = city_of(load_scenario(asked.scenario).network)
     times = TravelTimes(city)
     moves = Moves(times.first, times.second, allowed=np.full(len(city.edges), True), reverse=False)
     costs = moves.costing(times.free, times.free_turns)
