@@ -79,7 +79,16 @@ def test_load_and_deeds_are_counted(network):
     half = run(network, 1.0, 0.9)
     half = replace(half, perimeter=np.concatenate([half.perimeter[:5], run(network, 1.0, 0.2).perimeter[:5]]))
     done = explain.deeds(network, [half], [record(network, 50, 150, guided=100.0 * network.regions)])
-    assert done.held == 0.5 and done.guided == pytest.approx(2.0)
+    assert done.held == 0.5 and done.guided == pytest.approx(2.0) and done.waited == 0.0
+    backlog = np.zeros_like(half.backlog)
+    backlog[3:5, 0, 1] = 10.0  # vehicles, for two intervals of 90 s
+    waiting = [replace(half, backlog=backlog)] * 2
+    done = explain.deeds(network, waiting, [record(network, 6, 1)] * 2, metered=True)
+    trips = 6 * network.regions
+    assert done.waited == pytest.approx(10.0 * 180.0 / trips)
+    assert str(done) == (
+        f"it held back in 50 % of its commands and its trips waited {1800 / trips:.0f} s before they began")
+    assert explain.deeds(network, waiting, [record(network, 6, 1)] * 2).waited == 0.0
 
 
 def test_nothing_to_compare_with(network):

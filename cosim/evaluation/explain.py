@@ -14,7 +14,7 @@ import pandas as pd
 from jaxtyping import Int
 
 from cosim.evaluation import experiment, signal_reasons, statistics
-from cosim.plant.strategy import model_free
+from cosim.plant.strategy import metered, model_free
 from nmfd.arrays import PerRegion
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import run_folder
@@ -26,6 +26,7 @@ HARDLY = 0.01        # of the commands, or of the time
 NEARLY_OPEN = 0.1    # of the range of u, below its upper bound: a learned policy never quite reaches that
 MOSTLY_INSIDE = 0.5  # of what came into a region started there
 MORE_FULL = 0.02     # of the edges before gateways and intervals
+A_WAIT = 1.0         # s, before a trip begins
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,28 +62,36 @@ def load(network: RegionalModel, trajectories: Sequence[Trajectory], records: It
 @dataclass(frozen=True, kw_only=True)
 class ControlActivity:
     """What a controller did. held: share of its perimeter commands, one per boundary, direction and interval, that were
-    below the upper bound by more than NEARLY_OPEN of the range; guided: vehicles per trip that it gave a next region.
+    below the upper bound by more than NEARLY_OPEN of the range; guided: vehicles per trip that it gave a next region;
+    waited [s]: before a trip began, where trips are metered.
     """
 
     held: float
     guided: float
+    waited: float = 0.0
 
     def __str__(self) -> str:
         """As the end of a sentence about the controller."""
         parts = [f"it held back in {_share(self.held)} of its commands"] if self.held >= HARDLY else []
         if self.guided > 0:
             parts.append(f"it guided {self.guided:.1f} times per trip")
+        if self.waited >= A_WAIT:
+            parts.append(f"its trips waited {self.waited:.0f} s before they began")
         return " and ".join(parts) or "it never held back and never guided"
 
 
-def deeds(network: RegionalModel, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> ControlActivity:
-    """What a controller did in some runs."""
+def deeds(
+    network: RegionalModel, trajectories: Sequence[Trajectory], records: Iterable[Mapping], *, metered: bool = False,
+) -> ControlActivity:
+    """What a controller did in some runs; metered: whether it could make trips wait."""
     limit = network.u_max - NEARLY_OPEN * (network.u_max - network.u_min)
     held = [(t.perimeter[:, network.adjacency] < limit).mean() for t in trajectories]
     guided, trips = 0.0, 0.0
     for record in records:
         guided, trips = guided + record["guided"].sum(), trips + record["departures"].sum()
-    return ControlActivity(held=float(np.mean(held)), guided=float(guided / max(trips, 1.0)))
+    waited = sum(t.backlog[1:].sum() * t.step for t in trajectories) if metered else 0.0
+    return ControlActivity(
+        held=float(np.mean(held)), guided=float(guided / max(trips, 1.0)), waited=float(waited / max(trips, 1.0)))
 
 
 def text(folders: Mapping[float, Path], network: RegionalModel, rows: pd.DataFrame) -> str:
@@ -107,7 +116,7 @@ def at(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame) -
     lines = []
     for name, seeds in kept.items():
         if name != REFERENCE:
-            done = deeds(network, *_runs(folder, name, seeds))
+            done = deeds(network, *_runs(folder, name, seeds), metered=metered(name))
             lines.append(f"{name} {verdict(rows, level, name, found, leaking, done, network)}")
     return _city(network, found, leaking, shown), lines
 
@@ -120,7 +129,8 @@ def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.Dat
         return ""
     before, after = (_runs(folder, one, [int(seed) for seed in rows.loc[rows["controller"] == one, "seed"]])
                      for one in (shown, name))
-    found, then, done = load(network, *before), load(network, after[0], ()), deeds(network, *after)
+    found, then = load(network, *before), load(network, after[0], ())
+    done = deeds(network, *after, metered=metered(name))
     gained = statistics.paired(
         statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, shown)).percent < 0
     region = int(np.argmax(found.beyond))
@@ -129,7 +139,8 @@ def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.Dat
         return f"{name} {verdict(rows, level, name, found, leaking, done, network)}."
     acts = [text for text, there in (
         ("signals at the boundaries held vehicles back", done.held >= HARDLY),
-        ("drivers were guided to other routes", done.guided > 0)) if there and not model_free(name)]
+        ("drivers were guided to other routes", done.guided > 0),
+        ("trips waited outside for room", done.waited >= A_WAIT)) if there and not model_free(name)]
     means = f", because {' and '.join(acts)}" if acts else ""
     first = statistics.than(shown)
     return (

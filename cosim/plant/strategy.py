@@ -117,6 +117,12 @@ def model_free(name: str) -> bool:
     return first == ALONE or _option(first) is not None
 
 
+def metered(name: str) -> bool:
+    """Whether a strategy can make trips wait; its controller need not be there any more."""
+    _, words = registry.split(name)
+    return "metering" in words
+
+
 def configured(name: str, tables: Iterable[str]) -> str:
     """The controller of the strategy `name`, with as many of its options as one of the `tables` has in its name.
 
