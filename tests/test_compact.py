@@ -1,4 +1,4 @@
-"""Policies of nine numbers at most: what they command, and that they are trained, kept and watched as the others."""
+"""Policies of ten numbers at most: what they command, and that they are trained, kept and watched as the others."""
 
 from dataclasses import replace
 
@@ -74,6 +74,19 @@ def test_gates_and_prices_are_those_of_the_formula(network):
     assert (controls.prices > 0.0).any() and (controls.prices == 0.0).any()
 
 
+def test_trips_wait_for_the_protected_regions_wherever_they_begin(network):
+    critical, seen = np.array([mfd.critical for mfd in network.mfds]), set()
+    made = policy(network, NUMBERS._replace(metering=1.4, metering_protected=1.1), metering=True)
+    for seed in range(6):
+        x = crowded(network, seed)
+        full = x.sum(axis=1) / critical
+        room = np.minimum(1.4 - full, 1.1 - full[CENTRE])
+        found = made.metering(torch.from_numpy(x)).detach().numpy()
+        np.testing.assert_allclose(found, np.maximum(room, 0.0) * critical / HELD, rtol=1e-4, atol=1e-5)
+        seen |= {"own" if a < 1.1 - full[CENTRE] else "protected" if a > 0.0 else "none" for a in np.maximum(room, 0.0)}
+    assert seen == {"own", "protected", "none"}
+
+
 def test_with_an_integral_it_contains_the_pi_gate_and_relief_comes_on_top(network):
     scenario = load_scenario("economic_mpc")
     critical, span, ki = network.mfds[CENTRE].critical, network.u_max - network.u_min, 0.005
@@ -107,7 +120,7 @@ def test_a_policy_of_before_the_integral_is_read_as_it_was(network, tmp_path):
     scenario = load_scenario("economic_mpc")
     made, file = policy(network), tmp_path / "dpc-pcrg.pt"
     x = torch.from_numpy(crowded(network)).float()
-    for kept, read in ((8, True), (7, False)):
+    for kept, read in ((8, True), (9, True), (7, False)):
         content = checkpoint(made, scenario.network, {})
         content["weights"]["numbers"] = content["weights"]["numbers"][:kept]
         torch.save(content, file)
@@ -117,7 +130,7 @@ def test_a_policy_of_before_the_integral_is_read_as_it_was(network, tmp_path):
             continue
         found, _ = load_policy(file, scenario.network)
         torch.testing.assert_close(found(x)[0], made(x)[0])
-        assert found.remember(x, None) is None and found.numbers[-1] == 0.0
+        assert found.remember(x, None) is None and found.numbers[-2:].eq(0.0).all()
 
 
 def test_the_regional_model_sends_fewer_through_a_dear_region_and_nobody_where_there_is_no_way(network):
@@ -137,12 +150,13 @@ def test_the_regional_model_sends_fewer_through_a_dear_region_and_nobody_where_t
 
 def test_every_number_has_a_gradient_and_perimeter_control_alone_has_no_prices(network):
     x = torch.from_numpy(np.stack([crowded(network, seed) for seed in range(4)])).float()
-    made = policy(network, metering=True)
+    made = policy(network, NUMBERS._replace(metering_protected=1.1), metering=True)
     perimeter, splits = made(x)
     ((perimeter * torch.rand_like(perimeter)).sum() + (splits * torch.rand_like(splits)).sum()
      + made.metering(x).sum()).backward()
-    assert (made.numbers.grad[:-1].abs() > 0.0).all()
-    assert made.numbers.grad[-1] == 0.0  # of the integral, which no rollout has
+    grad = Numbers(*made.numbers.grad.abs())
+    assert grad.integral == 0.0  # which no rollout has
+    assert min(grad._replace(integral=1.0)) > 0.0
     alone = policy(network, guidance=False)
     assert alone.prices(x) is None and alone(x)[1] is None
 
@@ -162,7 +176,7 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
     (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend="true"))
     loaded = load_scenario(scenario)
     first, trained = (load_policy(file, loaded.network) for file in files.values())
-    assert first[0].numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5, 0.0])
+    assert first[0].numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5, 0.0, 0.0])
     assert isinstance(trained[0], CompactPolicy) and (trained[0].numbers != first[0].numbers).any()
     assert first[1]["configuration"]["steps"] == 0 and trained[1]["configuration"]["steps"] == 5
     assert trained[1]["configuration"]["validation_veh_s"] < first[1]["configuration"]["validation_veh_s"]
@@ -171,9 +185,9 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
 
 
 @pytest.mark.parametrize("table, expected", [
-    ("numbers = [1.0, 2.0, 0.0, 1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected 8 or 9 numbers >= 0 of a compact policy"),
+    ("numbers = [1.0, 2.0, 0.0, 1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected 8 to 10 numbers >= 0, of a compact"),
     ("compact = true\nnumbers = [1.0]", "numbers: "),
-    ("compact = true\nnumbers = [1.0, 2.0, 0.0, -1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected 8 or 9 numbers >= 0"),
+    ("compact = true\nnumbers = [1.0, 2.0, 0.0, -1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected 8 to 10 numbers >= 0"),
     ("compact = true\nlocal = true", "compact: begins with its numbers"),
     ("metering = true", "metering: only compact policies let trips wait"),
     ("steps = 0", "steps: expected a whole number from 1"),

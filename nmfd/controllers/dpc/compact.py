@@ -8,7 +8,12 @@ and the prices of all ways through p, are
 
 and every other entry is open; the prices of the other regions are elsewhere max(z_i - elsewhere_from, 0). `relief`
 opens a gate for a region that is beyond its own critical accumulation. Where trips can be made to wait,
-n_cr,i max(metering - z_i, 0) / HELD may begin in region i per second.
+
+    r_i = n_cr,i max(min(metering - z_i, metering_protected - max_p z_p), 0) / HELD
+
+may begin in region i per second; without `metering_protected` (0) nobody waits for the protected regions. A gate moves
+a queue into the regions around the one that it protects, which may lock in its place; trips that have not begun
+stand in nobody's way.
 
 With `integral` the gate is the PI gate of nmfd.controllers.pi_gating, which begins open, v_p = 1/2, with relief on top:
 
@@ -43,13 +48,13 @@ from nmfd.tensors import PerPair, PerRegion, PerTurn
 
 DISPERSION = 60.0  # s: how differently drivers see the same ways; assumed, nobody has measured it
 HELD = 90.0        # s, a cycle of the signals: how fast a region may fill
-OLDER = 8          # numbers of policies that were made before there was an integral
+OLDEST = 8         # numbers of the policies that had the fewest: neither integral nor metering_protected
 LONGEST = 20.0     # times as long as in free flow: the most that it takes in the model to leave a region
 
 
 class Numbers(NamedTuple):
-    """What a compact policy consists of, in this order; see above. `metering` counts where it lets trips wait; older
-    policies have no `integral`."""
+    """What a compact policy consists of, in this order; see above. Both of `metering` count where it lets trips wait;
+    older policies have no `integral` and no `metering_protected`."""
 
     set_point: float = 1.0
     gain: float = 2.0
@@ -60,12 +65,13 @@ class Numbers(NamedTuple):
     elsewhere_from: float = 0.6
     metering: float = 1.5
     integral: float = 0.0
+    metering_protected: float = 0.0
 
 
 class CompactPolicy(Policy):
     """The policy of these numbers, for the protected regions `architecture.compact`.
 
-    numbers: (9,) [-], `Numbers`
+    numbers: (10,) [-], `Numbers`
     """
 
     def _build(self, network: RegionalModel) -> None:
@@ -115,7 +121,12 @@ class CompactPolicy(Policy):
         """(..., R) [veh/s], the most trips that may begin in each region in the states x; None where nobody waits."""
         if not self.architecture.metering:
             return None
-        return self.scale.squeeze(-1) * (self._read().metering - self._full(x)).clamp(min=0.0) / HELD
+        numbers, full = self._read(), self._full(x)
+        room = numbers.metering - full
+        if numbers.metering_protected:
+            fullest = torch.where(self.held, full, torch.zeros_like(full)).amax(-1, keepdim=True)
+            room = torch.minimum(room, numbers.metering_protected - fullest)
+        return self.scale.squeeze(-1) * room.clamp(min=0.0) / HELD
 
     def bound(self) -> None:
         """Set numbers that fell below 0 to 0."""
@@ -125,7 +136,7 @@ class CompactPolicy(Policy):
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *others: Any) -> None:
         """Of an older file, what it does not have has its default."""
         kept = state_dict.get(f"{prefix}numbers")
-        if isinstance(kept, torch.Tensor) and kept.shape == (OLDER,):
+        if isinstance(kept, torch.Tensor) and kept.dim() == 1 and OLDEST <= len(kept) < len(Numbers()):
             state_dict[f"{prefix}numbers"] = torch.tensor(Numbers(*kept.tolist()))
         super()._load_from_state_dict(state_dict, prefix, *others)
 
