@@ -26,7 +26,8 @@ def originals(tmp_path):
 def test_seed_moves_departures_and_nothing_else(originals, tmp_path):
     def written(name, **options):
         path = tmp_path / name
-        write_recorded_trips(originals, path, **{"seed": 1, "factor": 1.0, "jitter": 10.0, "begin": 100.0} | options)
+        drawn = draw(originals, **{"seed": 1, "factor": 1.0, "jitter": 10.0, "begin": 100.0} | options)
+        write_recorded_trips(originals, drawn, path)
         return path.read_bytes()
 
     assert written("a") == written("b") != written("c", seed=2)

@@ -12,7 +12,7 @@ from cosim.importing.case import SumoInput
 from cosim.importing.demand import Traffic, wrapped
 from cosim.importing.generated import morning_peak
 from cosim.importing.streets import Streets
-from cosim.sumo.recorded_trips import MESOSCOPIC, read_recorded_trips, write_recorded_trips
+from cosim.sumo.recorded_trips import MESOSCOPIC, draw, read_recorded_trips, write_recorded_trips
 from nmfd.runs.scratch import Scratch
 
 MINUTE = 60.0
@@ -75,8 +75,9 @@ class Trials:
         if factor == 1.0 and seed == 0:
             return self._routes, [vehicle.get("id", "") for vehicle in original.elements]
         routes = folder / "vehicles.rou.xml"
-        return [routes], write_recorded_trips(
-            original, routes, seed=seed, factor=factor, jitter=JITTER if seed else 0.0, begin=self._clock.begin)
+        drawn = draw(original, seed=seed, factor=factor, jitter=JITTER if seed else 0.0, begin=self._clock.begin)
+        write_recorded_trips(original, drawn, routes)
+        return [routes], [name for _, _, name in drawn]
 
 
 class Peaks:

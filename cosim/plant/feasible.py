@@ -26,14 +26,10 @@ def signals_of(city: City, scenario: Scenario, chosen: Settings) -> CitySignals:
 
 
 def check_settings(scenario: Scenario, chosen: Settings) -> None:
-    """InputError for what needs lanes where there are none, and for trips that cannot be held back one by one."""
+    """InputError for what needs lanes where there are none."""
     for key, values, what in (("signals", PRESSURES, "counts vehicles lane by lane"),
                               ("measurement", (ESTIMATE,), "needs loop detectors on lanes")):
         if chosen.mesoscopic and (value := getattr(chosen, key)) in values:
             raise InputError(
                 f"{scenario_file(scenario)}: sumo.{key}: {value} {what}, but SUMO's mesoscopic model has no lanes; "
                 "omit it, or set mesoscopic = false (import the city without --mesoscopic)")
-    if chosen.metering and chosen.routes:
-        raise InputError(
-            f"{scenario_file(scenario)}: sumo.metering: trips of route files (sumo.routes) cannot be made to wait, "
-            "only those drawn from the scenario's demand; omit it")

@@ -12,15 +12,18 @@ from cosim.sumo.recorded_trips import (
     MESOSCOPIC,
     RecordedTrips,
     check_edges,
+    draw,
     read_recorded_trips,
     read_routes,
+    write_held_trips,
     write_recorded_trips,
 )
 from cosim.sumo.session import Session, Window
 from cosim.sumo.tripinfo import trip_options
-from cosim.sumo.trips import Trips, write_trips
+from cosim.sumo.trips import HeldTrips, held, write_trips
 from cosim.sumo.turning_flows import own_flows, turning_flows
 from cosim.sumo.xml_files import file_list
+from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.runs.scratch import Scratch
 
@@ -46,8 +49,8 @@ def own_files(scenario: Scenario, names: Sequence[str]) -> list[Path]:
 class Launch:
     """Starts SUMO for one run after the other, in a scratch folder that `close` removes.
 
-    vehicles: ids of those of the last run; trips: the same, where they are drawn from the scenario's demand; trip_file:
-    what SUMO tells of them when it ends
+    vehicles: ids of those of the last run; held: those of them that are metered; trip_file: what SUMO tells of them when
+    it ends
     """
 
     def __init__(
@@ -60,7 +63,7 @@ class Launch:
         self._scratch = Scratch("cosim-")
         self._originals: RecordedTrips | None = None
         self.vehicles: list[str] = []
-        self.trips: Trips | None = None
+        self.held: HeldTrips | None = None
         self.trip_file = outputs.get("tripinfo", self._scratch.path / "tripinfo.xml")
 
     def start(self, seed: int) -> Session:
@@ -114,18 +117,29 @@ class Launch:
         """The route file of one run; the ids of its vehicles."""
         scenario, chosen = self._scenario, self._settings
         if not chosen.routes:
-            self.trips = write_trips(
-                self._city, scenario.demand, scenario.step, seed, path, metered=chosen.metering)
-            return [f"v{n}" for n in range(len(self.trips.routes))]
+            trips = write_trips(self._city, scenario.demand, scenario.step, seed, path, metered=chosen.metering)
+            self.held = held(trips) if chosen.metering else None
+            return [f"v{n}" for n in range(len(trips.routes))]
         if self._originals is None:
             self._originals = own_vehicles(scenario, chosen, self._city)
-        return write_recorded_trips(
-            self._originals, path, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
+        drawn = draw(
+            self._originals, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
             begin=chosen.begin)
+        if chosen.metering:
+            self.held = write_held_trips(self._originals, drawn, path, self._shared_routes(), self._city.region_of)
+            if not self.held.orders:
+                raise InputError(
+                    f"{scenario_file(scenario)}: sumo.metering: none of the vehicles in sumo.routes can be made to wait: "
+                    "those can that have a route, no stop and no more attributes than cosim import leaves them; omit it")
+        else:
+            write_recorded_trips(self._originals, drawn, path)
+        return [name for _, _, name in drawn]
+
+    def _shared_routes(self) -> Mapping[str, tuple[str, ...]]:
+        return read_routes(own_files(self._scenario, self._settings.additional))
 
     def _own_flows(self) -> Mapping[tuple[str, str], float] | None:
         """Turning flows of the city's own vehicles; None where trips are drawn from the scenario's demand."""
         if self._originals is None:
             return None
-        routes = read_routes(own_files(self._scenario, self._settings.additional))
-        return own_flows(self._city, self._originals, routes, self._scenario.demand_factor)
+        return own_flows(self._city, self._originals, self._shared_routes(), self._scenario.demand_factor)

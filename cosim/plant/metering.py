@@ -3,7 +3,8 @@ with a long way to go longest.
 
 Gates move a queue; what cannot stand inside must stand outside. The trips of a metered city are not given to SUMO
 beforehand, but one by one when they may begin: on the same routes, with the same ids and by the same seed as without
-metering. Who waits is in the backlog and in the total time spent.
+metering, be they drawn from a demand between regions or a city's own vehicles. Who waits is in the backlog and in the
+total time spent.
 
 Without a command, PI control of the accumulation of every region (velocity form, as in ALINEA and as nmfd's PI gating):
 
@@ -15,7 +16,7 @@ import heapq
 import numpy as np
 
 from cosim.sumo.session import Session
-from cosim.sumo.trips import PerTrip, Trips
+from cosim.sumo.trips import HeldTrips, PerTrip
 from nmfd.arrays import PerPair, PerRegion
 
 KP, KI = 1.0, 0.3  # of the vehicles too many, those that are kept out in the next control interval [-]; not tuned
@@ -28,7 +29,7 @@ class Metering:
     waited: by those who were let in so far [s]
     """
 
-    def __init__(self, session: Session, trips: Trips, critical: PerRegion, *, level: float, step: float,
+    def __init__(self, session: Session, trips: HeldTrips, critical: PerRegion, *, level: float, step: float,
                  way: PerTrip | None = None):
         """critical: (R,) [veh]; level: accumulation that PI control holds, in these [-]; step: control interval [s];
         way: (N,) [s], if of those who wait in a region whoever has the shortest begins first; None: who is due first"""
@@ -64,7 +65,7 @@ class Metering:
             while queue and self._credit[region] >= 1.0 - 1e-9:
                 self._credit[region] -= 1.0
                 _, trip = heapq.heappop(queue)
-                self._session.begin_trip(f"v{trip}", f"r{trip}", self._trips.arrival[trip])
+                self._session.begin_trip(self._trips.orders[trip])
                 self.waited += now - depart[trip]
 
     def backlog(self) -> PerPair:

@@ -236,7 +236,7 @@ class SumoPlant:
         return self._scenario.network.nominal_splits if guided or controls.prices is not None else controls.splits
 
     def _new_metering(self) -> Metering | None:
-        chosen, network, trips = self._settings, self._planning.network, self._launch.trips
+        chosen, network, trips = self._settings, self._planning.network, self._launch.held
         if not chosen.metering or trips is None:
             return None
         city, way = self.city, None

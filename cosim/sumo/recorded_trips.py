@@ -2,7 +2,7 @@
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from cosim.sumo.arrays import PerTrip
 from cosim.sumo.net import City
+from cosim.sumo.trips import HeldTrips
 from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.errors import InputError
 from nmfd.runs import files
@@ -20,6 +21,12 @@ MESOSCOPIC = ("--mesosim", "true", "--meso-junction-control", "true")  # options
 BOUND = frozenset({
     "bus", "coach", "tram", "rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car", "ship",
     "aircraft", "bicycle", "pedestrian", "scooter", "wheelchair", "container", "drone"})
+DrawnTrip = tuple[float, int, str]  # departure [s], number of the vehicle, id
+HELD = "held."   # names of routes that vehicles in the file have to themselves
+# Attributes of a vehicle -> arguments of libsumo.vehicle.add, whose defaults are those of the attributes.
+ORDERED = {
+    "type": "typeID", "departLane": "departLane", "departPos": "departPos", "departSpeed": "departSpeed",
+    "arrivalLane": "arrivalLane", "arrivalPos": "arrivalPos", "arrivalSpeed": "arrivalSpeed"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +102,7 @@ def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
 
 def draw(
     originals: RecordedTrips, *, seed: int, factor: float, jitter: float, begin: float,
-) -> list[tuple[float, int, str]]:
+) -> list[DrawnTrip]:
     """(departure [s], number of the vehicle, its id) sorted by departure, for one run.
 
     factor: the demand is multiplied by it. Vehicles are left out, or driven twice or more (ids with .1, .2 and so on),
@@ -125,17 +132,60 @@ def _copy(name: str, number: int, taken: set[str]) -> str:
     return found
 
 
-def write_recorded_trips(
-    originals: RecordedTrips, path: Path, *, seed: int, factor: float, jitter: float, begin: float,
-) -> list[str]:
-    """Write the vehicles of one run to a SUMO route file; returns their ids. The same seed gives the same bytes."""
-    drawn = draw(originals, seed=seed, factor=factor, jitter=jitter, begin=begin)
-    lines = ["<routes>\n"]
+def write_recorded_trips(originals: RecordedTrips, drawn: Sequence[DrawnTrip], path: Path) -> None:
+    """Write the vehicles of one run to a SUMO route file. The same ones give the same bytes."""
+    _write(path, [_departing(originals.elements[n], name, depart) for depart, n, name in drawn])
+
+
+def write_held_trips(
+    originals: RecordedTrips, drawn: Sequence[DrawnTrip], path: Path, shared: Mapping[str, tuple[str, ...]],
+    region_of: Mapping[str, int],
+) -> HeldTrips:
+    """Those of one run that can be made to wait; their routes and all other vehicles are written to a SUMO route file.
+
+    shared: `read_routes`; region_of: of edges. Who stops on the way, has no route before the run, or an attribute that
+    cannot be told to SUMO while it runs, is a vehicle of the file.
+    """
+    elements, written, held = [], set[int](), list[tuple[float, tuple[str, ...], dict[str, str]]]()
     for depart, n, name in drawn:
         element = originals.elements[n]
-        before = dict(element.attrib)
-        element.attrib.update(id=name, depart=f"{depart:.2f}")
-        lines.append(f"  {ElementTree.tostring(element, encoding='unicode').strip()}\n")
-        element.attrib.update(before)
-    files.write_text(path, "".join([*lines, "</routes>\n"]))
-    return [name for _, _, name in drawn]
+        route = _waiting_route(element, shared)
+        if route is None:
+            elements.append(_departing(element, name, depart))
+            continue
+        known = element.get("route", f"{HELD}{n}")
+        if known == f"{HELD}{n}" and n not in written:
+            written.add(n)
+            elements.append(ElementTree.Element("route", id=known, edges=" ".join(route)))
+        order = {ORDERED[key]: value for key, value in element.attrib.items() if key in ORDERED}
+        held.append((depart, route, {"vehID": name, "routeID": known, **order}))
+    _write(path, elements)
+    return HeldTrips(
+        depart=np.array([depart for depart, _, _ in held]),
+        origin=np.array([region_of[route[0]] for _, route, _ in held], dtype=int),
+        destination=np.array([region_of[route[-1]] for _, route, _ in held], dtype=int),
+        routes=tuple(route for _, route, _ in held), orders=tuple(order for _, _, order in held))
+
+
+def _waiting_route(element: ElementTree.Element, shared: Mapping[str, tuple[str, ...]]) -> tuple[str, ...] | None:
+    """The edges of a vehicle that a program can let begin; None of one that it cannot."""
+    if element.tag != "vehicle" or not {"id", "depart", "route", "color", *ORDERED}.issuperset(element.attrib):
+        return None
+    if "route" in element.attrib:
+        return shared.get(element.attrib["route"]) if not len(element) else None
+    inside = list(element)
+    if [one.tag for one in inside] != ["route"] or len(inside[0]) or not {"edges", "color"}.issuperset(inside[0].attrib):
+        return None
+    return tuple(inside[0].get("edges", "").split()) or None
+
+
+def _departing(element: ElementTree.Element, name: str, depart: float) -> ElementTree.Element:
+    copy = ElementTree.Element(element.tag, {**element.attrib, "id": name, "depart": f"{depart:.2f}"})
+    copy.extend(element)
+    copy.text = element.text
+    return copy
+
+
+def _write(path: Path, elements: Sequence[ElementTree.Element]) -> None:
+    lines = [f"  {ElementTree.tostring(element, encoding='unicode').strip()}\n" for element in elements]
+    files.write_text(path, "".join(["<routes>\n", *lines, "</routes>\n"]))

@@ -274,12 +274,9 @@ class Session:
             return False
         return True
 
-    def begin_trip(self, vehicle: str, route: str, arrival: float) -> None:
-        """Let a car depart now, as those of cosim.sumo.trips do, on a route that SUMO knows, to `arrival` [m] on its
-        last edge."""
-        self._sumo.vehicle.add(
-            vehicle, route, typeID="car", depart="now", departLane="best", departPos="random_free", departSpeed="max",
-            arrivalPos=f"{arrival:.1f}")
+    def begin_trip(self, order: Mapping[str, str]) -> None:
+        """Let a vehicle depart now. order: arguments of libsumo.vehicle.add, with a route that SUMO knows."""
+        self._sumo.vehicle.add(**order, depart="now")
 
     def reroutes(self, vehicle: str) -> bool:
         """Whether it has SUMO's rerouting device."""

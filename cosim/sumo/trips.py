@@ -39,6 +39,32 @@ class Trips:
     arrival: PerTrip
 
 
+@dataclass(frozen=True, kw_only=True)
+class HeldTrips:
+    """N trips that SUMO is not given beforehand, but one by one when they may begin, sorted by departure.
+
+    depart: (N,) [s]
+    origin, destination: (N,) regions
+    routes: N tuples of edges
+    orders: N sets of arguments of `Session.begin_trip`; each names a route that SUMO knows
+    """
+
+    depart: PerTrip
+    origin: TripNumbers
+    destination: TripNumbers
+    routes: tuple[tuple[str, ...], ...]
+    orders: tuple[Mapping[str, str], ...]
+
+
+def held(trips: Trips) -> HeldTrips:
+    """Trips of `write_trips`, metered."""
+    orders = tuple(
+        {"vehID": f"v{n}", "routeID": f"r{n}", "typeID": "car", "departLane": "best", "departPos": "random_free",
+         "departSpeed": "max", "arrivalPos": f"{arrival:.1f}"} for n, arrival in enumerate(trips.arrival))
+    return HeldTrips(
+        depart=trips.depart, origin=trips.origin, destination=trips.destination, routes=trips.routes, orders=orders)
+
+
 def write_trips(
     city: City, demand: PairsOverTime, step: float, seed: int, path: Path, *, metered: bool = False,
 ) -> Trips:
