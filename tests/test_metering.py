@@ -1,5 +1,7 @@
 """Trips that are made to wait: how many, who first, and that nobody is lost or counted twice."""
 
+import gzip
+import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -11,7 +13,8 @@ from commands import cosim, error_line, good
 from cosim.plant.metering import FILLING, KI, KP, Metering
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
-from cosim.sumo.trips import Trips
+from cosim.sumo.trips import Trips, held
+from cosim.sumo.xml_files import read_xml
 from nmfd.api import load_scenario
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.types import Controls
@@ -23,11 +26,11 @@ def metering(depart, origin, level=1.2, way=None):
     """Of trips to region 1, and who has begun: (time, vehicle, route)."""
     begun, count = [], len(depart)
     session = SimpleNamespace(time=0.0, step_length=1.0)
-    session.begin_trip = lambda vehicle, route, arrival: begun.append((session.time, vehicle, route))
+    session.begin_trip = lambda order: begun.append((session.time, order["vehID"], order["routeID"]))
     trips = Trips(
         depart=np.array(depart, dtype=float), origin=np.array(origin, dtype=int), destination=np.ones(count, dtype=int),
         routes=(("a", "b"),) * count, arrival=np.zeros(count))
-    return Metering(session, trips, CRITICAL, level=level, step=90.0, way=way), session, begun
+    return Metering(session, held(trips), CRITICAL, level=level, step=90.0, way=way), session, begun
 
 
 def played(meters, session, seconds):
@@ -115,10 +118,51 @@ def test_in_a_city_the_books_hold_and_waiting_counts():
     assert spent < metered.departure_delay < spent + 90.0 * held[-1].backlog.sum()
 
 
-def test_trips_of_route_files_cannot_be_made_to_wait(tmp_path):
-    config = tiny_city.city(tmp_path)
-    good(cosim("import", config, "--regions", 3, "--no-run", "--method", "geometric", "--out",
+@pytest.fixture
+def own(tmp_path):
+    """A city whose vehicles come from a route file."""
+    good(cosim("import", tiny_city.city(tmp_path), "--regions", 3, "--no-run", "--method", "geometric", "--out",
                tmp_path / "networks" / "tiny"))
-    scenario = tmp_path / "scenarios" / "tiny"
-    line = error_line(cosim("run", scenario, "--controller", "no-control+metering", "--out", tmp_path / "out"))
-    assert "sumo.metering: trips of route files" in line and not (tmp_path / "out").exists()
+    return tmp_path / "scenarios" / "tiny"
+
+
+def ran(scenario, seed=5, **changes):
+    """(the states, what became of the trips, how many there were) of a city with nothing held back at its gateways."""
+    network = scenario.network
+    rate = changes.pop("rate", None)
+    opened = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None, metering=rate)
+    plant = SumoPlant(scenario, overrides=settings(scenario).changed(**changes))
+    plant.reset(seed)
+    states, trips = [plant.step(opened) for _ in range(scenario.steps)], plant.trips
+    facts = plant.trip_facts()
+    plant.close()
+    return states, facts, trips
+
+
+def test_a_citys_own_vehicles_wait_as_well(own):
+    scenario = replace(load_scenario(own), steps=6)
+    regions, step = scenario.network.regions, scenario.step
+    (free, _, due), *metered = (ran(scenario), *(
+        ran(scenario, metering=True, rate=np.full(regions, rate)) for rate in (100.0, 0.0, 1.0 / step)))
+    (fast, _, again), (closed, _, _), (held_back, facts, count) = metered
+    inside = [[state.accumulation.sum() + state.backlog.sum() + state.completed for state in states]
+              for states in (free, fast, closed, held_back)]
+    assert inside[0] == inside[1] == inside[2] == inside[3] and due == again == count
+    assert fast[-1].accumulation.sum() == pytest.approx(free[-1].accumulation.sum(), rel=0.15)
+    began = closed[-1].backlog.sum() - held_back[-1].backlog.sum()  # some of the file do not wait, whatever the rate
+    assert 0 < began <= regions * 6 and closed[-1].backlog.sum() > 0.9 * due
+    spent = step * sum(state.backlog.sum() for state in held_back[:-1])
+    assert spent < facts.departure_delay < spent + step * held_back[-1].backlog.sum()
+    assert facts.trips >= count
+
+
+def test_where_nobody_can_be_made_to_wait(own, tmp_path):
+    vehicles = next(own.glob("vehicles.rou.xml*"))
+    root = read_xml(vehicles)
+    for vehicle in root:
+        vehicle.set("line", "7")
+    with gzip.open(vehicles, "wb") as stream:
+        ElementTree.ElementTree(root).write(stream)
+    line = error_line(cosim("run", own, "--controller", "no-control+metering", "--out", tmp_path / "out"))
+    assert "sumo.metering: none of the vehicles in sumo.routes can be made to wait" in line
+    assert not (tmp_path / "out").exists()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tiny
 
-from cosim.sumo.recorded_trips import draw, read_recorded_trips, write_recorded_trips
+from cosim.sumo.recorded_trips import draw, read_recorded_trips, write_held_trips, write_recorded_trips
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
@@ -43,6 +43,46 @@ def _with_cents(elements):
     for element in elements:
         element.set("depart", f"{float(element.get('depart')):.2f}")
     return elements
+
+
+MIXED = """<routes>
+  <vehicle id="own" type="car" depart="1" departLane="best" arrivalPos="-1" color="red"><route edges="a b"/></vehicle>
+  <vehicle id="shared" depart="2" route="morning"/>
+  <vehicle id="unknown" depart="3" route="evening"/>
+  <vehicle id="stops" depart="4"><route edges="a b"/><stop lane="a_0" duration="5"/></vehicle>
+  <vehicle id="line" depart="5" line="7"><route edges="a b"/></vehicle>
+  <vehicle id="repeats" depart="6"><route edges="a b" repeat="3"/></vehicle>
+  <vehicle id="parks" depart="7"><route edges="a b"><stop lane="a_0" duration="5"/></route></vehicle>
+  <vehicle id="nowhere" depart="8"><route edges=""/></vehicle>
+  <vehicle id="tells" depart="9"><param key="a" value="b"/></vehicle>
+  <trip id="trip" depart="10" from="a" to="c"/>
+  <trip id="round" depart="11" from="c" to="c"/>
+  <trip id="via" depart="12" from="a" to="c" via="b"/>
+  <trip id="zone" depart="13" fromTaz="a" to="c"/>
+</routes>"""
+
+
+def test_whom_a_program_can_let_begin(tmp_path):
+    (tmp_path / "cars.rou.xml").write_text(MIXED)
+    originals = read_recorded_trips([tmp_path / "cars.rou.xml"])
+    drawn = draw(originals, seed=1, factor=2.0, jitter=0.0, begin=0.0)
+    held = write_held_trips(originals, drawn, tmp_path / "out.xml", {"morning": ("b", "c")}, {"a": 0, "b": 1, "c": 2})
+    assert held.orders == (
+        {"vehID": "own", "routeID": "held.0", "typeID": "car", "departLane": "best", "arrivalPos": "-1"},
+        {"vehID": "own.1", "routeID": "held.0", "typeID": "car", "departLane": "best", "arrivalPos": "-1"},
+        {"vehID": "shared", "routeID": "morning"}, {"vehID": "shared.1", "routeID": "morning"},
+        {"vehID": "trip", "routeID": "held.9"}, {"vehID": "trip.1", "routeID": "held.9"},
+        {"vehID": "round", "routeID": "held.10"}, {"vehID": "round.1", "routeID": "held.10"})
+    assert held.depart.tolist() == [1.0, 1.0, 2.0, 2.0, 10.0, 10.0, 11.0, 11.0]
+    assert held.routes[::2] == held.routes[1::2] == (("a", "b"), ("b", "c"), ("a", "c"), ("c",))
+    assert held.origin[::2].tolist() == [0, 1, 0, 2] and held.destination[::2].tolist() == [1, 2, 2, 2]
+    written = list(ElementTree.parse(tmp_path / "out.xml").getroot())
+    routes, others = ([e for e in written if (e.tag == "route") == held] for held in (True, False))
+    assert [(e.get("id"), e.get("edges")) for e in routes] == [("held.0", "a b"), ("held.9", "a c"), ("held.10", "c")]
+    assert sorted(e.get("id") for e in others) == sorted(
+        f"{name}{copy}" for name in ("unknown", "stops", "line", "repeats", "parks", "nowhere", "tells", "via", "zone")
+        for copy in ("", ".1"))
+    assert others[2].find("stop") is not None
 
 
 @pytest.mark.parametrize("factor, count", [(0.0, 0), (0.8, 160), (1.0, 200), (1.3, 260), (2.5, 500)])

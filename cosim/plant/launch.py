@@ -10,6 +10,7 @@ from cosim.sumo import outputs
 from cosim.sumo.net import City
 from cosim.sumo.recorded_trips import (
     MESOSCOPIC,
+    ORDERED,
     RecordedTrips,
     check_edges,
     draw,
@@ -49,8 +50,8 @@ def own_files(scenario: Scenario, names: Sequence[str]) -> list[Path]:
 class Launch:
     """Starts SUMO for one run after the other, in a scratch folder that `close` removes.
 
-    vehicles: ids of those of the last run; held: those of them that are metered; trip_file: what SUMO tells of them when
-    it ends
+    vehicles: ids of those of the last run; held: those of them that are metered; trip_file: what SUMO tells of them
+    when it ends
     """
 
     def __init__(
@@ -129,8 +130,9 @@ class Launch:
             self.held = write_held_trips(self._originals, drawn, path, self._shared_routes(), self._city.region_of)
             if not self.held.orders:
                 raise InputError(
-                    f"{scenario_file(scenario)}: sumo.metering: none of the vehicles in sumo.routes can be made to wait: "
-                    "those can that have a route, no stop and no more attributes than cosim import leaves them; omit it")
+                    f"{scenario_file(scenario)}: sumo.metering: none of the vehicles in sumo.routes can be made to "
+                    "wait: those can that have neither stops nor edges to go by, and no attributes but "
+                    f"{', '.join(ORDERED)}; omit it")
         else:
             write_recorded_trips(self._originals, drawn, path)
         return [name for _, _, name in drawn]

@@ -143,8 +143,8 @@ def write_held_trips(
 ) -> HeldTrips:
     """Those of one run that can be made to wait; their routes and all other vehicles are written to a SUMO route file.
 
-    shared: `read_routes`; region_of: of edges. Who stops on the way, has no route before the run, or an attribute that
-    cannot be told to SUMO while it runs, is a vehicle of the file.
+    shared: `read_routes`; region_of: of edges. Who stops on the way, goes by way of certain edges, or has an attribute
+    that cannot be told to SUMO while it runs, is a vehicle of the file.
     """
     elements, written, held = [], set[int](), list[tuple[float, tuple[str, ...], dict[str, str]]]()
     for depart, n, name in drawn:
@@ -169,14 +169,17 @@ def write_held_trips(
 
 def _waiting_route(element: ElementTree.Element, shared: Mapping[str, tuple[str, ...]]) -> tuple[str, ...] | None:
     """The edges of a vehicle that a program can let begin; None of one that it cannot."""
-    if element.tag != "vehicle" or not {"id", "depart", "route", "color", *ORDERED}.issuperset(element.attrib):
+    if not {"id", "depart", "route", "from", "to", "color", *ORDERED}.issuperset(element.attrib):
         return None
+    if element.tag == "trip":  # SUMO looks for a way between two edges that do not meet
+        ends = tuple(dict.fromkeys(element.get(key, "") for key in ("from", "to")))
+        return ends if all(ends) and not len(element) else None
     if "route" in element.attrib:
         return shared.get(element.attrib["route"]) if not len(element) else None
-    inside = list(element)
-    if [one.tag for one in inside] != ["route"] or len(inside[0]) or not {"edges", "color"}.issuperset(inside[0].attrib):
+    route = element[0] if len(element) == 1 else None
+    if route is None or route.tag != "route" or len(route) or not {"edges", "color"}.issuperset(route.attrib):
         return None
-    return tuple(inside[0].get("edges", "").split()) or None
+    return tuple(route.get("edges", "").split()) or None
 
 
 def _departing(element: ElementTree.Element, name: str, depart: float) -> ElementTree.Element:
