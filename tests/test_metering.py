@@ -10,7 +10,7 @@ import pytest
 import tiny_city
 from commands import cosim, error_line, good
 
-from cosim.plant.metering import FILLING, KI, KP, Metering
+from cosim.plant.metering import FILLING, KI, KP, Metering, ways
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.sumo.trips import Trips, held
@@ -154,6 +154,15 @@ def test_a_citys_own_vehicles_wait_as_well(own):
     spent = step * sum(state.backlog.sum() for state in held_back[:-1])
     assert spent < facts.departure_delay < spent + step * held_back[-1].backlog.sum()
     assert facts.trips >= count
+
+
+def test_how_far_those_have_to_go_who_wait():
+    city = SimpleNamespace(
+        length={"a": 100.0, "b": 50.0, "c": 30.0}, speed={"a": 10.0, "b": 10.0, "c": 10.0},
+        successors={"a": ("b",), "b": ("c",), "c": ()})
+    session = SimpleNamespace(fastest=lambda start, end: (77.0, (start, "b", end)))
+    routes = (("a", "b"), ("a", "c"), ("b", "c"), ("a", "bus lane", "c"), ("bus lane", "c"), ("c",))
+    assert ways(session, city, SimpleNamespace(routes=routes)).tolist() == [15.0, 77.0, 8.0, 13.0, 3.0, 3.0]
 
 
 def test_where_nobody_can_be_made_to_wait(own, tmp_path):

@@ -15,12 +15,24 @@ import heapq
 
 import numpy as np
 
+from cosim.sumo.net import City
 from cosim.sumo.session import Session
 from cosim.sumo.trips import HeldTrips, PerTrip
 from nmfd.arrays import PerPair, PerRegion
 
 KP, KI = 1.0, 0.3  # of the vehicles too many, those that are kept out in the next control interval [-]; not tuned
 FILLING = 60.0     # s, in which the largest rate fills a region to its critical accumulation
+
+
+def ways(session: Session, city: City, trips: HeldTrips) -> PerTrip:
+    """(N,) [s] on empty streets; nothing for those of another vehicle class, which the city does not have."""
+    def empty(route: tuple[str, ...]) -> float:
+        if len(route) == 2 and route[1] not in city.successors.get(route[0], route):  # SUMO looks for the way
+            return session.fastest(*route)[0]
+        return sum(city.length[edge] / city.speed[edge] for edge in route if edge in city.length)
+
+    times = {route: empty(route) for route in set(trips.routes)}
+    return np.array([times[route] for route in trips.routes])
 
 
 class Metering:

@@ -14,7 +14,7 @@ from cosim.plant.incidents import Incidents
 from cosim.plant.junctions import Junctions
 from cosim.plant.launch import Launch
 from cosim.plant.meter import Meter
-from cosim.plant.metering import Metering
+from cosim.plant.metering import Metering, ways
 from cosim.plant.observer import Observer
 from cosim.plant.record import Record, Recorder
 from cosim.plant.sensing import Estimation, Sensing
@@ -241,7 +241,7 @@ class SumoPlant:
             return None
         city, way = self.city, None
         if chosen.metering_first == SHORT:
-            way = np.array([sum(city.length[edge] / city.speed[edge] for edge in route) for route in trips.routes])
+            way = ways(self.session, city, trips)
         return Metering(
             self.session, trips, network.critical, level=chosen.metering_level,
             step=self._scenario.step, way=way)

@@ -26,10 +26,11 @@ _WORDS = {
     "estimate": ("measurement", "estimate"), "metering": ("metering", True),
     "short-first": ("metering_first", "short"), GUIDED: ("guided", True)}
 PERCENT, SECONDS = "percent", "seconds"
+LEVEL = "metering"  # with a number
 # Option with a whole number -> (field of cosim.plant.settings.Settings, least, most, its unit).
 _NUMBERS = {
     "rerouting": ("rerouting", 1, 100, PERCENT), "compliance": ("compliance", 0, 100, PERCENT),
-    "queue-override": ("queue_override", 1, 100, PERCENT),
+    "queue-override": ("queue_override", 1, 100, PERCENT), LEVEL: ("metering_level", 1, 1000, PERCENT),
     "guidance-period": ("guidance_period", 1, 3600, SECONDS)}
 OPTIONS = (*_WORDS, *(f"{name}-N" for name in _NUMBERS))
 _TEXTS = {
@@ -42,6 +43,7 @@ _TEXTS = {
     "estimate": "the controller sees what loops and probe vehicles tell, not the truth",
     "short-first": "of trips that wait, with +metering, those with a short way begin first",
     "metering": "trips wait outside where their region is full, or as the controller commands",
+    "metering-N": "the same, and without a command at N percent of the region's critical accumulation",
     GUIDED: "drivers are guided by travel times",
     "rerouting-N": "N percent of the drivers take another route by themselves, every minute",
     "compliance-N": "N percent of the drivers follow the guidance",
@@ -89,6 +91,8 @@ def parse(name: str) -> Strategy:
         if key in chosen:
             raise InputError(f"strategy {name!r}: {chosen[key]} and {word} exclude each other; omit one of them")
         chosen[key], overrides[key] = word, value
+    if "metering_level" in overrides:
+        overrides["metering"] = True
     return Strategy(name=name, controller=controller, overrides=overrides)
 
 
@@ -120,7 +124,7 @@ def model_free(name: str) -> bool:
 def metered(name: str) -> bool:
     """Whether a strategy can make trips wait; its controller need not be there any more."""
     _, words = registry.split(name)
-    return "metering" in words
+    return any(option[0].startswith("metering") for word in words if (option := _option(word)) is not None)
 
 
 def configured(name: str, tables: Iterable[str]) -> str:
