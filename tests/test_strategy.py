@@ -3,7 +3,7 @@
 import pytest
 
 from cosim.plant.settings import Settings
-from cosim.plant.strategy import ALONE, OPTIONS, configured, model_free, parse
+from cosim.plant.strategy import ALONE, OPTIONS, configured, metered, model_free, parse
 from nmfd.controllers import registry
 from nmfd.errors import InputError
 
@@ -22,6 +22,8 @@ from nmfd.errors import InputError
      {"gateways_fixed": True, "guided": True, "signals": "max-pressure"}),
     ("guided", "no-control", {"gateways_fixed": False, "guided": True}),
     ("dpc-pcrg+guidance-period-90", "dpc-pcrg", {"gateways_fixed": True, "guidance_period": 90.0}),
+    ("dpc-pc+metering", "dpc-pc", {"gateways_fixed": True, "metering": True}),
+    ("metering-120", "no-control", {"gateways_fixed": False, "metering": True, "metering_level": 1.2}),
 ])
 def test_what_a_name_means(name, controller, overrides):
     strategy = parse(name)
@@ -33,6 +35,13 @@ def test_what_a_name_means(name, controller, overrides):
     ("pi-gating", False), ("pi-gating+guided", True), ("guided", True), ("route-guidance", True), ("dpc-pc", False)])
 def test_who_guides(name, guides):
     assert parse(name).guides == guides
+
+
+@pytest.mark.parametrize("name, waits", [
+    ("pi-gating+metering", True), ("route-guidance+metering-90", True), ("mine.py:Gate+metering", True),
+    ("no-control+metering-100+short-first", True), ("pi-gating", False), ("max-pressure+rerouting-30", False)])
+def test_who_can_make_trips_wait(name, waits):
+    assert metered(name) == waits
 
 
 def test_every_controller_and_option_is_a_strategy():
@@ -66,6 +75,7 @@ def test_a_strategy_uses_the_table_that_fits_it_best():
     ("guidance-period-0", "guidance-period-N from 1 to 3600 seconds"),
     ("dpc-pcrg+guidance-period-3601", "unknown"),
     ("rerouting-05", "unknown"),
+    ("metering-0", "metering-N from 1 to 1000 percent"),
     ("rerouting", "unknown"),
     ("rerouting-2.5", "unknown"),
     ("actuated+webster", "actuated and webster exclude each other"),
