@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import tiny_city
-from commands import cosim, error_line, good
+from commands import cosim, error_line
 
 from cosim.plant.metering import FILLING, KI, KP, Metering, ways
 from cosim.plant.plant import SumoPlant
@@ -121,9 +121,7 @@ def test_in_a_city_the_books_hold_and_waiting_counts():
 @pytest.fixture
 def own(tmp_path):
     """A city whose vehicles come from a route file."""
-    good(cosim("import", tiny_city.city(tmp_path), "--regions", 3, "--no-run", "--method", "geometric", "--out",
-               tmp_path / "networks" / "tiny"))
-    return tmp_path / "scenarios" / "tiny"
+    return tiny_city.imported(tmp_path)
 
 
 def ran(scenario, seed=5, **changes):

@@ -1,6 +1,7 @@
 """What SUMO is started with: the vehicles of a run, the files beside them, and the command line."""
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 
 from cosim.plant.detectors import Layout, write_loops
@@ -127,7 +128,7 @@ class Launch:
             self._originals, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
             begin=chosen.begin)
         if chosen.metering:
-            self.held = write_held_trips(self._originals, drawn, path, self._shared_routes(), self._city.region_of)
+            self.held = write_held_trips(self._originals, drawn, path, self._shared_routes, self._city.region_of)
             if not self.held.orders:
                 raise InputError(
                     f"{scenario_file(scenario)}: sumo.metering: none of the vehicles in sumo.routes can be made to "
@@ -137,6 +138,7 @@ class Launch:
             write_recorded_trips(self._originals, drawn, path)
         return [name for _, _, name in drawn]
 
+    @cached_property
     def _shared_routes(self) -> Mapping[str, tuple[str, ...]]:
         return read_routes(own_files(self._scenario, self._settings.additional))
 
@@ -144,4 +146,4 @@ class Launch:
         """Turning flows of the city's own vehicles; None where trips are drawn from the scenario's demand."""
         if self._originals is None:
             return None
-        return own_flows(self._city, self._originals, self._shared_routes(), self._scenario.demand_factor)
+        return own_flows(self._city, self._originals, self._shared_routes, self._scenario.demand_factor)

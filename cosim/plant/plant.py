@@ -237,11 +237,9 @@ class SumoPlant:
 
     def _new_metering(self) -> Metering | None:
         chosen, network, trips = self._settings, self._planning.network, self._launch.held
-        if not chosen.metering or trips is None:
+        if trips is None:
             return None
-        city, way = self.city, None
-        if chosen.metering_first == SHORT:
-            way = ways(self.session, city, trips)
+        way = ways(self.session, self.city, trips) if chosen.metering_first == SHORT else None
         return Metering(
             self.session, trips, network.critical, level=chosen.metering_level,
             step=self._scenario.step, way=way)

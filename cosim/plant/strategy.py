@@ -26,12 +26,12 @@ _WORDS = {
     "estimate": ("measurement", "estimate"), "metering": ("metering", True),
     "short-first": ("metering_first", "short"), GUIDED: ("guided", True)}
 PERCENT, SECONDS = "percent", "seconds"
-LEVEL = "metering"  # with a number
 # Option with a whole number -> (field of cosim.plant.settings.Settings, least, most, its unit).
 _NUMBERS = {
     "rerouting": ("rerouting", 1, 100, PERCENT), "compliance": ("compliance", 0, 100, PERCENT),
-    "queue-override": ("queue_override", 1, 100, PERCENT), LEVEL: ("metering_level", 1, 1000, PERCENT),
+    "queue-override": ("queue_override", 1, 100, PERCENT), "metering": ("metering_level", 1, 1000, PERCENT),
     "guidance-period": ("guidance_period", 1, 3600, SECONDS)}
+METERING = ("metering", "metering_level")  # of these settings, those whose options make trips wait
 OPTIONS = (*_WORDS, *(f"{name}-N" for name in _NUMBERS))
 _TEXTS = {
     "webster": "fixed-time signals, optimised for the scenario's demand",
@@ -91,7 +91,7 @@ def parse(name: str) -> Strategy:
         if key in chosen:
             raise InputError(f"strategy {name!r}: {chosen[key]} and {word} exclude each other; omit one of them")
         chosen[key], overrides[key] = word, value
-    if "metering_level" in overrides:
+    if not overrides.keys().isdisjoint(METERING):
         overrides["metering"] = True
     return Strategy(name=name, controller=controller, overrides=overrides)
 
@@ -124,7 +124,7 @@ def model_free(name: str) -> bool:
 def metered(name: str) -> bool:
     """Whether a strategy can make trips wait; its controller need not be there any more."""
     _, words = registry.split(name)
-    return any(option[0].startswith("metering") for word in words if (option := _option(word)) is not None)
+    return any(option[0] in METERING for word in words if (option := _option(word)) is not None)
 
 
 def configured(name: str, tables: Iterable[str]) -> str:

@@ -100,6 +100,16 @@ def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
     return found
 
 
+def edges_of(element: ElementTree.Element, routes: Mapping[str, Sequence[str]]) -> tuple[Sequence[str], bool]:
+    """(the edges of a vehicle's route, True), or (those that it must pass, False)."""
+    route = element.find("route")
+    if route is not None:
+        return route.get("edges", "").split(), True
+    if name := element.get("route"):
+        return routes.get(name, ()), True
+    return [edge for key in ("from", "via", "to") for edge in element.get(key, "").split()], False
+
+
 def draw(
     originals: RecordedTrips, *, seed: int, factor: float, jitter: float, begin: float,
 ) -> list[DrawnTrip]:
@@ -150,11 +160,11 @@ def write_held_trips(
     for depart, n, name in drawn:
         element = originals.elements[n]
         route = _waiting_route(element, shared)
-        if route is None:
+        if not route:
             elements.append(_departing(element, name, depart))
             continue
         known = element.get("route", f"{HELD}{n}")
-        if known == f"{HELD}{n}" and n not in written:
+        if "route" not in element.attrib and n not in written:
             written.add(n)
             elements.append(ElementTree.Element("route", id=known, edges=" ".join(route)))
         order = {ORDERED[key]: value for key, value in element.attrib.items() if key in ORDERED}
@@ -167,19 +177,19 @@ def write_held_trips(
         routes=tuple(route for _, route, _ in held), orders=tuple(order for _, _, order in held))
 
 
-def _waiting_route(element: ElementTree.Element, shared: Mapping[str, tuple[str, ...]]) -> tuple[str, ...] | None:
-    """The edges of a vehicle that a program can let begin; None of one that it cannot."""
+def _waiting_route(element: ElementTree.Element, shared: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+    """The edges of a vehicle that a program can let begin; none of one that it cannot. Between two edges that do not
+    meet SUMO looks for the way."""
     if not {"id", "depart", "route", "from", "to", "color", *ORDERED}.issuperset(element.attrib):
-        return None
-    if element.tag == "trip":  # SUMO looks for a way between two edges that do not meet
-        ends = tuple(dict.fromkeys(element.get(key, "") for key in ("from", "to")))
-        return ends if all(ends) and not len(element) else None
-    if "route" in element.attrib:
-        return shared.get(element.attrib["route"]) if not len(element) else None
-    route = element[0] if len(element) == 1 else None
-    if route is None or route.tag != "route" or len(route) or not {"edges", "color"}.issuperset(route.attrib):
-        return None
-    return tuple(route.get("edges", "").split()) or None
+        return ()
+    brings = int(element.tag == "vehicle" and "route" not in element.attrib)  # a route of its own
+    if len(element) > brings or any(
+            one.tag != "route" or len(one) or not {"edges", "color"}.issuperset(one.attrib) for one in element):
+        return ()
+    edges, driven = edges_of(element, shared)
+    if driven:
+        return tuple(edges)
+    return tuple(dict.fromkeys(edges)) if element.tag == "trip" and len(edges) == 2 else ()
 
 
 def _departing(element: ElementTree.Element, name: str, depart: float) -> ElementTree.Element:

@@ -19,6 +19,7 @@ from nmfd.errors import InputError
 STREAM = 7101       # keeps the random numbers of trips apart from others of the same seed
 DRIVER_CLASSES = 8          # groups of drivers who see different travel times
 CLASS_SPREAD = 0.15  # standard deviation of the logarithm of their travel times
+DEPARTING = {"departLane": "best", "departSpeed": "max", "departPos": "random_free"}  # attributes of every trip
 SHORT = 30.0        # m; no trip starts or ends on a shorter edge where its region has longer ones
 
 
@@ -59,8 +60,8 @@ class HeldTrips:
 def held(trips: Trips) -> HeldTrips:
     """Trips of `write_trips`, metered."""
     orders = tuple(
-        {"vehID": f"v{n}", "routeID": f"r{n}", "typeID": "car", "departLane": "best", "departPos": "random_free",
-         "departSpeed": "max", "arrivalPos": f"{arrival:.1f}"} for n, arrival in enumerate(trips.arrival))
+        {"vehID": f"v{n}", "routeID": f"r{n}", "typeID": "car", "arrivalPos": f"{arrival:.1f}", **DEPARTING}
+        for n, arrival in enumerate(trips.arrival))
     return HeldTrips(
         depart=trips.depart, origin=trips.origin, destination=trips.destination, routes=trips.routes, orders=orders)
 
@@ -74,11 +75,12 @@ def write_trips(
     """
     trips = make_trips(city, demand, step, seed)
     lines = ['<routes>\n  <vType id="car" sigma="0.2"/>\n']
+    departing = " ".join(f'{key}="{value}"' for key, value in DEPARTING.items())
     for n, route in enumerate(trips.routes):
         edges = quoteattr(" ".join(route))
         lines.append(f'  <route id="r{n}" edges={edges}/>\n' if metered else (
-            f'  <vehicle id="v{n}" type="car" depart="{trips.depart[n]:.2f}" departLane="best" departSpeed="max" '
-            f'departPos="random_free" arrivalPos="{trips.arrival[n]:.1f}"><route edges={edges}/></vehicle>\n'))
+            f'  <vehicle id="v{n}" type="car" depart="{trips.depart[n]:.2f}" {departing} '
+            f'arrivalPos="{trips.arrival[n]:.1f}"><route edges={edges}/></vehicle>\n'))
     lines.append("</routes>\n")
     path = Path(path)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")

@@ -1,6 +1,5 @@
 """The flows that a signal plan is made for: the demand on static routes, in its busiest quarter of an hour."""
 
-import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -8,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from cosim.sumo.net import City
-from cosim.sumo.recorded_trips import RecordedTrips
+from cosim.sumo.recorded_trips import RecordedTrips, edges_of
 from cosim.sumo.trips import DRIVER_CLASSES, Ways, make_trips
 from nmfd.arrays import PairsOverTime
 
@@ -43,7 +42,7 @@ def own_flows(
     if not len(ends):
         return {}
     first = int(np.argmax(ends - np.arange(len(ends))))
-    busiest = [_edges(element, routes) for element in originals.elements[first : ends[first]]]
+    busiest = [edges_of(element, routes) for element in originals.elements[first : ends[first]]]
     known = set(city.edges)
     turns: Counter[tuple[str, str]] = Counter()
     for edges, driven in busiest:
@@ -58,13 +57,3 @@ def own_flows(
         for route in Ways(city, random).routes(begin, end, random.integers(DRIVER_CLASSES, size=len(legs))):
             turns.update(pairwise(route))
     return {turn: factor * count / PEAK for turn, count in turns.items()}
-
-
-def _edges(element: ElementTree.Element, routes: Mapping[str, Sequence[str]]) -> tuple[Sequence[str], bool]:
-    """(the edges of a vehicle's route, True), or (those that it must pass, False)."""
-    route = element.find("route")
-    if route is not None:
-        return route.get("edges", "").split(), True
-    if name := element.get("route"):
-        return routes.get(name, ()), True
-    return [edge for key in ("from", "via", "to") for edge in element.get(key, "").split()], False
