@@ -1,6 +1,7 @@
-"""Policies of ten numbers at most: what they command, and that they are trained, kept and watched as the others."""
+"""Policies of eleven numbers at most: what they command, and that they are trained, kept and watched as the others."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -76,15 +77,17 @@ def test_gates_and_prices_are_those_of_the_formula(network):
 
 def test_trips_wait_for_the_protected_regions_wherever_they_begin(network):
     critical, seen = np.array([mfd.critical for mfd in network.mfds]), set()
-    made = policy(network, NUMBERS._replace(metering=1.4, metering_protected=1.1), metering=True)
-    for seed in range(6):
+    for seed, gain in product(range(6), (1.0, 2.5)):
+        made = policy(
+            network, NUMBERS._replace(metering=1.4, metering_protected=1.1, metering_gain=gain), metering=True)
         x = crowded(network, seed)
         full = x.sum(axis=1) / critical
-        room = np.minimum(1.4 - full, 1.1 - full[CENTRE])
+        centre = gain * (1.1 - full[CENTRE])
+        room = np.maximum(np.minimum(1.4 - full, centre), 0.0)
         found = made.metering(torch.from_numpy(x)).detach().numpy()
-        np.testing.assert_allclose(found, np.maximum(room, 0.0) * critical / HELD, rtol=1e-4, atol=1e-5)
-        seen |= {"own" if a < 1.1 - full[CENTRE] else "protected" if a > 0.0 else "none" for a in np.maximum(room, 0.0)}
-    assert seen == {"own", "protected", "none"}
+        np.testing.assert_allclose(found, room * critical / HELD, rtol=1e-4, atol=1e-5)
+        seen |= {(gain, "own" if a < centre else "protected" if a > 0.0 else "none") for a in room}
+    assert seen == set(product((1.0, 2.5), ("own", "protected", "none")))
 
 
 def test_with_an_integral_it_contains_the_pi_gate_and_relief_comes_on_top(network):
@@ -116,11 +119,11 @@ def test_with_an_integral_it_contains_the_pi_gate_and_relief_comes_on_top(networ
 
 
 def test_a_policy_of_before_the_integral_is_read_as_it_was(network, tmp_path):
-    """The last of the numbers has its default; others that are missing are a damaged file."""
+    """The last of the numbers have their defaults; others that are missing are a damaged file."""
     scenario = load_scenario("economic_mpc")
     made, file = policy(network), tmp_path / "dpc-pcrg.pt"
     x = torch.from_numpy(crowded(network)).float()
-    for kept, read in ((8, True), (9, True), (7, False)):
+    for kept, read in ((8, True), (9, True), (10, True), (7, False)):
         content = checkpoint(made, scenario.network, {})
         content["weights"]["numbers"] = content["weights"]["numbers"][:kept]
         torch.save(content, file)
@@ -130,7 +133,7 @@ def test_a_policy_of_before_the_integral_is_read_as_it_was(network, tmp_path):
             continue
         found, _ = load_policy(file, scenario.network)
         torch.testing.assert_close(found(x)[0], made(x)[0])
-        assert found.remember(x, None) is None and found.numbers[-2:].eq(0.0).all()
+        assert found.remember(x, None) is None and Numbers(*found.numbers.tolist())[8:] == (0.0, 0.0, 1.0)
 
 
 def test_the_regional_model_sends_fewer_through_a_dear_region_and_nobody_where_there_is_no_way(network):
@@ -176,7 +179,7 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
     (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend="true"))
     loaded = load_scenario(scenario)
     first, trained = (load_policy(file, loaded.network) for file in files.values())
-    assert first[0].numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5, 0.0, 0.0])
+    assert first[0].numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5, 0.0, 0.0, 1.0])
     assert isinstance(trained[0], CompactPolicy) and (trained[0].numbers != first[0].numbers).any()
     assert first[1]["configuration"]["steps"] == 0 and trained[1]["configuration"]["steps"] == 5
     assert trained[1]["configuration"]["validation_veh_s"] < first[1]["configuration"]["validation_veh_s"]
@@ -185,9 +188,9 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
 
 
 @pytest.mark.parametrize("table, expected", [
-    ("numbers = [1.0, 2.0, 0.0, 1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected 8 to 10 numbers >= 0, of a compact"),
+    ("numbers = [1.0, 2.0, 0.0, 1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected 8 to 11 numbers >= 0, of a compact"),
     ("compact = true\nnumbers = [1.0]", "numbers: "),
-    ("compact = true\nnumbers = [1.0, 2.0, 0.0, -1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected 8 to 10 numbers >= 0"),
+    ("compact = true\nnumbers = [1.0, 2.0, 0.0, -1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected 8 to 11 numbers >= 0"),
     ("compact = true\nlocal = true", "compact: begins with its numbers"),
     ("metering = true", "metering: only compact policies let trips wait"),
     ("steps = 0", "steps: expected a whole number from 1"),

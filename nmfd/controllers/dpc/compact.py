@@ -9,11 +9,12 @@ and the prices of all ways through p, are
 and every other entry is open; the prices of the other regions are elsewhere max(z_i - elsewhere_from, 0). `relief`
 opens a gate for a region that is beyond its own critical accumulation. Where trips can be made to wait,
 
-    r_i = n_cr,i max(min(metering - z_i, metering_protected - max_p z_p), 0) / HELD
+    r_i = n_cr,i max(min(metering - z_i, metering_gain (metering_protected - max_p z_p)), 0) / HELD
 
 may begin in region i per second; without `metering_protected` (0) nobody waits for the protected regions. A gate moves
 a queue into the regions around the one that it protects, which may lock in its place; trips that have not begun
-stand in nobody's way.
+stand in nobody's way. The greater `metering_gain`, the less of `metering_protected` stays unused while somebody waits,
+and the more begin at once when there is room.
 
 With `integral` the gate is the PI gate of nmfd.controllers.pi_gating, which begins open, v_p = 1/2, with relief on top:
 
@@ -48,13 +49,13 @@ from nmfd.tensors import PerPair, PerRegion, PerTurn
 
 DISPERSION = 60.0  # s: how differently drivers see the same ways; assumed, nobody has measured it
 HELD = 90.0        # s, a cycle of the signals: how fast a region may fill
-OLDEST = 8         # numbers of the policies that had the fewest: neither integral nor metering_protected
+OLDEST = 8         # numbers of the policies that had the fewest: up to metering
 LONGEST = 20.0     # times as long as in free flow: the most that it takes in the model to leave a region
 
 
 class Numbers(NamedTuple):
     """What a compact policy consists of, in this order; see above. Both of `metering` count where it lets trips wait;
-    older policies have no `integral` and no `metering_protected`."""
+    older policies have no `integral`, `metering_protected` and `metering_gain`."""
 
     set_point: float = 1.0
     gain: float = 2.0
@@ -66,12 +67,13 @@ class Numbers(NamedTuple):
     metering: float = 1.5
     integral: float = 0.0
     metering_protected: float = 0.0
+    metering_gain: float = 1.0
 
 
 class CompactPolicy(Policy):
     """The policy of these numbers, for the protected regions `architecture.compact`.
 
-    numbers: (10,) [-], `Numbers`
+    numbers: (11,) [-], `Numbers`
     """
 
     def _build(self, network: RegionalModel) -> None:
@@ -125,7 +127,7 @@ class CompactPolicy(Policy):
         room = numbers.metering - full
         if numbers.metering_protected:
             fullest = torch.where(self.held, full, torch.zeros_like(full)).amax(-1, keepdim=True)
-            room = torch.minimum(room, numbers.metering_protected - fullest)
+            room = torch.minimum(room, numbers.metering_gain * (numbers.metering_protected - fullest))
         return self.scale.squeeze(-1) * room.clamp(min=0.0) / HELD
 
     def bound(self) -> None:

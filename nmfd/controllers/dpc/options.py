@@ -34,11 +34,12 @@ class Training(Options):
     compact: bool = setting(
         "a policy of a few numbers that can be read instead of a network: a gate on the protected regions, and prices "
         "of the ways through crowded regions, by which drivers are guided; trained on the CPU", False)
-    numbers: Annotated[Numbers, Field(min_length=8, max_length=10)] | None = setting(
+    numbers: Annotated[Numbers, Field(min_length=8, max_length=11)] | None = setting(
         "those that a compact policy begins with: set_point and gain of the gate, its relief for crowded regions "
         "before it, price and price_from of the protected regions, elsewhere and elsewhere_from of the others, "
         "metering; then, 0 if omitted, the integral of the gate, and metering_protected, by which trips wait for the "
-        "protected regions wherever they begin (nmfd/controllers/dpc/compact.py)", None, unit="-")
+        "protected regions wherever they begin; and metering_gain, 1 if omitted, how fast those begin when there is "
+        "room (nmfd/controllers/dpc/compact.py)", None, unit="-")
     metering: bool = setting(
         "a compact policy lets trips wait where regions are full; for cities with +metering", False)
     descend: bool = setting(
@@ -83,7 +84,7 @@ class Training(Options):
             raise Problem("compact", "begins with its numbers; omit local, from_gating, from_no_control")
         if self.numbers and not (self.compact and min(self.numbers) >= 0.0):
             raise Problem(
-                "numbers", "expected 8 to 10 numbers >= 0, of a compact policy; add compact = true, or omit it")
+                "numbers", "expected 8 to 11 numbers >= 0, of a compact policy; add compact = true, or omit it")
         if self.metering and not self.compact:
             raise Problem("metering", "only compact policies let trips wait; add compact = true, or omit it")
         if not (self.descend or self.compact):
