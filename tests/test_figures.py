@@ -1,10 +1,13 @@
 """Figures of an evaluation: data that arrives in them, distinct colours, every seed told apart."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from trajectories import trajectory
 
-from cosim.report import figures
+from cosim.report import figures, pictures
+from nmfd.api import load_scenario
 from nmfd.studies import plots
 
 
@@ -41,3 +44,16 @@ def test_demand_figure_has_the_levels_as_ticks(ax):
     figures.over_demand(ax, {"dpc-pc": {0.8: (0.9, 0.1), 1.3: (0.5, np.nan)}, "pi-gating": {0.8: (0.7, 0.1)}})
     assert [tick.get_text() for tick in ax.get_xticklabels()] == ["0.8", "1.3"]
     assert ax.get_ylim()[0] == 0.0 and len(ax.containers) == 2
+
+
+def test_prices_of_the_regions_that_have_one_and_the_trips_that_wait_there(monkeypatch, tmp_path):
+    network, drawn = load_scenario("two_region_2013").network, []
+    run, title = trajectory("dpc-pcrg", 0), [plots.region_title(network, region) for region in (0, 1)]
+    told, waiting = np.zeros(run.perimeter.shape[:2]), np.zeros(run.backlog.shape)
+    told[1:, 1], waiting[2:, 0, 1], waiting[:, 1, 0] = 0.25, 40.0, 1.0  # one waits for a gap in traffic anywhere
+    monkeypatch.setattr(plots, "save", lambda drawing, path: drawn.extend(drawing.axes) or path)
+    pictures.prices(tmp_path / "prices.png", network, replace(run, prices=told, backlog=waiting), "no teleport")
+    shown = [{step.get_label(): step.get_data().values for step in ax.patches} for ax in drawn]
+    assert [list(each) for each in shown] == [title[1:], title[:1]]
+    np.testing.assert_allclose(shown[0][title[1]], 100.0 * told[:, 1])
+    np.testing.assert_allclose(shown[1][title[0]], waiting[1:, 0].sum(axis=1))  # at the end of the interval

@@ -12,6 +12,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 
 from cosim.sumo.arrays import EdgeNumbers, PerEdge, Points, Series
 from nmfd.arrays import PerPair, Positions
+from nmfd.model.regional_model import RegionalModel
 from nmfd.studies import plots
 from nmfd.studies.benchmark import REFERENCE
 
@@ -80,6 +81,21 @@ def perimeter(ax: Axes, step: float, commanded: Series, green: Series, flow: Ser
         ax.stairs(values, time, color=tone, linewidth=width, label=label, baseline=None)
     ax.set_ylim(0.0, max(1.08, 1.05 * float(np.nanmax([green, flow], initial=1.0))))
     ax.set_ylabel("share [-]")
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
+def by_region(
+    ax: Axes, step: float, values: Float[np.ndarray, "T R"], regions: Sequence[int], network: RegionalModel,
+    label: str,
+) -> Axes:
+    """Something of these regions over time: `values` (T, R), one per control interval; `label` of the axis."""
+    time = plots.time_axis(ax, step * np.arange(len(values) + 1))
+    for region in regions:
+        ax.stairs(values[:, region], time, color=colormaps["tab10"](region % 10), linewidth=1.6, baseline=None,
+                  label=plots.region_title(network, region))
+    ax.set_ylim(bottom=0.0)
+    ax.set_ylabel(label)
     ax.spines[["top", "right"]].set_visible(False)
     return ax
 

@@ -48,7 +48,9 @@ PICTURES = (  # heading, its pictures with captions
         ("perimeter", "Perimeter control: the commanded share u [-] of each boundary (from > to) that was closed most, "
          "the green that its signals showed and the flow, both as shares of those of the original programme."),
         ("splits", "Route guidance: the commanded shares θ [-] by which the vehicles of a region should leave by each "
-         "neighbour, and the shares that did."))))
+         "neighbour, and the shares that did."),
+        ("prices", "Prices: by how much longer than they take ways through a region were told to guided drivers who "
+         "are bound for elsewhere [%], and the trips that waited to begin in a region [veh]."))))
 RUNS = {**{name: text for name, (_, text) in SUMMARY.items()}, **FACTS, "demand": "multiple of the scenario's"}
 SETTINGS = {"key": "of the configuration", "value": "as it was"}
 DEPENDS = {"strategy": "for signals and routes", "depends on": "if that changes, its runs have to be made again"}

@@ -15,8 +15,10 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
 from nmfd.studies import mfd_bands, plots
 from nmfd.studies.benchmark import draw_accumulations
+from nmfd.types import Trajectory
 
 PANELS = 11    # boundaries, or pairs of region and destination, that are shown one by one
+FEW = 5        # trips of one region; so many wait at any time for a gap in traffic
 NAMED = 2      # controllers with the most teleports in a title
 WINDOW = 3     # control intervals over which realised shares are taken
 DRAWN = (  # what pictures of gateways and guidance need of a record
@@ -50,6 +52,9 @@ def draw(
     guiding = next((name for name in names if name in results and results[name].record["guided"].sum() > 0), None)
     if guiding:
         splits(out / "splits.png", scenario.network, results[guiding], note)
+    telling = next((name for name in names if name in results and results[name].trajectory.prices.any()), None)
+    if telling:
+        prices(out / "prices.png", scenario.network, results[telling].trajectory, note)
 
 
 def recorded(folder: Path, rows: pd.DataFrame, seed: int) -> dict[str, Result]:
@@ -155,6 +160,20 @@ def splits(path: Path, network: RegionalModel, result: Result, note: str) -> Non
         f"{trajectory.controller}, seed {trajectory.seed}: commanded θ (lines), shares that went there (dots, over "
         f"{WINDOW} intervals); {note}", fontsize="medium")
     plots.legend_below(drawing, axes, columns=8)
+    plots.save(drawing, path)
+
+
+def prices(path: Path, network: RegionalModel, trajectory: Trajectory, note: str) -> None:
+    """By how much longer ways through each region were told, and the trips that waited to begin there, over time."""
+    told, waiting = 100.0 * trajectory.prices, trajectory.backlog[1:].sum(axis=2)
+    shown = [np.flatnonzero(told.max(axis=0) > 0.0).tolist(), np.flatnonzero(waiting.max(axis=0) > FEW).tolist()]
+    drawing, axes = plots.panels(2)
+    figures.by_region(axes[0], trajectory.step, told, shown[0], network, "told longer by [%]")
+    axes[0].set_title("ways through", fontsize="medium")
+    figures.by_region(axes[1], trajectory.step, waiting, shown[1], network, "trips that wait [veh]")
+    axes[1].set_title("trips that begin in", fontsize="medium")
+    drawing.suptitle(f"{trajectory.controller}, seed {trajectory.seed}; {note}", fontsize="medium")
+    plots.legend_below(drawing, axes)
     plots.save(drawing, path)
 
 
