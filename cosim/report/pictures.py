@@ -33,7 +33,6 @@ def draw(
     Those of gateways and guidance need the `city`, and records that hold DRAWN.
     """
     out = folder if out is None else out
-    names = ranked(rows)
     seed = shown_seed(rows)
     order = list(dict.fromkeys(rows["controller"]))
     runs = sorted((t for t in run_folder.trajectories(folder) if t.controller in order),
@@ -44,17 +43,13 @@ def draw(
                        outflow=experiment.measured_outflow(folder))
     if city is None:
         return
-    results = {
-        name: result for name, result in recorded(folder, rows, seed).items() if set(DRAWN) <= set(result.record)}
-    gating = next((name for name in names if name in results and acts(results[name], scenario.network)), None)
-    if gating:
-        perimeter(out / "perimeter.png", city, scenario.network, results[gating], note)
-    guiding = next((name for name in names if name in results and results[name].record["guided"].sum() > 0), None)
-    if guiding:
-        splits(out / "splits.png", scenario.network, results[guiding], note)
-    telling = next((name for name in names if name in results and results[name].trajectory.prices.any()), None)
-    if telling:
-        prices(out / "prices.png", scenario.network, results[telling].trajectory, note)
+    results = [run for run in recorded(folder, rows, seed).values() if set(DRAWN) <= set(run.record)]  # best first
+    if gating := next((run for run in results if acts(run, scenario.network)), None):
+        perimeter(out / "perimeter.png", city, scenario.network, gating, note)
+    if guiding := next((run for run in results if run.record["guided"].sum() > 0), None):
+        splits(out / "splits.png", scenario.network, guiding, note)
+    if telling := next((run for run in results if run.trajectory.prices.any()), None):
+        prices(out / "prices.png", scenario.network, telling.trajectory, note)
 
 
 def recorded(folder: Path, rows: pd.DataFrame, seed: int) -> dict[str, Result]:
