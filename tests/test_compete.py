@@ -7,6 +7,7 @@ import math
 import re
 import shutil
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import copies
@@ -16,7 +17,7 @@ import tiny
 import tiny_city
 from commands import cosim, error_line, good, nmfd
 
-from cosim.compete import entry, page, run, table, task_set, verify
+from cosim.compete import entry, page, run, table, task_set, verified, verify
 from cosim.compete.metrics import METRICS, TTS
 from cosim.evaluation.simulate import Task
 from nmfd.controllers import registry
@@ -374,6 +375,53 @@ def test_a_row_is_made_again_and_compared(place):
     assert good(cosim("verify", "out/noisy", "--list")).split() == ["no-control,0", "pi-gating,0"]
     assert "no row matches 'x'; there are no-control,0" in error_line(cosim("verify", "out/noisy", "--row", "x"))
     assert "does not say how its rows were made" in error_line(cosim("verify", "network"))
+
+
+@pytest.mark.usefixtures("here")
+def test_all_rows_are_made_again_and_what_came_of_them_is_kept(place, monkeypatch):
+    competed("no-control", "pi-gating", only="noisy")
+    text = good(cosim("verify", "out/noisy", "--all"))
+    assert "out/noisy: 2 rows: 2 the same; see runs/verified.csv" in text
+
+    def table():
+        with Path("runs/verified.csv").open(newline="", encoding="utf-8") as stream:
+            return {(row["folder"], row["row"]): (row["verdict"], row["compared"], row["equal"], row["what"])
+                    for row in csv.DictReader(stream)}
+
+    assert table() == dict.fromkeys(
+        [("out/noisy", "no-control,0"), ("out/noisy", "pi-gating,0")], ("the same", "11", "11", ""))
+    made, again = [], verify.verify
+    monkeypatch.setattr(verified, "verify", lambda row, within: made.append(row.label) or again(row, within))
+    assert "2 the same" in good(cosim("verify", "out/noisy", "--all")) and not made  # of this commit already
+    assert "1 rows: 1 the same" in good(cosim("verify", "out", "--all", "--row", "pi-gating,*"))
+    assert len(table()) == 3 and len(made) == 1
+    # Of another commit, of which one row comes out differently and one cannot be made.
+    monkeypatch.setattr(verified, "provenance", lambda: {"commit": "another"})
+
+    def changed(row, within):
+        if row.label.startswith("pi"):
+            raise InputError("no such thing")
+        return replace(again(row, within), differ={"completed_veh": (1, 2)})
+
+    monkeypatch.setattr(verified, "verify", changed)
+    done = cosim("verify", "out/noisy", "--all")
+    assert done.exit_code == 1 and "2 of 2 rows did not come out the same" in done.stderr
+    assert "1 different, 1 failed" in done.stdout and "no-control,0: different, completed_veh" in done.stderr
+    assert [line[0] for line in table().values()] == ["the same", "different", "failed"]
+    assert table()["out/noisy", "pi-gating,0"] == ("failed", "0", "0", "no such thing")
+    assert list(Path("runs").iterdir()) == [Path("runs/verified.csv")]
+
+
+@pytest.mark.usefixtures("here")
+def test_what_all_rows_cannot_be_written_to(place):
+    competed("no-control", only="noisy")
+    assert "--out is for --all" in cosim("verify", "out/noisy", "--out", "x").stderr
+    assert "--seed chooses one row" in cosim("verify", "out/noisy", "--all", "--seed", 1).stderr
+    for content, words in (("a,b\n1,2\n", "expected folder, row"), ("", "is no table of cosim verify (")):
+        Path("other").mkdir(exist_ok=True)
+        Path("other/verified.csv").write_text(content, encoding="utf-8")
+        assert words in error_line(cosim("verify", "out/noisy", "--all", "--out", "other"))
+        assert Path("other/verified.csv").read_text(encoding="utf-8") == content
 
 
 def asked(command: str, seeds: str = "0 1", **more) -> dict:

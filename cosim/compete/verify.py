@@ -12,7 +12,6 @@ not known, figures within ROUNDING, unless another share is asked for. Wall time
 
 import csv
 import math
-import random
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -101,13 +100,13 @@ def rows(folder: Path) -> list[Row]:
         "robustness.csv, one of an evaluation, or one of entries")
 
 
-def chosen(found: Sequence[Row], pattern: str | None, seed: int | None) -> Row:
-    """One at random of those whose label matches. InputError for none."""
-    fitting = [row for row in found if pattern is None or fnmatchcase(row.label, pattern)]
-    if not fitting:
+def fitting(found: Sequence[Row], pattern: str | None) -> list[Row]:
+    """Those whose label matches. InputError for none."""
+    matching = [row for row in found if pattern is None or fnmatchcase(row.label, pattern)]
+    if not matching:
         raise InputError(f"--row: no row matches {pattern!r}; there are {', '.join(row.label for row in found[:20])}"
                          + (" ..." if len(found) > 20 else ""))
-    return random.Random(seed).choice(fitting)
+    return matching
 
 
 def verify(row: Row, within: float | None = None) -> Verdict:

@@ -1,0 +1,80 @@
+"""Many rows of published tables made again, one after the other, and what came of them in one table.
+
+    verified.csv    folder, row, verdict (SAME, ROUNDED, DIFFERENT or FAILED), how many figures were compared, how many
+                    of them were the same to the last digit, which differ or why it failed, and the commit
+
+The table grows over calls: rows that it has of this commit are not made again, rows of other folders stay.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from cosim.compete.verify import Row, Verdict, verify
+from nmfd.errors import InputError, RunFailed
+from nmfd.runs.files import check_file, locked, write_table
+from nmfd.runs.progress import Show
+from nmfd.runs.provenance import provenance
+
+TABLE, LOCK = "verified.csv", ".verified.lock"
+SAME, ROUNDED, DIFFERENT, FAILED = "the same", "within rounding", "different", "failed"
+COLUMNS = ("folder", "row", "verdict", "compared", "equal", "what", "commit")
+
+Line = dict[str, object]
+
+
+def verify_all(
+    folder: Path, rows: Sequence[Row], *, out: Path, within: float | None = None, progress: Show,
+    tell: Callable[[str], None],
+) -> list[Line]:
+    """The lines of the table of `rows`, which are in `folder`, after those that are not there yet were made again.
+
+    out: the folder of the table; within: as of `verify`; tell: is told every row that did not come out the same.
+    InputError for a table that is none, or that another process writes.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out / LOCK, out / TABLE):
+        lines, commit, place = _read(out / TABLE), str(provenance()["commit"]), folder.as_posix()
+        for done, row in enumerate(rows):
+            progress(done, len(rows), row.label)
+            key = {"folder": place, "row": row.label}
+            before = next((line for line in lines if key.items() <= line.items()), None)
+            if before is None or before["commit"] != commit or before["verdict"] == FAILED:
+                line = {**key, **_line(row, within), "commit": commit}
+                lines = [one for one in lines if one is not before] + [line]
+                write_table(out / TABLE, pd.DataFrame(lines, columns=list(COLUMNS)))
+                if line["verdict"] in (DIFFERENT, FAILED):
+                    tell(f"{row.label}: {line['verdict']}, {line['what']}")
+        progress(len(rows), len(rows), "")
+    labels = {row.label for row in rows}
+    return [line for line in lines if line["folder"] == place and line["row"] in labels]
+
+
+def _line(row: Row, within: float | None) -> Line:
+    try:
+        found = verify(row, within)
+    except (InputError, RunFailed) as error:
+        return {"verdict": FAILED, "compared": 0, "equal": 0, "what": str(error)}
+    return {"verdict": _word(found), "compared": found.compared, "equal": found.equal, "what": "; ".join(found.differ)}
+
+
+def _word(found: Verdict) -> str:
+    if not found.good:
+        return DIFFERENT
+    return SAME if found.equal == found.compared else ROUNDED
+
+
+def _read(file: Path) -> list[Line]:
+    """What an earlier call has written. InputError."""
+    if not file.exists():
+        return []
+    check_file(file)
+    try:
+        table = pd.read_csv(file, dtype=str, keep_default_na=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file}: is no table of cosim verify ({error}); choose another folder with --out") from None
+    if not {*COLUMNS} <= {*table.columns}:
+        raise InputError(
+            f"{file}: is no table of cosim verify (expected {', '.join(COLUMNS)}); choose another folder with --out")
+    return table[list(COLUMNS)].to_dict("records")
