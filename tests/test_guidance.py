@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from streets import FAR_FROM_THE_END, seen
 
-from cosim.plant.guidance import Guide, _Present, _Visit, shifted
+from cosim.plant.guidance import Guide, _Present, shifted
 from cosim.plant.meter import Event
 from cosim.plant.shortest_paths import FEWEST_KEPT, MOST_KEPT, Home, Moves, Searches, Ways
 from cosim.sumo.net import City, Gateway
@@ -122,7 +122,7 @@ AFTER = {"a": ("m", "s"), "b": ("t",), "m": ("b",), "s": ("t",), "t": ()}
 DRIVER = Event(vehicle="driver", source=None, region=0, destination=2, edge="t")
 
 
-def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0, lanes=True, index=0):
+def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0, lanes=True):
     """A guide, its commands, the routes of the drivers, and where they are, which is at their routes' first edges."""
     moves = [(e, f) for e, after in AFTER.items() for f in after]
     edges = tuple(sorted(AFTER))
@@ -135,7 +135,7 @@ def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0, la
             for e, f in moves if REGION_OF[e] != REGION_OF[f]), key=lambda g: (g.source, g.target))))
     routes, road = {"driver": route}, Mock(side_effect=lambda vehicle: routes[vehicle][0])
     session = SimpleNamespace(
-        road=road, route=routes.get, route_index=lambda vehicle: index, step_length=1.0, **FAR_FROM_THE_END,
+        road=road, route=routes.get, route_index=lambda vehicle: 0, step_length=1.0, **FAR_FROM_THE_END,
         set_route=lambda vehicle, way: routes.update({vehicle: tuple(way)}) or True)
     own, splits = np.zeros((2, 3, 3, 3))
     own[0, 1:, 2], own[1, 0, 2] = 0.5, 1.0
@@ -188,40 +188,7 @@ def test_without_lanes_a_way_is_kept_unless_another_one_saves_its_share():
     """In the mesoscopic model 30 % of the other one's time, whatever the delay; and never where nobody is."""
     guide, *_ = crossroads(tuple("ambt"), ways_return=True, lanes=False)
     for takes, kept in ((39.0, True), (52.0, True), (52.1, False), (math.inf, False)):
-        assert guide._keeps(_Visit(DRIVER, 0), _Present([0, 2, 1, 4], takes, 20.0, True), 40.0) == kept
-
-
-def test_before_they_depart_drivers_take_the_fastest_way_however_little_it_saves():
-    """33 s by the side street, 13 of them delay, and 30 over m: on the road too little to change for."""
-    slow = seen([np.nan, np.nan, np.nan, 10.0 / 23.0, np.nan])  # m/s on a, b, m, s, t
-
-    def asked(guiding, index):
-        guide, splits, routes, _ = crossroads(tuple("ast"), ways_return=True, side=10.0, period=2.5, index=index)
-        guide.command(splits, slow)
-        guide.prepare([DRIVER] * guiding)
-        before = "".join(routes["driver"])
-        guide.apply([DRIVER])
-        assert guide.realised.sum() == guide.realised[0, 2, 2] == 1 and not guide._prepared
-        assert guide._due.keys() == {4}  # on the road, where he is asked again
-        return before, "".join(routes["driver"])
-
-    assert asked(0, 0) == ("ast", "ast")
-    assert asked(1, -2**30) == ("ambt", "ambt")  # SUMO's index of a route that has not begun
-
-
-def test_before_they_depart_nobody_has_a_lane_to_leave_and_who_does_not_follow_is_not_asked_twice():
-    guide, _, routes, _ = crossroads(tuple("ast"), ways_return=True, side=200.0)
-    guide._lanes = Mock(too_late=Mock(return_value=True), way_out=Mock(return_value=[]))
-    guide.apply([DRIVER])
-    assert "".join(routes["driver"]) == "ast"
-    guide.prepare([DRIVER])
-    assert "".join(routes["driver"]) == "ambt"
-    guide, _, routes, _ = crossroads(tuple("ast"), ways_return=True, side=200.0)
-    guide._compliance = 0.0
-    guide.prepare([DRIVER])
-    guide._compliance = 1.0
-    guide.apply([DRIVER])
-    assert "".join(routes["driver"]) == "ast"
+        assert guide._keeps(_Present([0, 2, 1, 4], takes, 20.0, True), 40.0) == kept
 
 
 def test_drivers_are_asked_again_where_they_are():

@@ -118,34 +118,6 @@ def test_in_a_city_the_books_hold_and_waiting_counts():
     assert spent < metered.departure_delay < spent + 90.0 * held[-1].backlog.sum()
 
 
-def test_whoever_is_told_the_way_before_the_departure_does_not_wait():
-    """The same trips as without, due at the same times; guided drivers come onto the road on another way."""
-    scenario = replace(load_scenario("grid7_peak"), steps=8)
-    network = scenario.network
-    guided = Controls(
-        perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=network.nominal_splits,
-        metering=np.full(7, 0.01))
-    told = settings(scenario).changed(pre_trip=True)
-    assert told.holds_trips and not told.metering
-    plant = SumoPlant(scenario, overrides=told)
-    plant.reset(5)
-    changed, prepare = 0, plant._guide.prepare
-
-    def watched(events):
-        nonlocal changed
-        before = [plant.session.route(event.vehicle) for event in events]
-        prepare(events)
-        changed += sum(plant.session.route(event.vehicle) != way for event, way in zip(events, before, strict=True))
-
-    plant._guide.prepare = watched
-    states = [plant.step(guided) for _ in range(8)]
-    facts, end = plant.trip_facts(), states[-1]
-    plant.close()
-    due = 90.0 * scenario.demand[:8].sum()
-    assert end.accumulation.sum() + end.backlog.sum() + end.completed == facts.trips == pytest.approx(due, rel=0.1)
-    assert changed > 0.3 * facts.trips and end.backlog.sum() <= 5.0
-
-
 @pytest.fixture
 def own(tmp_path):
     """A city whose vehicles come from a route file."""

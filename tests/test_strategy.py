@@ -21,8 +21,6 @@ from nmfd.errors import InputError
     ("pi-gating+guided+max-pressure", "pi-gating",
      {"gateways_fixed": True, "guided": True, "signals": "max-pressure"}),
     ("guided", "no-control", {"gateways_fixed": False, "guided": True}),
-    ("pi-gating+pre-trip", "pi-gating", {"gateways_fixed": True, "guided": True, "pre_trip": True}),
-    ("dpc-pcrg+pre-trip", "dpc-pcrg", {"gateways_fixed": True, "pre_trip": True}),
     ("dpc-pcrg+guidance-period-90", "dpc-pcrg", {"gateways_fixed": True, "guidance_period": 90.0}),
     ("dpc-pc+metering", "dpc-pc", {"gateways_fixed": True, "metering": True}),
     ("metering-120", "no-control", {"gateways_fixed": False, "metering": True, "metering_level": 1.2}),
@@ -34,8 +32,7 @@ def test_what_a_name_means(name, controller, overrides):
 
 
 @pytest.mark.parametrize("name, guides", [
-    ("pi-gating", False), ("pi-gating+guided", True), ("guided", True), ("pre-trip", True), ("route-guidance", True),
-    ("dpc-pc", False)])
+    ("pi-gating", False), ("pi-gating+guided", True), ("guided", True), ("route-guidance", True), ("dpc-pc", False)])
 def test_who_guides(name, guides):
     assert parse(name).guides == guides
 

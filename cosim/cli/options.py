@@ -18,8 +18,7 @@ CONTROLLER_HELP = (
     "no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc or dpc-pcrg; what else the city does is joined by +: webster, "
     "actuated, max-pressure or max-pressure-cyclic signals, rerouting-N (percent of the drivers), guided (drivers "
     "follow travel times), hold-back or redistribute, compliance-N, guidance-period-N (guided drivers are asked again "
-    "every N seconds), pre-trip (and before they depart), queue-override-N, metering or metering-N (trips wait "
-    "outside), short-first, estimate. A "
+    "every N seconds), queue-override-N, metering or metering-N (trips wait outside), short-first, estimate. A "
     "controller of your own: file.py:Class (see nmfd new-controller).")
 CONTROLLER = click.option("--controller", required=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
 POLICY = click.option(

@@ -68,11 +68,10 @@ def shifted(wish: Sequence[float], own: Sequence[float], theta: Sequence[float])
 @dataclass(eq=False)
 class _Visit:
     """A driver who follows, in one region: how they came, and how they see travel times; following: where they were
-    sent last, and in which control interval; departed: whether they are on the road."""
+    sent last, and in which control interval."""
 
     event: Event
     taste: int
-    departed: bool = True
     following: int | None = None
     interval: int = 0
 
@@ -110,7 +109,6 @@ class Guide:
         self._soon = math.ceil(SOON / session.step_length - 1e-6)
         self._steps = self._interval = 0
         self._visits: dict[str, _Visit] = {}
-        self._prepared: dict[str, _Visit | None] = {}  # of those who are about to depart; None: who does not follow
         self._due: dict[int, list[_Visit]] = {}  # simulation step -> whom to ask again then
         self._most_detour = most_detour
         self._session, self._city, self._compliance, self._random = session, city, compliance, random
@@ -164,19 +162,6 @@ class Guide:
             self._assigned *= MEMORY
             self._wished *= MEMORY
 
-    def prepare(self, events: list[Event]) -> None:
-        """Guide vehicles that are about to depart: SUMO has them, but they are not on the road. As they have no way yet
-        that they could stay on, nor a lane to leave, they take the fastest, however little it saves."""
-        if not self._guides:
-            return
-        for event in events:
-            visit = self._prepared[event.vehicle] = self._visit(event)
-            here = self._index.get(self._session.route(event.vehicle)[0])
-            if visit is not None and here is not None:
-                visit.departed = False
-                self._decide(visit, here)
-                visit.departed = True
-
     def apply(self, events: list[Event]) -> None:
         """Guide the vehicles that departed or entered a region in the last step, and those whose time has come."""
         if not self._guides:
@@ -184,33 +169,18 @@ class Guide:
         self._steps += 1
         for event in events:
             self._visits.pop(event.vehicle, None)
-            if event.vehicle in self._prepared:
-                visit = self._prepared.pop(event.vehicle)
-            else:
-                visit = self._visit(event)
-            if visit is not None:
-                self._ask(visit)
+            if event.free and self._random.random() < self._compliance:
+                visit = _Visit(event, int(self._random.integers(DRIVER_CLASSES)))
+                if event.edge in self._index:  # or it may use roads that are closed to cars, as taxis do
+                    self._ask(visit)
         for visit in self._due.pop(self._steps, ()):
             if self._visits.get(visit.event.vehicle) is visit:
                 self._ask(visit)
 
-    def _visit(self, event: Event) -> _Visit | None:
-        """None for who is not to be guided: those who do not follow, and who may use roads that are closed to cars, as
-        taxis do."""
-        if not event.free or self._random.random() >= self._compliance:
-            return None
-        visit = _Visit(event, int(self._random.integers(DRIVER_CLASSES)))
-        return visit if event.edge in self._index else None
-
-    def _decide(self, visit: _Visit, here: int) -> None:
-        """Guide a driver from the edge `here`."""
-        guide = self._guide_home if visit.event.region == visit.event.destination else self._guide_on
-        guide(visit, here, self._index[visit.event.edge])
-
     def _ask(self, visit: _Visit) -> None:
         """Guide a driver, unless they are on a junction or in the next region already, or before the stop line on a
         lane that does not lead there: too late to turn, and they are asked again soon."""
-        event, after = visit.event, self._period
+        event, target, after = visit.event, self._index[visit.event.edge], self._period
         self._late = False
         try:
             here = self._index.get(self._session.road(event.vehicle))
@@ -221,8 +191,10 @@ class Guide:
             after = min(self._period, 1)
         elif self._lanes and (way := self._lanes.way_out(event.vehicle, event.edge)):
             self.led_on += self._session.set_route(event.vehicle, way)
+        elif event.region == event.destination:
+            self._guide_home(visit, here, target)
         else:
-            self._decide(visit, here)
+            self._guide_on(visit, here, target)
         if self._late:
             after = self._soon
         if after:
@@ -234,9 +206,9 @@ class Guide:
         event, home = visit.event, self._home(visit.event.region, visit.taste, visit.event.destination)
         present = self._present(event.vehicle, here, home.time)
         cost = home.cost(here, target, present.takes + 1.0 if present.bound else np.inf)
-        if here == target or not np.isfinite(cost) or self._keeps(visit, present, cost):
+        if here == target or not np.isfinite(cost) or self._keeps(present, cost):
             return
-        self._send(visit, home.route(here, target))
+        self._send(event.vehicle, home.route(here, target))
 
     def _guide_on(self, visit: _Visit, here: int, target: int) -> None:
         """The next region, and the fastest way through it."""
@@ -279,10 +251,10 @@ class Guide:
             for c, share, sent, good in zip(least, shares, assigned, allowed, strict=True)]
         n = price.index(min(price))
         following = int(ways.neighbours[n])
-        if not self._keeps(visit, present, least[n], following):
+        if not self._keeps(present, least[n], following):
             if n != returning:
                 way = ways.route(here, int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]])), target)
-            if not self._send(visit, way):
+            if not self._send(event.vehicle, way):
                 return
         if visit.following is not None:  # what they were told before does not count any more
             before = event.region, visit.following, event.destination
@@ -294,8 +266,7 @@ class Guide:
 
     def _present(self, vehicle: str, here: int, time: PerEdge) -> _Present:
         """The driver's, who is asked on edge `here`, at `time` (E,) [s]."""
-        begun = max(self._session.route_index(vehicle), 0)  # SUMO has it below 0 before the departure
-        route = self._session.route(vehicle)[begun:]
+        route = self._session.route(vehicle)[self._session.route_index(vehicle):]
         way = [number for edge in route if (number := self._index.get(edge)) is not None]
         if len(way) < len(route):
             return _Present(None)
@@ -313,15 +284,13 @@ class Guide:
         """The regions that a way leads through, one after the other."""
         return [region for region, _ in groupby(map(self._region.__getitem__, way))]
 
-    def _keeps(self, visit: _Visit, present: _Present, cost: float, following: int | None = None) -> bool:
+    def _keeps(self, present: _Present, cost: float, following: int | None = None) -> bool:
         """Whether the driver's present way is about as good as one of `cost` [s], and leads into the region `following`
         next, if that is given; so it is where the way uses roads that are closed to cars."""
         if present.way is None:
             return True
         if math.isinf(present.takes) or following is not None and self._next_region(present.way) != following:
             return False
-        if not visit.departed:
-            return present.takes <= cost
         if not self._lanes:
             return present.takes <= (1.0 + MESO_THRESHOLD) * cost
         return present.takes <= cost + SWITCHING_THRESHOLD * present.delay**2 / max(present.takes, 1e-9)
@@ -333,10 +302,10 @@ class Guide:
         left = max(n for n, region in enumerate(regions) if region == regions[0]) if self._ways_return else 0
         return regions[min(left + 1, len(regions) - 1)]
 
-    def _send(self, visit: _Visit, way: list[int]) -> bool:
+    def _send(self, vehicle: str, way: list[int]) -> bool:
         """Give a vehicle this way, unless it is too late to change lanes; counts what SUMO refuses."""
-        vehicle, edges = visit.event.vehicle, [self._city.edges[n] for n in way]
-        if self._lanes and visit.departed and self._lanes.too_late(vehicle, edges):
+        edges = [self._city.edges[n] for n in way]
+        if self._lanes and self._lanes.too_late(vehicle, edges):
             self._late = True
             return False
         taken = self._session.set_route(vehicle, edges)

@@ -119,20 +119,19 @@ class Launch:
         """The route file of one run; the ids of its vehicles."""
         scenario, chosen = self._scenario, self._settings
         if not chosen.routes:
-            trips = write_trips(self._city, scenario.demand, scenario.step, seed, path, metered=chosen.holds_trips)
-            self.held = held(trips) if chosen.holds_trips else None
+            trips = write_trips(self._city, scenario.demand, scenario.step, seed, path, metered=chosen.metering)
+            self.held = held(trips) if chosen.metering else None
             return [f"v{n}" for n in range(len(trips.routes))]
         if self._originals is None:
             self._originals = own_vehicles(scenario, chosen, self._city)
         drawn = draw(
             self._originals, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
             begin=chosen.begin)
-        if chosen.holds_trips:
+        if chosen.metering:
             self.held = write_held_trips(self._originals, drawn, path, self._shared_routes, self._city.region_of)
             if not self.held.orders:
                 raise InputError(
-                    f"{scenario_file(scenario)}: sumo.{'metering' if chosen.metering else 'pre_trip'}: none of the "
-                    "vehicles in sumo.routes can be made to "
+                    f"{scenario_file(scenario)}: sumo.metering: none of the vehicles in sumo.routes can be made to "
                     "wait: those can that have neither stops nor edges to go by, and no attributes but "
                     f"{', '.join(ORDERED)}; omit it")
         else:

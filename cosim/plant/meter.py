@@ -160,14 +160,6 @@ class Meter:
         events.sort(key=lambda event: (event.source is not None, event.vehicle))  # set order is not reproducible
         return events
 
-    def beginning(self, vehicles: Iterable[str]) -> list[Event]:
-        """Of vehicles that SUMO was given and that have not departed yet, what they are about to do."""
-        loaded = [(vehicle, self._load(vehicle)) for vehicle in vehicles]
-        return [
-            Event(vehicle=vehicle, source=None, region=known.origin, destination=known.destination, edge=known.edge,
-                  free=known.free)
-            for vehicle, known in loaded]
-
     def accumulation(self, step: int = 0) -> PerPair:
         """x_ij (R, R) [veh]: every vehicle counted where it is now, on junctions too. LedgerError if the count differs
         from departures minus arrivals and removed ones, in total or in any (i, j) as followed from crossing to

@@ -54,8 +54,8 @@ class Metering:
         self._before: PerRegion | None = None
 
     def command(self, rate: PerRegion | None, accumulation: PerRegion) -> None:
-        """rate: (R,) [veh/s], the most trips that may begin in each region, infinite for all that are due; None: by PI
-        control of `accumulation` (R,) [veh]."""
+        """rate: (R,) [veh/s], the most trips that may begin in each region; None: by PI control of `accumulation`
+        (R,) [veh]."""
         if rate is not None:
             self._rate = rate
         else:
@@ -64,9 +64,8 @@ class Metering:
             self._rate = np.clip(self._rate + change / self._interval, 0.0, self._most)
         self._before = accumulation
 
-    def play(self) -> list[str]:
-        """Let begin who is due and may; the vehicles that do."""
-        begun: list[str] = []
+    def play(self) -> None:
+        """Let begin who is due and may."""
         now, depart, origin = self._session.time, self._trips.depart, self._trips.origin
         while self._due < len(depart) and depart[self._due] <= now:
             heapq.heappush(self._queues[origin[self._due]], (self._way[self._due], self._due))
@@ -79,9 +78,7 @@ class Metering:
                 self._credit[region] -= 1.0
                 _, trip = heapq.heappop(queue)
                 self._session.begin_trip(self._trips.orders[trip])
-                begun.append(self._trips.orders[trip]["vehID"])
                 self.waited += now - depart[trip]
-        return begun
 
     def backlog(self) -> PerPair:
         """(R, R) [veh]: due to depart from i for j, and made to wait."""

@@ -104,17 +104,14 @@ class SumoPlant:
             self._incidents.gated(controls.perimeter, network.u_min, network.u_max), vehicles)
         self._guide.command(self._splits(controls), streets, controls.prices)
         if self._metering:
-            self._metering.command(
-                controls.metering if self._settings.metering else np.full(network.regions, np.inf),
-                self._state.accumulation.sum(axis=1))
+            self._metering.command(controls.metering, self._state.accumulation.sum(axis=1))
         self._sensing.begin()
         if self._junctions:
             self._junctions.free()
         for _ in range(round(self._scenario.step / session.step_length)):
             self._actuation.play()
-            begun = self._metering.play() if self._metering else []
-            if self._settings.pre_trip:
-                self._guide.prepare(self._sensing.meter.beginning(begun))
+            if self._metering:
+                self._metering.play()
             session.step()
             entered = self._sensing.measure()
             self._guide.apply(entered)

@@ -44,8 +44,6 @@ class SumoTable(config.Settings):
     guidance_period: Seconds = setting(
         "guided drivers are asked again after this time in the same region; 0: when they depart and when they enter a "
         "region only", 0.0)
-    pre_trip: bool = setting(
-        "guided drivers are told the fastest way before they depart, too, when no lane has to be changed for it", False)
     most_detour: Seconds = setting("drivers do not follow route guidance into a next region that costs them more", 60.0)
     ways_return: bool = setting(
         "guided drivers may leave a region and come back to it where that is the fastest way of all, as on a main road "
@@ -78,11 +76,6 @@ class SumoTable(config.Settings):
         "SUMO's queue model instead of its car-following, about ten times as fast, for quick studies: no lanes and no "
         "positions on them, queues hold the vehicles that fit on an edge, signals cap the flow by their green share",
         False)
-
-    @property
-    def holds_trips(self) -> bool:
-        """Whether SUMO is given trips one by one, when they begin."""
-        return self.metering or self.pre_trip
 
     @model_validator(mode="after")
     def _is_measured(self) -> Self:

@@ -18,13 +18,13 @@ from nmfd.model.planning import PlanningModel, guided_model, planning_model, wit
 from nmfd.model.scenario import Scenario
 
 ALONE = "no-control"  # the controller of a name that is only options
-GUIDED, PRE_TRIP = "guided", "pre-trip"
+GUIDED = "guided"
 
 # Option -> (field of cosim.plant.settings.Settings, its value).
 _WORDS = {
     **{name: ("signals", name) for name in SIGNALS[1:]}, **{name: ("actuation", name) for name in MODES},
     "estimate": ("measurement", "estimate"), "metering": ("metering", True),
-    "short-first": ("metering_first", "short"), GUIDED: ("guided", True), PRE_TRIP: ("pre_trip", True)}
+    "short-first": ("metering_first", "short"), GUIDED: ("guided", True)}
 PERCENT, SECONDS = "percent", "seconds"
 # Option with a whole number -> (field of cosim.plant.settings.Settings, least, most, its unit).
 _NUMBERS = {
@@ -45,7 +45,6 @@ _TEXTS = {
     "metering": "trips wait outside where their region is full, or as the controller commands",
     "metering-N": "the same, and without a command at N percent of the region's critical accumulation",
     GUIDED: "drivers are guided by travel times",
-    PRE_TRIP: "drivers are guided, and told the fastest way before they depart as well",
     "rerouting-N": "N percent of the drivers take another route by themselves, every minute",
     "compliance-N": "N percent of the drivers follow the guidance",
     "queue-override-N": "a gateway is left open while its road is N percent full",
@@ -94,8 +93,6 @@ def parse(name: str) -> Strategy:
         chosen[key], overrides[key] = word, value
     if not overrides.keys().isdisjoint(METERING):
         overrides["metering"] = True
-    if PRE_TRIP in words and not registry.guides(controller):
-        overrides["guided"] = True
     return Strategy(name=name, controller=controller, overrides=overrides)
 
 
