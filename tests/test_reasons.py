@@ -1,5 +1,6 @@
 """Why a controller gains or not: made-up runs of which the reason is known."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -89,6 +90,14 @@ def test_load_and_deeds_are_counted(network):
     assert str(done) == (
         f"it held back in 50 % of its commands and its trips waited {1800 / trips:.0f} s before they began")
     assert explain.deeds(network, waiting, [record(network, 6, 1)] * 2).waited == 0.0
+
+
+@pytest.mark.parametrize("city, name, waits", [
+    ({}, "pi-gating", False), ({"metering": True}, "pi-gating", True), ({}, "pi-gating+metering", True)])
+def test_trips_can_wait_by_the_strategy_or_everywhere_in_a_city(tmp_path, city, name, waits):
+    sumo = {"configuration": {"sumo": city}, "controllers": {}, "sessions": []}
+    (tmp_path / "manifest.json").write_text(json.dumps(sumo), encoding="utf-8")
+    assert explain._metered(tmp_path, name) == waits
 
 
 def test_nothing_to_compare_with(network):

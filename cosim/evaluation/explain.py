@@ -116,9 +116,15 @@ def at(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame) -
     lines = []
     for name, seeds in kept.items():
         if name != REFERENCE:
-            done = deeds(network, *_runs(folder, name, seeds), metered=metered(name))
+            done = deeds(network, *_runs(folder, name, seeds), metered=_metered(folder, name))
             lines.append(f"{name} {verdict(rows, level, name, found, leaking, done, network)}")
     return _city(network, found, leaking, shown), lines
+
+
+def _metered(folder: Path, name: str) -> bool:
+    """Whether trips could be made to wait in the runs of a strategy: by its name, or everywhere in this city."""
+    everywhere = run_folder.read_manifest(folder / "manifest.json")["configuration"].get("sumo", {}).get("metering")
+    return metered(name) or bool(everywhere)
 
 
 def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame, name: str) -> str:
@@ -130,7 +136,7 @@ def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.Dat
     before, after = (_runs(folder, one, [int(seed) for seed in rows.loc[rows["controller"] == one, "seed"]])
                      for one in (shown, name))
     found, then = load(network, *before), load(network, after[0], ())
-    done = deeds(network, *after, metered=metered(name))
+    done = deeds(network, *after, metered=_metered(folder, name))
     gained = statistics.paired(
         statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, shown)).percent < 0
     region = int(np.argmax(found.beyond))
