@@ -412,6 +412,18 @@ def test_all_rows_are_made_again_and_what_came_of_them_is_kept(place, monkeypatc
     assert list(Path("runs").iterdir()) == [Path("runs/verified.csv")]
 
 
+@pytest.mark.usefixtures("place")
+def test_a_row_of_a_policy_that_was_given_is_made_again_with_it():
+    made = Path(shutil.copytree("scenario", "scenario/less"))
+    file = made / "scenario.toml"
+    file.write_text(file.read_text(encoding="utf-8").replace("../network", "../../network"), encoding="utf-8")
+    good(nmfd("train", "scenario", "--controller", "dpc-pc", "--steps", 2, "--no-compile"))
+    good(nmfd("benchmark", made, "--controllers", "dpc-pc", "--policy", "dpc-pc=scenario/dpc-pc.pt", "--out", "out"))
+    assert "The same" in good(cosim("verify", "out"))
+    Path("scenario/dpc-pc.pt").unlink()
+    assert "less/dpc-pc.pt: no such policy" in error_line(cosim("verify", "out"))
+
+
 @pytest.mark.usefixtures("here")
 def test_what_all_rows_cannot_be_written_to(place):
     competed("no-control", only="noisy")

@@ -29,13 +29,14 @@ from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs import run_folder, trail
-from nmfd.runs.files import check_file
+from nmfd.runs.files import check_file, file_hash
 from nmfd.runs.provenance import provenance
 from nmfd.runs.scratch import Scratch
 from nmfd.studies import benchmark, robustness
 
 Figures = Mapping[str, object]
 ROUNDING = 1e-9  # as a share: what sums in another order may come to
+POLICIES = ("*.pt", "*.npz")  # files of policies and plans
 CLOCK = (  # columns and metrics that are wall times, or depend on them
     "evaluation_time_s", "control_step_ms_median", "control_step_ms_max", "late_decisions", "wall_time_s",
     "sumo_time_s", "overhead_share", "setup_time_s", "decision_ms_median", "decision_ms_max", "notes")
@@ -155,8 +156,10 @@ def _regional(folder: Path, manifest: Mapping, scenario: Scenario) -> list[Row]:
     scenario = with_demand(scenario, steps=manifest["configuration"]["steps"])
 
     def make(name: str, seed: int, out: Path) -> Figures:
+        policy = _policy(scenario, manifest, name)
         made, failures = benchmark.perform(
-            scenario, [name], [seed], plant, out=out, noise=benchmark.Noise(**noise) if noise else None)
+            scenario, [name], [seed], plant, out=out, noise=benchmark.Noise(**noise) if noise else None,
+            policies={name: policy} if policy else None)
         if failures:
             raise InputError(f"{name}, seed {seed}: {failures[0][1].reason}")
         return made[0]
@@ -191,8 +194,19 @@ def _in_sumo(folder: Path, manifest: Mapping, scenario: Scenario, at: Path) -> l
 
     return [_of_run(folder, manifest, published, partial(_simulated, Task(
                 scenario=at, controller=published["controller"], seed=published["seed"], steps=about["steps"],
-                demand_factor=about["demand_factor"], faults=faults)))
+                demand_factor=about["demand_factor"], faults=faults,
+                policy=_policy(scenario, manifest, published["controller"]))))
             for published in experiment.overview(folder).to_dict("records")]
+
+
+def _policy(scenario: Scenario, manifest: Mapping, name: str) -> Path | None:
+    """The file that it was run with, which may have been given with --policy: of those in the scenario's folder and in
+    the one above it, that with the fingerprint in the manifest. None without a policy, and where that is gone."""
+    wanted, at = manifest["controllers"].get(name, {}).get("policy_hash"), scenario.folder
+    if wanted is None or at is None:
+        return None
+    files = (file for folder in (at, at.parent) for kind in POLICIES for file in sorted(folder.glob(kind)))
+    return next((file for file in files if file_hash(file) == wanted), None)
 
 
 def _simulated(task: Task, out: Path) -> Figures:
