@@ -492,6 +492,20 @@ def test_tables_that_cannot_be_made_again(place, found, words):
     assert "runs.csv: is no table of runs" in error_line(cosim("verify", "out"))
 
 
+def test_a_scenario_that_is_elsewhere_now_can_be_given(place, monkeypatch):
+    made = []
+    monkeypatch.setattr(verify, "_simulated", lambda task, out: made.append(task.scenario) or {"completed_veh": 5})
+    table_of(place / "out", asked("cosim evaluate nowhere --controllers no-control --first-seed 0"))
+    assert "give it with --scenario" in error_line(cosim("verify", "out"))
+    assert "The same: 1 figures" in good(cosim("verify", "out", "--row", "*,0", "--scenario", "scenario"))
+    assert made == [Path("scenario")]
+    assert "scenario.toml" in error_line(cosim("verify", "out", "--scenario", "out"))
+    good(nmfd("benchmark", "scenario", "--controllers", "no-control", "--out", "regional"))
+    Path("scenario").rename("moved")
+    assert "give it with --scenario" in error_line(cosim("verify", "regional"))
+    assert "The same" in good(cosim("verify", "regional", "--scenario", "moved"))
+
+
 @pytest.mark.usefixtures("place")
 def test_what_is_unknown_of_a_table_is_said(monkeypatch):
     monkeypatch.setattr(verify, "_simulated", lambda task, out: {"completed_veh": 5})

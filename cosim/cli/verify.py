@@ -30,9 +30,11 @@ if TYPE_CHECKING:  # heavy
 @click.option("--within", type=click.FloatRange(0.0, 1.0), metavar="SHARE",
               help="By which figures may differ, as a share of them. [default: 0 for the same version and commit, else "
                    "1e-9, for sums in another order]")
+@click.option("--scenario", type=FOLDER, metavar="DIR", help="The rows' scenario, if it is no longer where it was.")
 @click.option("--list", "listed", is_flag=True, help="Only show the labels of the rows.")
 def verify(
-    folder: Path, row: str | None, seed: int | None, every: bool, out: Path | None, within: float | None, listed: bool,
+    folder: Path, row: str | None, seed: int | None, every: bool, out: Path | None, within: float | None,
+    scenario: Path | None, listed: bool,
 ) -> None:
     """Make a row of a published table, or of a run folder, again from what is written beside it, and compare.
 
@@ -54,7 +56,7 @@ def verify(
         raise click.UsageError("--seed chooses one row, and --all takes every one; omit one of them")
     from cosim.compete import verify as method  # heavy
 
-    found = method.rows(folder)
+    found = method.rows(folder, scenario)
     if listed:
         click.echo("\n".join(one.label for one in found))
         return

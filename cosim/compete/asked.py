@@ -29,8 +29,9 @@ class Asked:
     session: Mapping
 
     @classmethod
-    def by(cls, command: str, session: Mapping, file: Path) -> Self | None:
-        """None for another command. InputError for a scenario that is not there."""
+    def by(cls, command: str, session: Mapping, file: Path, scenario: Path | None = None) -> Self | None:
+        """None for another command. scenario: where it is now, if not where the command says. InputError for one that
+        is not there."""
         words = [part for word in shlex.split(command) for part in (
             word.split("=", 1) if word.startswith("--") else [word])]
         if words[:2] != ["cosim", "evaluate"]:
@@ -39,7 +40,8 @@ class Asked:
         rest = [*words[2:at], *words[at + 1:]]
         given = list(zip(rest[::2], rest[1::2], strict=False))
         options, usual, where = dict(given), Evaluation(), f"{file.name}: {command}"
-        scenario = results.found_again(Path(words[at]), file.parent, where) if at < len(words) else Path()
+        if scenario is None:
+            scenario = results.found_again(Path(words[at]), file.parent, where) if at < len(words) else Path()
         try:
             first = int(options.get("--first-seed", usual.first_seed))
             return cls(

@@ -79,23 +79,27 @@ class Verdict:
         return any(not key.endswith("_hash") for key in self.depends)
 
 
-def rows(folder: Path) -> list[Row]:
-    """All that can be made again. InputError for a folder that does not say how."""
+def rows(folder: Path, scenario: Path | None = None) -> list[Row]:
+    """All that can be made again. scenario: where it is now, if not where the folder says. InputError for a folder that
+    does not say how, and for a scenario that is none."""
+    if scenario is not None:
+        load_scenario(scenario)
     if levels := evaluate.level_folders(folder):
-        return [replace(row, label=f"{level:g},{row.label}") for level, at in levels.items() for row in rows(at)]
+        return [replace(row, label=f"{level:g},{row.label}")
+                for level, at in levels.items() for row in rows(at, scenario)]
     if (folder / "manifest.json").is_file():
         manifest = run_folder.read_manifest(folder / "manifest.json")
-        at = results.scenario_folder(folder, manifest)
-        scenario = load_scenario(at)
+        at = scenario or results.scenario_folder(folder, manifest)
+        loaded = load_scenario(at)
         if (folder / "robustness.csv").is_file():
-            return _of_robustness(folder, manifest, scenario)
+            return _of_robustness(folder, manifest, loaded)
         if (folder / "summary.csv").is_file():
-            return _in_sumo(folder, manifest, scenario, at) if manifest["configuration"].get("plant") == "sumo" else (
-                _regional(folder, manifest, scenario))
+            return _in_sumo(folder, manifest, loaded, at) if manifest["configuration"].get("plant") == "sumo" else (
+                _regional(folder, manifest, loaded))
     if files := sorted(file for file in folder.glob("*.json") if file.name != "manifest.json"):
         return [row for file in files for row in _of_entry(entry.read(file))]
     if (folder / "runs.csv").is_file():
-        return _of_table(folder / "runs.csv")
+        return _of_table(folder / "runs.csv", scenario)
     raise InputError(
         f"{folder}: does not say how its rows were made; give a folder with manifest.json and summary.csv or "
         "robustness.csv, one of an evaluation, or one of entries")
@@ -216,11 +220,11 @@ def _simulated(task: Task, out: Path) -> Figures:
     return experiment.overview(out).to_dict("records")[0]
 
 
-def _of_table(file: Path) -> list[Row]:
+def _of_table(file: Path, scenario: Path | None) -> list[Row]:
     """Of cosim evaluate, by the commands that its trail names; rows that none of them asked for cannot be made."""
     found = trail.read(file)
     refused = found.get("not_again", {})  # patterns of controllers, and why
-    there = [order for one in trail.commands(found) if (order := Asked.by(*one, file))]
+    there = [order for one in trail.commands(found) if (order := Asked.by(*one, file, scenario))]
 
     def row(published: Mapping, asked: Asked) -> Row:
         place = f"demand-{published['demand']:g}"
