@@ -225,7 +225,7 @@ class Guide:
         returning = None  # the next region of the fastest way of all, where that is one that comes back
         if self._ways_return:
             home = self._home(event.region, visit.taste, event.destination)
-            of_all = home.cost(here, target, present.takes + 1.0 if present.bound else np.inf)
+            of_all = home.cost(here, target, min(fastest, present.takes + 1.0 if present.bound else np.inf))
             if of_all < fastest:
                 way, fastest = home.route(here, target), of_all
                 returning = int(np.searchsorted(ways.neighbours, self._next_region(way)))
