@@ -104,21 +104,22 @@ class Home:
     def __init__(self, moves: Moves, time: PerEdge, turns: PerMove, searches: Searches):
         """time: (E,) [s]; turns: (M,) [s]"""
         self.time, self._moves, self._costs = time, moves, moves.costing(time, turns)
-        self._searches = searches
+        # Not this object itself: `searches` would hold it, and both would stay until the garbage is collected.
+        self._searches, self._back = searches, object()
 
     def cost(self, here: int, target: int, most: float) -> float:
         """[s] from the end of edge `here` to the end of edge `target`, infinite if it is more than `most`."""
-        found = self._searches.get(self, target)
+        found = self._searches.get(self._back, target)
         if found is None or found[0] < most:
             cost, before = dijkstra(
                 self._costs, indices=self._moves.number[target], return_predecessors=True, limit=most)
-            found = self._searches.put(self, target, (most, cost, before), len(cost))
+            found = self._searches.put(self._back, target, (most, cost, before), len(cost))
         cost = found[1][self._moves.number[here]]
         return float(cost) if cost <= most else np.inf
 
     def route(self, here: int, target: int) -> list[int]:
         """The edges from `here` to `target`, whose cost was asked for just now."""
-        number, found = self._moves.number, self._searches.get(self, target)
+        number, found = self._moves.number, self._searches.get(self._back, target)
         assert found is not None  # it was asked for
         return self._moves.path(found[2], int(number[here]), int(number[target]))
 
