@@ -390,13 +390,17 @@ def test_all_rows_are_made_again_and_what_came_of_them_is_kept(place, monkeypatc
 
     assert table() == dict.fromkeys(
         [("out/noisy", "no-control,0"), ("out/noisy", "pi-gating,0")], ("the same", "11", "11", ""))
-    made, again = [], verify.verify
+    made, again, now = [], verify.verify, {"commit": "this", "dirty": False}
+    monkeypatch.setattr(verified, "provenance", lambda: now)
     monkeypatch.setattr(verified, "verify", lambda row, within: made.append(row.label) or again(row, within))
-    assert "2 the same" in good(cosim("verify", "out/noisy", "--all")) and not made  # of this commit already
+    assert "2 the same" in good(cosim("verify", "out/noisy", "--all")) and len(made) == 2  # of another commit
+    assert "2 the same" in good(cosim("verify", "out/noisy", "--all")) and len(made) == 2
+    now["dirty"] = True
+    assert "2 the same" in good(cosim("verify", "out/noisy", "--all")) and len(made) == 4
     assert "1 rows: 1 the same" in good(cosim("verify", "out", "--all", "--row", "pi-gating,*"))
-    assert len(table()) == 3 and len(made) == 1
+    assert len(table()) == 3 and len(made) == 5
     # Of another commit, of which one row comes out differently and one cannot be made.
-    monkeypatch.setattr(verified, "provenance", lambda: {"commit": "another"})
+    now.update(commit=None, dirty=None)
 
     def changed(row, within):
         if row.label.startswith("pi"):
@@ -410,6 +414,7 @@ def test_all_rows_are_made_again_and_what_came_of_them_is_kept(place, monkeypatc
     assert [line[0] for line in table().values()] == ["the same", "different", "failed"]
     assert table()["out/noisy", "pi-gating,0"] == ("failed", "0", "0", "no such thing")
     assert list(Path("runs").iterdir()) == [Path("runs/verified.csv")]
+    assert "version 0." in Path("runs/verified.csv").read_text(encoding="utf-8")
 
 
 @pytest.mark.usefixtures("place")

@@ -3,7 +3,8 @@
     verified.csv    folder, row, verdict (SAME, ROUNDED, DIFFERENT or FAILED), how many figures were compared, how many
                     of them were the same to the last digit, which differ or why it failed, and the commit
 
-The table grows over calls: rows that it has of this commit are not made again, rows of other folders stay.
+The table grows over calls: rows that it has of this commit are not made again, unless there are changes that are not
+committed; rows of other folders stay.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,6 +13,7 @@ from pathlib import Path
 import pandas as pd
 
 from cosim.compete.verify import Row, Verdict, verify
+from nmfd import __version__
 from nmfd.errors import InputError, RunFailed
 from nmfd.runs.files import check_file, locked, write_table
 from nmfd.runs.progress import Show
@@ -35,12 +37,13 @@ def verify_all(
     """
     out.mkdir(parents=True, exist_ok=True)
     with locked(out / LOCK, out / TABLE):
-        lines, commit, place = _read(out / TABLE), str(provenance()["commit"]), folder.as_posix()
+        lines, here, place = _read(out / TABLE), provenance(), folder.as_posix()
+        commit = here["commit"] or f"version {__version__}"  # not in a checkout
         for done, row in enumerate(rows):
             progress(done, len(rows), row.label)
             key = {"folder": place, "row": row.label}
             before = next((line for line in lines if key.items() <= line.items()), None)
-            if before is None or before["commit"] != commit or before["verdict"] == FAILED:
+            if before is None or before["commit"] != commit or here["dirty"] or before["verdict"] == FAILED:
                 line = {**key, **_line(row, within), "commit": commit}
                 lines = [one for one in lines if one is not before] + [line]
                 write_table(out / TABLE, pd.DataFrame(lines, columns=list(COLUMNS)))
