@@ -98,7 +98,6 @@ def _one(one: "Row", within: float | None) -> None:
     if not verdict.good:
         raise RunFailed(f"{one.label}: {len(verdict.differ)} of {verdict.compared} figures differ"
                         + ("" if verdict.same_bytes is not False else ", and so does the kept run"))
-    exact = verdict.equal == verdict.compared
     click.echo(f"The same: {verdict.compared} figures "
-               + ("to the last digit" if exact else f"within {verdict.within:g}, {verdict.equal} to the last digit")
+               + ("" if verdict.exact else f"within {verdict.within:g}, {verdict.equal} ") + "to the last digit"
                + (", the kept run to the byte" if verdict.same_bytes else ""))

@@ -65,7 +65,7 @@ def _line(row: Row, within: float | None) -> Line:
 def _word(found: Verdict) -> str:
     if not found.good:
         return DIFFERENT
-    return SAME if found.equal == found.compared else ROUNDED
+    return SAME if found.exact else ROUNDED
 
 
 def _read(file: Path) -> list[Line]:

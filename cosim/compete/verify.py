@@ -26,6 +26,7 @@ from cosim.evaluation import evaluate, experiment, results
 from cosim.evaluation.earlier import KEYS
 from cosim.evaluation.simulate import Task
 from nmfd.api import load_scenario
+from nmfd.controllers import registry
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs import run_folder, trail
@@ -36,7 +37,6 @@ from nmfd.studies import benchmark, robustness
 
 Figures = Mapping[str, object]
 ROUNDING = 1e-9  # as a share: what sums in another order may come to
-POLICIES = ("*.pt", "*.npz")  # files of policies and plans
 CLOCK = (  # columns and metrics that are wall times, or depend on them
     "evaluation_time_s", "control_step_ms_median", "control_step_ms_max", "late_decisions", "wall_time_s",
     "sumo_time_s", "overhead_share", "setup_time_s", "decision_ms_median", "decision_ms_max", "notes")
@@ -74,6 +74,11 @@ class Verdict:
         return not self.differ and (self.same_bytes is not False or self.another)
 
     @property
+    def exact(self) -> bool:
+        """Whether every figure is the same to the last digit."""
+        return self.equal == self.compared
+
+    @property
     def another(self) -> bool:
         """Whether it was made by another version, or one that is not known."""
         return any(not key.endswith("_hash") for key in self.depends)
@@ -82,15 +87,14 @@ class Verdict:
 def rows(folder: Path, scenario: Path | None = None) -> list[Row]:
     """All that can be made again. scenario: where it is now, if not where the folder says. InputError for a folder that
     does not say how, and for a scenario that is none."""
-    if scenario is not None:
-        load_scenario(scenario)
+    given = None if scenario is None else load_scenario(scenario)
     if levels := evaluate.level_folders(folder):
         return [replace(row, label=f"{level:g},{row.label}")
                 for level, at in levels.items() for row in rows(at, scenario)]
     if (folder / "manifest.json").is_file():
         manifest = run_folder.read_manifest(folder / "manifest.json")
         at = scenario or results.scenario_folder(folder, manifest)
-        loaded = load_scenario(at)
+        loaded = given or load_scenario(at)
         if (folder / "robustness.csv").is_file():
             return _of_robustness(folder, manifest, loaded)
         if (folder / "summary.csv").is_file():
@@ -196,10 +200,12 @@ def _in_sumo(folder: Path, manifest: Mapping, scenario: Scenario, at: Path) -> l
     about = manifest["configuration"]
     faults = tuple(fault for fault in about.get("faults", ()) if fault not in scenario.faults)
 
-    return [_of_run(folder, manifest, published, partial(_simulated, Task(
-                scenario=at, controller=published["controller"], seed=published["seed"], steps=about["steps"],
-                demand_factor=about["demand_factor"], faults=faults,
-                policy=_policy(scenario, manifest, published["controller"]))))
+    def make(name: str, seed: int, out: Path) -> Figures:
+        return _simulated(Task(
+            scenario=at, controller=name, seed=seed, steps=about["steps"], demand_factor=about["demand_factor"],
+            faults=faults, policy=_policy(scenario, manifest, name)), out)
+
+    return [_of_run(folder, manifest, published, partial(make, published["controller"], published["seed"]))
             for published in experiment.overview(folder).to_dict("records")]
 
 
@@ -209,7 +215,8 @@ def _policy(scenario: Scenario, manifest: Mapping, name: str) -> Path | None:
     wanted, at = manifest["controllers"].get(name, {}).get("policy_hash"), scenario.folder
     if wanted is None or at is None:
         return None
-    files = (file for folder in (at, at.parent) for kind in POLICIES for file in sorted(folder.glob(kind)))
+    files = (file for folder in (at, at.parent) for kind in (registry.POLICY, registry.PLAN)
+             for file in sorted(folder.glob(f"*.{kind.suffix}")))
     return next((file for file in files if file_hash(file) == wanted), None)
 
 

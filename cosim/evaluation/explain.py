@@ -123,8 +123,9 @@ def at(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame) -
 
 def _metered(folder: Path, name: str) -> bool:
     """Whether trips could be made to wait in the runs of a strategy: by its name, or everywhere in this city."""
-    everywhere = run_folder.read_manifest(folder / "manifest.json")["configuration"].get("sumo", {}).get("metering")
-    return metered(name) or bool(everywhere)
+    if metered(name):
+        return True
+    return bool(run_folder.read_manifest(folder / "manifest.json")["configuration"].get("sumo", {}).get("metering"))
 
 
 def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame, name: str) -> str:
