@@ -15,7 +15,7 @@ from streets import FAR_FROM_THE_END, seen
 
 from cosim.plant.guidance import Guide, _Present, shifted
 from cosim.plant.meter import Event
-from cosim.plant.shortest_paths import FEWEST_KEPT, MOST_KEPT, Home, Moves, Searches, Ways
+from cosim.plant.shortest_paths import FEWEST_KEPT, MOST_KEPT, Home, Moves, Searches, Trees, Ways
 from cosim.sumo.net import City, Gateway
 
 EDGES, REGION = 40, np.repeat([0, 1, 2, 3], 10)
@@ -39,10 +39,12 @@ def ways(city, request):
     gates = sorted({(int(REGION[b]), int(a), int(b), n) for n, (a, b) in enumerate(zip(first, second, strict=True))
                     if REGION[a] == 0 and REGION[b] != 0})
     following, gate, entry, move = np.array(gates).T
+    searches = Searches(request.param)
+    everywhere = Trees(Moves(first, second, allowed=np.full(EDGES, True), reverse=False), time, turn, searches)
     return Ways(gate, entry, following, inside=inside, outside=back, time=time, turns=turn, crossing=turn[move],
-                reached=back.leading_to(back.number[entry]),
-                ahead=back.ahead(back.number[entry], 0.8 * time, 0.7 * turn), searches=Searches(request.param)
-                ), gate, entry
+                leading=inside.leading_to(inside.number[gate]), reached=back.leading_to(back.number[entry]),
+                ahead=back.ahead(back.number[entry], 0.8 * time, 0.7 * turn), searches=searches,
+                everywhere=(everywhere, turn[move], back_to(gate, entry, city))), gate, entry
 
 
 def least(city, allowed):
@@ -56,6 +58,11 @@ def least(city, allowed):
     for k in range(EDGES):
         cost = np.minimum(cost, cost[:, [k]] + cost[[k]])
     return cost
+
+
+def back_to(gate, entry, city):
+    """(G,) [s] from behind the nearest gateway back to each."""
+    return 0.8 * least(city, np.full(EDGES, True))[np.ix_(entry, gate)].min(axis=0)
 
 
 def test_the_searches_find_the_least_times_up_to_a_limit(city, ways):
@@ -81,6 +88,30 @@ def test_the_searches_find_the_least_times_up_to_a_limit(city, ways):
                     takes = city[3][way[1:]].sum() + sum(turns[move] for move in zip(way[:-1], way[1:], strict=True))
                     assert takes == pytest.approx(exact[g])
     assert cut > 100
+
+
+def test_ways_that_come_back_are_found_where_they_are_the_fastest_of_all(city, ways):
+    found, gate, entry = ways
+    exact, back = least(city, np.full(EDGES, True)), 0
+    turns = {(int(a), int(b)): extra for a, b, extra in zip(*city[:3], strict=True)}
+    for most in (60.0, np.inf, 150.0):
+        for here in range(10):
+            for target in range(10, EDGES):
+                cost, _ = found.cost(here, target, most)
+                takes, gateway = found.returning(here, target, most)
+                if exact[here, target] < most:
+                    assert min(takes, cost.min()) == pytest.approx(exact[here, target])
+                if takes >= min(most, cost.min() - 1e-9):
+                    continue
+                way = found.returning_route(here, gateway, target)
+                assert (way[0], way[-1]) == (here, target)
+                assert sum(turns[move] + city[3][move[1]] for move in zip(way[:-1], way[1:], strict=True)) == (
+                    pytest.approx(takes))
+                crossing = max(n for n, edge in enumerate(way) if REGION[edge] == 0)
+                assert (way[crossing], way[crossing + 1]) == (gate[gateway], entry[gateway])
+                assert (REGION[way[:crossing]] != 0).any()
+                back += 1
+    assert back > 10
 
 
 @pytest.mark.parametrize("kept", [MOST_KEPT, 1])
@@ -120,7 +151,7 @@ def test_trees_of_old_travel_times_go_at_once_and_do_not_wait_for_the_garbage_co
     first, second, turn, time = city
     moves, searches = Moves(first, second, allowed=np.full(EDGES, True), reverse=True), Searches()
     home = Home(moves, time, turn, searches)
-    assert np.isfinite(home.cost(0, 5, np.inf)) and searches.get(home._back, 5)
+    assert np.isfinite(home.cost(0, 5, np.inf)) and searches.get(home._owner, 5)
     gone = weakref.ref(searches)
     gc.disable()
     try:

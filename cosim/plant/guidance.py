@@ -35,9 +35,9 @@ import numpy as np
 from cosim.plant.lanes import Lanes
 from cosim.plant.meter import Event
 from cosim.plant.sampling import StreetMeans
-from cosim.plant.shortest_paths import Home, Moves, Searches, Ways
+from cosim.plant.shortest_paths import Home, Moves, Searches, Trees, Ways
 from cosim.plant.travel_times import TravelTimes
-from cosim.sumo.arrays import PerEdge
+from cosim.sumo.arrays import PerEdge, PerGateway
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
 from nmfd.arrays import PerRegion, PerTurn
@@ -121,9 +121,12 @@ class Guide:
             [Moves(times.first, times.second, allowed=allowed ^ outside, reverse=reverse) for allowed in here]
             for outside, reverse in ((False, False), (False, True), (True, True)))
         self._ways_return = ways_return
+        self._homeward, self._anywhere = within_back, None  # by region, or one for all
         if ways_return:
-            within_back = [Moves(times.first, times.second, allowed=np.full(len(city.edges), True), reverse=True)]
-        self._homeward = within_back  # by region, or one for all
+            self._anywhere, back = (
+                Moves(times.first, times.second, allowed=np.full(len(city.edges), True), reverse=reverse)
+                for reverse in (False, True))
+            self._homeward = [back]
         ends = [(self._index[g.from_edge], self._index[g.to_edge], g) for g in city.gateways]
         self._gateways = [
             np.array([(first, second, self._move[first, second], g.target) for first, second, g in ends
@@ -133,11 +136,13 @@ class Guide:
         self._taste = np.exp(spread * random.standard_normal((DRIVER_CLASSES, len(city.edges))))
         self._prices: PerRegion | None = None
         self._told: dict[int | None, PerEdge] = {}  # region without a price, None for all with theirs -> (E,) [s]
-        self._reached: dict[int, np.ndarray] = {}
+        self._leading: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # region -> from where to gateways, and to where
         self._ahead: dict[tuple[int, int], np.ndarray] = {}
+        self._back: dict[tuple[int, int], np.ndarray] = {}
         # By region, taste and region without a price.
         self._ways: dict[tuple[int, int, int | None], Ways] = {}
         self._homes: dict[tuple[int, int, int | None], Home] = {}
+        self._everywhere: dict[tuple[int, int | None], Trees] = {}  # by the last two
         self._searches = Searches()
         self._guides, self._splits = False, own
         self._assigned, self._wished = np.zeros((2, *(city.regions,) * 3))
@@ -158,7 +163,7 @@ class Guide:
             if seen is not None:
                 self._times.learn(seen)
             self._told, self._prices = {}, prices
-            self._ways, self._homes, self._searches = {}, {}, Searches()
+            self._ways, self._homes, self._everywhere, self._searches = {}, {}, {}, Searches()
             self._assigned *= MEMORY
             self._wished *= MEMORY
 
@@ -205,7 +210,7 @@ class Guide:
         """The fastest way inside the region of destination; if ways may return, the fastest of all."""
         event, home = visit.event, self._home(visit.event.region, visit.taste, visit.event.destination)
         present = self._present(event.vehicle, here, home.time)
-        cost = home.cost(here, target, present.takes + 1.0 if present.bound else np.inf)
+        cost = home.cost(here, target, self._worth(present) + 1.0)
         if here == target or not np.isfinite(cost) or self._keeps(present, cost):
             return
         self._send(event.vehicle, home.route(here, target))
@@ -223,13 +228,11 @@ class Guide:
             for best, values in ((np.minimum, cost), (np.logical_or, reached)))
         fastest = min(least, default=np.inf)
         returning = None  # the next region of the fastest way of all, where that is one that comes back
-        if self._ways_return:
-            home = self._home(event.region, visit.taste, event.destination)
-            of_all = home.cost(here, target, min(fastest, present.takes + 1.0 if present.bound else np.inf))
-            if of_all < fastest:
-                way, fastest = home.route(here, target), of_all
-                returning = int(np.searchsorted(ways.neighbours, self._next_region(way)))
-                least[returning], open_ways[returning] = fastest, True
+        of_all, gateway = ways.returning(here, target, min(fastest, present.takes + 1.0 if present.bound else np.inf))
+        if of_all < fastest:
+            way, fastest = ways.returning_route(here, gateway, target), of_all
+            returning = int(np.searchsorted(ways.begins, gateway, side="right")) - 1
+            least[returning], open_ways[returning] = fastest, True
         if fastest == np.inf:
             return
         self._wished[event.region, ways.neighbours[least.index(fastest)], event.destination] += 1.0
@@ -267,17 +270,19 @@ class Guide:
     def _present(self, vehicle: str, here: int, time: PerEdge) -> _Present:
         """The driver's, who is asked on edge `here`, at `time` (E,) [s]."""
         route = self._session.route(vehicle)[self._session.route_index(vehicle):]
-        way = [number for edge in route if (number := self._index.get(edge)) is not None]
-        if len(way) < len(route):
+        way: list[int] = []
+        try:
+            way += map(self._index.__getitem__, route)
+        except KeyError:
             return _Present(None)
         if way[0] != here:
             return _Present(way)
-        moves = [self._move.get(move) for move in pairwise(way)]
-        known, regions = [move for move in moves if move is not None], self._regions(way)
-        back = not self._ways_return and regions.count(regions[0]) > 1
-        times, ahead = self._times, way[1:]
-        takes = time[ahead].sum() + times.turns[known].sum()
-        free = times.free[ahead].sum() + times.free_turns[known].sum()
+        moves = list(map(self._move.get, pairwise(way)))
+        known = np.array([move for move in moves if move is not None], dtype=int)
+        times, ahead = self._times, np.array(way[1:], dtype=int)
+        takes = time.take(ahead).sum() + times.turns.take(known).sum()
+        free = times.free.take(ahead).sum() + times.free_turns.take(known).sum()
+        back = not self._ways_return and (regions := self._regions(way)).count(regions[0]) > 1
         return _Present(way, takes, max(takes - free, 0.0), len(known) == len(moves) and not back)
 
     def _regions(self, way: list[int]) -> list[int]:
@@ -291,9 +296,13 @@ class Guide:
             return True
         if math.isinf(present.takes) or following is not None and self._next_region(present.way) != following:
             return False
-        if not self._lanes:
-            return present.takes <= (1.0 + MESO_THRESHOLD) * cost
-        return present.takes <= cost + SWITCHING_THRESHOLD * present.delay**2 / max(present.takes, 1e-9)
+        return cost >= self._worth(present)
+
+    def _worth(self, present: _Present) -> float:
+        """How little another way must take [s] for a driver to leave the present one."""
+        if not self._lanes or math.isinf(present.takes):
+            return present.takes / (1.0 + MESO_THRESHOLD)
+        return present.takes - SWITCHING_THRESHOLD * present.delay**2 / max(present.takes, 1e-9)
 
     def _next_region(self, way: list[int]) -> int:
         """The region that a way enters first, or, if ways may return, when it leaves its own for good; its own if it
@@ -334,17 +343,34 @@ class Guide:
         free, time = self._bound_for(destination)
         key = region, taste, free
         if key not in self._ways:
-            outside = self._without_back[region]
-            entries = outside.number[self._gateways[region][1]]
-            if region not in self._reached:
-                self._reached[region] = outside.leading_to(entries)
+            inside, outside, tastes = self._within[region], self._without_back[region], self._taste[taste]
+            first, second, move, following = self._gateways[region]
+            if region not in self._leading:
+                self._leading[region] = (
+                    inside.leading_to(inside.number[first]), outside.leading_to(outside.number[second]))
             if (region, taste) not in self._ahead:
                 self._ahead[region, taste] = outside.ahead(
-                    entries, self._times.free * self._taste[taste], self._times.free_turns)
-            first, second, move, following = self._gateways[region]
+                    outside.number[second], self._times.free * tastes, self._times.free_turns)
+            leading, reached = self._leading[region]
+            turns = self._times.turns
             self._ways[key] = Ways(
-                first, second, following, inside=self._within[region], outside=outside,
-                crossing=self._times.turns[move] if self._lanes else np.zeros(len(move)),
-                reached=self._reached[region], ahead=self._ahead[region, taste],
-                time=time * self._taste[taste], turns=self._times.turns, searches=self._searches)
+                first, second, following, inside=inside, outside=outside,
+                crossing=turns[move] if self._lanes else np.zeros(len(move)), leading=leading, reached=reached,
+                ahead=self._ahead[region, taste], time=time * tastes, turns=turns, searches=self._searches,
+                everywhere=self._by_all_moves(region, taste, free, time))
         return self._ways[key]
+
+    def _by_all_moves(
+        self, region: int, taste: int, free: int | None, time: PerEdge,
+    ) -> tuple[Trees, PerGateway, PerGateway] | None:
+        """What Ways calls `everywhere`."""
+        if self._anywhere is None:
+            return None
+        first, second, move, _ = self._gateways[region]
+        if (region, taste) not in self._back:
+            self._back[region, taste] = self._homeward[0].ahead(
+                second, self._times.free * self._taste[taste], self._times.free_turns)[first]
+        if (taste, free) not in self._everywhere:
+            self._everywhere[taste, free] = Trees(
+                self._anywhere, time * self._taste[taste], self._times.turns, self._searches)
+        return self._everywhere[taste, free], self._times.turns[move], self._back[region, taste]

@@ -98,30 +98,45 @@ class Searches:
         return tree
 
 
-class Home:
-    """Fastest ways to single edges by `moves`, searched back from them when somebody first goes there."""
+class Trees:
+    """Fastest ways by `moves` from single edges, searched when somebody first asks for one, and no further than he
+    would go."""
 
     def __init__(self, moves: Moves, time: PerEdge, turns: PerMove, searches: Searches):
         """time: (E,) [s]; turns: (M,) [s]"""
-        self.time, self._moves, self._costs = time, moves, moves.costing(time, turns)
+        self.time, self.number = time, moves.number
+        self._moves, self._costs = moves, moves.costing(time, turns)
         # Not this object itself: `searches` would hold it, and both would stay until the garbage is collected.
-        self._searches, self._back = searches, object()
+        self._searches, self._owner = searches, object()
+
+    def costs(self, begin: int, most: float) -> Float[np.ndarray, " nodes"]:
+        """(nodes,) [s] by `moves` from edge `begin`, `number` having the node of an edge; what is more than `most` may
+        be infinite."""
+        found = self._searches.get(self._owner, begin)
+        if found is None or found[0] < most:
+            cost, before = dijkstra(
+                self._costs, indices=self.number[begin], return_predecessors=True, limit=most)
+            found = self._searches.put(self._owner, begin, (most, cost, before), len(cost))
+        return found[1]
+
+    def back(self, begin: int, end: int) -> list[int]:
+        """The edges from `end` back to `begin`, whose costs were asked for just now."""
+        found = self._searches.get(self._owner, begin)
+        assert found is not None  # they were asked for
+        return self._moves.path(found[2], int(self.number[end]), int(self.number[begin]))
+
+
+class Home(Trees):
+    """Fastest ways to single edges: `moves` lead back."""
 
     def cost(self, here: int, target: int, most: float) -> float:
         """[s] from the end of edge `here` to the end of edge `target`, infinite if it is more than `most`."""
-        found = self._searches.get(self._back, target)
-        if found is None or found[0] < most:
-            cost, before = dijkstra(
-                self._costs, indices=self._moves.number[target], return_predecessors=True, limit=most)
-            found = self._searches.put(self._back, target, (most, cost, before), len(cost))
-        cost = found[1][self._moves.number[here]]
+        cost = self.costs(target, most)[self.number[here]]
         return float(cost) if cost <= most else np.inf
 
     def route(self, here: int, target: int) -> list[int]:
         """The edges from `here` to `target`, whose cost was asked for just now."""
-        number, found = self._moves.number, self._searches.get(self._back, target)
-        assert found is not None  # it was asked for
-        return self._moves.path(found[2], int(number[here]), int(number[target]))
+        return self.back(target, here)
 
 
 class Ways:
@@ -130,20 +145,27 @@ class Ways:
     Gateways begins[n] to ends[n] - 1 lead into region neighbours[n]. Searched is from where drivers are and from where
     they go, when somebody first is or goes there, and no further than they would go: in a large city that is much less
     than from all gateways to everywhere.
+
+    A way may also come back into the region before it leaves for good (`returning`): then it has the same end as one
+    that does not, from the last gateway on, and only the part before that is to be searched elsewhere.
     """
 
     def __init__(
         self, first: Int[np.ndarray, " G"], second: Int[np.ndarray, " G"], next_region: Int[np.ndarray, " G"], *,
-        inside: Moves, outside: Moves, crossing: PerGateway, reached: Bool[np.ndarray, "nodes G"],
-        ahead: Float[np.ndarray, " nodes"], time: PerEdge, turns: PerMove, searches: Searches,
+        inside: Moves, outside: Moves, crossing: PerGateway, leading: Bool[np.ndarray, "inside G"],
+        reached: Bool[np.ndarray, "nodes G"], ahead: Float[np.ndarray, " nodes"], time: PerEdge, turns: PerMove,
+        searches: Searches, everywhere: tuple[Trees, PerGateway, PerGateway] | None = None,
     ):
         """first, second, next_region: (G,), the last in rising order; inside: moves in the region; outside: those
-        elsewhere, back; crossing: (G,) [s], over each gateway; reached: (nodes of `outside`, G), which edges can be
-        reached from second[g]; ahead: (nodes of `outside`,) [s], to the nearest second[g] at times that are no more
-        than `time` (E,) [s] and `turns` (M,) [s]"""
-        self.time, self._inside, self._outside, self._reached, self._ahead = time, inside, outside, reached, ahead
-        self._first, self._second, self._entering = (
-            inside.number[first], outside.number[second], crossing + time[second])
+        elsewhere, back; crossing: (G,) [s], over each gateway; leading: (nodes of `inside`, G), from which edges
+        first[g] can be reached; reached: (nodes of `outside`, G), which edges can be reached from second[g]; ahead:
+        (nodes of `outside`,) [s], to the nearest second[g] at times that are no more than `time` (E,) [s] and `turns`
+        (M,) [s]; everywhere: ways by all moves at the same times, (G,) [s] over each gateway on such a way, and (G,)
+        [s], no more than it takes from behind the nearest gateway back to first[g]; None where no way may come back"""
+        self.time, self._inside, self._outside, self._ahead = time, inside, outside, ahead
+        self._leading, self._reached = leading, reached
+        self._gates, self._first, self._second = first, inside.number[first], outside.number[second]
+        self._behind, self._entering, self._everywhere = second, crossing + time[second], everywhere
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))
         self._costs = inside.costing(time, turns), outside.costing(time, turns, ahead)
@@ -152,27 +174,57 @@ class Ways:
     def cost(self, here: int, target: int, most: float) -> tuple[PerGateway, GatewayMask]:
         """(G,) [s] from the end of edge `here` to the end of edge `target`, infinite if it is more than `most`, and
         (G,) bool, whether there is a way at all."""
+        last = int(self._outside.number[target])
+        open_ways = self._leading[self._inside.number[here]] & self._reached[last]
+        within = max(most - self._ahead[last], 0.0)
         found = self._searches.get(self._from_here, here)
-        if found is None:
-            cost, before = dijkstra(self._costs[0], indices=self._inside.number[here], return_predecessors=True)
+        if found is None or found[0] < within:
+            cost, before = dijkstra(
+                self._costs[0], indices=self._inside.number[here], return_predecessors=True, limit=within)
             there = cost[self._first] + self._entering
-            found = self._searches.put(self._from_here, here, (
-                there, np.isfinite(there), float(there.min(initial=np.inf)), before), len(before))
-        (there, leads_out, nearest, _), last = found, int(self._outside.number[target])
+            found = self._searches.put(
+                self._from_here, here, (within, there, float(there.min(initial=np.inf)), before), len(before))
+        _, there, nearest, _ = found
         if nearest == np.inf:
-            return there, leads_out
+            return there, open_ways
         left = max(most - min(nearest, most) - self._ahead[last], 0.0)
         onward = self._searches.get(self._to_there, target)
         if onward is None or onward[0] < left:
             cost, after = dijkstra(self._costs[1], indices=last, return_predecessors=True, limit=left)
             onward = self._searches.put(
                 self._to_there, target, (left, cost[self._second] + self._ahead[last], after), len(after))
-        return there + onward[1], leads_out & self._reached[last]
+        return there + onward[1], open_ways
+
+    def returning(self, here: int, target: int, most: float) -> tuple[float, int]:
+        """[s] of the fastest way of all and the gateway by which it leaves for good, if it comes back before and takes
+        less than `most`; infinite if not. `cost` was asked for just now, for as much at least."""
+        there, onward = self._searches.get(self._from_here, here), self._searches.get(self._to_there, target)
+        if self._everywhere is None or there is None or onward is None:  # or there is no way out
+            return np.inf, 0
+        trees, crossing, back = self._everywhere
+        end = crossing + self.time[self._behind] + onward[1]
+        # By then it has left, and come back, which alone takes too long for most gateways.
+        end[there[2] + back + end >= most] = np.inf
+        if (nearest := float(end.min(initial=np.inf))) == np.inf:
+            return np.inf, 0
+        cost = trees.costs(here, most - nearest)[trees.number[self._gates]] + end
+        gateway = int(cost.argmin())
+        return float(cost[gateway]), gateway
 
     def route(self, here: int, gateway: int, target: int) -> list[int]:
         """The edges from `here` to `target` through `gateway`, whose cost was asked for just now."""
-        there, onward = self._searches.get(self._from_here, here), self._searches.get(self._to_there, target)
-        assert there is not None and onward is not None  # they were asked for
+        there = self._searches.get(self._from_here, here)
+        assert there is not None  # it was asked for
         to_gateway = self._inside.path(there[-1], int(self._first[gateway]), int(self._inside.number[here]))
-        return to_gateway[::-1] + self._outside.path(
-            onward[2], int(self._second[gateway]), int(self._outside.number[target]))
+        return to_gateway[::-1] + self._onward(gateway, target)
+
+    def returning_route(self, here: int, gateway: int, target: int) -> list[int]:
+        """As `route`, of a way that `returning` has found."""
+        assert self._everywhere is not None  # it has found one
+        return self._everywhere[0].back(here, int(self._gates[gateway]))[::-1] + self._onward(gateway, target)
+
+    def _onward(self, gateway: int, target: int) -> list[int]:
+        """The edges from behind `gateway` to `target`."""
+        onward = self._searches.get(self._to_there, target)
+        assert onward is not None  # it was asked for
+        return self._outside.path(onward[2], int(self._second[gateway]), int(self._outside.number[target]))
