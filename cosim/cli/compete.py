@@ -3,6 +3,8 @@
 Heavy modules are imported inside it: help takes 0.1 s instead of 3 s.
 """
 
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -81,8 +83,8 @@ def _run(
         done = len(made.tasks) - len(made.missing)
         click.echo(f"{made.controller}: {done} of {len(made.tasks)} tasks complete, {len(failed)} runs failed")
         for outcome in made.tasks:
-            for failure in outcome.failed:
-                click.echo(f"  {outcome.task}, seed {failure.seed}: {failure.reason}")
+            for reason, alike in groupby(outcome.failed, key=attrgetter("reason")):
+                click.echo(f"  {outcome.task}, seed {', '.join(str(failure.seed) for failure in alike)}: {reason}")
     click.echo(f"Written to {order.out}: an entry per controller; cosim compete --table {order.out} compares them")
 
 
