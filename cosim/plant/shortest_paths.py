@@ -99,7 +99,7 @@ class Searches:
 
 
 class Trees:
-    """Fastest ways by `moves` from single edges, searched when somebody first asks for one, and no further than he
+    """Fastest ways by `moves` from single edges, searched when somebody first asks for one, and no further than they
     would go."""
 
     def __init__(self, moves: Moves, time: PerEdge, turns: PerMove, searches: Searches):
@@ -165,7 +165,10 @@ class Ways:
         self.time, self._inside, self._outside, self._ahead = time, inside, outside, ahead
         self._leading, self._reached = leading, reached
         self._gates, self._first, self._second = first, inside.number[first], outside.number[second]
-        self._behind, self._entering, self._everywhere = second, crossing + time[second], everywhere
+        self._entering, self._everywhere = crossing + time[second], None
+        if everywhere is not None:
+            trees, over, back = everywhere
+            self._everywhere = trees, trees.number[first], over + time[second], back
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))
         self._costs = inside.costing(time, turns), outside.costing(time, turns, ahead)
@@ -201,13 +204,13 @@ class Ways:
         there, onward = self._searches.get(self._from_here, here), self._searches.get(self._to_there, target)
         if self._everywhere is None or there is None or onward is None:  # or there is no way out
             return np.inf, 0
-        trees, crossing, back = self._everywhere
-        end = crossing + self.time[self._behind] + onward[1]
+        trees, gates, entering, back = self._everywhere
+        end = entering + onward[1]
         # By then it has left, and come back, which alone takes too long for most gateways.
         end[there[2] + back + end >= most] = np.inf
         if (nearest := float(end.min(initial=np.inf))) == np.inf:
             return np.inf, 0
-        cost = trees.costs(here, most - nearest)[trees.number[self._gates]] + end
+        cost = trees.costs(here, most - nearest)[gates] + end
         gateway = int(cost.argmin())
         return float(cost[gateway]), gateway
 
