@@ -399,6 +399,8 @@ def test_all_rows_are_made_again_and_what_came_of_them_is_kept(place, monkeypatc
     assert "2 the same" in good(cosim("verify", "out/noisy", "--all")) and len(made) == 4
     assert "1 rows: 1 the same" in good(cosim("verify", "out", "--all", "--row", "pi-gating,*"))
     assert len(table()) == 3 and len(made) == 5
+    now["commit"] = "another"
+    assert "2 the same" in good(cosim("verify", "out/noisy", "--all", "--missing")) and len(made) == 5
     # Of another commit, of which one row comes out differently and one cannot be made.
     now.update(commit=None, dirty=None)
 
@@ -417,6 +419,21 @@ def test_all_rows_are_made_again_and_what_came_of_them_is_kept(place, monkeypatc
     assert "version 0." in Path("runs/verified.csv").read_text(encoding="utf-8")
 
 
+@pytest.mark.usefixtures("here")
+def test_two_processes_let_the_table_grow_at_a_time(place, monkeypatch):
+    competed("no-control", "pi-gating", only="noisy")
+    again = verify.verify
+
+    def slow(row, within):
+        monkeypatch.setattr(verified, "verify", again)
+        assert "1 the same" in good(cosim("verify", "out/noisy", "--all", "--row", "pi-gating,*"))
+        return again(row, within)
+
+    monkeypatch.setattr(verified, "verify", slow)
+    assert "1 the same" in good(cosim("verify", "out/noisy", "--all", "--row", "no-control,*"))
+    assert [line["row"] for line in verified._read(Path("runs/verified.csv"))] == ["pi-gating,0", "no-control,0"]
+
+
 @pytest.mark.usefixtures("place")
 def test_a_row_of_a_policy_that_was_given_is_made_again_with_it():
     made = Path(shutil.copytree("scenario", "scenario/less"))
@@ -433,6 +450,7 @@ def test_a_row_of_a_policy_that_was_given_is_made_again_with_it():
 def test_what_all_rows_cannot_be_written_to(place):
     competed("no-control", only="noisy")
     assert "--out is for --all" in cosim("verify", "out/noisy", "--out", "x").stderr
+    assert "--missing is for --all" in cosim("verify", "out/noisy", "--missing").stderr
     assert "--seed chooses one row" in cosim("verify", "out/noisy", "--all", "--seed", 1).stderr
     for content, words in (("a,b\n1,2\n", "expected folder, row"), ("", "is no table of cosim verify (")):
         Path("other").mkdir(exist_ok=True)

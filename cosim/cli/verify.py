@@ -25,6 +25,8 @@ if TYPE_CHECKING:  # heavy
 @click.option("--all", "every", is_flag=True,
               help="All that fit, one after the other, instead of one of them. What comes of them is in verified.csv "
                    "in the folder --out; the same command goes on where it was interrupted.")
+@click.option("--missing", is_flag=True,
+              help="With --all: only those that verified.csv does not have, of this or another commit.")
 @click.option("--out", type=FOLDER, metavar="DIR",
               help="With --all: the folder of verified.csv, which may have rows of other folders. [default: runs]")
 @click.option("--within", type=click.FloatRange(0.0, 1.0), metavar="SHARE",
@@ -33,8 +35,8 @@ if TYPE_CHECKING:  # heavy
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="The rows' scenario, if it is no longer where it was.")
 @click.option("--list", "listed", is_flag=True, help="Only show the labels of the rows.")
 def verify(
-    folder: Path, row: str | None, seed: int | None, every: bool, out: Path | None, within: float | None,
-    scenario: Path | None, listed: bool,
+    folder: Path, row: str | None, seed: int | None, every: bool, missing: bool, out: Path | None,
+    within: float | None, scenario: Path | None, listed: bool,
 ) -> None:
     """Make a row of a published table, or of a run folder, again from what is written beside it, and compare.
 
@@ -50,8 +52,8 @@ def verify(
       cosim verify scenarios/bologna/reference --row '1,no-control,3000'
       cosim verify scenarios/economic_mpc/reference/economic_mpc --all
     """
-    if out is not None and not every:
-        raise click.UsageError("--out is for --all; add that, or omit it")
+    for option in [name for name, given in (("--out", out is not None), ("--missing", missing)) if given and not every]:
+        raise click.UsageError(f"{option} is for --all; add that, or omit it")
     if seed is not None and every:
         raise click.UsageError("--seed chooses one row, and --all takes every one; omit one of them")
     from cosim.compete import verify as method  # heavy
@@ -62,18 +64,19 @@ def verify(
         return
     fitting = method.fitting(found, row)
     if every:
-        _all(folder, fitting, Path("runs") if out is None else out, within)
+        _all(folder, fitting, Path("runs") if out is None else out, within, missing)
         return
     one = random.Random(seed).choice(fitting)
     click.echo(f"{folder}: {one.label}, one of {len(found)} rows")
     _one(one, within)
 
 
-def _all(folder: Path, rows: "list[Row]", out: Path, within: float | None) -> None:
+def _all(folder: Path, rows: "list[Row]", out: Path, within: float | None, missing: bool) -> None:
     from cosim.compete import verified  # heavy
 
     with resumable("verify", out, verified.TABLE) as progress:
-        lines = verified.verify_all(folder, rows, out=out, within=within, progress=progress, tell=tell)
+        lines = verified.verify_all(
+            folder, rows, out=out, within=within, missing=missing, progress=progress, tell=tell)
     count = Counter(str(line["verdict"]) for line in lines)
     words = ", ".join(f"{number} {word}" for word, number in count.items())
     click.echo(f"{folder}: {len(lines)} rows: {words}; see {out / verified.TABLE}")

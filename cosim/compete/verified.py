@@ -1,10 +1,11 @@
 """Many rows of published tables made again, one after the other, and what came of them in one table.
 
-    verified.csv    folder, row, verdict (SAME, ROUNDED, DIFFERENT or FAILED), how many figures were compared, how many
+    verified.csv    folder, row, verdict (WAIT = 60.0  # s, for other processes that add a line
+SAME, ROUNDED, DIFFERENT or FAILED), how many figures were compared, how many
                     of them were the same to the last digit, which differ or why it failed, and the commit
 
 The table grows over calls: rows that it has of this commit are not made again, unless there are changes that are not
-committed; rows of other folders stay.
+committed; rows of other folders stay. Several processes may let it grow at a time.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,6 +21,7 @@ from nmfd.runs.progress import Show
 from nmfd.runs.provenance import provenance
 
 TABLE, LOCK = "verified.csv", ".verified.lock"
+WAIT = 60.0  # s, for other processes that add a line
 SAME, ROUNDED, DIFFERENT, FAILED = "the same", "within rounding", "different", "failed"
 COLUMNS = ("folder", "row", "verdict", "compared", "equal", "what", "commit")
 
@@ -27,31 +29,40 @@ Line = dict[str, object]
 
 
 def verify_all(
-    folder: Path, rows: Sequence[Row], *, out: Path, within: float | None = None, progress: Show,
-    tell: Callable[[str], None],
+    folder: Path, rows: Sequence[Row], *, out: Path, within: float | None = None, missing: bool = False,
+    progress: Show, tell: Callable[[str], None],
 ) -> list[Line]:
     """The lines of the table of `rows`, which are in `folder`, after those that are not there yet were made again.
 
-    out: the folder of the table; within: as of `verify`; tell: is told every row that did not come out the same.
-    InputError for a table that is none, or that another process writes.
+    out: the folder of the table; within: as of `verify`; missing: whether a line of another commit is enough; tell: is
+    told every row that did not come out the same. InputError for a table that is none.
     """
     out.mkdir(parents=True, exist_ok=True)
-    with locked(out / LOCK, out / TABLE):
-        lines, here, place = _read(out / TABLE), provenance(), folder.as_posix()
-        commit = here["commit"] or f"version {__version__}"  # not in a checkout
-        for done, row in enumerate(rows):
-            progress(done, len(rows), row.label)
-            key = {"folder": place, "row": row.label}
-            before = next((line for line in lines if key.items() <= line.items()), None)
-            if before is None or before["commit"] != commit or here["dirty"] or before["verdict"] == FAILED:
-                line = {**key, **_line(row, within), "commit": commit}
-                lines = [one for one in lines if one is not before] + [line]
+    here, place = provenance(), folder.as_posix()
+    commit = here["commit"] or f"version {__version__}"  # not in a checkout
+
+    def add(line: Line | None = None) -> list[Line]:
+        """All lines, with that of a row instead of what there was of it."""
+        with locked(out / LOCK, out / TABLE, WAIT):
+            lines = _read(out / TABLE)
+            if line:
+                lines = [one for one in lines if (one["folder"], one["row"]) != (place, line["row"])] + [line]
                 write_table(out / TABLE, pd.DataFrame(lines, columns=list(COLUMNS)))
-                if line["verdict"] in (DIFFERENT, FAILED):
-                    tell(f"{row.label}: {line['verdict']}, {line['what']}")
-        progress(len(rows), len(rows), "")
+        return lines
+
+    def enough(line: Line) -> bool:
+        return line["verdict"] != FAILED and (missing or line["commit"] == commit and not here["dirty"])
+
+    for done, row in enumerate(rows):
+        progress(done, len(rows), row.label)
+        if not any((line["folder"], line["row"]) == (place, row.label) and enough(line) for line in add()):
+            line = {"folder": place, "row": row.label, **_line(row, within), "commit": commit}
+            add(line)
+            if line["verdict"] in (DIFFERENT, FAILED):
+                tell(f"{row.label}: {line['verdict']}, {line['what']}")
+    progress(len(rows), len(rows), "")
     labels = {row.label for row in rows}
-    return [line for line in lines if line["folder"] == place and line["row"] in labels]
+    return [line for line in add() if line["folder"] == place and line["row"] in labels]
 
 
 def _line(row: Row, within: float | None) -> Line:

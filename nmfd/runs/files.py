@@ -73,12 +73,12 @@ def sweep(folder: Path, stems: Collection[str] | None = None) -> None:
 
 
 @contextmanager
-def locked(file: Path, what: Path) -> Iterator[None]:
-    """`what` to oneself: InputError if another process has it.
+def locked(file: Path, what: Path, wait: float = 0.0) -> Iterator[None]:
+    """`what` to oneself: InputError if another process has it, for `wait` [s] or longer.
 
     file: the lock, which holds process and host. The system lets go of it when the process ends, however it ends.
     """
-    lock = FileLock(file, timeout=0)
+    lock = FileLock(file, timeout=wait)
     try:
         lock.acquire()
     except Timeout:
