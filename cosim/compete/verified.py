@@ -1,7 +1,6 @@
 """Many rows of published tables made again, one after the other, and what came of them in one table.
 
-    verified.csv    folder, row, verdict (WAIT = 60.0  # s, for other processes that add a line
-SAME, ROUNDED, DIFFERENT or FAILED), how many figures were compared, how many
+    verified.csv    folder, row, verdict (SAME, ROUNDED, DIFFERENT or FAILED), how many figures were compared, how many
                     of them were the same to the last digit, which differ or why it failed, and the commit
 
 The table grows over calls: rows that it has of this commit are not made again, unless there are changes that are not
@@ -41,28 +40,26 @@ def verify_all(
     here, place = provenance(), folder.as_posix()
     commit = here["commit"] or f"version {__version__}"  # not in a checkout
 
-    def add(line: Line | None = None) -> list[Line]:
-        """All lines, with that of a row instead of what there was of it."""
+    def add(line: Line) -> None:
+        """Instead of what the table had of that row."""
         with locked(out / LOCK, out / TABLE, WAIT):
-            lines = _read(out / TABLE)
-            if line:
-                lines = [one for one in lines if (one["folder"], one["row"]) != (place, line["row"])] + [line]
-                write_table(out / TABLE, pd.DataFrame(lines, columns=list(COLUMNS)))
-        return lines
+            others = [one for one in _read(out / TABLE) if (one["folder"], one["row"]) != (place, line["row"])]
+            write_table(out / TABLE, pd.DataFrame([*others, line], columns=list(COLUMNS)))
 
     def enough(line: Line) -> bool:
         return line["verdict"] != FAILED and (missing or line["commit"] == commit and not here["dirty"])
 
     for done, row in enumerate(rows):
         progress(done, len(rows), row.label)
-        if not any((line["folder"], line["row"]) == (place, row.label) and enough(line) for line in add()):
+        if not any((line["folder"], line["row"]) == (place, row.label) and enough(line)
+                   for line in _read(out / TABLE)):
             line = {"folder": place, "row": row.label, **_line(row, within), "commit": commit}
             add(line)
             if line["verdict"] in (DIFFERENT, FAILED):
                 tell(f"{row.label}: {line['verdict']}, {line['what']}")
     progress(len(rows), len(rows), "")
     labels = {row.label for row in rows}
-    return [line for line in add() if line["folder"] == place and line["row"] in labels]
+    return [line for line in _read(out / TABLE) if line["folder"] == place and line["row"] in labels]
 
 
 def _line(row: Row, within: float | None) -> Line:
