@@ -46,13 +46,11 @@ def verify_all(
             others = [one for one in _read(out / TABLE) if (one["folder"], one["row"]) != (place, line["row"])]
             write_table(out / TABLE, pd.DataFrame([*others, line], columns=list(COLUMNS)))
 
-    def enough(line: Line) -> bool:
-        return line["verdict"] != FAILED and (missing or line["commit"] == commit and not here["dirty"])
-
+    enough = {line["row"] for line in _read(out / TABLE) if line["folder"] == place and line["verdict"] != FAILED
+              and (missing or line["commit"] == commit and not here["dirty"])}
     for done, row in enumerate(rows):
         progress(done, len(rows), row.label)
-        if not any((line["folder"], line["row"]) == (place, row.label) and enough(line)
-                   for line in _read(out / TABLE)):
+        if row.label not in enough:
             line = {"folder": place, "row": row.label, **_line(row, within), "commit": commit}
             add(line)
             if line["verdict"] in (DIFFERENT, FAILED):
