@@ -30,7 +30,7 @@ def city():
     return first, second, random.uniform(0.0, 3.0, len(pairs)), random.uniform(5.0, 60.0, EDGES)
 
 
-@pytest.fixture(scope="module", params=[MOST_KEPT, 1])
+@pytest.fixture(params=[MOST_KEPT, 1])
 def ways(city, request):
     """Out of region 0, with all trees kept or hardly any."""
     first, second, turn, time = city
