@@ -24,7 +24,7 @@ from cosim.evaluation.simulate import Task, simulate
 from nmfd.errors import InputError
 from nmfd.runs.workers import Failure
 
-WAIT = 120.0  # s, for what has to happen
+WAIT = 240.0  # s, for what has to happen
 # It tells of every run that begins, and waits in the middle of all but those of seed 0 until it is let go.
 HELD = """
 import os, time
@@ -130,7 +130,9 @@ def test_an_encrypted_scheduler_is_reached_with_its_authority_only(certificates,
     with encrypted(certificates, n_workers=0, processes=False) as cluster:
         address = cluster.scheduler_address
         assert address.startswith("tls://")
-        dask_cluster.connect(dask_cluster.Scheduler(address=address, **shown(certificates, "here", "here"))).close()
+        told = []
+        dask_cluster.source(dask_cluster.Scheduler(address=address, **shown(certificates, "here", "here")), told.append)
+        assert told == [f"--scheduler {address}: has no workers; runs wait for the first (dask worker {address})"]
         for cert, authority in (("other", "here"), ("here", "other")):
             with pytest.raises(InputError, match="no Dask scheduler answers at .* with certificates that it trusts"):
                 dask_cluster.connect(dask_cluster.Scheduler(address=address, **shown(certificates, cert, authority)))
@@ -197,8 +199,8 @@ class Cluster:
     def start(self, workers: int) -> None:
         """A scheduler, always at the same address, with so many new workers."""
         self.master = self._process("scheduler", "--protocol", "tls", "--host", "tls://127.0.0.1", "--port", self.port)
+        until(self._answers)  # workers do not wait for it longer than half a minute
         self.workers = [self.work() for _ in range(workers)]
-        until(self._answers)
         client = dask_cluster.connect(self.scheduler)
         client.wait_for_workers(workers, timeout=WAIT)
         client.close()
@@ -221,7 +223,7 @@ class Cluster:
         return self.began[-1]
 
     def end(self) -> None:
-        for process in self.began:
+        for process in list(self.began):
             process.kill()
             process.wait()
 
@@ -274,6 +276,7 @@ def meddle(cluster: Cluster, here: Path, summary: Path, wrong: list) -> None:
         until(lambda: sum(begun(here / "begun").values()) >= before + 2)
     except BaseException as error:
         wrong.append(error)
+        cluster.end()  # else the runs might wait for workers for ever
     finally:
         (here / "go").touch()
 
@@ -293,7 +296,8 @@ def timeless(file: Path) -> object:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["evaluate", "compete"])
-def test_a_worker_is_killed_and_the_scheduler_and_nothing_is_lost_or_done_twice(command, cluster, tmp_path):
+def test_a_worker_and_the_scheduler_are_killed_and_nothing_is_lost_or_done_twice(
+        command, cluster, tmp_path, monkeypatch):
     """Nor is a byte different from what is made without a cluster; all of it encrypted."""
     (tmp_path / "begun").mkdir()
     Path("held.py").write_text(HELD, encoding="utf-8")
@@ -308,6 +312,7 @@ def test_a_worker_is_killed_and_the_scheduler_and_nothing_is_lost_or_done_twice(
         Path("mine.toml").write_text(TASKS, encoding="utf-8")
         order = ("compete", "held.py:Held", "--tasks", "mine.toml")
         runs, tables = "one", ("held.py%3AHeld.json",)
+    monkeypatch.setattr(dask_cluster, "RETURN", WAIT)
     wrong: list = []
     thread = threading.Thread(
         target=meddle, args=(cluster, tmp_path, tmp_path / "there" / runs / "summary.csv", wrong))

@@ -11,6 +11,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -68,13 +69,17 @@ def _here(address: str) -> bool:
 
 def source(scheduler: Scheduler | str | None, tell: Tell | None = None) -> Source | None:
     """`outcomes` of a scheduler, which has answered before anything is written; None without one. tell: takes one line
-    where others may listen, and where it was lost. InputError as `connect`."""
+    where others may listen, where there are no workers yet, and where it was lost. InputError as `connect`."""
     if scheduler is None:
         return None
     found = Scheduler(address=scheduler) if isinstance(scheduler, str) else scheduler
-    connect(found).close()
+    client = connect(found)
+    workers = client.nthreads()
+    _close(client)
     if tell and found.warning:
         tell(found.warning)
+    if tell and not workers:
+        tell(f"--scheduler {found.address}: has no workers; runs wait for the first (dask worker {found.address})")
     return partial(outcomes, found, tell=tell)
 
 
@@ -128,6 +133,12 @@ def _until_lost(client: "Client", function: Callable, tasks: Sequence) -> Iterat
     finally:
         if client.status == "running":
             client.cancel(list(futures), force=True)
+        _close(client)
+
+
+def _close(client: "Client") -> None:
+    """Also one whose scheduler does not answer any more."""
+    with suppress(TimeoutError):
         client.close()
 
 
