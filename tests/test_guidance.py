@@ -15,7 +15,7 @@ from streets import FAR_FROM_THE_END, seen
 
 from cosim.plant.guidance import Guide, _Present, shifted
 from cosim.plant.meter import Event
-from cosim.plant.shortest_paths import FEWEST_KEPT, MOST_KEPT, Home, Moves, Searches, Trees, Ways
+from cosim.plant.shortest_paths import FAR, FEWEST_KEPT, MOST_KEPT, Home, Moves, Searches, Trees, Ways
 from cosim.sumo.net import City, Gateway
 
 EDGES, REGION = 40, np.repeat([0, 1, 2, 3], 10)
@@ -112,6 +112,16 @@ def test_ways_that_come_back_are_found_where_they_are_the_fastest_of_all(city, w
                 assert (REGION[way[:crossing]] != 0).any()
                 back += 1
     assert back > 10
+
+
+def test_what_is_ahead_is_hardly_less_than_the_least_time(city):
+    first, second, turn, time = city
+    outside, entry = Moves(first, second, allowed=REGION != 0, reverse=True), np.array([12, 25])
+    exact = least(city, REGION != 0)[entry].min(axis=0)[10:]
+    ahead = outside.ahead(outside.number[entry], time, turn)[outside.number[10:EDGES]]
+    assert np.isfinite(exact).any() and (ahead <= exact).all()
+    np.testing.assert_allclose(ahead[np.isfinite(exact)], exact[np.isfinite(exact)], rtol=1e-5)
+    assert (ahead[~np.isfinite(exact)] == FAR).all()
 
 
 @pytest.mark.parametrize("kept", [MOST_KEPT, 1])
