@@ -223,7 +223,7 @@ class Cluster:
         return self.began[-1]
 
     def end(self) -> None:
-        for process in list(self.began):
+        for process in self.began:
             process.kill()
             process.wait()
 
@@ -296,8 +296,7 @@ def timeless(file: Path) -> object:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["evaluate", "compete"])
-def test_a_worker_and_the_scheduler_are_killed_and_nothing_is_lost_or_done_twice(
-        command, cluster, tmp_path, monkeypatch):
+def test_a_worker_and_the_scheduler_are_killed_and_nothing_is_lost_or_done_twice(command, cluster, tmp_path):
     """Nor is a byte different from what is made without a cluster; all of it encrypted."""
     (tmp_path / "begun").mkdir()
     Path("held.py").write_text(HELD, encoding="utf-8")
@@ -312,7 +311,6 @@ def test_a_worker_and_the_scheduler_are_killed_and_nothing_is_lost_or_done_twice
         Path("mine.toml").write_text(TASKS, encoding="utf-8")
         order = ("compete", "held.py:Held", "--tasks", "mine.toml")
         runs, tables = "one", ("held.py%3AHeld.json",)
-    monkeypatch.setattr(dask_cluster, "RETURN", WAIT)
     wrong: list = []
     thread = threading.Thread(
         target=meddle, args=(cluster, tmp_path, tmp_path / "there" / runs / "summary.csv", wrong))
