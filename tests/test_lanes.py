@@ -62,6 +62,19 @@ def drive(session, seconds):
     return len(ended) == QUEUE * len(TARGETS)
 
 
+def guide_of(session, *, period, turn_late=False):
+    """Of the whole network as one region."""
+    after = {
+        "ab": ("bl", "br"), "bl": ("le", "lr"), "br": ("re", "rl"), "lr": ("re",), "rl": ("le",), "le": (), "re": ()}
+    of_all = {edge: 0 for edge in after}
+    city = City(
+        net_file=Path(), edges=tuple(after), region_of=of_all, length=dict.fromkeys(after, 300.0),
+        lanes=dict.fromkeys(after, 1), lane_ids={}, speed=dict.fromkeys(after, 13.9), gateways=(), signals={},
+        successors=after, regions=1, turn_time={(e, f): 0.0 for e, following in after.items() for f in following})
+    return Guide(session, city, np.zeros((1, 1, 1)), compliance=1.0, most_detour=60.0, period=period,
+                 turn_late=turn_late, random=np.random.default_rng(0))
+
+
 @pytest.mark.parametrize("session", [-0.5], indirect=True)
 def test_they_block_the_street_for_ever_without(session):
     assert not drive(session, 900)
@@ -89,19 +102,22 @@ def test_near_the_end_of_a_lane_it_is_too_late_for_others(session, late):
     assert 0.5 < LEADER < NEAR < 200.0 - 12.0
     assert lanes.too_late("left0", ["ab", "bl", "le"]) is late
     assert not lanes.too_late("left0", ["ab", "br", "re"]) and not lanes.too_late("left0", ["ab"])
+    assert not Lanes(session, 0.0).too_late("left0", ["ab", "bl", "le"])
+
+
+@pytest.mark.parametrize("session", [-0.5], indirect=True)
+@pytest.mark.parametrize("turn_late, period, sent", [(False, 60.0, False), (True, 60.0, True), (True, 0.0, False)])
+def test_from_before_the_stop_line_they_are_sent_elsewhere_only_if_they_are_led_on(session, turn_late, period, sent):
+    guide = guide_of(session, period=period, turn_late=turn_late)
+    assert session.set_route("left0", ["ab", "br", "rl", "le"])  # longer than by bl, where the lane does not lead
+    guide.command(np.zeros((1, 1, 1)), None)
+    guide.apply([Event(vehicle="left0", source=None, edge="le", region=0, destination=0)])
+    assert (session.route("left0") == ("ab", "bl", "le")) is sent
 
 
 @pytest.mark.parametrize("session", [-0.5], indirect=True)
 def test_guided_drivers_are_led_on(session):
-    after = {
-        "ab": ("bl", "br"), "bl": ("le", "lr"), "br": ("re", "rl"), "lr": ("re",), "rl": ("le",), "le": (), "re": ()}
-    of_all = {edge: 0 for edge in after}
-    city = City(
-        net_file=Path(), edges=tuple(after), region_of=of_all, length=dict.fromkeys(after, 300.0),
-        lanes=dict.fromkeys(after, 1), lane_ids={}, speed=dict.fromkeys(after, 13.9), gateways=(), signals={},
-        successors=after, regions=1, turn_time={(e, f): 0.0 for e, following in after.items() for f in following})
-    guide = Guide(session, city, np.zeros((1, 1, 1)), compliance=1.0, most_detour=60.0, period=60.0,
-                  random=np.random.default_rng(0))
+    guide = guide_of(session, period=60.0)
     guide.command(np.zeros((1, 1, 1)), None)
     guide.apply([
         Event(vehicle=vehicle, source=None, edge=TARGETS[vehicle.rstrip("0123456789")], region=0, destination=0)

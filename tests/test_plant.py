@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from signal_rules import MIN_GREEN, check
 
-from cosim.plant.guidance import shifted
+from cosim.plant.guidance import Guide, shifted
 from cosim.plant.plant import SumoPlant
 from cosim.plant.sampling import StreetSampler
 from cosim.plant.settings import Settings
@@ -220,6 +220,16 @@ def test_guided_vehicles_are_asked_again(scenario, plant_of):
     assert 0 < record.guided.sum() <= record.departures.sum() + record.crossings.sum()
     assert (record.guided.sum(axis=0) >= 0).all()
     assert [m.accumulation.tolist() for m in first] == [m.accumulation.tolist() for m in second]
+
+
+@pytest.mark.parametrize("signals, late", [
+    ("fixed", True), ("webster", True), ("actuated", True), ("max-pressure", False), ("max-pressure-cyclic", False)])
+def test_before_the_stop_line_nobody_is_sent_elsewhere_only_under_max_pressure(plant_of, monkeypatch, signals, late):
+    told = {}
+    monkeypatch.setattr(
+        "cosim.plant.plant.Guide", lambda *args, **options: told.update(options) or Guide(*args, **options))
+    plant_of(signals=signals, guidance_period=60.0).reset(1)
+    assert told["turn_late"] is late
 
 
 def test_same_seed_same_city(scenario, plant_of):

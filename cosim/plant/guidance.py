@@ -32,7 +32,7 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
-from cosim.plant.lanes import Lanes
+from cosim.plant.lanes import NEAR, Lanes
 from cosim.plant.meter import Event
 from cosim.plant.sampling import StreetMeans
 from cosim.plant.shortest_paths import Home, Moves, Searches, Trees, Ways
@@ -101,10 +101,13 @@ class Guide:
     def __init__(
         self, session: Session, city: City, own: PerTurn, *, compliance: float, most_detour: float,
         random: np.random.Generator, ways_return: bool = False, period: float = 0.0, lanes: bool = True,
+        turn_late: bool = False,
     ):
         """own: (R, R, R) [-], the drivers' own split ratios, which controllers mean as well
-        lanes: whether vehicles are on lanes, as in the mesoscopic model they are not"""
-        self._own, self._lanes, self._late = own, Lanes(session) if lanes else None, False
+        lanes: whether vehicles are on lanes, as in the mesoscopic model they are not
+        turn_late: whether drivers who are asked again may turn elsewhere from the wrong lane before the stop line"""
+        self._own, self._late = own, False
+        self._lanes = Lanes(session, 0.0 if turn_late and period else NEAR) if lanes else None
         self._period = math.ceil(period / session.step_length - 1e-6) if period else 0  # simulation steps
         self._soon = math.ceil(SOON / session.step_length - 1e-6)
         self._steps = self._interval = 0

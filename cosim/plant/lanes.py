@@ -5,6 +5,9 @@ cannot, because a queue stands there, it waits at the end of the wrong one until
 neighbouring lanes who each wait for the other's block a street for ever, and soon the city behind it. So drivers near
 the end of a lane are told of ways on that it leads to only; and who has stood at its end for a while, bound for
 elsewhere, drives on and is guided again where he comes out.
+
+Where the second is done, the first can be left out (`near` = 0), and under fixed-time signals it should be: who stands
+before a full street could turn nowhere else, and so the city locks (README.md, Lanes).
 """
 
 from collections.abc import Sequence
@@ -17,10 +20,11 @@ PATIENCE = 60.0  # s that the first stands there before he gives up
 
 
 class Lanes:
-    """Those of one simulation with lanes; the mesoscopic model has none."""
+    """Those of one simulation with lanes; the mesoscopic model has none. near: [m] before the end of one, from where on
+    it is too late; 0: never."""
 
-    def __init__(self, session: Session):
-        self._session = session
+    def __init__(self, session: Session, near: float = NEAR):
+        self._session, self._near = session, near
         self._known: dict[str, tuple[float, frozenset[str]]] = {}  # lane -> its length [m], and where it leads
 
     def too_late(self, vehicle: str, way: Sequence[str]) -> bool:
@@ -28,7 +32,7 @@ class Lanes:
         if len(way) < 2:
             return False
         left, onward = self._left(vehicle)
-        return left < NEAR and way[1] not in onward
+        return left < self._near and way[1] not in onward
 
     def way_out(self, vehicle: str, target: str) -> list[str]:
         """A way to edge `target` from the end of a lane that does not lead where its leader is bound for, once he has

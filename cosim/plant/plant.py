@@ -260,7 +260,8 @@ class SumoPlant:
         return Guide(
             self.session, self.city, self._scenario.network.nominal_splits, compliance=chosen.compliance,
             most_detour=chosen.most_detour, ways_return=chosen.ways_return, period=chosen.guidance_period,
-            lanes=not chosen.mesoscopic, random=np.random.default_rng([seed, GUIDANCE]))
+            lanes=not chosen.mesoscopic, turn_late=chosen.signals not in PRESSURES,
+            random=np.random.default_rng([seed, GUIDANCE]))
 
     def _new_actuation(self) -> Actuation:
         flows = self._launch.turning_flows() if self._settings.signals in PRESSURES else None
