@@ -177,6 +177,14 @@ def test_an_entry_counts_without_its_run_folder_while_it_is_of_the_same(place, m
     assert [again.sessions[one.session]["date"] for one in runs] == ["0", "0", "0", "1", "1"]
     assert again.outcome("nominal").depends_on == first.outcome("nominal").depends_on
     assert competed(name, out="elsewhere")[name] == again and len(made) == 8
+    # Of the first three, whose session no run has any more, and the others, all is known as before.
+    last = again.changed(tasks=tuple(
+        one.changed(runs=one.runs[3:]) if one.task == "nominal" else one for one in again.tasks))
+    Path("third").mkdir()
+    entry.write(entry.path(Path("third"), name), last)
+    third = competed(name, out="third")[name]
+    assert made[8:] == [(name, 1), (name, 2), (name, 3)] and not third.missing
+    assert [third.sessions[one.session]["date"] for one in third.outcome("nominal").runs] == ["3", "3", "3", "1", "1"]
     shutil.rmtree("elsewhere/nominal")
     Path("mine.py").write_text(tiny.CONTROLLER.replace("0.5", "0.125"), encoding="utf-8")
     changed = competed(name, out="elsewhere", only="noisy")[name]

@@ -104,7 +104,7 @@ class _Books:
     worlds: Mapping[str, str]
     failed: dict[Key, str] = field(default_factory=dict)
     _depends: dict[tuple[str, str], dict] = field(default_factory=dict)
-    _held: dict[tuple[str, str], dict[int, Run]] = field(default_factory=dict)
+    _held: dict[tuple[str, str], frozenset[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._session = provenance()
@@ -149,24 +149,24 @@ class _Books:
             self._depends[key] = json.loads(json.dumps(found[called]))
         return self._depends[key]
 
-    def held(self, name: str, task: TaskTable) -> dict[int, Run]:
-        """Seed -> run that the entry has from before, and that is not in the run folder."""
+    def held(self, name: str, task: TaskTable) -> frozenset[int]:
+        """Seeds of runs that the entry has from before, and that are not in the run folder."""
         if (key := (name, task.id)) not in self._held:
             self._held[key] = self._still_good(name, task)
         return self._held[key]
 
-    def _still_good(self, name: str, task: TaskTable) -> dict[int, Run]:
+    def _still_good(self, name: str, task: TaskTable) -> frozenset[int]:
         before = self._before[name]
         old = before.outcome(task.id) if before else None
         if old is None or not old.runs or old.world != self.worlds[task.id]:
-            return {}
+            return frozenset()
         try:
             if old.depends_on != self.depends(name, task):
-                return {}
+                return frozenset()
         except InputError:
-            return {}
+            return frozenset()
         there = self._there[task.id]
-        return {run.seed: run for run in old.runs if (strategy(name, task), run.seed) not in there}
+        return frozenset(run.seed for run in old.runs if (strategy(name, task), run.seed) not in there)
 
     def begin(self, name: str, task: TaskTable) -> None:
         """Failed runs are tried again."""
@@ -208,15 +208,15 @@ class _Books:
         old = before.outcome(task.id) if before else None
         if any(depends.get(key) != value for key, value in self._source[name].items()):
             rows = {}  # of the file as it was before
-        known = {run.seed: run for run in old.runs} if old and old.depends_on == depends else {}
         held = self.held(name, task)
         if held and not depends:  # it has no run folder
             depends = self.depends(name, task)
+        known = {run.seed: run for run in old.runs} if old and old.depends_on == depends else {}
         runs, failed = [], []
         for seed in task.seeds:
             row, kept = rows.get((called, seed)), known.get(seed)
-            if row is None and seed in held:
-                runs.append(held[seed])
+            if row is None and kept is not None and seed in held:
+                runs.append(kept)
             elif row is None:
                 if (reason := self.failed.get((name, task.id, seed))) is not None:
                     failed.append(Failure(seed=seed, reason=reason))
