@@ -64,6 +64,18 @@ def test_a_strategy_uses_the_table_that_fits_it_best():
         assert configured(name, tables) == expected
 
 
+def test_tables_that_fit_equally_well_are_an_error():
+    tables = ["dpc-pc+max-pressure", "dpc-pc+metering"]
+    with pytest.raises(InputError, match=(
+            r"^scenario.toml: strategy 'dpc-pc\+metering\+max-pressure': the tables "
+            r'\[controllers."dpc-pc\+max-pressure"\] and \[controllers."dpc-pc\+metering"\] fit it equally well; .*'
+            r'\[controllers."dpc-pc\+metering\+max-pressure"\] of its own$')):
+        configured("dpc-pc+metering+max-pressure", tables)
+    assert configured("dpc-pc+max-pressure", tables) == "dpc-pc+max-pressure"
+    both = "dpc-pc+max-pressure+metering"  # its words may come in any order
+    assert configured("dpc-pc+metering+max-pressure", [*tables, both]) == both
+
+
 @pytest.mark.parametrize("name, expected", [
     ("nobody", "controller 'nobody' is unknown; choose from no-control, route-guidance, pi-gating"),
     ("", "controller '' is unknown"),

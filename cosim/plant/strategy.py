@@ -131,11 +131,18 @@ def configured(name: str, tables: Iterable[str]) -> str:
     """The controller of the strategy `name`, with as many of its options as one of the `tables` has in its name.
 
     tables: names CONTROLLER+OPTION... of tables in [controllers], each with a regional model or a policy for that city
+    Raises InputError where several fit equally well: their order in the file shall decide nothing.
     """
     controller = parse(name).controller
     words = {controller, *name.split("+")}
     fitting = [table for table in tables if table.startswith(f"{controller}+") and set(table.split("+")) <= words]
-    return max(fitting, key=lambda table: table.count("+"), default=controller)
+    best = max(fitting, key=lambda table: table.count("+"), default=controller)
+    if len(rivals := [table for table in fitting if table.count("+") == best.count("+")]) > 1:
+        raise InputError(
+            f"scenario.toml: strategy {name!r}: the tables "
+            + " and ".join(f'[controllers."{table}"]' for table in rivals)
+            + f' fit it equally well; which one counts, say in a table [controllers."{name}"] of its own')
+    return best
 
 
 def planning_of(scenario: Scenario, strategy: str, model: Path | None = None) -> PlanningModel:
