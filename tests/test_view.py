@@ -203,6 +203,12 @@ def test_a_page_shows_every_street_and_trusts_no_name(task, city, seen):
     page.place(document, EVIL, [Button(label=EVIL, name="pause")], [Button(label="x", name="close")])
     page.show([whole[-1], None], whole[-1].time, city_map.SPEED, [frozenset(drawn.boundaries[:1]), frozenset()])
     page.trace([whole, whole[:2]], whole[-1].time)
+    arrows = page.maps[0].arrows.data
+    assert len(arrows["width"])
+    sent_elsewhere = replace(whole[-1], guided=np.full_like(whole[-1].guided, -1.0))
+    page.show([sent_elsewhere, None], whole[-1].time, city_map.SPEED, [frozenset(), frozenset()])
+    assert not any(arrows[column].any() for column in ("width", "head", "guided"))
+    page.show([whole[-1], None], whole[-1].time, city_map.SPEED, [frozenset(drawn.boundaries[:1]), frozenset()])
     for one in page.maps:
         assert list(one.streets.data["edge"]) == list(city.edges)
         assert len(one.streets.data["xs"]) == len(city.edges)

@@ -203,7 +203,8 @@ class CityMap:
     def _show_guidance(self, frame: Frame) -> None:
         if not self._pairs:
             return
-        guided = np.array([frame.guided[pair] for pair in self._pairs])
+        # Who was sent elsewhere when they were asked again counts there, and no more where they were sent before.
+        guided = np.maximum([frame.guided[pair] for pair in self._pairs], 0.0)
         width = WIDEST * np.sqrt(guided / max(guided.max(), 1.0))
         every = slice(len(guided))
         self.arrows.patch({
