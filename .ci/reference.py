@@ -30,6 +30,7 @@ def build(folder: Path) -> None:
 
 def _with_lists(to_markdown):
     """The same filter, but lines such as "seed: of the noise", of which docstrings are made, become a list."""
+
     @jinja2.pass_context
     def filtered(context: jinja2.runtime.Context, text: str) -> str:
         return to_markdown(context, re.sub(r"^(\w+(?:, \w+)*): ", r"* **\1**: ", text, flags=re.MULTILINE))

@@ -1,6 +1,6 @@
 """Release a task set: what it says and what happens in its tasks goes into cosim/compete/released.toml, for ever.
 
-    python .ci/release.py v1
+python .ci/release.py v1
 """
 
 import sys
@@ -13,8 +13,10 @@ from nmfd.runs.files import write_text
 def main(name: str) -> None:
     released = config.read(task_set.RELEASED)
     if name in released:
-        sys.exit(f"{name}: was released; a changed task set gets a new number. Delete its table in {task_set.RELEASED} "
-                 "as long as nobody has it yet")
+        sys.exit(
+            f"{name}: was released; a changed task set gets a new number. Delete its table in {task_set.RELEASED} "
+            "as long as nobody has it yet"
+        )
     loaded = task_set.read(name)
     worlds = {task.id: task_set.world(task, loaded.scenario(task)) for task in loaded.tasks.tasks}
     released[name] = {"hash": loaded.hash, "worlds": worlds}

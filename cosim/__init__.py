@@ -23,14 +23,33 @@ if TYPE_CHECKING:
     from cosim.report.city import City
 
 __all__ = [
-    "City", "Result", "Settings", "SumoPlant", "Sweep", "Task", "overview", "read_run", "run", "run_tasks", "settings",
-    "sweep"]
+    "City",
+    "Result",
+    "Settings",
+    "SumoPlant",
+    "Sweep",
+    "Task",
+    "overview",
+    "read_run",
+    "run",
+    "run_tasks",
+    "settings",
+    "sweep",
+]
 _PLACES = {
-    "City": "report.city.City", "Result": "evaluation.simulate.Result", "Settings": "plant.settings.Settings",
+    "City": "report.city.City",
+    "Result": "evaluation.simulate.Result",
+    "Settings": "plant.settings.Settings",
     "SumoPlant": "plant.plant.SumoPlant",
-    "Task": "evaluation.simulate.Task", "overview": "evaluation.experiment.overview",
-    "read_run": "api.read_run", "run": "api.run", "run_tasks": "api.run_tasks",
-    "settings": "plant.settings.settings", "Sweep": "evaluation.sweeps.Sweep", "sweep": "api.sweep"}
+    "Task": "evaluation.simulate.Task",
+    "overview": "evaluation.experiment.overview",
+    "read_run": "api.read_run",
+    "run": "api.run",
+    "run_tasks": "api.run_tasks",
+    "settings": "plant.settings.settings",
+    "Sweep": "evaluation.sweeps.Sweep",
+    "sweep": "api.sweep",
+}
 
 
 def __getattr__(name: str) -> object:

@@ -20,9 +20,16 @@ from nmfd.types import Controller
 
 
 def run(
-    scenario: Scenario | Path | str, controller: str | Controller, *, seed: int = 0, steps: int | None = None,
-    demand_factor: float = 1.0, policy: Path | str | None = None, city: str = "",
-    sumo_output: Mapping[str, Path | str] | None = None, progress: Progress = None,
+    scenario: Scenario | Path | str,
+    controller: str | Controller,
+    *,
+    seed: int = 0,
+    steps: int | None = None,
+    demand_factor: float = 1.0,
+    policy: Path | str | None = None,
+    city: str = "",
+    sumo_output: Mapping[str, Path | str] | None = None,
+    progress: Progress = None,
 ) -> Result:
     """One closed loop in SUMO, in this process and without a run folder.
 
@@ -61,8 +68,11 @@ def run(
         name, acting, planning = *named(controller, scenario, policy), planning_model(scenario)
         strategy = parse(city or ALONE)
         strategy = replace(
-            strategy, name=f"{name}+{city}" if city else name, controller=name,
-            overrides={**strategy.overrides, "gateways_fixed": name != ALONE})
+            strategy,
+            name=f"{name}+{city}" if city else name,
+            controller=name,
+            overrides={**strategy.overrides, "gateways_fixed": name != ALONE},
+        )
     outputs = {kind: Path(file) for kind, file in (sumo_output or {}).items()}
     check(outputs)
     with watched(strategy.name, progress) as show:
@@ -70,7 +80,11 @@ def run(
 
 
 def run_tasks(
-    tasks: Task | Sequence[Task], *, out: Path | str, workers: int = 1, progress: Progress = None,
+    tasks: Task | Sequence[Task],
+    *,
+    out: Path | str,
+    workers: int = 1,
+    progress: Progress = None,
     tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Closed loops in SUMO with a run folder: those that are not yet in `out`; returns a row for every run there.
@@ -81,13 +95,21 @@ def run_tasks(
     """
     with watched("cosim", progress) as show:
         return experiment.experiment(
-            [tasks] if isinstance(tasks, Task) else list(tasks), out=Path(out), workers=workers, progress=show,
-            tell=tell)
+            [tasks] if isinstance(tasks, Task) else list(tasks),
+            out=Path(out),
+            workers=workers,
+            progress=show,
+            tell=tell,
+        )
 
 
 def sweep(
-    order: Sweep, *, workers: int = 1, scheduler: dask_cluster.Scheduler | str | None = None,
-    progress: Progress = None, tell: Callable[[str], None] | None = None,
+    order: Sweep,
+    *,
+    workers: int = 1,
+    scheduler: dask_cluster.Scheduler | str | None = None,
+    progress: Progress = None,
+    tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Controllers x seeds x demand levels x compliance in SUMO, as one table: cosim.evaluation.sweeps.sweep.
 

@@ -29,17 +29,47 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"  # of the package perimeter-cosim, nmfd and cosim alike
 _MODULES = {
-    "api": ("benchmark", "controller", "identify", "load_scenario", "run", "train"), "errors": ("InputError",),
-    "metrics": ("summary", "total_time_spent"), "model.planning": ("PlanningModel",),
-    "model.plant": ("AcyclicPlant", "NmfdPlant"), "model.regional_model": ("RegionalModel", "load_network"),
-    "model.scenario": ("Scenario",), "runs.run_folder": ("read_trajectory", "write_trajectory"),
-    "studies.measured": ("Identified",), "studies.summary": ("Summary", "summary_table"),
-    "types": ("Controller", "Controls", "Observation", "Plant", "State", "Status", "Trajectory")}
+    "api": ("benchmark", "controller", "identify", "load_scenario", "run", "train"),
+    "errors": ("InputError",),
+    "metrics": ("summary", "total_time_spent"),
+    "model.planning": ("PlanningModel",),
+    "model.plant": ("AcyclicPlant", "NmfdPlant"),
+    "model.regional_model": ("RegionalModel", "load_network"),
+    "model.scenario": ("Scenario",),
+    "runs.run_folder": ("read_trajectory", "write_trajectory"),
+    "studies.measured": ("Identified",),
+    "studies.summary": ("Summary", "summary_table"),
+    "types": ("Controller", "Controls", "Observation", "Plant", "State", "Status", "Trajectory"),
+}
 __all__ = [
-    "AcyclicPlant", "Controller", "Controls", "Identified", "InputError", "NmfdPlant", "Observation", "Plant",
-    "PlanningModel", "RegionalModel", "Scenario", "State", "Status", "Summary", "Trajectory", "benchmark", "controller",
-    "identify", "load_network", "load_scenario", "read_trajectory", "run", "summary", "summary_table",
-    "total_time_spent", "train", "write_trajectory"]
+    "AcyclicPlant",
+    "Controller",
+    "Controls",
+    "Identified",
+    "InputError",
+    "NmfdPlant",
+    "Observation",
+    "Plant",
+    "PlanningModel",
+    "RegionalModel",
+    "Scenario",
+    "State",
+    "Status",
+    "Summary",
+    "Trajectory",
+    "benchmark",
+    "controller",
+    "identify",
+    "load_network",
+    "load_scenario",
+    "read_trajectory",
+    "run",
+    "summary",
+    "summary_table",
+    "total_time_spent",
+    "train",
+    "write_trajectory",
+]
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 

@@ -45,8 +45,14 @@ def controller(name: str, scenario: Scenario | Path | str, *, policy: Path | str
 
 
 def run(
-    scenario: Scenario | Path | str, controller: str | Controller, *, seed: int = 0, plant: str | Plant = "nmfd",
-    steps: int | None = None, policy: Path | str | None = None, progress: Progress = None,
+    scenario: Scenario | Path | str,
+    controller: str | Controller,
+    *,
+    seed: int = 0,
+    plant: str | Plant = "nmfd",
+    steps: int | None = None,
+    policy: Path | str | None = None,
+    progress: Progress = None,
 ) -> Trajectory:
     """One closed loop on a regional model.
 
@@ -79,13 +85,20 @@ def run(
     with watched(name, progress) as show:
         trajectory = closed_loop.run(driven, acting, scenario, seed=seed, progress=show)
     return run_folder.labelled(
-        trajectory, controller=name, plant=plant if isinstance(plant, str) else type(plant).__name__)
+        trajectory, controller=name, plant=plant if isinstance(plant, str) else type(plant).__name__
+    )
 
 
 def benchmark(
-    scenario: Scenario | Path | str, controllers: str | Sequence[str], *, seeds: int | Sequence[int] = 1,
-    plant: str = "nmfd", out: Path | str | None = None, policies: Mapping[str, Path | str] | None = None,
-    workers: int = 1, progress: Progress = None,
+    scenario: Scenario | Path | str,
+    controllers: str | Sequence[str],
+    *,
+    seeds: int | Sequence[int] = 1,
+    plant: str = "nmfd",
+    out: Path | str | None = None,
+    policies: Mapping[str, Path | str] | None = None,
+    workers: int = 1,
+    progress: Progress = None,
 ) -> Summary:
     """`nmfd benchmark`: controllers x seeds with a run folder; returns the rows of its summary.csv.
 
@@ -102,19 +115,33 @@ def benchmark(
     Raises InputError and nmfd.runs.workers.RunFailed.
     """
     scenario, files = _loaded(scenario), {name: Path(file) for name, file in (policies or {}).items()}
-    chosen = names.chosen(
-        controllers, registry.check, lambda: dict.fromkeys([*registry.ready(scenario), *files]))
+    chosen = names.chosen(controllers, registry.check, lambda: dict.fromkeys([*registry.ready(scenario), *files]))
     _check_plant(plant)
     with watched("benchmark", progress) as show:
-        return Summary(run_all(
-            scenario, chosen, range(seeds) if isinstance(seeds, int) else list(seeds), plant,
-            out=run_folder.default_folder(scenario.name) if out is None else Path(out), policies=files,
-            workers=workers, progress=show))
+        return Summary(
+            run_all(
+                scenario,
+                chosen,
+                range(seeds) if isinstance(seeds, int) else list(seeds),
+                plant,
+                out=run_folder.default_folder(scenario.name) if out is None else Path(out),
+                policies=files,
+                workers=workers,
+                progress=show,
+            )
+        )
 
 
 def train(
-    scenario: Scenario | Path | str, controller: str, *, out: Path | str, seed: int = 0, steps: int | None = None,
-    resume: bool = False, anyway: bool = False, progress: Progress = None,
+    scenario: Scenario | Path | str,
+    controller: str,
+    *,
+    out: Path | str,
+    seed: int = 0,
+    steps: int | None = None,
+    resume: bool = False,
+    anyway: bool = False,
+    progress: Progress = None,
 ) -> Path:
     """`nmfd train` on the CPU: train the DPC policy `controller` and write it to the file `out`, which is returned.
 
@@ -123,14 +150,30 @@ def train(
     """
     with watched(controller, progress) as show:
         return training.train(
-            _loaded(scenario), controller, seed=seed, out=Path(out), steps=steps, resume=resume, anyway=anyway,
-            progress=show)
+            _loaded(scenario),
+            controller,
+            seed=seed,
+            out=Path(out),
+            steps=steps,
+            resume=resume,
+            anyway=anyway,
+            progress=show,
+        )
 
 
 def identify(
-    counts: Path | str, *, out: Path | str, detectors: Path | str | None = None, regions: Path | str | None = None,
-    about: Path | str | None = None, adjacency: Path | str | None = None, city: str | None = None,
-    skip_bad: bool = False, name: str | None = None, force: bool = False, **settings: float,
+    counts: Path | str,
+    *,
+    out: Path | str,
+    detectors: Path | str | None = None,
+    regions: Path | str | None = None,
+    about: Path | str | None = None,
+    adjacency: Path | str | None = None,
+    city: str | None = None,
+    skip_bad: bool = False,
+    name: str | None = None,
+    force: bool = False,
+    **settings: float,
 ) -> Identified:
     """`nmfd identify`: measured counts and occupancies -> MFDs per region, and a network.toml in the folder `out`.
 
@@ -144,16 +187,25 @@ def identify(
     """
     given = {"detectors": detectors, "regions": regions, "about": about, "adjacency": adjacency}
     return measured.identify(
-        measured.Sources(counts=Path(counts), city=city, skip_bad=skip_bad, **{
-            key: None if file is None else Path(file) for key, file in given.items()}),
-        config.checked(Measured, settings, "identify"), out=Path(out), name=name, force=force)
+        measured.Sources(
+            counts=Path(counts),
+            city=city,
+            skip_bad=skip_bad,
+            **{key: None if file is None else Path(file) for key, file in given.items()},
+        ),
+        config.checked(Measured, settings, "identify"),
+        out=Path(out),
+        name=name,
+        force=force,
+    )
 
 
 def _check_plant(plant: str, more: str = "") -> None:
     """InputError for an unknown name; more: what else is allowed."""
     if plant not in PLANTS:
         raise InputError(
-            f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from {', '.join(PLANTS)}{more}")
+            f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from {', '.join(PLANTS)}{more}"
+        )
 
 
 def named(controller: str | Controller, scenario: Scenario, policy: Path | str | None) -> tuple[str, Controller]:
@@ -165,7 +217,8 @@ def named(controller: str | Controller, scenario: Scenario, policy: Path | str |
     for method in ("reset", "act"):
         if not callable(getattr(controller, method, None)):
             raise InputError(
-                f"controller: expected a name or an object with reset and act, got {controller!r} without {method}")
+                f"controller: expected a name or an object with reset and act, got {controller!r} without {method}"
+            )
     return getattr(controller, "name", type(controller).__name__), controller
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 PerRegion = Float[np.ndarray, " R"]
-PerPair = Float[np.ndarray, "R R"]      # [i, j] = in i bound for j, or [i, h] = from i to h
-PerTurn = Float[np.ndarray, "R R R"]    # [i, h, j] = in i, bound for j, by way of h
+PerPair = Float[np.ndarray, "R R"]  # [i, j] = in i bound for j, or [i, h] = from i to h
+PerTurn = Float[np.ndarray, "R R R"]  # [i, h, j] = in i, bound for j, by way of h
 PairsOverTime = Float[np.ndarray, "T R R"]
 TurnsOverTime = Float[np.ndarray, "T R R R"]
 RegionsOverTime = Float[np.ndarray, "T R"]

@@ -16,7 +16,11 @@ from nmfd.types import Controller, Controls, Observation, Plant, State, Status, 
 
 @one_thread()
 def run(
-    plant: Plant, controller: Controller, scenario: Scenario, *, seed: int,
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    *,
+    seed: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
     """Drive `plant` with `controller` for `scenario.steps` control intervals.
@@ -54,17 +58,25 @@ def run(
         if progress:
             progress(k + 1, scenario.steps)
     return Trajectory(
-        controller=controller.name, plant=type(plant).__name__, seed=seed, step=scenario.step,
-        accumulation=np.stack([s.accumulation for s in states]), backlog=np.stack([s.backlog for s in states]),
-        completed=np.array([s.completed for s in states]), observed=np.stack([o.accumulation for o in observations]),
-        observed_backlog=np.stack([o.backlog for o in observations]), estimated=sensors.estimated,
+        controller=controller.name,
+        plant=type(plant).__name__,
+        seed=seed,
+        step=scenario.step,
+        accumulation=np.stack([s.accumulation for s in states]),
+        backlog=np.stack([s.backlog for s in states]),
+        completed=np.array([s.completed for s in states]),
+        observed=np.stack([o.accumulation for o in observations]),
+        observed_backlog=np.stack([o.backlog for o in observations]),
+        estimated=sensors.estimated,
         perimeter=np.stack([c.perimeter for c in controls]),
         splits=np.stack([network.nominal_splits if c.splits is None else c.splits for c in controls]),
-        decision_time=np.array(decision_time), status=np.array([c.status.value for c in controls]),
+        decision_time=np.array(decision_time),
+        status=np.array([c.status.value for c in controls]),
         note=tuple(c.note for c in controls),
         removed=np.stack([np.zeros_like(s.backlog) if s.removed is None else s.removed for s in states]),
         prices=np.stack([np.zeros(network.regions) if c.prices is None else c.prices for c in controls]),
-        wall_time=time.perf_counter() - begin)
+        wall_time=time.perf_counter() - begin,
+    )
 
 
 class _Sensors:
@@ -89,8 +101,7 @@ def noise_of(seed: int) -> np.random.Generator:
 
 def noisy(state: State, noise: PerPair) -> Observation:
     """The state as it is measured with `noise` (R, R) [veh] on the accumulation."""
-    return Observation(
-        step=state.step, time=state.time, accumulation=state.accumulation + noise, backlog=state.backlog)
+    return Observation(step=state.step, time=state.time, accumulation=state.accumulation + noise, backlog=state.backlog)
 
 
 def _deadline(controller: Controller, step: float) -> float:
@@ -102,9 +113,9 @@ def _deadline(controller: Controller, step: float) -> float:
 def _copied(controls: Controls) -> Controls:
     """With arrays of its own: a controller may go on writing into those that it returned."""
     splits, prices, metering = (
-        None if asked is None else np.array(asked) for asked in (controls.splits, controls.prices, controls.metering))
-    return replace(
-        controls, perimeter=np.array(controls.perimeter), splits=splits, prices=prices, metering=metering)
+        None if asked is None else np.array(asked) for asked in (controls.splits, controls.prices, controls.metering)
+    )
+    return replace(controls, perimeter=np.array(controls.perimeter), splits=splits, prices=prices, metering=metering)
 
 
 def _booked(controls: Controls, status: Status, note: str) -> Controls:

@@ -17,6 +17,6 @@ class RunFailed(Exception):
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
-    """"; did you mean ...?" with the one of `choices` that is written most like `word`; "" if none is."""
+    """ "; did you mean ...?" with the one of `choices` that is written most like `word`; "" if none is."""
     close = difflib.get_close_matches(word, list(choices), n=1)
     return f"; did you mean {close[0]}?" if close else ""

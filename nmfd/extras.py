@@ -14,4 +14,5 @@ def need(what: str, extra: str, *modules: str) -> None:
     """InputError that names the `extra` to install, where `what` needs one of `modules` that is not installed."""
     if missing := [module for module in modules if not there(module)]:
         raise InputError(
-            f"{what}: needs {', '.join(missing)}; install the extra {extra} with: pip install -e '.[{extra}]'")
+            f"{what}: needs {', '.join(missing)}; install the extra {extra} with: pip install -e '.[{extra}]'"
+        )

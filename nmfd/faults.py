@@ -22,8 +22,14 @@ COMPUTING = {"solver-fails": None, "solver-diverges": None, "solver-late": None,
 CITY = {"closed": "edge", "signal": "signal", "gate": "gate", "sumo-exits": None}
 KINDS = {**SENSORS, **COMPUTING, **CITY}
 EXAMPLES = {
-    "intervals": "delayed:2", "region": "missing:3", "share": "detectors:0.2", "factor": "off:1.5",
-    "edge": "closed:A0A1", "signal": "signal:B1", "gate": "gate:2-3=0"}
+    "intervals": "delayed:2",
+    "region": "missing:3",
+    "share": "detectors:0.2",
+    "factor": "off:1.5",
+    "edge": "closed:A0A1",
+    "signal": "signal:B1",
+    "gate": "gate:2-3=0",
+}
 GATE = re.compile(r"(?P<source>\d{1,4})-(?P<target>\d{1,4})=(?P<share>[^=]+)")
 LAST = 999_999  # the last control interval that a text can name
 FORM = re.compile(r"(?P<kind>[a-z-]+)(:(?P<value>[^@]+))?(@(?P<begin>\d{1,6})-(?P<end>\d{1,6}))?")
@@ -62,7 +68,8 @@ def parse(text: str, where: str, regions: int) -> Fault:
         hint = did_you_mean(re.split("[:@]", text)[0], KINDS)
         raise InputError(
             f"{where}: expected KIND[:VALUE][@FROM-TO] with a kind out of {', '.join(KINDS)}, got {text[:60]!r} "
-            f"instead{hint}")
+            f"instead{hint}"
+        )
     kind, value = match["kind"], match["value"]
     begin, end = int(match["begin"] or 0), int(match["end"] or 10**9)
     unit = KINDS[kind]
@@ -75,8 +82,12 @@ def parse(text: str, where: str, regions: int) -> Fault:
         return replace(gate(value or "", f"{where}: {text}", regions), begin=begin, end=end)
     if unit in (None, "edge", "signal"):
         return Fault(kind=kind, name=value or "", begin=begin, end=end)
-    low, high, whole = {"intervals": (1, 1000, True), "region": (0, regions - 1, True), "share": (0.0, 1.0, False),
-                        "factor": (0.0, 10.0, False)}[unit]
+    low, high, whole = {
+        "intervals": (1, 1000, True),
+        "region": (0, regions - 1, True),
+        "share": (0.0, 1.0, False),
+        "factor": (0.0, 10.0, False),
+    }[unit]
     try:
         number = float(value)
     except ValueError:
@@ -84,7 +95,8 @@ def parse(text: str, where: str, regions: int) -> Fault:
     if not low <= number <= high or (whole and number != int(number)):
         kind_of = "whole number" if whole else "number"
         raise InputError(
-            f"{where}: {kind}: expected a {kind_of} from {low:g} to {high:g} as its {unit}, got {value[:60]!r} instead")
+            f"{where}: {kind}: expected a {kind_of} from {low:g} to {high:g} as its {unit}, got {value[:60]!r} instead"
+        )
     return Fault(kind=kind, number=number, begin=begin, end=end)
 
 
@@ -99,7 +111,8 @@ def gate(value: str, where: str, regions: int) -> Fault:
     if source == target or max(source, target) >= regions or not 0.0 <= share <= 1.0:
         raise InputError(
             f"{where}: expected I-H=SHARE, two regions from 0 to {regions - 1} and a share from 0 (the least green) to "
-            f"1 (all), such as {EXAMPLES['gate']}, got {value[:60]!r} instead")
+            f"1 (all), such as {EXAMPLES['gate']}, got {value[:60]!r} instead"
+        )
     return Fault(kind="gate", number=share, name=f"{source}-{target}={share:g}", pair=(source, target))
 
 
@@ -124,8 +137,7 @@ def without_city(faults: Sequence[Fault], where: str) -> None:
     """InputError for a fault that only a simulated city can have."""
     for fault in faults:
         if fault.kind in CITY:
-            raise InputError(
-                f"{where}: {fault.kind} is a fault of a city in SUMO, not of the regional model; omit it")
+            raise InputError(f"{where}: {fault.kind} is a fault of a city in SUMO, not of the regional model; omit it")
 
 
 class Sensors:
@@ -158,15 +170,17 @@ class Sensors:
                     late = min(int(fault.number), len(self._seen) - 1)
                     observation, problem = self._then(self._seen[-1 - late], k), f"{late} intervals late"
                 case "missing":
-                    observation = replace(observation, accumulation=np.where(
-                        np.arange(len(x))[:, None] == int(fault.number), np.nan, x))
+                    observation = replace(
+                        observation, accumulation=np.where(np.arange(len(x))[:, None] == int(fault.number), np.nan, x)
+                    )
                 case "detectors" if not estimated:
                     if self._silent is None:
                         self._silent = self._random.random(x.shape) < fault.number
                     observation = replace(observation, accumulation=np.where(self._silent, np.nan, x))
                 case "off":
-                    observation = replace(observation, accumulation=fault.number * x, backlog=(
-                        fault.number * observation.backlog))
+                    observation = replace(
+                        observation, accumulation=fault.number * x, backlog=(fault.number * observation.backlog)
+                    )
                     problem = f"off by a factor of {fault.number:g}"
             problems += [problem] if problem else []
         observation, missing = self._filled(observation)
@@ -186,7 +200,8 @@ class Sensors:
         if missing or not np.isfinite(backlog).all():
             last = np.zeros_like(x) if self._last is None else self._last
             observation = replace(
-                observation, accumulation=np.where(good, x, last), backlog=np.nan_to_num(backlog, posinf=0.0))
+                observation, accumulation=np.where(good, x, last), backlog=np.nan_to_num(backlog, posinf=0.0)
+            )
         self._last = observation.accumulation
         return observation, missing
 
@@ -214,10 +229,15 @@ class Supervised:
         asked = (controls.perimeter, controls.splits, controls.prices, controls.metering)
         if not all(np.isfinite(numbers).all() for numbers in asked if numbers is not None):
             controls = Controls(
-                perimeter=self._opened, splits=None, status=Status.SOLVER_FAILURE | Status.FALLBACK,
-                note="the controls were no numbers: perimeter opened")
+                perimeter=self._opened,
+                splits=None,
+                status=Status.SOLVER_FAILURE | Status.FALLBACK,
+                note="the controls were no numbers: perimeter opened",
+            )
         if not problem:
             return controls
         return replace(
-            controls, status=controls.status | Status.SENSOR_FAULT,
-            note="; ".join(note for note in (problem, controls.note) if note))
+            controls,
+            status=controls.status | Status.SENSOR_FAULT,
+            note="; ".join(note for note in (problem, controls.note) if note),
+        )

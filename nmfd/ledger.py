@@ -20,6 +20,7 @@ def check(step: int, time: float, *, entered: float, ended: float, inside: float
     if not (math.isfinite(surplus) and abs(surplus) <= allowed):
         raise LedgerError(
             f"{where}: {entered:.6f} vehicles entered, {ended:.6f} ended their trips and {inside:.6f} are inside, "
-            f"{surplus:+.6g} of them from nowhere")
+            f"{surplus:+.6g} of them from nowhere"
+        )
     if not least >= -allowed:
         raise LedgerError(f"{where}: an accumulation is {least:.6g} vehicles")

@@ -19,7 +19,8 @@ COUNTED = {
 
 # Columns of summary.csv: type, and what they say.
 SUMMARY: dict[str, tuple[type, str]] = {
-    "controller": (str, "the strategy"), "seed": (int, "of trips, drivers and guidance"),
+    "controller": (str, "the strategy"),
+    "seed": (int, "of trips, drivers and guidance"),
     "plant": (str, "what was driven: a regional model, or the city in SUMO"),
     "total_time_spent_veh_s": (float, "running, waiting to enter, and as long as it could be of those removed"),
     "final_accumulation_veh": (float, "inside at the end"),
@@ -43,16 +44,15 @@ def total_time_spent(trajectory: Trajectory) -> float:
         >>> bool(total_time_spent(run) == run.step * run.accumulation[:2].sum())  # nobody waits or was removed
         True
     """
-    vehicles = (
-        trajectory.accumulation[:-1].sum() + trajectory.backlog[:-1].sum() + trajectory.removed[:-1].sum())
+    vehicles = trajectory.accumulation[:-1].sum() + trajectory.backlog[:-1].sum() + trajectory.removed[:-1].sum()
     return float(trajectory.step * vehicles)
 
 
 def percent_change(value: float, reference: float) -> float:
     """How far `value` is above `reference` [%]; NaN, not defined, where that is 0.
 
-        >>> percent_change(150.0, 100.0)
-        50.0
+    >>> percent_change(150.0, 100.0)
+    50.0
     """
     return 100.0 * (value / reference - 1.0) if reference else math.nan
 
@@ -93,8 +93,8 @@ def notes(trajectory: Trajectory, most: int = 3) -> str:
 def summary(trajectory: Trajectory) -> dict[str, float | int | str]:
     """One row of summary.csv: column (with its unit in the name) -> value, such as "total_time_spent_veh_s".
 
-        >>> round(summary(nmfd.run("economic_mpc", "no-control", steps=20))["max_accumulation_veh"])
-        12558
+    >>> round(summary(nmfd.run("economic_mpc", "no-control", steps=20))["max_accumulation_veh"])
+    12558
     """
     total = trajectory.accumulation.sum(axis=(1, 2))
     decision_ms = 1e3 * trajectory.decision_time

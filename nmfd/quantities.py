@@ -30,4 +30,6 @@ def variables(kind: type, values: Mapping) -> dict[str, tuple]:
     attributes)."""
     return {
         name: (about["dimensions"], np.asarray(values[name]), {"long_name": about["text"], **about["attributes"]})
-        for name, about in quantities(kind).items() if name in values}
+        for name, about in quantities(kind).items()
+        if name in values
+    }

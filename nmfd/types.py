@@ -95,7 +95,8 @@ class Observation:
     def copy(self) -> "Observation":
         """The same with arrays of its own."""
         return Observation(
-            step=self.step, time=self.time, accumulation=self.accumulation.copy(), backlog=self.backlog.copy())
+            step=self.step, time=self.time, accumulation=self.accumulation.copy(), backlog=self.backlog.copy()
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,27 +173,51 @@ class Trajectory:
     backlog: StatesOverTime = quantity("time", "region", "destination", unit="veh", text="vehicles waiting to enter")
     completed: Cumulative = quantity("time", unit="veh", text="trips that reached their end, cumulative")
     observed: StatesOverTime = quantity(
-        "time", "region", "destination", unit="veh",
-        text="vehicles inside as the controller was given them; the last as it would have been")
+        "time",
+        "region",
+        "destination",
+        unit="veh",
+        text="vehicles inside as the controller was given them; the last as it would have been",
+    )
     observed_backlog: StatesOverTime = quantity(
-        "time", "region", "destination", unit="veh", text="vehicles waiting to enter as the controller was given them")
+        "time", "region", "destination", unit="veh", text="vehicles waiting to enter as the controller was given them"
+    )
     perimeter: PairsOverTime = quantity(
-        "interval", "region", "next_region", unit="1",
-        text="share of the desired transfer flow that may pass; 0 between regions that are not adjacent")
+        "interval",
+        "region",
+        "next_region",
+        unit="1",
+        text="share of the desired transfer flow that may pass; 0 between regions that are not adjacent",
+    )
     splits: TurnsOverTime = quantity(
-        "interval", "region", "next_region", "destination", unit="1",
-        text="share of the vehicles that heads for the next region; nominal where there was no route guidance")
+        "interval",
+        "region",
+        "next_region",
+        "destination",
+        unit="1",
+        text="share of the vehicles that heads for the next region; nominal where there was no route guidance",
+    )
     decision_time: Intervals = quantity("interval", unit="s", text="wall time of Controller.act; not in files")
     status: Flags = quantity(
-        "interval", unit="1", text="what was not as it should be with the decision, 0 if nothing (nmfd.types.Status)",
-        attributes={"flag_masks": [kind.value for kind in Status],
-                    "flag_meanings": " ".join(str(kind.name).lower() for kind in Status)})
+        "interval",
+        unit="1",
+        text="what was not as it should be with the decision, 0 if nothing (nmfd.types.Status)",
+        attributes={
+            "flag_masks": [kind.value for kind in Status],
+            "flag_meanings": " ".join(str(kind.name).lower() for kind in Status),
+        },
+    )
     note: tuple[str, ...] = quantity("interval", unit="", text="the status in words", repr=False)
     removed: StatesOverTime = quantity(
-        "time", "region", "destination", unit="veh", text="vehicles taken out on their way, cumulative", default=None)
+        "time", "region", "destination", unit="veh", text="vehicles taken out on their way, cumulative", default=None
+    )
     prices: RegionsOverTime = quantity(
-        "interval", "region", unit="1",
-        text="by how much longer than it is drivers were told that a way through the region takes", default=None)
+        "interval",
+        "region",
+        unit="1",
+        text="by how much longer than it is drivers were told that a way through the region takes",
+        default=None,
+    )
 
     def __post_init__(self) -> None:
         """Nobody is removed, and nothing has a price, where nothing is said of it."""
@@ -208,29 +233,44 @@ class Trajectory:
         return {
             "time": ("time", times, {"long_name": "time since the start", "units": "s"}),
             "interval": ("interval", times[:-1], {"long_name": "beginning of the interval", "units": "s"}),
-            **variables(Trajectory, vars(self))}
+            **variables(Trajectory, vars(self)),
+        }
 
     def _repr_html_(self) -> str:
         """Its regions, for notebooks."""
         present, names = self.accumulation + self.backlog + self.removed, [*range(self.accumulation.shape[1]), "all"]
         inside, waiting, spending = (
-            np.column_stack([x.sum(axis=2), x.sum(axis=(1, 2))]).T for x in (self.accumulation, self.backlog, present))
+            np.column_stack([x.sum(axis=2), x.sum(axis=(1, 2))]).T for x in (self.accumulation, self.backlog, present)
+        )
         lines = [
-            [name, f"{x.mean():,.0f}", f"{x.max():,.0f}", f"{x[-1]:,.0f}", f"{queue.max():,.0f}",
-             f"{self.step * spent[:-1].sum():.3e}"]
-            for name, x, queue, spent in zip(names, inside, waiting, spending, strict=True)]
+            [
+                name,
+                f"{x.mean():,.0f}",
+                f"{x.max():,.0f}",
+                f"{x[-1]:,.0f}",
+                f"{queue.max():,.0f}",
+                f"{self.step * spent[:-1].sum():.3e}",
+            ]
+            for name, x, queue, spent in zip(names, inside, waiting, spending, strict=True)
+        ]
         return html_table(
-            ["region", "mean [veh]", "most [veh]", "end [veh]", "most waiting [veh]", "time spent [veh s]"], lines,
+            ["region", "mean [veh]", "most [veh]", "end [veh]", "most waiting [veh]", "time spent [veh s]"],
+            lines,
             f"{self.controller}, plant {self.plant}, seed {self.seed}: {len(self.status)} control intervals of "
             f"{self.step:g} s, {self.completed[-1]:,.0f} trips completed, {int((self.status != 0).sum())} decisions "
-            "not as they should be")
+            "not as they should be",
+        )
 
     @property
     def labels(self) -> dict[str, str | int | float]:
         """What run this is: controller, plant, seed, step [s] and estimated (0 or 1)."""
         return {
-            "controller": self.controller, "plant": self.plant, "seed": self.seed, "step": self.step,
-            "estimated": int(self.estimated)}
+            "controller": self.controller,
+            "plant": self.plant,
+            "seed": self.seed,
+            "step": self.step,
+            "estimated": int(self.estimated),
+        }
 
     def to_xarray(self) -> "xarray.Dataset":
         """Everything but `wall_time`, with named dimensions, times in seconds, and units as attributes."""

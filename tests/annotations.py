@@ -8,8 +8,13 @@ from beartype import BeartypeConf, FrozenDict, beartype
 from jaxtyping import AbstractArray
 
 # NumPy's numbers may stand for Python's, and whole ones for any.
-check = beartype(conf=BeartypeConf(hint_overrides=FrozenDict({
-    int: int | np.integer, float: float | int | np.floating | np.integer, bool: bool | np.bool_})))
+check = beartype(
+    conf=BeartypeConf(
+        hint_overrides=FrozenDict(
+            {int: int | np.integer, float: float | int | np.floating | np.integer, bool: bool | np.bool_}
+        )
+    )
+)
 
 
 def check_arrays(function: Callable) -> Callable:

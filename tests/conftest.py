@@ -21,13 +21,18 @@ ALLOWED = ("no GPU", "no real city", "--benchmark-skip active")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
-        "--no-skips", action="store_true", help="a skipped test fails, unless a GPU or a real city is missing")
+        "--no-skips", action="store_true", help="a skipped test fails, unless a GPU or a real city is missing"
+    )
     parser.addoption(
-        "--may-skip", action="append", default=[*ALLOWED], metavar="REASON", help="nor does it fail for this reason")
+        "--may-skip", action="append", default=[*ALLOWED], metavar="REASON", help="nor does it fail for this reason"
+    )
     parser.addoption(
-        "--annotations", choices=("on", "off"), default="on",
+        "--annotations",
+        choices=("on", "off"),
+        default="on",
         help="whether types and shapes are checked at every call of nmfd, which costs half as much time again where "
-             "arrays are all there is")
+        "arrays are all there is",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -13,12 +13,31 @@ from markdown_it import MarkdownIt
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("cosim", "networks", "nmfd", "scenarios", "tests")
-FILES = [ROOT / "README.md", *sorted(
-    file for folder in FOLDERS for pattern in ("README.md", "record.md", "*.ipynb")
-    for file in (ROOT / folder).rglob(pattern) if not any(part[0] == "." for part in file.relative_to(ROOT).parts))]
+FILES = [
+    ROOT / "README.md",
+    *sorted(
+        file
+        for folder in FOLDERS
+        for pattern in ("README.md", "record.md", "*.ipynb")
+        for file in (ROOT / folder).rglob(pattern)
+        if not any(part[0] == "." for part in file.relative_to(ROOT).parts)
+    ),
+]
 NOTEBOOKS = [file for file in FILES if file.suffix == ".ipynb"]
-PROGRAMS = ("nmfd", "cosim", "python", "python3", "pip", "pytest", "dask", "pdoc", "jupyter", ".", "netgenerate",
-            "openssl")
+PROGRAMS = (
+    "nmfd",
+    "cosim",
+    "python",
+    "python3",
+    "pip",
+    "pytest",
+    "dask",
+    "pdoc",
+    "jupyter",
+    ".",
+    "netgenerate",
+    "openssl",
+)
 
 
 @dataclass(frozen=True)
@@ -54,8 +73,8 @@ def read(file: Path) -> Document:
                 names.append(part.content)
     lines = [line for block in blocks if kind(block) == "shell" for line in _lines(block)]
     return Document(
-        file, links, names, headings, blocks,
-        [words for line in (*lines, *called) for words in _words(line) if words])
+        file, links, names, headings, blocks, [words for line in (*lines, *called) for words in _words(line) if words]
+    )
 
 
 def kind(block: str) -> str:
@@ -92,11 +111,15 @@ def _called(sources: list[str]) -> Iterator[str]:
     """The first argument of every call of `command` in the cells of a notebook. {NAME} in it is what NAME = QUICK-value
     if QUICK else VALUE gives to whoever runs it whole."""
     nodes = [node for source in sources if not source.startswith("%%") for node in ast.walk(ast.parse(source))]
-    values = {node.targets[0].id: ast.literal_eval(node.value.orelse) for node in nodes if isinstance(
-        node, ast.Assign) and isinstance(node.targets[0], ast.Name) and isinstance(node.value, ast.IfExp)}
+    values = {
+        node.targets[0].id: ast.literal_eval(node.value.orelse)
+        for node in nodes
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and isinstance(node.value, ast.IfExp)
+    }
     for node in nodes:
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "command":
             given = node.args[0]
             parts = given.values if isinstance(given, ast.JoinedStr) else [given]
             yield "".join(
-                str(part.value if isinstance(part, ast.Constant) else values[part.value.id]) for part in parts)
+                str(part.value if isinstance(part, ast.Constant) else values[part.value.id]) for part in parts
+            )

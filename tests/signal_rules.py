@@ -20,8 +20,11 @@ def signal(phases, links=(), name="s"):
 
 def cross(name="s"):
     """Two streets, one lane each."""
-    return signal(CROSS, (Link(index=0, from_edge="a", lane=0, to_edge="b"),
-                          Link(index=1, from_edge="c", lane=0, to_edge="d")), name)
+    return signal(
+        CROSS,
+        (Link(index=0, from_edge="a", lane=0, to_edge="b"), Link(index=1, from_edge="c", lane=0, to_edge="d")),
+        name,
+    )
 
 
 def runs(states, link):
@@ -33,8 +36,8 @@ def runs(states, link):
 def check(states, phases, min_green=MIN_GREEN):
     """What must hold under any command; the first and the last run of every link may be cut off by the simulation."""
     together = {
-        pair for state, _ in phases
-        for pair in itertools.combinations([n for n, c in enumerate(state) if c in "Gg"], 2)}
+        pair for state, _ in phases for pair in itertools.combinations([n for n, c in enumerate(state) if c in "Gg"], 2)
+    }
     for state in set(states):
         for pair in itertools.combinations([n for n, c in enumerate(state) if c in "Gg"], 2):
             assert pair in together, f"{state} shows {pair} green together"

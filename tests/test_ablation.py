@@ -26,7 +26,11 @@ def test_training_compares_both_methods_on_the_plant(training_command, tmp_path)
     assert result.exit_code == 0, result.stderr
     curve = files.read_rows(out / "validation.csv", ablation.VALIDATION_COLUMNS)
     assert [(row["method"], row["adam_step"]) for row in curve] == [
-        ("alternating", 1), ("alternating", 2), ("joint", 1), ("joint", 2)]
+        ("alternating", 1),
+        ("alternating", 2),
+        ("joint", 1),
+        ("joint", 2),
+    ]
     assert curve[1]["total_time_spent_veh_s"] != curve[3]["total_time_spent_veh_s"]
     rows = files.read_rows(out / "training.csv", ablation.TRAINING_COLUMNS)
     assert [(row["method"], row["seed"], row["adam_steps"]) for row in rows] == [("alternating", 0, 2), ("joint", 0, 2)]
@@ -37,7 +41,11 @@ def test_training_compares_both_methods_on_the_plant(training_command, tmp_path)
         assert row["total_time_spent_veh_s"] == pytest.approx(min(points), rel=1e-2)
     assert {path.name for path in out.iterdir()} == {"validation.csv", "training.csv", "training.png", "manifest.json"}
     assert [line.split()[:2] for line in result.stdout.splitlines()[1:5]] == [
-        ["alternating", "0"], ["joint", "0"], ["alternating", "mean"], ["joint", "mean"]]
+        ["alternating", "0"],
+        ["joint", "0"],
+        ["alternating", "mean"],
+        ["joint", "mean"],
+    ]
 
 
 def test_training_is_not_repeated_and_seeds_can_be_added(training_command, tmp_path, monkeypatch):
@@ -88,12 +96,16 @@ def test_horizon_runs_every_length_and_can_be_extended(folder, tmp_path):
     assert (out / "horizon.png").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("arguments, fragment", [
-    (["training", "--controller", "dpc-pc"], "dpc-pc has one decoder only"),
-    (["horizon", "--controllers", "dpc-pc"], "dpc-pc has no horizon"),
-    (["horizon", "--horizons", "1,8"], "'--horizons': expected a list of distinct whole numbers from 2"),
-    (["horizon", "--horizons", "8,8"], "'--horizons': expected a list of distinct"),
-    (["training", "--controller", "mpc-pc"], "'mpc-pc' cannot be trained")])
+@pytest.mark.parametrize(
+    "arguments, fragment",
+    [
+        (["training", "--controller", "dpc-pc"], "dpc-pc has one decoder only"),
+        (["horizon", "--controllers", "dpc-pc"], "dpc-pc has no horizon"),
+        (["horizon", "--horizons", "1,8"], "'--horizons': expected a list of distinct whole numbers from 2"),
+        (["horizon", "--horizons", "8,8"], "'--horizons': expected a list of distinct"),
+        (["training", "--controller", "mpc-pc"], "'mpc-pc' cannot be trained"),
+    ],
+)
 def test_wrong_arguments_are_one_line(folder, tmp_path, arguments, fragment):
     result = nmfd("ablation", arguments[0], folder, *arguments[1:], "--out", tmp_path / "out")
     assert result.exit_code == 2 and result.stderr.count("\n") == 1 and fragment in result.stderr
@@ -103,15 +115,19 @@ def test_wrong_arguments_are_one_line(folder, tmp_path, arguments, fragment):
 def test_curves_show_the_best_so_far_of_every_seed():
     rows = [
         dict(zip(ablation.VALIDATION_COLUMNS, ("joint", seed, step, total), strict=True))
-        for seed, totals in enumerate(([4.0, 5.0, 2.0], [8.0, 1.0, 3.0])) for step, total in enumerate(totals)]
+        for seed, totals in enumerate(([4.0, 5.0, 2.0], [8.0, 1.0, 3.0]))
+        for step, total in enumerate(totals)
+    ]
     ax = plots_studies.training_curves(plots.figure(4, 3).subplots(), rows)
     assert list(ax.lines[0].get_ydata()) == [6.0, 2.5, 1.5] and "2 seeds" in ax.lines[0].get_label()
     assert "veh s" in ax.get_ylabel()
 
 
 def test_every_trained_policy_has_its_point():
-    rows = [{"method": method, "total_time_spent_veh_s": total} for method, total in (
-        ("alternating", 3.0), ("alternating", 5.0), ("joint", 2.0))]
+    rows = [
+        {"method": method, "total_time_spent_veh_s": total}
+        for method, total in (("alternating", 3.0), ("alternating", 5.0), ("joint", 2.0))
+    ]
     ax = plots_studies.trained(plots.figure(4, 3).subplots(), rows)
     assert [list(line.get_ydata()) for line in ax.lines] == [[3.0, 5.0], [2.0]]
     assert [text.get_text() for text in ax.get_xticklabels()] == ["alternating", "joint"]

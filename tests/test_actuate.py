@@ -11,7 +11,8 @@ from cosim.sumo.session import Phase, Programme
 
 def programme(phases, position=0.0):
     return Programme(
-        signal="s", phases=tuple(Phase(duration=d, state=s) for s, d in phases), position=position, static=True)
+        signal="s", phases=tuple(Phase(duration=d, state=s) for s, d in phases), position=position, static=True
+    )
 
 
 def play(phases, movements, mode, commands, *, position=0.0, interval=90):
@@ -45,8 +46,13 @@ def test_random_commands_are_safe(mode, phases):
         movements = {int(link): (0, int(link) + 1) for link in links}
         commands = random.uniform(-0.2, 1.2, (30, 6, 6)).clip(0, 1)
         states = play(
-            phases, movements, mode, list(commands), position=float(random.integers(90)),
-            interval=int(random.choice([30, 45, 90, 170])))
+            phases,
+            movements,
+            mode,
+            list(commands),
+            position=float(random.integers(90)),
+            interval=int(random.choice([30, 45, 90, 170])),
+        )
         check(states, phases)
 
 
@@ -156,17 +162,34 @@ def test_u_max_is_the_original_programme_to_the_fraction_of_a_second():
     assert signal.green_time()[0] == pytest.approx(3 * 42.4)
 
 
-@pytest.mark.parametrize("total, weights, shares", [
-    (10, [1, 1, 1], [4, 3, 3]), (7, [2, 1], [5, 2]), (5, [1, 3], [1, 4]), (0, [1, 2], [0, 0]), (7.5, [1, 1], [4.5, 3]),
-    (11, [5, 3, 3], [5, 3, 3]), (2, [1, 1, 1, 1], [1, 1, 0, 0]), (9, [4], [9])])
+@pytest.mark.parametrize(
+    "total, weights, shares",
+    [
+        (10, [1, 1, 1], [4, 3, 3]),
+        (7, [2, 1], [5, 2]),
+        (5, [1, 3], [1, 4]),
+        (0, [1, 2], [0, 0]),
+        (7.5, [1, 1], [4.5, 3]),
+        (11, [5, 3, 3], [5, 3, 3]),
+        (2, [1, 1, 1, 1], [1, 1, 0, 0]),
+        (9, [4], [9]),
+    ],
+)
 def test_seconds_are_shared_out_whole_and_all(total, weights, shares):
     assert _apportion(total, weights) == shares
 
 
-@pytest.mark.parametrize("states, expected", [
-    ([("G", 30), ("y", 2), ("y", 3), ("r", 55)], 5), ([("G", 30), ("r", 60)], YELLOW), ([("G", 30), ("y", 4)], 4),
-    ([("g", 9), ("y", 3), ("r", 5), ("G", 9), ("y", 4), ("r", 5)], 4), ([("y", 3), ("r", 9)], YELLOW),
-    ([("y", 2), ("r", 9), ("G", 9), ("y", 3)], 5)])
+@pytest.mark.parametrize(
+    "states, expected",
+    [
+        ([("G", 30), ("y", 2), ("y", 3), ("r", 55)], 5),
+        ([("G", 30), ("r", 60)], YELLOW),
+        ([("G", 30), ("y", 4)], 4),
+        ([("g", 9), ("y", 3), ("r", 5), ("G", 9), ("y", 4), ("r", 5)], 4),
+        ([("y", 3), ("r", 9)], YELLOW),
+        ([("y", 2), ("r", 9), ("G", 9), ("y", 3)], 5),
+    ],
+)
 def test_the_longest_yellow_after_a_green(states, expected):
     assert yellow_time(programme(states).phases, 0) == expected
 

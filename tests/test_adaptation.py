@@ -29,8 +29,11 @@ QUICK = {"dpc-pc-online": {"look_ahead": 10, "iterations": 2, "learning_rate": 0
 @pytest.fixture
 def scenario(tmp_path):
     """Three regions in a row, loaded enough that control matters, with an untrained policy."""
-    text = tiny.SCENARIO.replace("to = 1", "to = 2").replace("peak = 2.0", "peak = 3.0").replace(
-        "flat = 120.0", "flat = 400.0")
+    text = (
+        tiny.SCENARIO.replace("to = 1", "to = 2")
+        .replace("peak = 2.0", "peak = 3.0")
+        .replace("flat = 120.0", "flat = 400.0")
+    )
     loaded = load_scenario(tiny.write(tmp_path, scenario=text, network=tiny.row_network(3)))
     torch.manual_seed(0)
     policy = Policy(loaded.network, Architecture(width=8))
@@ -38,8 +41,7 @@ def scenario(tmp_path):
     return replace(loaded, controller_options=QUICK)
 
 
-@pytest.mark.parametrize("case, demand, outflow", [
-    ("nominal", 1.0, 1.0), ("more", 1.2, 1.0), ("rain", 1.0, 0.8)])
+@pytest.mark.parametrize("case, demand, outflow", [("nominal", 1.0, 1.0), ("more", 1.2, 1.0), ("rain", 1.0, 0.8)])
 def test_the_estimate_finds_what_changed(case, demand, outflow):
     """From noisy measurements of the loading phase."""
     actual, random = changed(BENCHMARK, case), np.random.default_rng(0)
@@ -91,7 +93,8 @@ def test_the_command(scenario, tmp_path):
     names = "no-control,dpc-pc,dpc-pc-online"
     command = ["adaptation", str(scenario.folder), "--controllers", names, "--out", str(out)]
     (scenario.folder / "scenario.toml").open("a").write(
-        "\n[controllers.dpc-pc-online]\nlook_ahead = 3\niterations = 1\nrollouts = 1\n")
+        "\n[controllers.dpc-pc-online]\nlook_ahead = 3\niterations = 1\nrollouts = 1\n"
+    )
     done = CliRunner().invoke(main, [*command, "--cases", "rain,later"])
     assert done.exit_code == 0, done.output + str(done.exception)
     assert done.stdout.count("dpc-pc-online") == 2 and all(what in done.stdout for what in CASES.values())

@@ -43,8 +43,10 @@ def test_the_lines_of_the_readme(monkeypatch, capsys):
 
 
 def test_importing_the_packages_imports_nothing_heavy():
-    code = ("import sys, json, nmfd, cosim; nmfd.__all__, cosim.__all__; print(json.dumps([m for m in "
-            "('torch', 'numpy', 'pandas', 'libsumo', 'casadi', 'matplotlib') if m in sys.modules]))")
+    code = (
+        "import sys, json, nmfd, cosim; nmfd.__all__, cosim.__all__; print(json.dumps([m for m in "
+        "('torch', 'numpy', 'pandas', 'libsumo', 'casadi', 'matplotlib') if m in sys.modules]))"
+    )
     assert json.loads(subprocess.check_output([sys.executable, "-c", code], text=True)) == []
 
 
@@ -68,8 +70,9 @@ def test_the_wheel_takes_py_typed_along():
 
 def test_run_and_benchmark_agree_with_the_command_line(tmp_path):
     folder, out = tiny.write(tmp_path), tmp_path / "out"
-    done = CliRunner().invoke(main, [
-        "benchmark", str(folder), "--controllers", "pi-gating", "--seeds", "2", "--out", str(out)])
+    done = CliRunner().invoke(
+        main, ["benchmark", str(folder), "--controllers", "pi-gating", "--seeds", "2", "--out", str(out)]
+    )
     assert done.exit_code == 0, done.output
     trajectory = nmfd.run(folder, "pi-gating", seed=1)
     nmfd.write_trajectory(tmp_path / "same.nc", trajectory)
@@ -95,13 +98,16 @@ def test_a_controller_and_a_plant_as_objects(tmp_path):
     assert trajectory.perimeter.shape == (5, 2, 2) and (trajectory.perimeter == 0.5).all()
 
 
-@pytest.mark.parametrize("arguments, options, expected", [
-    (("nobody",), {}, "controller 'nobody' is unknown"),
-    (("pi-gating",), {"plant": "sumo"}, "plant 'sumo' is unknown; choose from nmfd, acyclic"),
-    (("pi-gating",), {"steps": 0}, "steps: expected 1 or more"),
-    ((Half(),), {"policy": "x.pt"}, "policy: x.pt: is for a controller by name"),
-    ((3,), {}, "got 3 without reset"),
-])
+@pytest.mark.parametrize(
+    "arguments, options, expected",
+    [
+        (("nobody",), {}, "controller 'nobody' is unknown"),
+        (("pi-gating",), {"plant": "sumo"}, "plant 'sumo' is unknown; choose from nmfd, acyclic"),
+        (("pi-gating",), {"steps": 0}, "steps: expected 1 or more"),
+        ((Half(),), {"policy": "x.pt"}, "policy: x.pt: is for a controller by name"),
+        ((3,), {}, "got 3 without reset"),
+    ],
+)
 @pytest.mark.usefixtures("unchecked")
 def test_mistakes_are_input_errors(tmp_path, arguments, options, expected):
     with pytest.raises(nmfd.InputError, match=re.escape(expected)):

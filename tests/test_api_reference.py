@@ -14,9 +14,17 @@ import nmfd
 
 ROOT = Path(__file__).parents[1]
 MODULES = (  # in which public names are defined
-    "nmfd.api", "nmfd.metrics", "nmfd.types", "nmfd.model.mfd", "nmfd.model.plant", "nmfd.model.regional_model",
-    "nmfd.runs.run_folder", "cosim.plant.settings", "cosim.plant.strategy",
-    pytest.param("cosim.api", marks=pytest.mark.slow))  # starts SUMO
+    "nmfd.api",
+    "nmfd.metrics",
+    "nmfd.types",
+    "nmfd.model.mfd",
+    "nmfd.model.plant",
+    "nmfd.model.regional_model",
+    "nmfd.runs.run_folder",
+    "cosim.plant.settings",
+    "cosim.plant.strategy",
+    pytest.param("cosim.api", marks=pytest.mark.slow),
+)  # starts SUMO
 
 
 @pytest.mark.slow
@@ -24,7 +32,8 @@ def test_the_reference_is_built_without_warnings(tmp_path):
     pytest.importorskip("pdoc")
     pytest.importorskip("gymnasium", reason="no extra rl")
     done = subprocess.run(
-        [sys.executable, str(ROOT / ".ci" / "reference.py"), str(tmp_path)], capture_output=True, text=True)
+        [sys.executable, str(ROOT / ".ci" / "reference.py"), str(tmp_path)], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     for package in (nmfd, cosim):
         page = (tmp_path / f"{package.__name__}.html").read_text(encoding="utf-8")
@@ -37,7 +46,9 @@ def test_the_reference_is_built_without_warnings(tmp_path):
 def test_examples_in_docstrings(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = doctest.testmod(
-        importlib.import_module(name), extraglobs={"nmfd": nmfd, "cosim": cosim},
-        optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+        importlib.import_module(name),
+        extraglobs={"nmfd": nmfd, "cosim": cosim},
+        optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE,
+    )
     assert found.attempted and not found.failed, "see the output above"
     assert os.listdir(tmp_path) == []  # an example that writes cleans up

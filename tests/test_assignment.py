@@ -20,12 +20,15 @@ from cosim.sumo.recorded_trips import read_recorded_trips
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 
-NODES = "".join(f'<node id="{name}" x="{x}" y="{y}"/>' for name, x, y in (
-    ("a", 0, 0), ("b", 200, 0), ("c", 700, 200), ("m", 700, 0), ("d", 1200, 0), ("e", 1400, 0)))
+NODES = "".join(
+    f'<node id="{name}" x="{x}" y="{y}"/>'
+    for name, x, y in (("a", 0, 0), ("b", 200, 0), ("c", 700, 200), ("m", 700, 0), ("d", 1200, 0), ("e", 1400, 0))
+)
 # From b to d: straight on, where two lanes become one at m, or 1.08 times as long over c.
-EDGES = "".join(f'<edge id="{name}" from="{name[0]}" to="{name[1]}" numLanes="{lanes}" speed="{speed}"/>' for
-                name, lanes, speed in (("ab", 3, 20), ("bm", 2, 13), ("md", 1, 13), ("bc", 2, 13), ("cd", 2, 13),
-                                       ("de", 3, 20)))
+EDGES = "".join(
+    f'<edge id="{name}" from="{name[0]}" to="{name[1]}" numLanes="{lanes}" speed="{speed}"/>'
+    for name, lanes, speed in (("ab", 3, 20), ("bm", 2, 13), ("md", 1, 13), ("bc", 2, 13), ("cd", 2, 13), ("de", 3, 20))
+)
 
 
 @pytest.fixture(scope="module")
@@ -35,10 +38,26 @@ def fork(tmp_path_factory):
     (folder / "n.nod.xml").write_text(f"<nodes>{NODES}</nodes>")
     (folder / "e.edg.xml").write_text(f"<edges>{EDGES}</edges>")
     net = folder / "fork.net.xml"
-    subprocess.run([Path(sumo.SUMO_HOME) / "bin" / "netconvert", "-n", folder / "n.nod.xml", "-e", folder / "e.edg.xml",
-                    "-o", net, "--no-turnarounds"], check=True, capture_output=True)
-    vehicles = [fromstring(f'<vehicle id="v{n}" type="car" depart="{n}.00" departLane="best">'
-                           '<route edges="ab bm md de"/></vehicle>') for n in range(600)]
+    subprocess.run(
+        [
+            Path(sumo.SUMO_HOME) / "bin" / "netconvert",
+            "-n",
+            folder / "n.nod.xml",
+            "-e",
+            folder / "e.edg.xml",
+            "-o",
+            net,
+            "--no-turnarounds",
+        ],
+        check=True,
+        capture_output=True,
+    )
+    vehicles = [
+        fromstring(
+            f'<vehicle id="v{n}" type="car" depart="{n}.00" departLane="best"><route edges="ab bm md de"/></vehicle>'
+        )
+        for n in range(600)
+    ]
     return net, [fromstring('<vType id="car"/>'), *vehicles]
 
 
@@ -47,8 +66,16 @@ def test_routes_spread_until_nobody_gains(fork):
     net, vehicles = fork
     told = []
     effort = Effort(iterations=2, gap=0.05)
-    found = assign(net, vehicles, begin=0.0, end=1800.0, seed=3, effort=effort, mesoscopic=False, 
-                   tell=lambda stage, share=0.0: told.append(stage))
+    found = assign(
+        net,
+        vehicles,
+        begin=0.0,
+        end=1800.0,
+        seed=3,
+        effort=effort,
+        mesoscopic=False,
+        tell=lambda stage, share=0.0: told.append(stage),
+    )
     ways = {tuple(route) for route in found.routes.values()}
     assert ways == {("ab", "bm", "md", "de"), ("ab", "bc", "cd", "de")} and len(found.routes) == 600
     queue, followed = ([one.gap for one in found.iterations if one.mesoscopic == kind] for kind in (True, False))
@@ -57,7 +84,7 @@ def test_routes_spread_until_nobody_gains(fork):
     assert len(told) == len(found.iterations) and told[0] == "assignment, at most 2 iterations"
     assert "car-following" in told[-1]
     again = assign(net, vehicles, begin=0.0, end=1800.0, seed=3, effort=effort)
-    assert again.iterations == found.iterations[:len(queue)]
+    assert again.iterations == found.iterations[: len(queue)]
 
 
 def test_an_assignment_that_sumo_refuses(fork):
@@ -92,8 +119,27 @@ def test_an_interrupted_assignment_leaves_nothing(fork, monkeypatch, tmp_path):
 def test_an_import_assigns_its_peak(tmp_path):
     """The gap is in the report and a table, the routes in the scenario; a gap that is not reached is a warning."""
     net = tiny_city.network(tmp_path, "--tls.set", "B1,C2", name="tiny.net.xml")
-    text = good(cosim("import", net, "--regions", 2, "--demand", "peak", "--mesoscopic", "--method", "geometric",
-                      "--iterations", 1, "--gap", 0, "--seeds", 2, "--out", tmp_path / "networks" / "tiny"))
+    text = good(
+        cosim(
+            "import",
+            net,
+            "--regions",
+            2,
+            "--demand",
+            "peak",
+            "--mesoscopic",
+            "--method",
+            "geometric",
+            "--iterations",
+            1,
+            "--gap",
+            0,
+            "--seeds",
+            2,
+            "--out",
+            tmp_path / "networks" / "tiny",
+        )
+    )
     scenario = load_scenario(tmp_path / "scenarios" / "tiny")
     table = pd.read_csv(scenario.folder / "assignment.csv")
     assert len(table) == 1 and table.chosen.sum() == 1
@@ -117,8 +163,23 @@ def test_an_import_assigns_its_peak(tmp_path):
 
 def test_without_a_run_the_report_says_that_nobody_avoids_queues(tmp_path):
     net = tiny_city.network(tmp_path, name="tiny.net.xml")
-    text = good(cosim("import", net, "--regions", 2, "--demand", "peak", "--level", 0.5, "--method", "geometric",
-                      "--no-run", "--out", tmp_path / "networks" / "tiny"))
+    text = good(
+        cosim(
+            "import",
+            net,
+            "--regions",
+            2,
+            "--demand",
+            "peak",
+            "--level",
+            0.5,
+            "--method",
+            "geometric",
+            "--no-run",
+            "--out",
+            tmp_path / "networks" / "tiny",
+        )
+    )
     assert "WARNING: everybody takes a way that is fastest at free flow" in text
     assert not (tmp_path / "scenarios" / "tiny" / "assignment.csv").exists()
 
@@ -128,7 +189,9 @@ def made(production, *, times, spread=0.4):
     held = 1000.0 * times * np.minimum(np.arange(1, 17), np.arange(16, 0, -1)) / 8
     return level.Loaded(
         accumulation=np.stack([held, 0.1 * held], axis=1),
-        production=np.stack([production(held), 0.5 * held], axis=1), spread=np.array([spread, spread]))
+        production=np.stack([production(held), 0.5 * held], axis=1),
+        spread=np.array([spread, spread]),
+    )
 
 
 def parabola(held):
@@ -146,14 +209,20 @@ def test_the_level_is_one_at_which_a_region_comes_to_its_critical_accumulation(m
 
     found, congests = level.congesting(probe, mesoscopic=mesoscopic, tell=lambda line: None)
     assert congests and found == 1.2  # three intervals beyond 0.9 times it: from 1.03 on, or from 1.14 on
-    assert level.critical(*(getattr(probe(2.0, True), name)[:, 0] for name in ("accumulation", "production"))) \
-        == pytest.approx(1000.0, rel=0.15)
+    assert level.critical(
+        *(getattr(probe(2.0, True), name)[:, 0] for name in ("accumulation", "production"))
+    ) == pytest.approx(1000.0, rel=0.15)
 
 
-@pytest.mark.parametrize("probe", [
-    lambda times, meso: made(bottleneck, times=times), lambda times, meso: made(parabola, times=times, spread=0.01),
-    lambda times, meso: made(lambda held: 8.0 * held, times=times)],
-    ids=["a bottleneck", "a few streets", "free flow"])
+@pytest.mark.parametrize(
+    "probe",
+    [
+        lambda times, meso: made(bottleneck, times=times),
+        lambda times, meso: made(parabola, times=times, spread=0.01),
+        lambda times, meso: made(lambda held: 8.0 * held, times=times),
+    ],
+    ids=["a bottleneck", "a few streets", "free flow"],
+)
 def test_what_is_no_congested_network(probe):
     assert level.congesting(probe, mesoscopic=True, tell=lambda line: None) == (level.level(level.MOST), False)
 
@@ -175,8 +244,9 @@ def test_whether_crowded_streets_stand(tmp_path):
     presence = np.full((6, len(streets.edges)), 10.0)
     presence[2:5, 7] = 1e4
     for slower in (1.0, 5.0):
-        baseline = Baseline(presence=presence, production=presence * streets.speed / slower, ways={}, teleports=0,
-                            waiting=0, running=0)
+        baseline = Baseline(
+            presence=presence, production=presence * streets.speed / slower, ways={}, teleports=0, waiting=0, running=0
+        )
         assert baseline.concentration(streets.drivable)[0] == 1
         assert baseline.pace_of_crowded(streets, streets.drivable) == pytest.approx(slower)
 
@@ -185,12 +255,44 @@ def test_whether_crowded_streets_stand(tmp_path):
 def test_a_peak_at_the_level_at_which_a_region_congests(tmp_path):
     """--level auto with --demand peak: every level tried is assigned, and the one found is driven as it was."""
     net = tiny_city.network(tmp_path, "--tls.set", "B1,C2", name="tiny.net.xml")
-    text = good(cosim("import", net, "--regions", 2, "--demand", "peak", "--mesoscopic", "--method", "geometric",
-                      "--iterations", 1, "--level", "auto", "--seeds", 1, "--out", tmp_path / "networks" / "tiny"))
+    text = good(
+        cosim(
+            "import",
+            net,
+            "--regions",
+            2,
+            "--demand",
+            "peak",
+            "--mesoscopic",
+            "--method",
+            "geometric",
+            "--iterations",
+            1,
+            "--level",
+            "auto",
+            "--seeds",
+            1,
+            "--out",
+            tmp_path / "networks" / "tiny",
+        )
+    )
     scenario = load_scenario(tmp_path / "scenarios" / "tiny")
     times = float(re.search(r"demand times ([\d.]+) ", text)[1])
     trips = len(read_recorded_trips([scenario.folder / "vehicles.rou.xml.gz"]).depart)
-    usual = good(cosim("import", net, "--regions", 2, "--demand", "peak", "--method", "geometric", "--no-run", "--out",
-                       tmp_path / "networks" / "usual"))
+    usual = good(
+        cosim(
+            "import",
+            net,
+            "--regions",
+            2,
+            "--demand",
+            "peak",
+            "--method",
+            "geometric",
+            "--no-run",
+            "--out",
+            tmp_path / "networks" / "usual",
+        )
+    )
     assert scenario.demand_factor == 1.0
     assert trips == pytest.approx(times * int(re.search(r"peak: ([\d,]+)", usual)[1].replace(",", "")), rel=0.02)

@@ -41,6 +41,7 @@ class Accepted(BaseException):
 @pytest.fixture(autouse=True)
 def nothing_runs(monkeypatch):
     """What is accepted would run for long: here it says so instead."""
+
     def accepted(*_, **__):
         raise Accepted
 
@@ -78,18 +79,27 @@ def toml_cases(text: str, seed: int, required=()):
 
 SCENARIO_TEXT = (ECONOMIC / "scenario.toml").read_text().replace("../../networks", str(ROOT / "networks"))
 SCENARIO_KEYS = [("", key) for key in ("name", "network", "step", "steps")] + [
-    ("demand", key) for key in ("from", "to", "start", "peak", "ramp_up", "flat", "ramp_down")]
+    ("demand", key) for key in ("from", "to", "start", "peak", "ramp_up", "flat", "ramp_down")
+]
 NETWORKS = {
     source.name: (source / "network.toml").read_text().replace("../grid7", str(GRID))
-    for source in (HEXAGON, GRID.with_name("grid7_guided"))}
+    for source in (HEXAGON, GRID.with_name("grid7_guided"))
+}
 NETWORK_KEYS = [("", "name"), ("perimeter", "min"), ("mfd", "a"), ("regions", "adjacent"), ("regions.mfd", "jam")]
 CITY_TEXT = (PEAK / "scenario.toml").read_text().replace("../../networks", str(ROOT / "networks"))
 RECIPE = (GRID / "city.toml").read_text()
 RECIPE_CASES = [
     *toml_cases(RECIPE, 4, [("centre", "x"), ("signals", "cycle")]),
-    *((f"regions {old!r} to {new!r}", RECIPE.replace(old, new, 1).encode()) for old, new in (
-        ("0 0 0 0 0 1", "0 0 0 0 9 1"), ("2 2 2 . . .", "2 2 2 . ."), ("2 2 2 . . .", "2 2 2 3 . ."),
-        ("0 0 0", "0 . 0")))]
+    *(
+        (f"regions {old!r} to {new!r}", RECIPE.replace(old, new, 1).encode())
+        for old, new in (
+            ("0 0 0 0 0 1", "0 0 0 0 9 1"),
+            ("2 2 2 . . .", "2 2 2 . ."),
+            ("2 2 2 . . .", "2 2 2 3 . ."),
+            ("0 0 0", "0 . 0"),
+        )
+    ),
+]
 
 
 @pytest.mark.parametrize("content", params(toml_cases(SCENARIO_TEXT, 1, SCENARIO_KEYS)))
@@ -100,9 +110,14 @@ def test_every_key_of_a_scenario(tmp_path, content):
     check("nmfd", "benchmark", tmp_path, "--controllers", "no-control", "--out", out, names=names, out=out)
 
 
-@pytest.mark.parametrize("case", params(
-    (f"{name} {what}", (what, content)) for name, text in NETWORKS.items()
-    for what, content in toml_cases(text, 2, NETWORK_KEYS)))
+@pytest.mark.parametrize(
+    "case",
+    params(
+        (f"{name} {what}", (what, content))
+        for name, text in NETWORKS.items()
+        for what, content in toml_cases(text, 2, NETWORK_KEYS)
+    ),
+)
 def test_every_key_of_a_network(tmp_path, case):
     what, content = case
     scenario, out = tmp_path / "scenario", tmp_path / "out"
@@ -110,8 +125,9 @@ def test_every_key_of_a_network(tmp_path, case):
     toml = scenario / "scenario.toml"
     toml.write_text(toml.read_text().replace("../../networks/hexagon7", str(tmp_path)))
     (tmp_path / "network.toml").write_bytes(content)
-    program, *command = ["cosim", "run", "--controller"] if what.startswith("sumo.") else [
-        "nmfd", "benchmark", "--controllers"]
+    program, *command = (
+        ["cosim", "run", "--controller"] if what.startswith("sumo.") else ["nmfd", "benchmark", "--controllers"]
+    )
     names = "" if "xxx" in what else "network.toml"  # the recipe that it names is missing
     check(program, *command, "no-control", scenario, "--out", out, names=names, out=out)
 
@@ -166,8 +182,12 @@ def policy(tmp_path_factory):
     """The content of a policy for tiny's network, and its bytes."""
     network = load_network(tiny.write(tmp_path_factory.mktemp("policy")).parent / "network")
     torch.manual_seed(0)
-    content = checkpoint(Policy(network, Architecture(width=4)), network, {}, states={
-        "mean": torch.zeros(4), "precision": torch.eye(4), "limit": torch.tensor(1.0)})
+    content = checkpoint(
+        Policy(network, Architecture(width=4)),
+        network,
+        {},
+        states={"mean": torch.zeros(4), "precision": torch.eye(4), "limit": torch.tensor(1.0)},
+    )
     return content, saved(content)
 
 
@@ -178,8 +198,15 @@ def saved(content) -> bytes:
 
 
 # What a policy file holds besides: name -> the file, from its content and its bytes. None of it may be executed.
-WEIGHTS = ("scale", "backbone.0.weight", "backbone.0.bias", "backbone.2.weight", "backbone.2.bias",
-           "perimeter_decoder.weight", "perimeter_decoder.bias")
+WEIGHTS = (
+    "scale",
+    "backbone.0.weight",
+    "backbone.0.bias",
+    "backbone.2.weight",
+    "backbone.2.bias",
+    "perimeter_decoder.weight",
+    "perimeter_decoder.bias",
+)
 POLICIES = {
     "empty": lambda content, whole: b"",
     "text": lambda content, whole: b"no policy",
@@ -187,23 +214,51 @@ POLICIES = {
     "pickled code in torch's format": lambda content, whole: saved(Evil()),
     "pickled code among the weights": lambda content, whole: saved({**content, "weights": {"scale": Evil()}}),
     "a plan": lambda content, whole: npz(perimeter=np.zeros(3)),
-    **{f"cut at {share}": lambda content, whole, share=share: whole[: int(share * len(whole))]
-       for share in (0.1, 0.5, 0.9, 0.99)},
+    **{
+        f"cut at {share}": lambda content, whole, share=share: whole[: int(share * len(whole))]
+        for share in (0.1, 0.5, 0.9, 0.99)
+    },
     **{f"noise {seed}": lambda content, whole, seed=seed: noisy(whole, random.Random(seed)) for seed in range(10)},
-    **{f"{key} missing": lambda content, whole, key=key: saved(without(content, key))
-       for key in ("format", "network_hash", "architecture", "weights")},
-    **{f"{key} = {value}": lambda content, whole, key=key, value=value: saved({**content, key: value})
-       for key in ("format", "network_hash", "architecture", "weights") for value in (None, 17, "x", [1], {})},
-    **{f"architecture {key} = {value}": lambda content, whole, key=key, value=value: saved(
-        {**content, "architecture": {**content["architecture"], key: value}})
-       for key, value in (("width", 10**9), ("width", -1), ("width", "4"), ("layers", 10**9), ("layers", 0),
-                          ("activation", "sine"), ("guidance", True), ("depth", 3), ("sparse", []))},
-    **{f"weight {key} missing": lambda content, whole, key=key: saved(
-        {**content, "weights": without(content["weights"], key)}) for key in WEIGHTS},
-    **{f"weight {key} of another shape": lambda content, whole, key=key: saved(
-        {**content, "weights": {**content["weights"], key: torch.zeros(3, 3, 3)}}) for key in WEIGHTS},
+    **{
+        f"{key} missing": lambda content, whole, key=key: saved(without(content, key))
+        for key in ("format", "network_hash", "architecture", "weights")
+    },
+    **{
+        f"{key} = {value}": lambda content, whole, key=key, value=value: saved({**content, key: value})
+        for key in ("format", "network_hash", "architecture", "weights")
+        for value in (None, 17, "x", [1], {})
+    },
+    **{
+        f"architecture {key} = {value}": lambda content, whole, key=key, value=value: saved(
+            {**content, "architecture": {**content["architecture"], key: value}}
+        )
+        for key, value in (
+            ("width", 10**9),
+            ("width", -1),
+            ("width", "4"),
+            ("layers", 10**9),
+            ("layers", 0),
+            ("activation", "sine"),
+            ("guidance", True),
+            ("depth", 3),
+            ("sparse", []),
+        )
+    },
+    **{
+        f"weight {key} missing": lambda content, whole, key=key: saved(
+            {**content, "weights": without(content["weights"], key)}
+        )
+        for key in WEIGHTS
+    },
+    **{
+        f"weight {key} of another shape": lambda content, whole, key=key: saved(
+            {**content, "weights": {**content["weights"], key: torch.zeros(3, 3, 3)}}
+        )
+        for key in WEIGHTS
+    },
     **{f"only {value}": lambda content, whole, value=value: saved(value) for value in ([1, 2], "x", 5.0)},
-    "only a tensor": lambda content, whole: saved(torch.zeros(3))}
+    "only a tensor": lambda content, whole: saved(torch.zeros(3)),
+}
 
 
 def without(table: dict, key: str) -> dict:
@@ -225,8 +280,19 @@ def test_policies(tmp_path, policy, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     scenario, file, out = tiny.write(tmp_path), tmp_path / "p.pt", tmp_path / "out"
     file.write_bytes(POLICIES[name](*policy))
-    check("nmfd", "benchmark", scenario, "--controllers", "dpc-pc", "--policy", f"dpc-pc={file}", "--out", out,
-          names=file.name, out=out)
+    check(
+        "nmfd",
+        "benchmark",
+        scenario,
+        "--controllers",
+        "dpc-pc",
+        "--policy",
+        f"dpc-pc={file}",
+        "--out",
+        out,
+        names=file.name,
+        out=out,
+    )
     assert not Path("executed").exists()
 
 
@@ -234,16 +300,34 @@ def test_policies(tmp_path, policy, monkeypatch, name):
 def test_policies_for_the_guard(tmp_path, policy, states):
     scenario, file, out = tiny.write(tmp_path), tmp_path / "p.pt", tmp_path / "out"
     content, _ = policy
-    file.write_bytes(saved(
-        {**content, "states": {**content["states"], "limit": None} if states == "no limit" else states}))
-    check("nmfd", "benchmark", scenario, "--controllers", "dpc-pc-guarded", "--policy", f"dpc-pc-guarded={file}",
-          "--out", out, names=file.name, out=out)
+    file.write_bytes(
+        saved({**content, "states": {**content["states"], "limit": None} if states == "no limit" else states})
+    )
+    check(
+        "nmfd",
+        "benchmark",
+        scenario,
+        "--controllers",
+        "dpc-pc-guarded",
+        "--policy",
+        f"dpc-pc-guarded={file}",
+        "--out",
+        out,
+        names=file.name,
+        out=out,
+    )
 
 
 PLANS = {
-    "empty": lambda: b"", "text": lambda: b"x", "other arrays": lambda: npz(a=np.zeros(3)),
-    "pickle": lambda: pickle.dumps(Evil()), "objects": lambda: npz(perimeter=np.array([{}], dtype=object)),
-    "a zip": lambda: zipped(), "torch": lambda: saved({"configuration": {}}), "torch list": lambda: saved([1])}
+    "empty": lambda: b"",
+    "text": lambda: b"x",
+    "other arrays": lambda: npz(a=np.zeros(3)),
+    "pickle": lambda: pickle.dumps(Evil()),
+    "objects": lambda: npz(perimeter=np.array([{}], dtype=object)),
+    "a zip": lambda: zipped(),
+    "torch": lambda: saved({"configuration": {}}),
+    "torch list": lambda: saved([1]),
+}
 
 
 @pytest.mark.parametrize("name", PLANS)
@@ -262,14 +346,24 @@ def zipped() -> bytes:
 
 
 DEMANDS = {
-    "no header": "0,0,1,2.0\n", "another header": "k,i,j,q\n0,0,1,1\n", "empty": "",
+    "no header": "0,0,1,2.0\n",
+    "another header": "k,i,j,q\n0,0,1,1\n",
+    "empty": "",
     "text": "interval,from,to,veh_s\na,b,c,d\n",
-    "three columns": "interval,from,to,veh_s\n0,0,1\n", "five columns": "interval,from,to,veh_s\n0,0,1,1,1\n",
-    "negative": "interval,from,to,veh_s\n0,0,1,-1\n", "nan": "interval,from,to,veh_s\n0,0,1,nan\n",
-    "inf": "interval,from,to,veh_s\n0,0,1,inf\n", "huge": "interval,from,to,veh_s\n0,0,1,1e300\n",
-    "region": "interval,from,to,veh_s\n0,0,9,1\n", "negative region": "interval,from,to,veh_s\n0,-1,1,1\n",
-    "interval": "interval,from,to,veh_s\n-1,0,1,1\n", "digits": f"interval,from,to,veh_s\n{'9' * 5000},0,1,1\n",
-    "fraction": "interval,from,to,veh_s\n0.5,0,1,1\n", "zeros": "\0\0\0", "quote": 'interval,from,to,veh_s\n"0,0,1,1\n'}
+    "three columns": "interval,from,to,veh_s\n0,0,1\n",
+    "five columns": "interval,from,to,veh_s\n0,0,1,1,1\n",
+    "negative": "interval,from,to,veh_s\n0,0,1,-1\n",
+    "nan": "interval,from,to,veh_s\n0,0,1,nan\n",
+    "inf": "interval,from,to,veh_s\n0,0,1,inf\n",
+    "huge": "interval,from,to,veh_s\n0,0,1,1e300\n",
+    "region": "interval,from,to,veh_s\n0,0,9,1\n",
+    "negative region": "interval,from,to,veh_s\n0,-1,1,1\n",
+    "interval": "interval,from,to,veh_s\n-1,0,1,1\n",
+    "digits": f"interval,from,to,veh_s\n{'9' * 5000},0,1,1\n",
+    "fraction": "interval,from,to,veh_s\n0.5,0,1,1\n",
+    "zeros": "\0\0\0",
+    "quote": 'interval,from,to,veh_s\n"0,0,1,1\n',
+}
 
 
 @pytest.mark.parametrize("content", params(DEMANDS.items()))
@@ -282,10 +376,16 @@ def test_demand_files(tmp_path, content):
 
 
 MANIFESTS = {
-    "empty": "", "cut": "{", "a list": "[]", "null": "null", "a number": "5", "nested": "[" * 5000,
+    "empty": "",
+    "cut": "{",
+    "a list": "[]",
+    "null": "null",
+    "a number": "5",
+    "nested": "[" * 5000,
     "no table": '{"configuration": 1, "controllers": {}, "sessions": []}',
     "no list": '{"configuration": {}, "controllers": {}, "sessions": 1}',
-    "no controllers": '{"configuration": {}, "sessions": []}'}
+    "no controllers": '{"configuration": {}, "sessions": []}',
+}
 
 
 @pytest.mark.parametrize("program", ["nmfd", "cosim"])
@@ -295,8 +395,11 @@ def test_results_of_another_program(tmp_path, text, program):
     out = tmp_path / "out"
     out.mkdir()
     (out / "manifest.json").write_text(text)
-    command = ["compare", out] if program == "cosim" else [
-        "benchmark", tiny.write(tmp_path), "--controllers", "no-control", "--out", out]
+    command = (
+        ["compare", out]
+        if program == "cosim"
+        else ["benchmark", tiny.write(tmp_path), "--controllers", "no-control", "--out", out]
+    )
     check(program, *command, names="manifest.json", out=out)
     assert [path.name for path in out.iterdir()] == ["manifest.json"]
 
@@ -319,15 +422,35 @@ def copied(city, tmp_path):
 
 def run_city(copied, *arguments, names):
     out = copied / "out"
-    return check("cosim", "run", copied / "scenarios" / "tiny", "--controller", "no-control", "--steps", "1", "--out",
-                 out, *arguments, names=names, out=out)
+    return check(
+        "cosim",
+        "run",
+        copied / "scenarios" / "tiny",
+        "--controller",
+        "no-control",
+        "--steps",
+        "1",
+        "--out",
+        out,
+        *arguments,
+        names=names,
+        out=out,
+    )
 
 
 REGIONS = {
-    "empty": "", "header": "a,b\n", "no regions": "edge,region\n", "unknown edge": "edge,region\nnowhere,0\n",
-    "twice": None, "text": "edge,region\nA0A1,x\n", "negative": "edge,region\nA0A1,-1\n",
+    "empty": "",
+    "header": "a,b\n",
+    "no regions": "edge,region\n",
+    "unknown edge": "edge,region\nnowhere,0\n",
+    "twice": None,
+    "text": "edge,region\nA0A1,x\n",
+    "negative": "edge,region\nA0A1,-1\n",
     "gap": "edge,region\nA0A1,7\n",
-    "columns": "edge,region\nA0A1\n", "digits": f"edge,region\nA0A1,{'1' * 5000}\n", "zeros": "\0" * 10}
+    "columns": "edge,region\nA0A1\n",
+    "digits": f"edge,region\nA0A1,{'1' * 5000}\n",
+    "zeros": "\0" * 10,
+}
 
 
 @pytest.mark.parametrize("content", params(REGIONS.items()))
@@ -346,22 +469,34 @@ def test_an_edge_without_a_region(copied):
 
 # What is wrong -> the file from the whole one: what to replace by what once, or another text altogether.
 NETS = {
-    "empty": "", "no XML": "city", "another root": "<routes/>", "no edges": "<net></net>",
+    "empty": "",
+    "no XML": "city",
+    "another root": "<routes/>",
+    "no edges": "<net></net>",
     "encoding": "<?xml version='1.0' encoding='utf-77'?><net/>",
-    **{f"{attribute} = {value}": (rf'( {attribute})="[^"]+"', rf'\1="{value}"')
-       for attribute in ("length", "speed") for value in ("0", "-5", "nan", "inf", "fast", "")},
+    **{
+        f"{attribute} = {value}": (rf'( {attribute})="[^"]+"', rf'\1="{value}"')
+        for attribute in ("length", "speed")
+        for value in ("0", "-5", "nan", "inf", "fast", "")
+    },
     **{f"{attribute} missing": (rf' {attribute}="[^"]+"', "") for attribute in ("length", "speed")},
-    **{f"connection {attribute} missing": (rf'(<connection[^>]*?) {attribute}="[^"]+"', r"\1")
-       for attribute in ("from", "to", "fromLane", "toLane")},
-    "via": (r' via="[^"]+"', ' via=":nowhere_0_0"'), "link index": (r' linkIndex="[^"]+"', ' linkIndex="x"'),
+    **{
+        f"connection {attribute} missing": (rf'(<connection[^>]*?) {attribute}="[^"]+"', r"\1")
+        for attribute in ("from", "to", "fromLane", "toLane")
+    },
+    "via": (r' via="[^"]+"', ' via=":nowhere_0_0"'),
+    "link index": (r' linkIndex="[^"]+"', ' linkIndex="x"'),
     "phase": (r'<phase duration="[^"]+"', '<phase duration="long"'),
     "state": (r'(<phase [^>]*) state="[^"]+"', r"\1"),
     "offset": (r'(<tlLogic [^>]*) offset="[^"]+"', r'\1 offset="late"'),
     "edge id": (r'<edge id="A0A1"', "<edge"),
-    **{f"cut at {share}": share for share in (0.01, 0.3, 0.5, 0.8, 0.99)}}
+    **{f"cut at {share}": share for share in (0.01, 0.3, 0.5, 0.8, 0.99)},
+}
 DAMAGES = {
-    "cut gzip": lambda whole, packed: packed[: len(packed) // 2], "no gzip": lambda whole, packed: whole,
-    "noise": lambda whole, packed: packed[:20] + bytes(99)}
+    "cut gzip": lambda whole, packed: packed[: len(packed) // 2],
+    "no gzip": lambda whole, packed: whole,
+    "noise": lambda whole, packed: packed[:20] + bytes(99),
+}
 
 
 def changed(whole: str, change) -> str:
@@ -389,16 +524,22 @@ def test_a_damaged_network_of_sumo(copied, damage):
 
 
 ROUTES = {
-    "empty": "", "no XML": "routes", "another root": "<net/>", "cut": 0.5,
+    "empty": "",
+    "no XML": "routes",
+    "another root": "<net/>",
+    "cut": 0.5,
     "a flow": "<routes><flow id='f' begin='0' end='9' number='3' from='A0A1' to='A1A2'/></routes>",
-    **{f"depart = {value}": (r'depart="[^"]+"', f'depart="{value}"')
-       for value in ("-5", "nan", "inf", "triggered", "soon", "")},
+    **{
+        f"depart = {value}": (r'depart="[^"]+"', f'depart="{value}"')
+        for value in ("-5", "nan", "inf", "triggered", "soon", "")
+    },
     "no depart": (r' depart="[^"]+"', ""),
     "no id": (r'(<(?:vehicle|trip)[^>]*?) id="[^"]+"', r"\1"),
     "id twice": None,
     "unknown edge": (r'(edges|from)="\w+', r'\1="nowhere'),
     "unknown end": "<routes><trip id='t' depart='700' from='A0A1' to='nowhere'/></routes>",
-    "unknown way": "<routes><trip id='t' depart='700' from='A0A1' to='D1D2' via='nowhere'/></routes>"}
+    "unknown way": "<routes><trip id='t' depart='700' from='A0A1' to='D1D2' via='nowhere'/></routes>",
+}
 
 
 @pytest.mark.parametrize("name", ROUTES)
@@ -414,8 +555,9 @@ def test_route_files(copied, name):
 @pytest.mark.parametrize("name", ["background.rou.xml.gz", "city.add.xml.gz"])
 def test_other_files_of_sumo(copied, name, damage):
     file = copied / "scenarios" / "tiny" / name
-    file.write_bytes({
-        "empty": b"", "no gzip": b"<routes/>", "no XML": gzip.compress(b"x"), "cut": file.read_bytes()[:50]}[damage])
+    file.write_bytes(
+        {"empty": b"", "no gzip": b"<routes/>", "no XML": gzip.compress(b"x"), "cut": file.read_bytes()[:50]}[damage]
+    )
     run_city(copied, names=name)
 
 
@@ -461,7 +603,9 @@ LINES = {
         bound {s} --controller bound-pc --from nobody|,
         bound {s} --controller bound-pc --iterations 0|x
         bound {s} --controller bound-pc --out {none}/x.npz
-        ablation horizon {s} --horizons 1|a|2,2|-3|""" + "9" * 5000 + """
+        ablation horizon {s} --horizons 1|a|2,2|-3|"""
+    + "9" * 5000
+    + """
         ablation horizon {s} --controllers dpc-pc|pi-gating
         ablation sideways {s}
         ablation training {s} --controller dpc-pc|pi-gating
@@ -566,12 +710,23 @@ def lines(program: str):
             yield [*words, alternative]
 
 
-@pytest.mark.parametrize("program, words", [
-    pytest.param(program, words, id=" ".join([program, *words])[:80]) for program in LINES for words in lines(program)])
+@pytest.mark.parametrize(
+    "program, words",
+    [
+        pytest.param(program, words, id=" ".join([program, *words])[:80])
+        for program in LINES
+        for words in lines(program)
+    ],
+)
 def test_command_lines(tmp_path, program, words, city, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    places = {"s": tiny.write(tmp_path / "tiny"), "g": PEAK, "none": tmp_path / "none", "out": tmp_path / "out",
-              "net": city / "networks" / "tiny" / "city.net.xml.gz"}
+    places = {
+        "s": tiny.write(tmp_path / "tiny"),
+        "g": PEAK,
+        "none": tmp_path / "none",
+        "out": tmp_path / "out",
+        "net": city / "networks" / "tiny" / "city.net.xml.gz",
+    }
     before = sorted(tmp_path.rglob("*"))
     filled = [word.format(**places) for word in words]
     if program == "nmfd" and filled[0] in ("benchmark", "show", "robustness", "ablation") and "--out" not in filled:
@@ -580,15 +735,25 @@ def test_command_lines(tmp_path, program, words, city, monkeypatch):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("words", [
-    ["nmfd", "benchmark", "{s}", "--controllers", "none"], ["nmfd", "show", "{none}"], ["cosim", "run", "{none}"],
-    ["cosim", "compare", "{none}"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["nmfd", "benchmark", "{s}", "--controllers", "none"],
+        ["nmfd", "show", "{none}"],
+        ["cosim", "run", "{none}"],
+        ["cosim", "compare", "{none}"],
+    ],
+    ids=" ".join,
+)
 def test_the_same_in_a_process_of_its_own(tmp_path, words):
     """CliRunner is not the shell: status and stderr are those of a process."""
     places = {"s": tiny.write(tmp_path), "none": tmp_path / "none"}
     program, *arguments = words
     done = subprocess.run(
-        [sys.executable, "-m", program, *(a.format(**places) for a in arguments)], capture_output=True,
-        text=True, cwd=tmp_path)
+        [sys.executable, "-m", program, *(a.format(**places) for a in arguments)],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
     assert done.returncode == 2 and done.stdout == ""
     assert re.fullmatch(f"{program}: error: [^\n]+\n", done.stderr), done.stderr

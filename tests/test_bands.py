@@ -22,7 +22,8 @@ def test_a_band_is_the_interval_over_runs_not_over_samples():
 def test_bins_with_one_run_tell_no_band():
     random = np.random.default_rng(0)
     wide, narrow = (
-        np.column_stack([x, 0.1 * x]) for x in (120.0 * np.sqrt(random.random(4000)), 59.9 * random.random(4000)))
+        np.column_stack([x, 0.1 * x]) for x in (120.0 * np.sqrt(random.random(4000)), 59.9 * random.random(4000))
+    )
     found = band([wide, narrow, narrow])
     assert len(found) == BINS // 2 and found[:, 0].max() < 60.0 < wide[:, 0].max()
     assert np.allclose(found[:, 1], 0.1 * found[:, 0], rtol=0.02)

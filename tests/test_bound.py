@@ -59,7 +59,8 @@ def test_plans_are_admissible_and_replayed_exactly(name):
     if plan.splits is not None:
         assert (plan.splits[:, ~network.split_mask] == 0.0).all()
         np.testing.assert_allclose(
-            plan.splits.sum(axis=2), np.broadcast_to(1.0 - np.eye(7), (40, 7, 7)), rtol=0.0, atol=1e-12)
+            plan.splits.sum(axis=2), np.broadcast_to(1.0 - np.eye(7), (40, 7, 7)), rtol=0.0, atol=1e-12
+        )
     assert closed(scenario, open_loop.OpenLoop(plan)) == pytest.approx(plan.totals[plan.start], rel=1e-12)
     assert plan.totals[plan.start] == min(plan.totals.values())
     assert set(plan.totals) == {"open", "middle", "pi-gating"}
@@ -100,11 +101,14 @@ def test_command_writes_a_plan_that_benchmark_replays(folder, tmp_path):
 
 def test_wrong_names_and_missing_plans(folder, tmp_path):
     for arguments, fragment in (
-            (["bound", folder, "--controller", "dpc-pc"], "'dpc-pc' is no bound; choose one of bound-pc, bound-pcrg"),
-            (["bound", folder, "--controller", "bound-pc", "--from", "nobody"], "controller 'nobody' is unknown"),
-            (["bound", folder, "--controller", "bound-pc", "--out", tmp_path / "a" / "b.npz"], "no such folder"),
-            (["benchmark", folder, "--controllers", "bound-pc", "--out", tmp_path / "out"],
-             f"compute one with: nmfd bound {folder} --controller bound-pc")):
+        (["bound", folder, "--controller", "dpc-pc"], "'dpc-pc' is no bound; choose one of bound-pc, bound-pcrg"),
+        (["bound", folder, "--controller", "bound-pc", "--from", "nobody"], "controller 'nobody' is unknown"),
+        (["bound", folder, "--controller", "bound-pc", "--out", tmp_path / "a" / "b.npz"], "no such folder"),
+        (
+            ["benchmark", folder, "--controllers", "bound-pc", "--out", tmp_path / "out"],
+            f"compute one with: nmfd bound {folder} --controller bound-pc",
+        ),
+    ):
         result = nmfd(*arguments)
         assert result.exit_code == 2 and result.stderr.count("\n") == 1 and fragment in result.stderr, result.stderr
 

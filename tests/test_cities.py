@@ -22,8 +22,11 @@ from nmfd.metrics import total_time_spent
 ROOT = Path(__file__).parents[1]
 GAMES = Path(sumo.SUMO_HOME) / "tools" / "game"
 CITIES = Path(os.environ.get("CITIES", Path(__file__).parents[2] / "shared" / "cities"))
-REAL = {"bologna": ("bologna/run.sumocfg", 4), "ingolstadt": ("ingolstadt21/ingolstadt21.sumocfg", 3),
-        "luxembourg": ("luxembourg/luxembourg.net.xml.gz", 6)}
+REAL = {
+    "bologna": ("bologna/run.sumocfg", 4),
+    "ingolstadt": ("ingolstadt21/ingolstadt21.sumocfg", 3),
+    "luxembourg": ("luxembourg/luxembourg.net.xml.gz", 6),
+}
 COMMITTED = sorted(notice.parent.name for notice in (ROOT / "networks").glob("*/NOTICE.txt"))
 
 
@@ -42,14 +45,30 @@ def check(folder: Path, name: str, intervals: int) -> None:
 
 
 @pytest.mark.skipif(not GAMES.is_dir(), reason="this SUMO comes without its demos")
-@pytest.mark.parametrize("name, expected", [
-    ("cross", None), ("grid6", None), ("corridor", None), ("A10KW", None),
-    ("DRT", "names no vehicles for the streets of cars"), ("ramp", "no two regions can be made"),
-    ("rail", "has no edge that cars may use"),
-])
+@pytest.mark.parametrize(
+    "name, expected",
+    [
+        ("cross", None),
+        ("grid6", None),
+        ("corridor", None),
+        ("A10KW", None),
+        ("DRT", "names no vehicles for the streets of cars"),
+        ("ramp", "no two regions can be made"),
+        ("rail", "has no edge that cars may use"),
+    ],
+)
 def test_demos_of_sumo(tmp_path, name, expected):
-    result = cosim("import", GAMES / f"{name}.sumocfg", "--regions", 3, "--method", "geometric", "--no-run", "--out",
-                   tmp_path / "networks" / name)
+    result = cosim(
+        "import",
+        GAMES / f"{name}.sumocfg",
+        "--regions",
+        3,
+        "--method",
+        "geometric",
+        "--no-run",
+        "--out",
+        tmp_path / "networks" / name,
+    )
     if expected is None:
         assert result.exit_code == 0, result.output + str(result.exception)
         check(tmp_path, name, 2)
@@ -65,8 +84,18 @@ def test_real_cities(tmp_path, name):
     if not (CITIES / source).is_file():
         pytest.skip(f"no real city: {CITIES / source} is not there")
     peak = ("--demand", "peak", "--level", "0.05") if name == "luxembourg" else ()
-    result = cosim("import", CITIES / source, "--regions", count, "--method", "geometric", "--no-run", *peak, "--out",
-                   tmp_path / "networks" / name)
+    result = cosim(
+        "import",
+        CITIES / source,
+        "--regions",
+        count,
+        "--method",
+        "geometric",
+        "--no-run",
+        *peak,
+        "--out",
+        tmp_path / "networks" / name,
+    )
     assert result.exit_code == 0, result.output + str(result.exception)
     assert f"{count} regions by method geometric" in result.stdout
     check(tmp_path, name, 2)
@@ -80,13 +109,13 @@ def test_max_pressure_takes_no_longer_than_fixed_time(tmp_path, name, level):
     (config,) = (CITIES / name).glob("*.sumocfg") if (CITIES / name).is_dir() else (None,)
     if config is None:
         pytest.skip(f"no real city: {CITIES / name} is not there")
-    result = cosim("import", config, "--regions", 3, "--method", "geometric", "--no-run", "--out",
-                   tmp_path / "networks" / name)
+    result = cosim(
+        "import", config, "--regions", 3, "--method", "geometric", "--no-run", "--out", tmp_path / "networks" / name
+    )
     assert result.exit_code == 0, result.output + str(result.exception)
     spent = {}
     for signals in ("no-control", "max-pressure", "max-pressure-cyclic"):
-        run = simulate(Task(
-            scenario=tmp_path / "scenarios" / name, controller=signals, seed=1, demand_factor=level))
+        run = simulate(Task(scenario=tmp_path / "scenarios" / name, controller=signals, seed=1, demand_factor=level))
         spent[signals] = total_time_spent(run.trajectory)
         assert run.trajectory.completed[-1] == run.facts["trips"], signals
     assert max(spent, key=spent.get) == "no-control", spent
@@ -110,5 +139,8 @@ def test_committed_cities_are_small_and_need_nothing_else(name):
 @pytest.mark.parametrize("name", COMMITTED)
 def test_committed_cities_run_under_their_policies(tmp_path, name):
     for strategy in ("route-guidance", *(policy.stem for policy in (ROOT / "scenarios" / name).glob("*.pt"))):
-        good(cosim("run", ROOT / "scenarios" / name, "--controller", strategy, "--steps", 2, "--out",
-                   tmp_path / strategy))
+        good(
+            cosim(
+                "run", ROOT / "scenarios" / name, "--controller", strategy, "--steps", 2, "--out", tmp_path / strategy
+            )
+        )

@@ -32,8 +32,10 @@ def city(files):
 @pytest.fixture(scope="module")
 def lights(files):
     root = ElementTree.parse(files.net_file).getroot()
-    return {tl.get("id"): [(float(phase.get("duration")), phase.get("state")) for phase in tl.iter("phase")]
-            for tl in root.iter("tlLogic")}
+    return {
+        tl.get("id"): [(float(phase.get("duration")), phase.get("state")) for phase in tl.iter("phase")]
+        for tl in root.iter("tlLogic")
+    }
 
 
 def test_same_recipe_same_bytes(files):
@@ -87,8 +89,11 @@ def test_gateways_join_the_adjacent_regions(city):
 
 def test_gateway_links_are_those_of_their_movement(files, city):
     root = ElementTree.parse(files.net_file).getroot()
-    movement = {(c.get("tl"), int(c.get("linkIndex"))): (c.get("from"), c.get("to"))
-                for c in root.iter("connection") if c.get("tl")}
+    movement = {
+        (c.get("tl"), int(c.get("linkIndex"))): (c.get("from"), c.get("to"))
+        for c in root.iter("connection")
+        if c.get("tl")
+    }
     for gateway in city.gateways:
         assert city.region_of[gateway.from_edge] == gateway.source != gateway.target
         assert city.region_of[gateway.to_edge] == gateway.target
@@ -113,14 +118,20 @@ def test_about_a_hundred_lights_with_one_cycle_and_yellow(lights):
         assert all(duration >= 3.0 for duration, state in phases if "y" in state)
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    (lambda text: text.replace("edge,region", "edge;region"), "line 1: expected edge,region"),
-    (lambda text: text + "nowhere,3\n", "edge nowhere is not in"),
-    (lambda text: text.replace("c00-c01,3\n", ""), r"edge c00-c01 has no region \(1 such edges\)"),
-    (lambda text: text.replace("c00-c01,3", "c00-c01,7"), "expected an edge and a region from 0 to 6, got c00-c01,7"),
-    (lambda text: text + "c00-c01,3\n", "edge c00-c01 appears twice"),
-    (lambda text: re.sub(r",6\n", ",5\n", text), "region 6 has no edges"),
-])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: text.replace("edge,region", "edge;region"), "line 1: expected edge,region"),
+        (lambda text: text + "nowhere,3\n", "edge nowhere is not in"),
+        (lambda text: text.replace("c00-c01,3\n", ""), r"edge c00-c01 has no region \(1 such edges\)"),
+        (
+            lambda text: text.replace("c00-c01,3", "c00-c01,7"),
+            "expected an edge and a region from 0 to 6, got c00-c01,7",
+        ),
+        (lambda text: text + "c00-c01,3\n", "edge c00-c01 appears twice"),
+        (lambda text: re.sub(r",6\n", ",5\n", text), "region 6 has no edges"),
+    ],
+)
 def test_wrong_regions_give_one_line(files, tmp_path, change, message):
     table = tmp_path / "regions.csv"
     table.write_text(change(files.regions_csv.read_text()))
@@ -143,9 +154,10 @@ def test_wrong_recipes_give_one_line(tmp_path):
     path = tmp_path / "grid7" / "city.toml"
     good = path.read_text()
     for old, new, message in (
-            ("speed =", "sped =", "centre.sped: unknown key; did you mean speed"),
-            ("0 0 0 0 0 1 1 1 1", "0 0 0 0 0 1 1 1 9", r"expected a region from 0 to 6 .* got '9'"),
-            ("cycle = 90", "cycle = 90\nwrong = 1", "signals.wrong: unknown key")):
+        ("speed =", "sped =", "centre.sped: unknown key; did you mean speed"),
+        ("0 0 0 0 0 1 1 1 1", "0 0 0 0 0 1 1 1 9", r"expected a region from 0 to 6 .* got '9'"),
+        ("cycle = 90", "cycle = 90\nwrong = 1", "signals.wrong: unknown key"),
+    ):
         path.write_text(good.replace(old, new, 1))
         with pytest.raises(InputError, match=message):
             ensure_built(load_network(tmp_path / "grid7"))

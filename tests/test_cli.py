@@ -28,7 +28,8 @@ TIMES = ("evaluation_time_s", "control_step_ms_median", "control_step_ms_max")
 COLUMNS = (
     "controller,seed,plant,total_time_spent_veh_s,final_accumulation_veh,max_accumulation_veh,completed_veh,"
     "evaluation_time_s,control_step_ms_median,control_step_ms_max,solver_failures,fallbacks,"
-    "late_decisions,sensor_faults,plant_faults")
+    "late_decisions,sensor_faults,plant_faults"
+)
 
 
 @pytest.fixture
@@ -43,8 +44,10 @@ def benchmark_command(scenario, tmp_path):
 
 def timeless(folder):
     """The rows of summary.csv without what differs from run to run, and the bytes of every trajectory."""
-    rows = [{key: value for key, value in row.items() if key not in TIMES} for row in run_folder.read_summary(
-        folder / "summary.csv")]
+    rows = [
+        {key: value for key, value in row.items() if key not in TIMES}
+        for row in run_folder.read_summary(folder / "summary.csv")
+    ]
     return rows, {path.name: path.read_bytes() for path in folder.glob("*.nc")}
 
 
@@ -96,15 +99,26 @@ def test_benchmark_writes_a_run_folder(benchmark_command, tmp_path):
     summary = (tmp_path / "out" / "summary.csv").read_text().splitlines()
     assert summary[0] == f"{COLUMNS},trail" and '""command"":""nmfd benchmark ' in summary[1]
     assert [line.split(",")[:3] for line in summary[1:]] == [
-        [name, seed, "nmfd"] for name in ("no-control", "pi-gating") for seed in "01"]
+        [name, seed, "nmfd"] for name in ("no-control", "pi-gating") for seed in "01"
+    ]
     manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
     with Image.open(tmp_path / "out" / "mfd.png") as picture:
         assert json.loads(picture.info["Trail"])["command"] == manifest["sessions"][0]["command"]
     assert manifest["configuration"]["plant"] == "nmfd"
     assert manifest["sessions"][0]["seeds"] == [0, 1] and manifest["sessions"][0]["versions"]["torch"]
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "summary.csv", "manifest.json", "total_accumulation.png", "region_accumulation.png", "spawn_matrix.png",
-        "region_map.png", "mfd.png", "no-control-0.nc", "no-control-1.nc", "pi-gating-0.nc", "pi-gating-1.nc"}
+        "summary.csv",
+        "manifest.json",
+        "total_accumulation.png",
+        "region_accumulation.png",
+        "spawn_matrix.png",
+        "region_map.png",
+        "mfd.png",
+        "no-control-0.nc",
+        "no-control-1.nc",
+        "pi-gating-0.nc",
+        "pi-gating-1.nc",
+    }
 
 
 def test_trajectories_of_the_folder_agree_with_the_summary(benchmark_command, tmp_path):
@@ -151,8 +165,7 @@ def test_interrupted_before_the_first_run_leaves_nothing(benchmark_command, tmp_
 
     monkeypatch.setattr(closed_loop, "run", run)
     result = nmfd(*benchmark_command[:-1], tmp_path / "a" / "b")
-    assert (result.exit_code, result.stderr) == (
-        130, "nmfd: interrupted before a run was finished; nothing is kept\n")
+    assert (result.exit_code, result.stderr) == (130, "nmfd: interrupted before a run was finished; nothing is kept\n")
     assert not (tmp_path / "a").exists()
 
 
@@ -212,7 +225,9 @@ def test_training_interrupted_at_once_keeps_nothing(scenario, monkeypatch):
     monkeypatch.setattr(training.Rollout, "random_start", random_start)
     result = nmfd("train", scenario, "--controller", "dpc-pc")
     assert (result.exit_code, result.stderr) == (
-        130, "nmfd: interrupted before the first validation; nothing is kept\n")
+        130,
+        "nmfd: interrupted before the first validation; nothing is kept\n",
+    )
     assert [path.name for path in scenario.iterdir()] == ["scenario.toml"]
 
 
@@ -296,7 +311,9 @@ def declared_options():
         pytest.param(package, command, option, id=f"{package}-{command}-{option.name}")
         for package in ("nmfd", "cosim")
         for command, found in importlib.import_module(f"{package}.cli.main").main.commands.items()
-        for option in found.params if isinstance(option, Declared)]
+        for option in found.params
+        if isinstance(option, Declared)
+    ]
 
 
 @pytest.mark.parametrize("package, command, option", declared_options())

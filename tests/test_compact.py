@@ -22,7 +22,8 @@ from nmfd.model.plant import NmfdPlant
 from nmfd.types import Observation
 
 NUMBERS = Numbers(
-    set_point=1.1, gain=2.0, relief=0.5, price=3.0, price_from=0.7, elsewhere=0.4, elsewhere_from=1.2, metering=1.3)
+    set_point=1.1, gain=2.0, relief=0.5, price=3.0, price_from=0.7, elsewhere=0.4, elsewhere_from=1.2, metering=1.3
+)
 CENTRE = 3
 TABLE = """
 [controllers.dpc-pcrg]
@@ -51,8 +52,12 @@ def crowded(network, seed=0):
     """(R, R) [veh], regions from half to twice their critical accumulation."""
     random = np.random.default_rng(seed)
     critical = np.array([[mfd.critical] for mfd in network.mfds])
-    return 2.0 * critical * random.uniform(0.25, 1.0, (network.regions, 1)) * random.dirichlet(
-        np.ones(network.regions), network.regions)
+    return (
+        2.0
+        * critical
+        * random.uniform(0.25, 1.0, (network.regions, 1))
+        * random.dirichlet(np.ones(network.regions), network.regions)
+    )
 
 
 def test_gates_and_prices_are_those_of_the_formula(network):
@@ -65,11 +70,13 @@ def test_gates_and_prices_are_those_of_the_formula(network):
         expected = network.u_min + (network.u_max - network.u_min) * share
         assert controls.perimeter[i, h] == pytest.approx(expected, abs=1e-5)
     expected = np.where(
-        np.arange(network.regions) == CENTRE, 3.0 * np.maximum(full - 0.7, 0.0), 0.4 * np.maximum(full - 1.2, 0.0))
+        np.arange(network.regions) == CENTRE, 3.0 * np.maximum(full - 0.7, 0.0), 0.4 * np.maximum(full - 1.2, 0.0)
+    )
     np.testing.assert_allclose(controls.prices, expected, atol=1e-5)
     assert controls.metering is None
     controls = DpcController(policy(network, metering=True)).act(
-        Observation(step=0, time=0.0, accumulation=x, backlog=0.0 * x))
+        Observation(step=0, time=0.0, accumulation=x, backlog=0.0 * x)
+    )
     expected = np.maximum(1.3 - full, 0.0) * [mfd.critical for mfd in network.mfds] / HELD
     np.testing.assert_allclose(controls.metering, expected, rtol=1e-5, atol=1e-5)
     assert (controls.prices > 0.0).any() and (controls.prices == 0.0).any()
@@ -79,7 +86,8 @@ def test_trips_wait_for_the_protected_regions_wherever_they_begin(network):
     critical, seen = np.array([mfd.critical for mfd in network.mfds]), set()
     for seed, gain in product(range(6), (1.0, 2.5)):
         made = policy(
-            network, NUMBERS._replace(metering=1.4, metering_protected=1.1, metering_gain=gain), metering=True)
+            network, NUMBERS._replace(metering=1.4, metering_protected=1.1, metering_gain=gain), metering=True
+        )
         x = crowded(network, seed)
         full = x.sum(axis=1) / critical
         centre = gain * (1.1 - full[CENTRE])
@@ -93,12 +101,16 @@ def test_trips_wait_for_the_protected_regions_wherever_they_begin(network):
 def test_with_an_integral_it_contains_the_pi_gate_and_relief_comes_on_top(network):
     scenario = load_scenario("economic_mpc")
     critical, span, ki = network.mfds[CENTRE].critical, network.u_max - network.u_min, 0.005
-    planning = replace(planning_model(scenario), protected=(CENTRE,), controller_options={
-        "pi-gating": {"set_point": [0.8 * critical], "kp": 1.2, "ki": ki}})
+    planning = replace(
+        planning_model(scenario),
+        protected=(CENTRE,),
+        controller_options={"pi-gating": {"set_point": [0.8 * critical], "kp": 1.2, "ki": ki}},
+    )
     gate = PiGating(planning)
     numbers = Numbers(set_point=0.8, gain=1.2 / span, integral=ki * planning.step / span)
     alone, relieved = (
-        DpcController(policy(network, numbers._replace(relief=relief), guidance=False)) for relief in (0.0, 0.25))
+        DpcController(policy(network, numbers._replace(relief=relief), guidance=False)) for relief in (0.0, 0.25)
+    )
     before = int(np.flatnonzero(network.adjacency[:, CENTRE])[0])
     x, seen = np.zeros((network.regions,) * 2), []
     x[before, before] = 1.4 * network.mfds[before].critical
@@ -109,11 +121,13 @@ def test_with_an_integral_it_contains_the_pi_gate_and_relief_comes_on_top(networ
             x[CENTRE, CENTRE] = full * critical
             expected, found, more = (
                 controller.act(Observation(step=k, time=0.0, accumulation=x, backlog=0.0 * x)).perimeter
-                for controller in (gate, alone, relieved))
+                for controller in (gate, alone, relieved)
+            )
             np.testing.assert_allclose(found, expected, atol=1e-5)
             np.testing.assert_allclose(np.delete(more, before, axis=0), np.delete(expected, before, axis=0), atol=1e-5)
             assert more[before, CENTRE] == pytest.approx(
-                min(expected[before, CENTRE] + 0.25 * 0.4 * span, network.u_max), abs=1e-5)
+                min(expected[before, CENTRE] + 0.25 * 0.4 * span, network.u_max), abs=1e-5
+            )
             seen.append(expected[before, CENTRE])
     assert max(seen) == network.u_max and min(seen) == network.u_min and len(set(seen)) >= 5
 
@@ -155,8 +169,11 @@ def test_every_number_has_a_gradient_and_perimeter_control_alone_has_no_prices(n
     x = torch.from_numpy(np.stack([crowded(network, seed) for seed in range(4)])).float()
     made = policy(network, NUMBERS._replace(metering_protected=1.1), metering=True)
     perimeter, splits = made(x)
-    ((perimeter * torch.rand_like(perimeter)).sum() + (splits * torch.rand_like(splits)).sum()
-     + made.metering(x).sum()).backward()
+    (
+        (perimeter * torch.rand_like(perimeter)).sum()
+        + (splits * torch.rand_like(splits)).sum()
+        + made.metering(x).sum()
+    ).backward()
     grad = Numbers(*made.numbers.grad.abs())
     assert grad.integral == 0.0  # which no rollout has
     assert min(grad._replace(integral=1.0)) > 0.0
@@ -175,7 +192,8 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
     (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend="false"))
     refused = nmfd("train", scenario, "--controller", "dpc-pcrg", "--steps", 3)
     assert refused.exit_code == 2 and refused.stderr.endswith(
-        f"--steps: dpc-pcrg stays as it begins (descend = false in {scenario}/scenario.toml); omit one of them\n")
+        f"--steps: dpc-pcrg stays as it begins (descend = false in {scenario}/scenario.toml); omit one of them\n"
+    )
     (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend="true"))
     loaded = load_scenario(scenario)
     first, trained = (load_policy(file, loaded.network) for file in files.values())
@@ -183,19 +201,24 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
     assert isinstance(trained[0], CompactPolicy) and (trained[0].numbers != first[0].numbers).any()
     assert first[1]["configuration"]["steps"] == 0 and trained[1]["configuration"]["steps"] == 5
     assert trained[1]["configuration"]["validation_veh_s"] < first[1]["configuration"]["validation_veh_s"]
-    good(nmfd("benchmark", scenario, "--controllers", "dpc-pcrg,dpc-pcrg-guarded", "--out",
-              tmp_path / "out"))
+    good(nmfd("benchmark", scenario, "--controllers", "dpc-pcrg,dpc-pcrg-guarded", "--out", tmp_path / "out"))
 
 
-@pytest.mark.parametrize("table, expected", [
-    ("numbers = [1.0, 2.0, 0.0, 1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected 8 to 11 numbers >= 0, of a compact"),
-    ("compact = true\nnumbers = [1.0]", "numbers: "),
-    ("compact = true\nnumbers = [1.0, 2.0, 0.0, -1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected 8 to 11 numbers >= 0"),
-    ("compact = true\nlocal = true", "compact: begins with its numbers"),
-    ("metering = true", "metering: only compact policies let trips wait"),
-    ("steps = 0", "steps: expected a whole number from 1"),
-    ("descend = false", "descend: only a compact policy may stay as it begins"),
-])
+@pytest.mark.parametrize(
+    "table, expected",
+    [
+        ("numbers = [1.0, 2.0, 0.0, 1.0, 0.6, 0.0, 0.6, 1.5]", "numbers: expected 8 to 11 numbers >= 0, of a compact"),
+        ("compact = true\nnumbers = [1.0]", "numbers: "),
+        (
+            "compact = true\nnumbers = [1.0, 2.0, 0.0, -1.0, 0.6, 0.0, 0.6, 1.5]",
+            "numbers: expected 8 to 11 numbers >= 0",
+        ),
+        ("compact = true\nlocal = true", "compact: begins with its numbers"),
+        ("metering = true", "metering: only compact policies let trips wait"),
+        ("steps = 0", "steps: expected a whole number from 1"),
+        ("descend = false", "descend: only a compact policy may stay as it begins"),
+    ],
+)
 def test_wrong_settings(tmp_path, table, expected):
     scenario = tiny.write(tmp_path)
     with (scenario / "scenario.toml").open("a") as stream:
@@ -219,7 +242,8 @@ def test_prices_are_in_the_run_and_go_where_the_guard_withdraws_the_split_ratios
     run = closed_loop.run(NmfdPlant(scenario), DpcController(made), scenario, seed=0)
     states = run.accumulation[:4] / made.scale.numpy()
     np.testing.assert_allclose(
-        run.prices, [made.prices(torch.from_numpy(x)).detach().numpy() for x in run.observed[:4]], atol=1e-5)
+        run.prices, [made.prices(torch.from_numpy(x)).detach().numpy() for x in run.observed[:4]], atol=1e-5
+    )
     watched = Guarded(made, statistics(np.repeat(states, 40, axis=0).reshape(160, -1)), planning)
     watched._judge.problem = lambda foreseen: "told"
     x = run.observed[2]

@@ -44,12 +44,23 @@ def result(scenario):
         crossings.append(scenario.step * transfers.numpy())
         arrivals.append(scenario.step * completions.numpy())
     trajectory = trajectories.made(
-        controller="random", plant="sumo", seed=0, step=scenario.step, accumulation=np.stack(states),
-        backlog=np.zeros((scenario.steps + 1, 7, 7)), completed=np.zeros(scenario.steps + 1),
-        perimeter=np.stack(perimeter), splits=np.repeat(network.nominal_splits[None], scenario.steps, axis=0),
-        decision_time=np.zeros(scenario.steps), wall_time=1.0)
+        controller="random",
+        plant="sumo",
+        seed=0,
+        step=scenario.step,
+        accumulation=np.stack(states),
+        backlog=np.zeros((scenario.steps + 1, 7, 7)),
+        completed=np.zeros(scenario.steps + 1),
+        perimeter=np.stack(perimeter),
+        splits=np.repeat(network.nominal_splits[None], scenario.steps, axis=0),
+        decision_time=np.zeros(scenario.steps),
+        wall_time=1.0,
+    )
     record = {
-        "departures": scenario.step * scenario.demand, "crossings": np.stack(crossings), "arrivals": np.stack(arrivals)}
+        "departures": scenario.step * scenario.demand,
+        "crossings": np.stack(crossings),
+        "arrivals": np.stack(arrivals),
+    }
     return Result(trajectory=trajectory, record=record, facts={})
 
 
@@ -77,20 +88,35 @@ def test_the_model_of_those_who_drive():
     """A controller's own model, or what the scenario names for a strategy; else the scenario's; or another one."""
     scenario = load_scenario(ROOT / "scenarios" / "grid7_peak")
     network = scenario.network.folder
-    names = {strategy: planning_of(scenario, strategy).network.folder.resolve().name for strategy in (
-        "no-control", "pi-gating", "dpc-pcrg", "dpc-pcrg+max-pressure+compliance-50", "route-guidance",
-        "rerouting-30", "max-pressure+rerouting-30")}
+    names = {
+        strategy: planning_of(scenario, strategy).network.folder.resolve().name
+        for strategy in (
+            "no-control",
+            "pi-gating",
+            "dpc-pcrg",
+            "dpc-pcrg+max-pressure+compliance-50",
+            "route-guidance",
+            "rerouting-30",
+            "max-pressure+rerouting-30",
+        )
+    }
     assert names == {
-        "no-control": "grid7", "pi-gating": "grid7", "dpc-pcrg": "grid7_guided", "route-guidance": "grid7_guided",
-        "dpc-pcrg+max-pressure+compliance-50": "grid7_max_pressure", "rerouting-30": "grid7_rerouting",
-        "max-pressure+rerouting-30": "grid7_rerouting"}
+        "no-control": "grid7",
+        "pi-gating": "grid7",
+        "dpc-pcrg": "grid7_guided",
+        "route-guidance": "grid7_guided",
+        "dpc-pcrg+max-pressure+compliance-50": "grid7_max_pressure",
+        "rerouting-30": "grid7_rerouting",
+        "max-pressure+rerouting-30": "grid7_rerouting",
+    }
     assert planning_of(scenario, "dpc-pcrg", network).network.folder == network
 
 
 def test_outflow_samples_lie_on_the_mfd(scenario, result):
     for region in (0, 3):
         cloud = outflow_samples(
-            [result.trajectory], [result.record], scenario.network.u_max, region, scenario.network.adjacency)
+            [result.trajectory], [result.record], scenario.network.u_max, region, scenario.network.adjacency
+        )
         points = np.concatenate(list(cloud.values()))
         expected = scenario.network.mfds[region].outflow(points[:, 0])
         # The samples are taken at the middle of an interval, the flows at its beginning.
@@ -154,8 +180,10 @@ def test_regions_that_no_loading_run_filled_are_named(scenario):
     state = np.zeros((5, 7, 7))
     state[2] = np.diag(critical * [1.1, 0.4, 1.2, 1.3, 1.5, 1.01, 2.0])
     empty = [{"loading": np.empty((0, 2))}] * 7
-    short = [any(doubt.startswith("not reached") for doubt in fit.doubts)
-             for fit in region_fits(network, empty, [state, 0.5 * state])]
+    short = [
+        any(doubt.startswith("not reached") for doubt in fit.doubts)
+        for fit in region_fits(network, empty, [state, 0.5 * state])
+    ]
     assert short == [False, True, *[False] * 5]
     assert "not reached (40 % of critical)" in region_fits(network, empty, [state])[1].doubts
     assert not any("not reached" in doubt for fit in region_fits(network, empty, [3.0 * state]) for doubt in fit.doubts)

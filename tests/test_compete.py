@@ -98,8 +98,9 @@ def here(monkeypatch):
 
 
 def competed(*controllers: str, only: str = "", out: str = "out") -> dict[str, entry.Entry]:
-    order = run.Order(task_set=task_set.read("mine.toml"), controllers=controllers, out=Path(out),
-                      only=(only,) if only else ())
+    order = run.Order(
+        task_set=task_set.read("mine.toml"), controllers=controllers, out=Path(out), only=(only,) if only else ()
+    )
     return {one.controller: one for one in run.compete(order)}
 
 
@@ -115,9 +116,16 @@ def test_who_is_late_wrong_and_slow_in_turns_fails_alone(place):
     assert [one.seed for one in nominal.runs] == [1] and found.outcome("noisy").complete
     late, punctual = nominal.runs[0].metrics, before["no-control"].outcome("nominal").runs[0].metrics
     assert late["late_decisions"] >= 2 and late[TTS] == punctual[TTS] and punctual["late_decisions"] == 0
-    for failure, words in zip(nominal.failed, (
-            "perimeter: expected finite numbers of shape (2, 2)", "got shape (9, 9)", "RuntimeError: no more",
-            "took longer than 0.2 s"), strict=True):
+    for failure, words in zip(
+        nominal.failed,
+        (
+            "perimeter: expected finite numbers of shape (2, 2)",
+            "got shape (9, 9)",
+            "RuntimeError: no more",
+            "took longer than 0.2 s",
+        ),
+        strict=True,
+    ):
         assert words in failure.reason and "trouble.py:Trouble" in failure.reason
     assert found.missing == ("nominal",)
     beside = table.read(["out"])
@@ -159,15 +167,19 @@ def test_an_entry_counts_without_its_run_folder_while_it_is_of_the_same(place, m
     """What is missing of it alone is run, elsewhere; of a changed controller everything."""
     calls, made = itertools.count(), []
     monkeypatch.setattr(run, "provenance", lambda: {"date": str(next(calls)), "versions": {"torch": "2"}})
-    monkeypatch.setattr(benchmark, "run_one", lambda task, run_one=benchmark.run_one, **others: (
-        made.append(task), run_one(task, **others))[1])
+    monkeypatch.setattr(
+        benchmark,
+        "run_one",
+        lambda task, run_one=benchmark.run_one, **others: (made.append(task), run_one(task, **others))[1],
+    )
     Path("mine.toml").write_text(TASKS.replace('"acyclic"', f'"{plant}"'), encoding="utf-8")
     Path("mine.py").write_text(tiny.CONTROLLER, encoding="utf-8")
     name = "mine.py:Mine"
     first = competed(name, only="nominal")[name]
     assert len(made) == 5
-    part = first.changed(tasks=tuple(
-        one.changed(runs=one.runs[:3]) if one.task == "nominal" else one for one in first.tasks))
+    part = first.changed(
+        tasks=tuple(one.changed(runs=one.runs[:3]) if one.task == "nominal" else one for one in first.tasks)
+    )
     Path("elsewhere").mkdir()
     entry.write(entry.path(Path("elsewhere"), name), part)
     again = competed(name, out="elsewhere")[name]
@@ -178,8 +190,9 @@ def test_an_entry_counts_without_its_run_folder_while_it_is_of_the_same(place, m
     assert again.outcome("nominal").depends_on == first.outcome("nominal").depends_on
     assert competed(name, out="elsewhere")[name] == again and len(made) == 8
     # Of the first three, whose session no run has any more, and the others, all is known as before.
-    last = again.changed(tasks=tuple(
-        one.changed(runs=one.runs[3:]) if one.task == "nominal" else one for one in again.tasks))
+    last = again.changed(
+        tasks=tuple(one.changed(runs=one.runs[3:]) if one.task == "nominal" else one for one in again.tasks)
+    )
     Path("third").mkdir()
     entry.write(entry.path(Path("third"), name), last)
     third = competed(name, out="third")[name]
@@ -197,38 +210,50 @@ def test_what_is_run_for_an_entry():
     fixed = regional.changed(plant="sumo")
     pressed = fixed.changed(signals="max-pressure")
     for name, expected in (
-            ("no-control", ("no-control", "no-control", "max-pressure")),
-            ("max-pressure-cyclic", ("no-control", "max-pressure-cyclic", "max-pressure")),
-            ("pi-gating+guided", ("pi-gating", "pi-gating+guided", "pi-gating+guided+max-pressure")),
-            ("dpc-pc+actuated+rerouting-30", ("dpc-pc", "dpc-pc+actuated+rerouting-30",
-                                              "dpc-pc+rerouting-30+max-pressure"))):
+        ("no-control", ("no-control", "no-control", "max-pressure")),
+        ("max-pressure-cyclic", ("no-control", "max-pressure-cyclic", "max-pressure")),
+        ("pi-gating+guided", ("pi-gating", "pi-gating+guided", "pi-gating+guided+max-pressure")),
+        (
+            "dpc-pc+actuated+rerouting-30",
+            ("dpc-pc", "dpc-pc+actuated+rerouting-30", "dpc-pc+rerouting-30+max-pressure"),
+        ),
+    ):
         assert tuple(run.strategy(name, task) for task in (regional, fixed, pressed)) == expected
 
 
-@pytest.mark.parametrize("old, new, words", [
-    ('"acyclic"', '"sumo"\nnoise = 1.0', "tasks[0].noise: is for regional models"),
-    ('"acyclic"', '"acyclic"\nsignals = "max-pressure"', "tasks[0].signals: is for SUMO"),
-    ('id = "noisy"', 'id = "Nominal"', "tasks[1].id: Nominal is there twice"),
-    ('id = "noisy"', 'id = "../noisy"', "tasks[1].id: expected"),
-    ("seeds = [0]", "seeds = []", "tasks[1].seeds: expected"),
-    ("seeds = [0]", "seed = [0]", "unknown key; did you mean seeds"),
-    ('scenario = "scenario"', 'scenario = "nothing"', "nominal: scenario: there is no nothing/scenario.toml"),
-    ("time_limit = 5.0", "time_limit = 0.0", "time_limit: expected a number above 0"),
-])
+@pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ('"acyclic"', '"sumo"\nnoise = 1.0', "tasks[0].noise: is for regional models"),
+        ('"acyclic"', '"acyclic"\nsignals = "max-pressure"', "tasks[0].signals: is for SUMO"),
+        ('id = "noisy"', 'id = "Nominal"', "tasks[1].id: Nominal is there twice"),
+        ('id = "noisy"', 'id = "../noisy"', "tasks[1].id: expected"),
+        ("seeds = [0]", "seeds = []", "tasks[1].seeds: expected"),
+        ("seeds = [0]", "seed = [0]", "unknown key; did you mean seeds"),
+        ('scenario = "scenario"', 'scenario = "nothing"', "nominal: scenario: there is no nothing/scenario.toml"),
+        ("time_limit = 5.0", "time_limit = 0.0", "time_limit: expected a number above 0"),
+    ],
+)
 def test_a_wrong_task_set(place, old, new, words):
     Path("mine.toml").write_text(TASKS.replace(old, new), encoding="utf-8")
     assert words in error_line(cosim("compete", "no-control", "--tasks", "mine.toml", "--out", "out"))
     assert not Path("out").exists()
 
 
-@pytest.mark.parametrize("words, expected", [
-    (("no-control", "--tasks", "v0"), "no task set of that name comes with the package; choose from v1"),
-    (("no-control", "--tasks", "mine.toml", "--only", "nominal,x*"), "--only: no task matches 'x*'; there are nominal"),
-    (("no-contrl", "--tasks", "mine.toml"), "did you mean no-control"),
-    ((), "expected controllers to run, or --table DIR"),
-    (("--table", "scenario"), "scenario: holds no entries"),
-    (("no-control", "--scheduler-ca", "x"), "--scheduler: missing"),
-])
+@pytest.mark.parametrize(
+    "words, expected",
+    [
+        (("no-control", "--tasks", "v0"), "no task set of that name comes with the package; choose from v1"),
+        (
+            ("no-control", "--tasks", "mine.toml", "--only", "nominal,x*"),
+            "--only: no task matches 'x*'; there are nominal",
+        ),
+        (("no-contrl", "--tasks", "mine.toml"), "did you mean no-control"),
+        ((), "expected controllers to run, or --table DIR"),
+        (("--table", "scenario"), "scenario: holds no entries"),
+        (("no-control", "--scheduler-ca", "x"), "--scheduler: missing"),
+    ],
+)
 def test_wrong_words(place, words, expected):
     assert expected in error_line(cosim("compete", *words))
     assert not Path("runs").exists()
@@ -270,20 +295,43 @@ def test_the_world_of_a_task_is_that_of_its_plant(place):
 
 def made(name: str, spent: dict[str, dict[int, float]], seeds=(1, 2)) -> entry.Entry:
     """An entry with this total time spent by task and seed; a run with a negative one failed."""
+
     def outcome(task: str, values: dict[int, float]) -> entry.Outcome:
-        runs = [entry.Run(seed=seed, session=0, metrics=dict.fromkeys(METRICS, 1.0) | {TTS: value})
-                for seed, value in values.items() if value >= 0]
+        runs = [
+            entry.Run(seed=seed, session=0, metrics=dict.fromkeys(METRICS, 1.0) | {TTS: value})
+            for seed, value in values.items()
+            if value >= 0
+        ]
         failed = [entry.Failure(seed=seed, reason="<i>no</i>") for seed, value in values.items() if value < 0]
         return entry.Outcome(
-            task=task, text="a <b>task</b>", strategy=name, plant="sumo", scenario="tiny", scenario_hash="a",
-            network="n", network_hash="b", world="w", demand=1.0, time_limit=1.0, depends_on={}, seeds=seeds,
-            runs=tuple(runs), failed=tuple(failed), missing=tuple(seed for seed in seeds if seed not in values))
+            task=task,
+            text="a <b>task</b>",
+            strategy=name,
+            plant="sumo",
+            scenario="tiny",
+            scenario_hash="a",
+            network="n",
+            network_hash="b",
+            world="w",
+            demand=1.0,
+            time_limit=1.0,
+            depends_on={},
+            seeds=seeds,
+            runs=tuple(runs),
+            failed=tuple(failed),
+            missing=tuple(seed for seed in seeds if seed not in values),
+        )
 
     tasks = tuple(outcome(task, values) for task, values in spent.items())
     return entry.Entry(
-        controller=name, task_set=entry.TaskSetName(name="v0", named="v0", hash="h", released=True),
-        command="cosim compete", sessions=({"date": "2026-01-01", "versions": {"torch": "2"}, "commit": None},),
-        tasks=tasks, missing=tuple(one.task for one in tasks if not one.complete), metrics=entry.about_metrics())
+        controller=name,
+        task_set=entry.TaskSetName(name="v0", named="v0", hash="h", released=True),
+        command="cosim compete",
+        sessions=({"date": "2026-01-01", "versions": {"torch": "2"}, "commit": None},),
+        tasks=tasks,
+        missing=tuple(one.task for one in tasks if not one.complete),
+        metrics=entry.about_metrics(),
+    )
 
 
 ENTRIES = {
@@ -305,7 +353,7 @@ def test_the_rank(tmp_path):
     board = table.read([str(written(tmp_path / "all"))])
     overall = {row.name: row for row in board.overall}
     assert [row.name for row in board.overall][:2] == ["half", "no-control"]
-    assert (overall["half"].rank, overall["half"].worth) == (1, pytest.approx(0.5 ** 0.5))
+    assert (overall["half"].rank, overall["half"].worth) == (1, pytest.approx(0.5**0.5))
     assert (overall["no-control"].rank, overall["no-control"].worth) == (2, pytest.approx(1.0))
     assert overall["quarter"].rank is None and overall["quarter"].missing == 1  # however good it is
     assert overall["<script>alert(1)</script>"].rank is None
@@ -314,7 +362,8 @@ def test_the_rank(tmp_path):
     assert in_a["<script>alert(1)</script>"] == (None, None)
     fewer = table.read([str(written(tmp_path / "fewer", {name: ENTRIES[name] for name in ("no-control", "half")}))])
     assert {row.name: row.worth for row in fewer.overall} == {
-        name: overall[name].worth for name in ("no-control", "half")}
+        name: overall[name].worth for name in ("no-control", "half")
+    }
     without = table.read([str(written(tmp_path / "without", {"half": ENTRIES["half"]}))])
     assert without.overall[0].rank is None and without.by_task["a"][0].metrics[TTS] == 125.0
 
@@ -341,16 +390,19 @@ def test_the_entries_that_come_with_the_package(tmp_path):
     assert "--out: missing" in error_line(cosim("compete", "--table", "v1"))
 
 
-@pytest.mark.parametrize("change, words", [
-    (lambda one: one["task_set"].update(name="v9"), "its task set is v9, but that of"),
-    (lambda one: one["task_set"].update(hash="other"), "its hash is other, but that of"),
-    (lambda one: one["tasks"][0].update(world="other"), "a: is another task there than in"),
-    (lambda one: one["tasks"].pop(), "b: is another task there than in"),
-    (lambda one: one.pop("tasks"), "tasks: missing"),
-    (lambda one: one.update(controller=3), "controller: expected"),
-    (lambda one: one["tasks"][0]["runs"][0]["metrics"].update(TTS=1.0), "a: 'TTS' is no metric of version"),
-    (lambda one: one["tasks"][0]["runs"][0]["metrics"].update({TTS: float("nan")}), "tasks[0].runs[0].metrics"),
-])
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda one: one["task_set"].update(name="v9"), "its task set is v9, but that of"),
+        (lambda one: one["task_set"].update(hash="other"), "its hash is other, but that of"),
+        (lambda one: one["tasks"][0].update(world="other"), "a: is another task there than in"),
+        (lambda one: one["tasks"].pop(), "b: is another task there than in"),
+        (lambda one: one.pop("tasks"), "tasks: missing"),
+        (lambda one: one.update(controller=3), "controller: expected"),
+        (lambda one: one["tasks"][0]["runs"][0]["metrics"].update(TTS=1.0), "a: 'TTS' is no metric of version"),
+        (lambda one: one["tasks"][0]["runs"][0]["metrics"].update({TTS: float("nan")}), "tasks[0].runs[0].metrics"),
+    ],
+)
 def test_entries_that_cannot_be_compared(tmp_path, change, words):
     folder = written(tmp_path / "all")
     content = json.loads((folder / "quarter.json").read_text(encoding="utf-8"))
@@ -393,11 +445,14 @@ def test_all_rows_are_made_again_and_what_came_of_them_is_kept(place, monkeypatc
 
     def table():
         with Path("runs/verified.csv").open(newline="", encoding="utf-8") as stream:
-            return {(row["folder"], row["row"]): (row["verdict"], row["compared"], row["equal"], row["what"])
-                    for row in csv.DictReader(stream)}
+            return {
+                (row["folder"], row["row"]): (row["verdict"], row["compared"], row["equal"], row["what"])
+                for row in csv.DictReader(stream)
+            }
 
     assert table() == dict.fromkeys(
-        [("out/noisy", "no-control,0"), ("out/noisy", "pi-gating,0")], ("the same", "11", "11", ""))
+        [("out/noisy", "no-control,0"), ("out/noisy", "pi-gating,0")], ("the same", "11", "11", "")
+    )
     made, again, now = [], verify.verify, {"commit": "this", "dirty": False}
     monkeypatch.setattr(verified, "provenance", lambda: now)
     monkeypatch.setattr(verified, "verify", lambda row, within: made.append(row.label) or again(row, within))
@@ -474,8 +529,16 @@ def asked(command: str, seeds: str = "0 1", **more) -> dict:
 
 
 def table_of(folder: Path, trail_of_it: dict, **changed) -> None:
-    rows = pd.DataFrame({"demand": [1.0, 1.0, 1.3], "controller": "no-control", "seed": [0, 1, 0],
-                         "completed_veh": [5.0, 6.0, 7.0], "co2_kg": [0.1 + 0.2, math.nan, 0.5], "wall_time_s": 1.0})
+    rows = pd.DataFrame(
+        {
+            "demand": [1.0, 1.0, 1.3],
+            "controller": "no-control",
+            "seed": [0, 1, 0],
+            "completed_veh": [5.0, 6.0, 7.0],
+            "co2_kg": [0.1 + 0.2, math.nan, 0.5],
+            "wall_time_s": 1.0,
+        }
+    )
     folder.mkdir()
     rows.assign(**changed, trail=[json.dumps(trail_of_it), "", ""]).to_csv(folder / "runs.csv", index=False)
 
@@ -488,33 +551,52 @@ def test_a_published_table_is_made_again_by_the_command_that_it_names(place, mon
         return {"completed_veh": 5 + task.seed, "co2_kg": 0.1 + 0.2, "wall_time_s": 2.0, "demand": 1.0}
 
     monkeypatch.setattr(verify, "_simulated", simulated)
-    table_of(place / "out", asked("cosim evaluate --seeds=2 scenario --controllers 'no-*,x' --first-seed 0 --steps 3 "
-                                  "--policy x=y.pt --policy no-control=mine.pt"))
+    table_of(
+        place / "out",
+        asked(
+            "cosim evaluate --seeds=2 scenario --controllers 'no-*,x' --first-seed 0 --steps 3 "
+            "--policy x=y.pt --policy no-control=mine.pt"
+        ),
+    )
     assert good(cosim("verify", "out", "--list")).split() == ["1,no-control,0", "1,no-control,1"]  # 1.3: nobody asked
     text = good(cosim("verify", "out", "--row", "*,0"))
     assert "The same: 3 figures to the last digit" in text and "commit: abc then" in text and "python: 2.7 then" in text
     assert made == [Task(scenario=Path("scenario"), controller="no-control", seed=0, steps=3, policy=Path("mine.pt"))]
     assert "The same: 2 figures" in good(cosim("verify", "out", "--row", "*,1"))  # an empty one is none
-    table_of(place / "other", asked("cosim evaluate scenario --controllers no-control --seeds 2 --first-seed 0"),
-             completed_veh=[5.0, 7.0, 7.0])
+    table_of(
+        place / "other",
+        asked("cosim evaluate scenario --controllers no-control --seeds 2 --first-seed 0"),
+        completed_veh=[5.0, 7.0, 7.0],
+    )
     done = cosim("verify", "other", "--row", "*,1")
     assert done.exit_code == 1 and "completed_veh differs: 7.0 published, 6 made again" in done.stdout
     near = good(cosim("verify", "other", "--row", "*,1", "--within", 0.2))
     assert "2 figures within 0.2, 1 to the last digit" in near
-    table_of(place / "rounded", asked("cosim evaluate scenario --controllers no-control --seeds 2 --first-seed 0"),
-             completed_veh=[5.0, 6.0 + 1e-14, 7.0])  # of another version
+    table_of(
+        place / "rounded",
+        asked("cosim evaluate scenario --controllers no-control --seeds 2 --first-seed 0"),
+        completed_veh=[5.0, 6.0 + 1e-14, 7.0],
+    )  # of another version
     assert "2 figures within 1e-09, 1 to the last digit" in good(cosim("verify", "rounded", "--row", "*,1"))
     assert cosim("verify", "rounded", "--row", "*,1", "--within", 0).exit_code == 1
 
 
-@pytest.mark.parametrize("found, words", [
-    (asked("cosim evaluate scenario --controllers no-control", not_again={"no-*": "too old"}), "made again: too old"),
-    (asked("cosim evaluate scenario --controllers no-control"), "names no command"),  # seeds from 2000 up
-    (asked("cosim sweep scenario --controllers no-control --first-seed 0"), "names no command"),
-    (asked("cosim evaluate nowhere --controllers no-control --first-seed 0"), "there is no nowhere"),
-    (asked("cosim evaluate scenario --first-seed 0"), "is no command of version"),
-    (asked("cosim evaluate scenario --controllers no-control --seeds many"), "is no command of version"),
-    (asked("unknown"), "names no command"), ({}, "names no command")])
+@pytest.mark.parametrize(
+    "found, words",
+    [
+        (
+            asked("cosim evaluate scenario --controllers no-control", not_again={"no-*": "too old"}),
+            "made again: too old",
+        ),
+        (asked("cosim evaluate scenario --controllers no-control"), "names no command"),  # seeds from 2000 up
+        (asked("cosim sweep scenario --controllers no-control --first-seed 0"), "names no command"),
+        (asked("cosim evaluate nowhere --controllers no-control --first-seed 0"), "there is no nowhere"),
+        (asked("cosim evaluate scenario --first-seed 0"), "is no command of version"),
+        (asked("cosim evaluate scenario --controllers no-control --seeds many"), "is no command of version"),
+        (asked("unknown"), "names no command"),
+        ({}, "names no command"),
+    ],
+)
 def test_tables_that_cannot_be_made_again(place, found, words):
     table_of(place / "out", found)
     line = error_line(cosim("verify", "out"))
@@ -556,8 +638,24 @@ def test_what_is_published_names_its_commands():
 def test_a_table_of_a_city_is_made_again(place):
     tiny_city.city(place)
     tiny_city.imported(place)
-    good(cosim("evaluate", "scenarios/tiny", "--controllers", "no-control,pi-gating", "--seeds", 1, "--first-seed", 0,
-               "--steps", 2, "--demand", "1,1.3", "--out", "evaluated"))
+    good(
+        cosim(
+            "evaluate",
+            "scenarios/tiny",
+            "--controllers",
+            "no-control,pi-gating",
+            "--seeds",
+            1,
+            "--first-seed",
+            0,
+            "--steps",
+            2,
+            "--demand",
+            "1,1.3",
+            "--out",
+            "evaluated",
+        )
+    )
     Path("published").mkdir()
     shutil.copy("evaluated/runs.csv", "published")
     for row in ("1.3,pi-gating,0", "1,no-control,0"):
@@ -576,9 +674,12 @@ def test_strangers_in_sumo(place):
     """The template and one that is late, wrong and slow in turns, in processes of their own, on grid7."""
     copies.peak(place)
     Path("mine.toml").write_text(
-        TASKS.replace('"scenario"', '"scenarios/peak"').replace('"acyclic"', '"sumo"').replace(
-            "time_limit = 0.2", "time_limit = 3.0").replace("seeds = [1, 2, 3, 4, 5]", "seeds = [1, 5]"),
-        encoding="utf-8")
+        TASKS.replace('"scenario"', '"scenarios/peak"')
+        .replace('"acyclic"', '"sumo"')
+        .replace("time_limit = 0.2", "time_limit = 3.0")
+        .replace("seeds = [1, 2, 3, 4, 5]", "seeds = [1, 5]"),
+        encoding="utf-8",
+    )
     Path("trouble.py").write_text(TROUBLE, encoding="utf-8")
     good(nmfd("new-controller", "mine.py"))
     command = ("compete", "--tasks", "mine.toml", "--only", "nominal", "--out", "out", "--workers", "2")

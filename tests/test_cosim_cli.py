@@ -55,8 +55,10 @@ def test_every_controller_runs(small, tmp_path, controller):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("strategy, against", [
-    ("pi-gating+max-pressure+rerouting-30", "actuated"), ("dpc-pcrg+webster+redistribute+compliance-50", None)])
+@pytest.mark.parametrize(
+    "strategy, against",
+    [("pi-gating+max-pressure+rerouting-30", "actuated"), ("dpc-pcrg+webster+redistribute+compliance-50", None)],
+)
 def test_strategies_run_and_are_filed_under_their_names(small, tmp_path, strategy, against):
     out, names = tmp_path / "run", {strategy, against} - {None}
     other = ("--against", against) if against else ()
@@ -130,18 +132,25 @@ def test_identify_writes_a_network_that_loads(small, tmp_path):
     assert "and from 4 runs under no-control, probing-pc, seeds 1000 to 1001." in text
 
 
-@pytest.mark.parametrize("old, new, expected", [
-    ("compliance = 1.0", "complience = 1.0", "sumo.complience: unknown key"),
-    ("compliance = 1.0", "compliance = 2.0", "sumo.compliance: expected a number in [0, 1], got 2.0 instead"),
-    ("guidance_period = 0.0", "guidance_period = -1", "sumo.guidance_period: expected a number"),
-    ('actuation = "hold-back"', 'actuation = "hold"', "sumo.actuation: expected one of hold-back, redistribute"),
-    ('actuation = "hold-back"', 'signals = "green"', "sumo.signals: expected one of fixed, webster, actuated, max-pr"),
-    ("step_length = 1.0", "step_length = 0.7", "sumo.step_length: expected a divisor of the control interval"),
-    ("steps = 80", 'steps = "80"', "scenario.toml: steps: "),
-    ("from = 2", "from = 9", "region 9 is unknown"),
-    ("../../networks/grid7", "../../networks/none", "network.toml: no such file"),
-    ("../../networks/grid7", str(ROOT / "networks" / "hexagon7"), "sumo"),
-])
+@pytest.mark.parametrize(
+    "old, new, expected",
+    [
+        ("compliance = 1.0", "complience = 1.0", "sumo.complience: unknown key"),
+        ("compliance = 1.0", "compliance = 2.0", "sumo.compliance: expected a number in [0, 1], got 2.0 instead"),
+        ("guidance_period = 0.0", "guidance_period = -1", "sumo.guidance_period: expected a number"),
+        ('actuation = "hold-back"', 'actuation = "hold"', "sumo.actuation: expected one of hold-back, redistribute"),
+        (
+            'actuation = "hold-back"',
+            'signals = "green"',
+            "sumo.signals: expected one of fixed, webster, actuated, max-pr",
+        ),
+        ("step_length = 1.0", "step_length = 0.7", "sumo.step_length: expected a divisor of the control interval"),
+        ("steps = 80", 'steps = "80"', "scenario.toml: steps: "),
+        ("from = 2", "from = 9", "region 9 is unknown"),
+        ("../../networks/grid7", "../../networks/none", "network.toml: no such file"),
+        ("../../networks/grid7", str(ROOT / "networks" / "hexagon7"), "sumo"),
+    ],
+)
 def test_scenario_errors(small, tmp_path, old, new, expected):
     shutil.copytree(small.parent.parent, tmp_path / "city")
     file = tmp_path / "city" / "scenarios" / "small" / "scenario.toml"
@@ -160,18 +169,24 @@ def test_policy_for_another_network(small, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("arguments, expected", [
-    (("run", "{small}", "--controller", "nobody"), "controller 'nobody' is unknown; choose from no-control"),
-    (("run", "{small}"), "--controller"),
-    (("identify", "{small}", "--runs", "{tmp}"), "--runs: fits one model; say which, by --guided, --own or --with"),
-    (("identify", "{small}", "--own", "--network", "{tmp}/more", "--runs", "{tmp}"), "holds no finished runs"),
-    (("run", "{tmp}/none", "--controller", "no-control"), "scenario.toml: no such file"),
-    (("run", "{small}", "--controller", "no-control", "--steps", "0"), "--steps"),
-    (("run", "{small}", "--controller", "no-control", "--policy", "x.pt"), "reads no policy"),
-    (("identify", "{small}", "--levels", "a,b"), "'--levels': expected a list of distinct numbers above 0 up to 10"),
-    (("compare", "{tmp}"), "scenario.toml: no such file"),
-    (("drive",), "drive"),
-])
+@pytest.mark.parametrize(
+    "arguments, expected",
+    [
+        (("run", "{small}", "--controller", "nobody"), "controller 'nobody' is unknown; choose from no-control"),
+        (("run", "{small}"), "--controller"),
+        (("identify", "{small}", "--runs", "{tmp}"), "--runs: fits one model; say which, by --guided, --own or --with"),
+        (("identify", "{small}", "--own", "--network", "{tmp}/more", "--runs", "{tmp}"), "holds no finished runs"),
+        (("run", "{tmp}/none", "--controller", "no-control"), "scenario.toml: no such file"),
+        (("run", "{small}", "--controller", "no-control", "--steps", "0"), "--steps"),
+        (("run", "{small}", "--controller", "no-control", "--policy", "x.pt"), "reads no policy"),
+        (
+            ("identify", "{small}", "--levels", "a,b"),
+            "'--levels': expected a list of distinct numbers above 0 up to 10",
+        ),
+        (("compare", "{tmp}"), "scenario.toml: no such file"),
+        (("drive",), "drive"),
+    ],
+)
 def test_command_line_errors(small, tmp_path, arguments, expected):
     filled = [argument.format(small=small, tmp=tmp_path) for argument in arguments]
     assert expected in error_line(cosim(*filled))

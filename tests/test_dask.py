@@ -79,9 +79,14 @@ def test_remote_gives_the_reason(tmp_path):
     assert "nowhere: no such folder here" in outcome.reason and "\n" not in outcome.reason
 
 
-@pytest.mark.parametrize("command, chosen", [
-    ("sweep", ("--controllers", "no-control")), ("frontier", ("--controllers", "no-control")),
-    ("identify", ("--own",))])
+@pytest.mark.parametrize(
+    "command, chosen",
+    [
+        ("sweep", ("--controllers", "no-control")),
+        ("frontier", ("--controllers", "no-control")),
+        ("identify", ("--own",)),
+    ],
+)
 def test_no_scheduler_answers(peak, tmp_path, monkeypatch, command, chosen):
     pytest.importorskip("distributed", reason="the extra dask is not installed")
     monkeypatch.setattr("cosim.evaluation.dask_cluster.PATIENCE", 0.5)
@@ -89,7 +94,6 @@ def test_no_scheduler_answers(peak, tmp_path, monkeypatch, command, chosen):
         done = cosim(command, peak, *chosen, "--scheduler", address, "--out", tmp_path / "out")
         assert done.exit_code == 2 and "no Dask scheduler answers at" in done.stderr, done.output + str(done.exception)
         assert done.stderr.count("\n") == 1 and not (tmp_path / "out").exists()
-
 
 
 @pytest.fixture(scope="module")
@@ -102,11 +106,35 @@ def certificates(tmp_path_factory) -> Path:
 
     new = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
     for name in ("here", "other"):
-        openssl("req", "-x509", *new, "-keyout", f"{name}-ca.key", "-out", f"{name}-ca.pem", "-days", "2",
-                "-subj", f"/CN={name} authority")
+        openssl(
+            "req",
+            "-x509",
+            *new,
+            "-keyout",
+            f"{name}-ca.key",
+            "-out",
+            f"{name}-ca.pem",
+            "-days",
+            "2",
+            "-subj",
+            f"/CN={name} authority",
+        )
         openssl("req", *new, "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", "/CN=localhost")
-        openssl("x509", "-req", "-in", f"{name}.csr", "-CA", f"{name}-ca.pem", "-CAkey", f"{name}-ca.key",
-                "-CAcreateserial", "-out", f"{name}.pem", "-days", "2")
+        openssl(
+            "x509",
+            "-req",
+            "-in",
+            f"{name}.csr",
+            "-CA",
+            f"{name}-ca.pem",
+            "-CAkey",
+            f"{name}-ca.key",
+            "-CAcreateserial",
+            "-out",
+            f"{name}.pem",
+            "-days",
+            "2",
+        )
     return folder
 
 
@@ -117,12 +145,24 @@ def shown(folder: Path, name: str, authority: str) -> dict:
 def encrypted(folder: Path, **more):
     """A cluster that trusts who has a certificate of the authority here."""
     distributed = pytest.importorskip("distributed", reason="the extra dask is not installed")
-    security = distributed.security.Security(require_encryption=True, tls_ca_file=str(folder / "here-ca.pem"), **{
-        f"tls_{side}_{what}": str(folder / f"here.{end}")
-        for side in ("client", "scheduler", "worker") for what, end in (("cert", "pem"), ("key", "key"))})
+    security = distributed.security.Security(
+        require_encryption=True,
+        tls_ca_file=str(folder / "here-ca.pem"),
+        **{
+            f"tls_{side}_{what}": str(folder / f"here.{end}")
+            for side in ("client", "scheduler", "worker")
+            for what, end in (("cert", "pem"), ("key", "key"))
+        },
+    )
     return distributed.LocalCluster(
-        security=security, protocol="tls://", threads_per_worker=1, dashboard_address=None, silence_logs=50,
-        memory_limit=0, **more)
+        security=security,
+        protocol="tls://",
+        threads_per_worker=1,
+        dashboard_address=None,
+        silence_logs=50,
+        memory_limit=0,
+        **more,
+    )
 
 
 def test_an_encrypted_scheduler_is_reached_with_its_authority_only(certificates, monkeypatch):
@@ -140,20 +180,44 @@ def test_an_encrypted_scheduler_is_reached_with_its_authority_only(certificates,
             dask_cluster.connect(address)
 
 
-@pytest.mark.parametrize("address, warned", [
-    ("tcp://127.0.0.1:1", False), ("localhost:1", False), ("tcp://[::1]:1", False), ("tls://far:1", False),
-    ("inproc://1/2", False), ("tcp://far:1", True), ("10.0.0.1:8786", True), ("ucx://10.0.0.1:1", True), ("", True)])
+@pytest.mark.parametrize(
+    "address, warned",
+    [
+        ("tcp://127.0.0.1:1", False),
+        ("localhost:1", False),
+        ("tcp://[::1]:1", False),
+        ("tls://far:1", False),
+        ("inproc://1/2", False),
+        ("tcp://far:1", True),
+        ("10.0.0.1:8786", True),
+        ("ucx://10.0.0.1:1", True),
+        ("", True),
+    ],
+)
 def test_who_is_trusted_is_said(address, warned):
     assert ("whoever reaches it can run code" in dask_cluster.Scheduler(address=address).warning) == warned
 
 
-@pytest.mark.parametrize("arguments, expected", [
-    (("--scheduler", "tcp://x:1", "--scheduler-ca", "here-ca.pem"), "--scheduler-ca: is for an encrypted scheduler"),
-    (("--scheduler", "tls://x:1", "--scheduler-ca", "nowhere.pem"), "nowhere.pem: no such file"),
-    (("--scheduler", "tls://x:1", "--scheduler-ca", "here-ca.pem"), "--scheduler-cert: missing"),
-    (("--scheduler", "tls://x:1", *(word for what in ("ca", "cert", "key") for word in (
-        f"--scheduler-{what}", "here.csr"))), "no Dask scheduler answers"),
-    (("--scheduler-key", "here.key"), "--scheduler: missing")])
+@pytest.mark.parametrize(
+    "arguments, expected",
+    [
+        (
+            ("--scheduler", "tcp://x:1", "--scheduler-ca", "here-ca.pem"),
+            "--scheduler-ca: is for an encrypted scheduler",
+        ),
+        (("--scheduler", "tls://x:1", "--scheduler-ca", "nowhere.pem"), "nowhere.pem: no such file"),
+        (("--scheduler", "tls://x:1", "--scheduler-ca", "here-ca.pem"), "--scheduler-cert: missing"),
+        (
+            (
+                "--scheduler",
+                "tls://x:1",
+                *(word for what in ("ca", "cert", "key") for word in (f"--scheduler-{what}", "here.csr")),
+            ),
+            "no Dask scheduler answers",
+        ),
+        (("--scheduler-key", "here.key"), "--scheduler: missing"),
+    ],
+)
 def test_mistakes_with_certificates(peak, tmp_path, certificates, monkeypatch, arguments, expected):
     pytest.importorskip("distributed", reason="the extra dask is not installed")
     monkeypatch.chdir(certificates)
@@ -175,8 +239,11 @@ def test_a_scheduler_that_stays_away_or_dies_of_the_runs(monkeypatch, back, expe
 
     monkeypatch.setattr(dask_cluster, "connect", connect)
     monkeypatch.setattr(dask_cluster, "RETURN", 60.0 if back else 0.0)
-    monkeypatch.setattr(dask_cluster, "_until_lost", lambda client, function, tasks: (
-        (task, function(task)) for task in tasks if task == 1))
+    monkeypatch.setattr(
+        dask_cluster,
+        "_until_lost",
+        lambda client, function, tasks: ((task, function(task)) for task in tasks if task == 1),
+    )
     found = dict(dask_cluster.outcomes("tcp://127.0.0.1:1", str, [1, 2, 3], tell=told.append))
     assert found[1] == "1" and found[2] == found[3] == Failure(f"the scheduler at tcp://127.0.0.1:1 {expected}")
     assert "tcp://127.0.0.1:1 was lost; its 2 runs begin again" in told[0] and len(told) == (6 if back else 1)
@@ -189,10 +256,14 @@ class Cluster:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
-        self.options = [word for what, end in (("ca-file", "-ca.pem"), ("cert", ".pem"), ("key", ".key")) for word in (
-            f"--tls-{what}", str(certificates / f"here{end}"))]
+        self.options = [
+            word
+            for what, end in (("ca-file", "-ca.pem"), ("cert", ".pem"), ("key", ".key"))
+            for word in (f"--tls-{what}", str(certificates / f"here{end}"))
+        ]
         self.scheduler = dask_cluster.Scheduler(
-            address=f"tls://127.0.0.1:{self.port}", **shown(certificates, "here", "here"))
+            address=f"tls://127.0.0.1:{self.port}", **shown(certificates, "here", "here")
+        )
         self.workers: list[subprocess.Popen] = []
         self.began: list[subprocess.Popen] = []
 
@@ -217,9 +288,20 @@ class Cluster:
         return True
 
     def _process(self, what: str, *arguments) -> subprocess.Popen:
-        self.began.append(subprocess.Popen(
-            [sys.executable, "-m", f"distributed.cli.dask_{what}", *map(str, arguments), "--no-dashboard",
-             *self.options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+        self.began.append(
+            subprocess.Popen(
+                [
+                    sys.executable,
+                    "-m",
+                    f"distributed.cli.dask_{what}",
+                    *map(str, arguments),
+                    "--no-dashboard",
+                    *self.options,
+                ],
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+        )
         return self.began[-1]
 
     def end(self) -> None:
@@ -303,8 +385,20 @@ def test_a_worker_and_the_scheduler_are_killed_and_nothing_is_lost_or_done_twice
     if command == "evaluate":
         tiny_city.city(tmp_path)
         scenario = tiny_city.imported(tmp_path).relative_to(tmp_path)
-        order = ("evaluate", scenario, "--controllers", "held.py:Held", "--seeds", 3, "--first-seed", 0, "--steps", 2,
-                 "--time-limit", 100)
+        order = (
+            "evaluate",
+            scenario,
+            "--controllers",
+            "held.py:Held",
+            "--seeds",
+            3,
+            "--first-seed",
+            0,
+            "--steps",
+            2,
+            "--time-limit",
+            100,
+        )
         runs, tables = "demand-1", ("runs.csv", "demand-1/sumo.csv")
     else:
         tiny.write(tmp_path)
@@ -312,12 +406,22 @@ def test_a_worker_and_the_scheduler_are_killed_and_nothing_is_lost_or_done_twice
         order = ("compete", "held.py:Held", "--tasks", "mine.toml")
         runs, tables = "one", ("held.py%3AHeld.json",)
     wrong: list = []
-    thread = threading.Thread(
-        target=meddle, args=(cluster, tmp_path, tmp_path / "there" / runs / "summary.csv", wrong))
+    thread = threading.Thread(target=meddle, args=(cluster, tmp_path, tmp_path / "there" / runs / "summary.csv", wrong))
     thread.start()
     at = cluster.scheduler
-    there = cosim(*order, "--out", "there", "--scheduler", at.address, "--scheduler-ca", at.ca, "--scheduler-cert",
-                  at.cert, "--scheduler-key", at.key)
+    there = cosim(
+        *order,
+        "--out",
+        "there",
+        "--scheduler",
+        at.address,
+        "--scheduler-ca",
+        at.ca,
+        "--scheduler-cert",
+        at.cert,
+        "--scheduler-key",
+        at.key,
+    )
     thread.join()
     assert not wrong, wrong
     until(lambda: cluster.began[2].poll() is not None)  # a worker that lost its scheduler ends
@@ -332,5 +436,3 @@ def test_a_worker_and_the_scheduler_are_killed_and_nothing_is_lost_or_done_twice
         assert Path("there", runs, file).read_bytes() == Path("here", runs, file).read_bytes(), file
     for table in tables:
         assert timeless(Path("there", table)) == timeless(Path("here", table))
-
-

@@ -35,7 +35,9 @@ def test_a_delay_is_beyond_a_road_of_ones_own(scenario):
     crowd = replace(scenario, demand=3.0 * scenario.demand)
     crowded, _ = delays.delays_by_origin(crowd, run(crowd, "no-control", plant="acyclic", progress=False))
     assert crowded[0] > 10.0 and crowded[1] == 0.0
-    held = replace(run(alone, "no-control", plant="acyclic", progress=False),
-                   perimeter=np.where(scenario.network.adjacency, 0.1, 0.0) * np.ones((scenario.steps, 1, 1)))
+    held = replace(
+        run(alone, "no-control", plant="acyclic", progress=False),
+        perimeter=np.where(scenario.network.adjacency, 0.1, 0.0) * np.ones((scenario.steps, 1, 1)),
+    )
     waiting, _ = delays.delays_by_origin(alone, held)
     assert waiting[0] > 60.0  # behind a gate that is hardly open, with nobody else there

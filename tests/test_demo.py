@@ -19,8 +19,11 @@ def made(monkeypatch):
     scenario, opened = load_scenario(made_up.SCENARIO), []
     city = made_up.city_of(scenario.network)
     monkeypatch.setattr(demo, "SCENARIO", made_up.SCENARIO)
-    monkeypatch.setattr(experiment, "outcomes", lambda function, todo, workers, **_: (
-        (task, made_up.result(task, city)) for task in todo))
+    monkeypatch.setattr(
+        experiment,
+        "outcomes",
+        lambda function, todo, workers, **_: ((task, made_up.result(task, city)) for task in todo),
+    )
     for module, name in ((html.pictures, "draw"), (html.pictures, "draw_more"), (experiment, "draw_accumulations")):
         monkeypatch.setattr(module, name, lambda *_, **__: None)
     monkeypatch.setattr(html, "_replay", lambda *_: (None, "no map"))
@@ -50,7 +53,8 @@ def test_the_city_locks_without_gates_and_flows_with_them(tmp_path):
     said = good(cosim("demo", "--out", tmp_path / "demo", "--no-open")).splitlines()
     (locked, trips), (served, same) = (
         [float(number.replace(",", "")) for number in re.findall(r"[\d,]+(?= of)|(?<=of )[\d,]+", line)]
-        for line in said[:2])
+        for line in said[:2]
+    )
     assert trips == same and locked < 0.75 * trips and served > 0.99 * trips
     page = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
     assert "pi-gating instead of no control" in page and len(page) < 8e6

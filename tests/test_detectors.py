@@ -121,6 +121,7 @@ def test_the_closed_loop_runs_on_estimates(scenario, run):
 
 def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
     """The same controls give the same city, with detectors or without."""
+
     class Again:
         name = "again"
 
@@ -129,6 +130,7 @@ def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
 
         def act(self, measurement: Observation):
             from nmfd.types import Controls
+
             return Controls(perimeter=run.perimeter[measurement.step], splits=None)
 
     plant = SumoPlant(scenario, overrides=Settings())
@@ -142,15 +144,20 @@ def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
 
 def test_states_are_estimated_with_the_model_of_those_who_drive():
     """`simulate` gives the plant the model with which the controller plans: another estimate of the same city."""
-    tasks = [Task(scenario=SCENARIO, controller=name, seed=3, steps=INTERVALS)
-             for name in ("route-guidance+estimate", "route-guidance+estimate+max-pressure")]
+    tasks = [
+        Task(scenario=SCENARIO, controller=name, seed=3, steps=INTERVALS)
+        for name in ("route-guidance+estimate", "route-guidance+estimate+max-pressure")
+    ]
     models = [planning_of(scenario_of(task), task.controller).network for task in tasks]
     assert [model.folder.name for model in models] == ["grid7_guided", "grid7_max_pressure"]
     scenario = scenario_of(tasks[0])
     found = simulate(tasks[0]).trajectory
     for model, same in zip(models, (True, False), strict=True):
-        plant = SumoPlant(scenario, overrides=settings(scenario).changed(measurement="estimate"),
-                          planning=replace(planning_model(scenario), network=model))
+        plant = SumoPlant(
+            scenario,
+            overrides=settings(scenario).changed(measurement="estimate"),
+            planning=replace(planning_model(scenario), network=model),
+        )
         try:
             again = closed_loop.run(plant, registry.make("route-guidance", scenario), scenario, seed=3)
         finally:
@@ -179,11 +186,15 @@ def test_table_and_picture(scenario, run, tmp_path):
     assert estimation_errors.write_errors(tmp_path / "none", scenario.network, [replace(run, estimated=False)]).empty
 
 
-@pytest.mark.parametrize("lines, problem", [
-    ('measurement = "guess"', "sumo.measurement: expected one of exact, estimate, got 'guess' instead"),
-    ("detector_share = 1.2", r"sumo.detector_share: expected a number in \[0, 1\], got 1.2 instead"),
-    ("probe_share = -0.1", r"sumo.probe_share: expected a number in \[0, 1\]"),
-    ('measurement = "estimate"\ndetector_share = 0\nprobe_share = 0', "needs detectors or probes")])
+@pytest.mark.parametrize(
+    "lines, problem",
+    [
+        ('measurement = "guess"', "sumo.measurement: expected one of exact, estimate, got 'guess' instead"),
+        ("detector_share = 1.2", r"sumo.detector_share: expected a number in \[0, 1\], got 1.2 instead"),
+        ("probe_share = -0.1", r"sumo.probe_share: expected a number in \[0, 1\]"),
+        ('measurement = "estimate"\ndetector_share = 0\nprobe_share = 0', "needs detectors or probes"),
+    ],
+)
 def test_wrong_settings(scenario, tmp_path, lines, problem):
     (tmp_path / "scenario.toml").write_text(f"[sumo]\n{lines}\n")
     with pytest.raises(InputError, match=problem) as caught:

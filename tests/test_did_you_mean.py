@@ -18,19 +18,27 @@ def problem(call, *arguments) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("call, arguments, hint", [
-    (registry.check, ["dpc-prcg"], "dpc-pcrg"), (registry.check, ["pi_gating"], "pi-gating"),
-    (strategy.parse, ["dpc-pcrg+max-presure"], "max-pressure"), (strategy.parse, ["no-controll"], "no-control"),
-    (strategy.parse, ["dpc-pcrg+complience-50"], "compliance-N"), (strategy.parse, ["actuatd"], "actuated"),
-    (faults.parse, ["delaid:2@3-4", "--fault", 7], "delayed"),
-    (faults.parse, ["solver-fail", "--fault", 7], "solver-fails"),
-], ids=lambda value: value[0] if isinstance(value, list) else "")
+@pytest.mark.parametrize(
+    "call, arguments, hint",
+    [
+        (registry.check, ["dpc-prcg"], "dpc-pcrg"),
+        (registry.check, ["pi_gating"], "pi-gating"),
+        (strategy.parse, ["dpc-pcrg+max-presure"], "max-pressure"),
+        (strategy.parse, ["no-controll"], "no-control"),
+        (strategy.parse, ["dpc-pcrg+complience-50"], "compliance-N"),
+        (strategy.parse, ["actuatd"], "actuated"),
+        (faults.parse, ["delaid:2@3-4", "--fault", 7], "delayed"),
+        (faults.parse, ["solver-fail", "--fault", 7], "solver-fails"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
 def test_names(call, arguments, hint):
     assert f"did you mean {hint}?" in problem(call, *arguments)
 
 
 @pytest.mark.parametrize(
-    "load, name", [(load_scenario, "scenario"), (load_network, "network")], ids=["scenario", "network"])
+    "load, name", [(load_scenario, "scenario"), (load_network, "network")], ids=["scenario", "network"]
+)
 def test_folders(tmp_path, load, name):
     tiny.write(tmp_path)
     (tmp_path / f"{name}s").mkdir()  # nearer, but holds nothing
@@ -38,9 +46,11 @@ def test_folders(tmp_path, load, name):
     assert text.startswith(f"{tmp_path}/{name}x/{name}.toml: no such file; did you mean {name}?")
 
 
-@pytest.mark.parametrize("old, new, key", [
-    ("step = 30.0", "stepp = 30.0", "step"), ("ramp_up", "rampup", "ramp_up"), ("[noise]", "[nois]", "noise")],
-    ids=["in place of a required key", "in a list", "a table"])
+@pytest.mark.parametrize(
+    "old, new, key",
+    [("step = 30.0", "stepp = 30.0", "step"), ("ramp_up", "rampup", "ramp_up"), ("[noise]", "[nois]", "noise")],
+    ids=["in place of a required key", "in a list", "a table"],
+)
 def test_keys(tmp_path, old, new, key):
     scenario = tiny.write(tmp_path, scenario=tiny.SCENARIO.replace(old, new))
     assert f"unknown key; did you mean {key}?; allowed here: " in problem(load_scenario, scenario)

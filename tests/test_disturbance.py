@@ -34,8 +34,13 @@ def believed():
     """The benchmark with a part of its demand, as it is believed in."""
     loaded = load_scenario("economic_mpc")
     return replace(
-        loaded, network=replace(loaded.network, disturbance=LAW), demand=0.4 * loaded.demand, steps=80,
-        controller_options={}, measurement_std=0.0)
+        loaded,
+        network=replace(loaded.network, disturbance=LAW),
+        demand=0.4 * loaded.demand,
+        steps=80,
+        controller_options={},
+        measurement_std=0.0,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +53,12 @@ def slow(believed):
 def run(slow):
     trajectory = closed_loop.run(NmfdPlant(slow), NoControl(planning_model(slow)), slow, seed=0)
     return Observed(
-        accumulation=trajectory.accumulation, demand=slow.demand[:slow.steps], perimeter=trajectory.perimeter,
-        splits=trajectory.splits, crossings=np.full((slow.steps, 7, 7), 60.0))
+        accumulation=trajectory.accumulation,
+        demand=slow.demand[: slow.steps],
+        perimeter=trajectory.perimeter,
+        splits=trajectory.splits,
+        crossings=np.full((slow.steps, 7, 7), 60.0),
+    )
 
 
 def test_the_newest_counts_most_and_a_constant_error_counts_in_full():
@@ -97,7 +106,7 @@ def test_a_model_that_is_right_needs_no_correction(slow, run):
 
 
 def test_runs_too_short_tell_nothing(believed, run):
-    short = Observed(**{name: values[:LOOK + (name == "accumulation")] for name, values in vars(run).items()})
+    short = Observed(**{name: values[: LOOK + (name == "accumulation")] for name, values in vars(run).items()})
     assert identification.fit_disturbance(believed.network, [short], step=believed.step) is believed.network
 
 
@@ -124,7 +133,8 @@ def test_mpc_foresees_what_it_did_not_know(believed, slow):
 def test_where_the_model_is_right_nothing_changes(believed):
     plain, free = (
         closed_loop.run(NmfdPlant(believed), mpc(believed, offset_free=on), replace(believed, steps=20), seed=0)
-        for on in (False, True))
+        for on in (False, True)
+    )
     np.testing.assert_allclose(free.accumulation, plain.accumulation, atol=0.5)
 
 

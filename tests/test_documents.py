@@ -16,10 +16,33 @@ from nmfd.runs import shipped
 
 # What a reader replaces, and files and folders that are not kept here: a path that begins so need not exist.
 PLACEHOLDERS = (
-    "runs", "networks/mycity", "scenarios/mycity", "mycity", "city.", "mine", "scenarios/mine", "networks/mine",
-    "counts.csv", "detectors.csv", "regions.csv", "about.csv", "dpc-pcrg.onnx", "bologna/", "ingolstadt21/",
-    "luxembourg/", "networks/ingolstadt", "scenarios/r100", "left.net.xml", "networks/left",
-    "scenarios/left", "FILE", "NAME", "build/", "SCENARIO", "DIR")
+    "runs",
+    "networks/mycity",
+    "scenarios/mycity",
+    "mycity",
+    "city.",
+    "mine",
+    "scenarios/mine",
+    "networks/mine",
+    "counts.csv",
+    "detectors.csv",
+    "regions.csv",
+    "about.csv",
+    "dpc-pcrg.onnx",
+    "bologna/",
+    "ingolstadt21/",
+    "luxembourg/",
+    "networks/ingolstadt",
+    "scenarios/r100",
+    "left.net.xml",
+    "networks/left",
+    "scenarios/left",
+    "FILE",
+    "NAME",
+    "build/",
+    "SCENARIO",
+    "DIR",
+)
 SUFFIXES = r"py|md|toml|csv|png|txt|json|nc|npz|pt|onnx|xml|gz|parquet|css|js|j2|ipynb|html|mp4|log|tmp|lock"
 PATH = re.compile(rf"(?:\.?[\w+=-]+/)*\.?[\w.+-]*\w\.(?:{SUFFIXES})|(?:\.?[\w+-]+/)+[\w+-]*")
 PYTHON = re.compile(r"(?:nmfd|cosim)(?:\.\w+)+")
@@ -43,8 +66,14 @@ def test_every_link_leads_somewhere(document):
 
 
 def test_every_name_of_a_file_is_one(document):
-    wrong = [name for name in document.names if PATH.fullmatch(name) and not (_is_there(name, document) or any(
-        name.startswith(start) for start in PLACEHOLDERS) or _is_written(name))]
+    wrong = [
+        name
+        for name in document.names
+        if PATH.fullmatch(name)
+        and not (
+            _is_there(name, document) or any(name.startswith(start) for start in PLACEHOLDERS) or _is_written(name)
+        )
+    ]
     assert not wrong, "no such files, and no code that writes them"
 
 
@@ -177,5 +206,9 @@ def _is_of_pytest(option: str, pytestconfig: pytest.Config) -> bool:
 @cache
 def _options() -> set[str]:
     return {"--help", "--version"} | {
-        opt for group in MAINS.values() for command in group.commands.values() for param in command.params
-        for opt in (*param.opts, *param.secondary_opts)}
+        opt
+        for group in MAINS.values()
+        for command in group.commands.values()
+        for param in command.params
+        for opt in (*param.opts, *param.secondary_opts)
+    }

@@ -56,7 +56,7 @@ def test_any_weights_and_any_state_give_admissible_controls(guidance, activation
 def test_forbidden_regions_have_no_gradient_and_no_nan():
     made = policy(guidance=True)
     _, splits = made(torch.full((3, 7, 7), 500.0))
-    (splits ** 2).sum().backward()
+    (splits**2).sum().backward()
     gradient = made.splits_decoder.weight.grad.unflatten(0, (7, 7, 7))
     assert torch.isfinite(gradient).all()
     assert (gradient[torch.tensor(~NETWORK.split_mask)] == 0.0).all() and gradient.abs().max() > 0.0
@@ -148,14 +148,18 @@ def test_a_policy_of_the_other_kind_is_refused(tmp_path, scenario):
     one_line(caught, path)
 
 
-@pytest.mark.parametrize("damage, problem", [
-    (lambda path: path.unlink(), "no such policy"),
-    (lambda path: path.write_bytes(b"not a policy"), "is not a policy file"),
-    (lambda path: path.write_bytes(path.read_bytes()[:2000]), "is not a policy file"),
-    (lambda path: torch.save({"format": 99}, path), "format: expected"),
-    (lambda path: torch.save({"format": 1}, path), "is damaged"),
-    (lambda path: torch.save([1, 2], path), "is damaged")],
-    ids=["missing", "text", "truncated", "format", "empty", "list"])
+@pytest.mark.parametrize(
+    "damage, problem",
+    [
+        (lambda path: path.unlink(), "no such policy"),
+        (lambda path: path.write_bytes(b"not a policy"), "is not a policy file"),
+        (lambda path: path.write_bytes(path.read_bytes()[:2000]), "is not a policy file"),
+        (lambda path: torch.save({"format": 99}, path), "format: expected"),
+        (lambda path: torch.save({"format": 1}, path), "is damaged"),
+        (lambda path: torch.save([1, 2], path), "is damaged"),
+    ],
+    ids=["missing", "text", "truncated", "format", "empty", "list"],
+)
 def test_a_damaged_policy_file_is_one_line(tmp_path, damage, problem):
     path = saved(tmp_path / "p.pt", policy(guidance=False), NETWORK)
     damage(path)
@@ -252,9 +256,15 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
         assert training.available("auto") == expected and training.available("cpu") == "cpu"
 
 
-@pytest.mark.parametrize("options, problem", [
-    ({"widht": 3}, "widht: unknown key"), ({"activation": "sine"}, "activation: expected one of"),
-    ({"steps": 0}, "steps: expected a whole number from 1"), ({"batch": 1.5}, "batch: expected a whole number")])
+@pytest.mark.parametrize(
+    "options, problem",
+    [
+        ({"widht": 3}, "widht: unknown key"),
+        ({"activation": "sine"}, "activation: expected one of"),
+        ({"steps": 0}, "steps: expected a whole number from 1"),
+        ({"batch": 1.5}, "batch: expected a whole number"),
+    ],
+)
 def test_wrong_training_settings(scenario, options, problem):
     with pytest.raises(InputError, match=f"controllers.dpc-pc.{problem}"):
         training.settings(replace(scenario, controller_options={"dpc-pc": options}), "dpc-pc")
@@ -269,8 +279,9 @@ def test_a_sparse_policy_is_the_dense_one_with_the_same_weights(guidance):
     rows = {"perimeter_decoder": (here * 7 + onward).ravel()}
     rows["splits_decoder"] = ((here * 7 + onward)[..., None] * 7 + np.arange(7)).ravel()
     weights = dense.state_dict()
-    sparse.load_state_dict({
-        key: value[rows[key.split(".")[0]]] if key.split(".")[0] in rows else value for key, value in weights.items()})
+    sparse.load_state_dict(
+        {key: value[rows[key.split(".")[0]]] if key.split(".")[0] in rows else value for key, value in weights.items()}
+    )
     x = 1000.0 * torch.rand(5, 7, 7)
     for a, b in zip(dense(x), sparse(x), strict=True):
         if a is not None:
@@ -290,14 +301,14 @@ def test_a_local_policy_looks_around_every_boundary():
     local = Policy(NETWORK, Architecture(width=8, local=True))
     critical, x = NETWORK.mfds[0].critical, 1000.0 * torch.rand(7, 7)
     full, ending = x.sum(1) / critical, x.diagonal() / critical
-    by_hand = torch.stack([
-        full[2], full[[0, 3, 5]].mean(), ending[2], full[0], full[[1, 2, 3]].mean(), ending[0]])
+    by_hand = torch.stack([full[2], full[[0, 3, 5]].mean(), ending[2], full[0], full[[1, 2, 3]].mean(), ending[0]])
     share = torch.sigmoid(local.perimeter_decoder(local.backbone(by_hand)))
     perimeter, splits = local(x)
     assert splits is None and perimeter[2, 0].item() == pytest.approx(0.1 + 0.8 * share.item(), rel=1e-5)
     assert ((perimeter > 0.0).numpy() == NETWORK.adjacency).all()
     np.testing.assert_allclose(
-        DpcController(local).act(measurement(x.numpy().astype(float))).perimeter, perimeter.detach(), rtol=1e-5)
+        DpcController(local).act(measurement(x.numpy().astype(float))).perimeter, perimeter.detach(), rtol=1e-5
+    )
     torch.testing.assert_close(local(x.expand(3, 2, 7, 7))[0], perimeter.expand(3, 2, 7, 7))
     alike = local(torch.full((7, 7), 300.0))[0]  # the gates of the centre to all sides
     assert alike[3, NETWORK.adjacency[3]].max() == alike[3, NETWORK.adjacency[3]].min()
@@ -390,8 +401,9 @@ def test_swings_of_the_gates_cost_what_they_are(scenario):
         return perimeter, None
 
     made.forward = act
-    totals = [rollout.total_time_spent(made, x, demand, torch.Generator().manual_seed(1))
-              for rollout in (still, costly)]
+    totals = [
+        rollout.total_time_spent(made, x, demand, torch.Generator().manual_seed(1)) for rollout in (still, costly)
+    ]
     torch.testing.assert_close(totals[1] - totals[0], torch.full((2,), 7.0 * 1.75), rtol=1e-3, atol=1.0)
 
 
@@ -400,7 +412,8 @@ def test_detours_cost_what_they_divert(scenario):
     torch.manual_seed(0)
     made = Policy(scenario.network, Architecture(width=8, guidance=True))
     plain, costly = (
-        training.Rollout(planning_model(scenario), dtype=torch.float32, detour_cost=cost) for cost in (0.0, 50.0))
+        training.Rollout(planning_model(scenario), dtype=torch.float32, detour_cost=cost) for cost in (0.0, 50.0)
+    )
     generator = torch.Generator()
     x, demand = plain.random_start(2, 0.2, 1.0, generator.manual_seed(0))
     demand = demand[:3]
@@ -413,4 +426,5 @@ def test_detours_cost_what_they_divert(scenario):
     leaving = dynamics.rate(plain.parameters, exact.sum(-1)).unsqueeze(-1) * exact
     diverted = 0.5 * (splits - plain.nominal_splits).abs().sum(-2) * leaving
     torch.testing.assert_close(
-        total(costly) - total(plain), 50.0 * scenario.step * diverted.sum((0, -2, -1)), rtol=1e-3, atol=1.0)
+        total(costly) - total(plain), 50.0 * scenario.step * diverted.sum((0, -2, -1)), rtol=1e-3, atol=1.0
+    )

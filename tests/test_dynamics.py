@@ -30,9 +30,17 @@ def random_tensors(seed, *, filling, batch=()):
 
 
 def one_region(mfd):
-    return dynamics.parameters(RegionalModel(
-        name="one", region_names=("only",), positions=np.zeros((1, 2)), adjacency=np.zeros((1, 1), dtype=bool),
-        mfds=(mfd,), u_min=0.1, u_max=0.9))
+    return dynamics.parameters(
+        RegionalModel(
+            name="one",
+            region_names=("only",),
+            positions=np.zeros((1, 2)),
+            adjacency=np.zeros((1, 1), dtype=bool),
+            mfds=(mfd,),
+            u_min=0.1,
+            u_max=0.9,
+        )
+    )
 
 
 @KINDS
@@ -64,8 +72,10 @@ def test_vehicles_leave_as_their_trips_end():
 def test_one_euler_step_is_the_default():
     x, demand, perimeter, splits = random_tensors(9, filling=6000.0)
     expected = dynamics.euler(PARAMETERS, x, demand, perimeter, splits, STEP)
-    for after in (dynamics.advance(PARAMETERS, x, demand, perimeter, splits, STEP),
-                  dynamics.advance_counted(PARAMETERS, x, demand, perimeter, splits, STEP)[0]):
+    for after in (
+        dynamics.advance(PARAMETERS, x, demand, perimeter, splits, STEP),
+        dynamics.advance_counted(PARAMETERS, x, demand, perimeter, splits, STEP)[0],
+    ):
         torch.testing.assert_close(after, expected, rtol=1e-13, atol=1e-10)
 
 
@@ -98,8 +108,12 @@ def test_a_turned_or_mirrored_hexagon_is_the_same_hexagon(order):
     assert (NETWORK.adjacency[order][:, order] == NETWORK.adjacency).all()
     plain = dynamics.advance(PARAMETERS, x, demand, perimeter, splits, STEP, substeps=3)
     turned = dynamics.advance(
-        PARAMETERS, *(matrix[order][:, order] for matrix in (x, demand, perimeter)),
-        splits[order][:, order][:, :, order], STEP, substeps=3)
+        PARAMETERS,
+        *(matrix[order][:, order] for matrix in (x, demand, perimeter)),
+        splits[order][:, order][:, :, order],
+        STEP,
+        substeps=3,
+    )
     torch.testing.assert_close(turned, plain[order][:, order], rtol=1e-12, atol=0.0)
 
 
@@ -111,7 +125,8 @@ def test_order_of_convergence(integrator, order):
     exact = dynamics.advance(PARAMETERS, *state, 1200.0, integrator="rk4", substeps=1000)
     error = [
         (dynamics.advance(PARAMETERS, *state, 1200.0, integrator=integrator, substeps=n) - exact).abs().max().item()
-        for n in (10, 20)]
+        for n in (10, 20)
+    ]
     assert np.log2(error[0] / error[1]) == pytest.approx(order, abs=0.3)
 
 
@@ -140,10 +155,15 @@ def test_torch_and_casadi_agree(integrator, substeps, network):
         demand, (perimeter, splits) = random.uniform(0.0, 2.0, (7, 7)), random_controls(random, NETWORK)
         kwargs = {"integrator": integrator, "substeps": substeps}
         x = dynamics.advance(
-            dynamics.parameters(network), x, *(torch.from_numpy(array) for array in (demand, perimeter, splits)), STEP,
-            **kwargs)
+            dynamics.parameters(network),
+            x,
+            *(torch.from_numpy(array) for array in (demand, perimeter, splits)),
+            STEP,
+            **kwargs,
+        )
         twin = dynamics_casadi.advance(
-            p, twin, ca.DM(demand), ca.DM(perimeter), dynamics_casadi.splits_list(splits), STEP, **kwargs)
+            p, twin, ca.DM(demand), ca.DM(perimeter), dynamics_casadi.splits_list(splits), STEP, **kwargs
+        )
         most = max(most, x.sum(-1).max().item())
         np.testing.assert_allclose(twin.full(), x.numpy(), rtol=0.0, atol=1e-9)
     assert most > 1.5 * NETWORK.mfds[0].jam

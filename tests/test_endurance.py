@@ -73,9 +73,20 @@ def intervals(scenario, count):
 
 def test_an_hour_in_a_tiny_city(tmp_path):
     """Its vehicles again and again: the same load in every interval."""
-    result = CliRunner().invoke(main, [
-        "import", str(tiny_city.city(tmp_path)), "--regions", "3", "--no-run", "--method", "geometric", "--out",
-        str(tmp_path / "networks" / "tiny")])
+    result = CliRunner().invoke(
+        main,
+        [
+            "import",
+            str(tiny_city.city(tmp_path)),
+            "--regions",
+            "3",
+            "--no-run",
+            "--method",
+            "geometric",
+            "--out",
+            str(tmp_path / "networks" / "tiny"),
+        ],
+    )
     assert result.exit_code == 0, result.output
     scenario = load_scenario(tmp_path / "scenarios" / "tiny")
     network = scenario.network

@@ -26,10 +26,13 @@ OPEN = Controls(perimeter=np.where(NETWORK.adjacency, NETWORK.u_max, 0.0), split
 def equipped(*, detectors=0.3, probes=0.1, error=0.15):
     """Instruments that are alike in every region."""
     return Instruments(
-        detector_share=np.full(REGIONS, detectors), detector_error=np.full(REGIONS, error),
+        detector_share=np.full(REGIONS, detectors),
+        detector_error=np.full(REGIONS, error),
         detector_noise=np.full(REGIONS, error),
         counted_share=np.where(NETWORK.adjacency, detectors, 0.0),
-        counted_gateways=np.where(NETWORK.adjacency, 2, 0), probe_share=probes)
+        counted_gateways=np.where(NETWORK.adjacency, 2, 0),
+        probe_share=probes,
+    )
 
 
 def nothing():
@@ -64,9 +67,15 @@ class Crowd:
         for _ in range(SCENARIO.substeps):
             x = self.accumulation
             before = x.sum(axis=1)
-            ends, transfers = (part.numpy() for part in dynamics.flows(
-                self._parameters, torch.from_numpy(x + 1e-9), torch.from_numpy(controls.perimeter),
-                torch.from_numpy(NETWORK.nominal_splits)))
+            ends, transfers = (
+                part.numpy()
+                for part in dynamics.flows(
+                    self._parameters,
+                    torch.from_numpy(x + 1e-9),
+                    torch.from_numpy(controls.perimeter),
+                    torch.from_numpy(NETWORK.nominal_splits),
+                )
+            )
             change = np.zeros_like(self.groups)
             for i, j in np.argwhere(x > 0):
                 ways = step * outflow[i] * each[i, :, j] * transfers[i, :, j] / x[i, j]
@@ -78,8 +87,7 @@ class Crowd:
                     crossings[i] += np.where(np.arange(REGIONS) == i, 0, moved)
                     moved[i] = 0
                     change[group, :, j] += moved
-            entered = random.poisson(
-                shares[:, None, None] * step * SCENARIO.demand[k] * wish[:, None])
+            entered = random.poisson(shares[:, None, None] * step * SCENARIO.demand[k] * wish[:, None])
             departures += entered[0]
             self.groups += change + entered
             mean += 0.5 * (before + self.accumulation.sum(axis=1)) / SCENARIO.substeps
@@ -87,16 +95,25 @@ class Crowd:
         known = self._known
         slow = np.exp(-SCENARIO.step / estimation.EXPANSION_MEMORY)
         self._expansion = slow * self._expansion + np.sqrt(1.0 - slow**2) * known.detector_error * random.normal(
-            size=REGIONS)
+            size=REGIONS
+        )
         noise = random.normal(size=REGIONS) * np.sqrt(
-            mean * (1.0 - known.detector_share) / known.detector_share + (known.detector_noise * mean) ** 2)
+            mean * (1.0 - known.detector_share) / known.detector_share + (known.detector_noise * mean) ** 2
+        )
         share = np.where(NETWORK.adjacency, known.counted_share, 1.0)
-        uneven = np.sqrt(np.maximum(1.0 - share, 0.0)) * random.normal(size=share.shape) * np.sqrt(
-            crossings / share + estimation.COUNT_ERROR**2 * crossings**2 / np.maximum(known.counted_gateways, 1))
+        uneven = (
+            np.sqrt(np.maximum(1.0 - share, 0.0))
+            * random.normal(size=share.shape)
+            * np.sqrt(
+                crossings / share + estimation.COUNT_ERROR**2 * crossings**2 / np.maximum(known.counted_gateways, 1)
+            )
+        )
         return Readings(
             accumulation=np.maximum((1.0 + self._expansion) * mean + noise, 0.0),
-            crossings=np.where(NETWORK.adjacency, crossings + uneven, np.nan), probes=self.groups[0].astype(float),
-            probe_departures=departures)
+            crossings=np.where(NETWORK.adjacency, crossings + uneven, np.nan),
+            probes=self.groups[0].astype(float),
+            probe_departures=departures,
+        )
 
 
 def watch(seed, known, *, steps=40, changed=lambda observation: observation, wrong=1.0):
@@ -164,9 +181,11 @@ def test_never_negative_nor_fewer_than_the_probes(runs):
     for _ in range(30):  # readings that contradict one another
         probes = random.integers(0, 40, (REGIONS, REGIONS)).astype(float)
         observation = Readings(
-            accumulation=random.uniform(0.0, 300.0, REGIONS), probes=probes,
+            accumulation=random.uniform(0.0, 300.0, REGIONS),
+            probes=probes,
             crossings=np.where(NETWORK.adjacency, random.uniform(0.0, 50.0, (REGIONS, REGIONS)), np.nan),
-            probe_departures=random.integers(0, 5, (REGIONS, REGIONS)).astype(float))
+            probe_departures=random.integers(0, 5, (REGIONS, REGIONS)).astype(float),
+        )
         estimate = estimator.step(OPEN, observation)
         assert np.isfinite(estimate).all() and (estimate >= probes - 1e-9).all()
 
@@ -193,9 +212,10 @@ def test_detectors_tell_the_total_and_probes_the_destinations():
     """Demand and outflow are other than the model has them: either instrument notices, and only probes tell apart."""
     off = {}
     for name, known, changed in (
-            ("detectors", equipped(), lambda o: replace(nothing(), accumulation=o.accumulation)),
-            ("probes", equipped(), lambda o: replace(o, accumulation=nothing().accumulation)),
-            ("nothing", equipped(), lambda o: nothing())):
+        ("detectors", equipped(), lambda o: replace(nothing(), accumulation=o.accumulation)),
+        ("probes", equipped(), lambda o: replace(o, accumulation=nothing().accumulation)),
+        ("nothing", equipped(), lambda o: nothing()),
+    ):
         truth, estimate, *_ = watch(2, known, changed=changed)
         off[name] = rmse((estimate - truth).sum(axis=2)), rmse(estimate - truth)
     assert max(off["detectors"][0], off["probes"][0]) < 0.5 * off["nothing"][0]
@@ -205,6 +225,7 @@ def test_detectors_tell_the_total_and_probes_the_destinations():
 @pytest.mark.parametrize("broken", [np.nan, 40.0])
 def test_a_region_without_its_detector_is_predicted_on(broken):
     """Missing, or stuck at a number: without probes there, it would follow a stuck one for ever."""
+
     def without_region_0(observation):
         accumulation = observation.accumulation.copy()
         accumulation[0] = broken
@@ -249,8 +270,11 @@ def readings(known, *, mean=40.0, expansion=0.1, crossings=9.0, x=25.0, probes=1
     z[model._expansion], z[model._x], z[model._mean] = expansion, x, mean
     z[model._crossings], z[model._probes], z[model._departures] = crossings, probes, 3.0
     observation = Readings(
-        accumulation=np.full(REGIONS, 1.0), crossings=np.full((REGIONS, REGIONS), 2.0),
-        probes=np.full((REGIONS, REGIONS), 3.0), probe_departures=np.full((REGIONS, REGIONS), 4.0))
+        accumulation=np.full(REGIONS, 1.0),
+        crossings=np.full((REGIONS, REGIONS), 2.0),
+        probes=np.full((REGIONS, REGIONS), 3.0),
+        probe_departures=np.full((REGIONS, REGIONS), 4.0),
+    )
     columns = model._readings(z, np.full(REGIONS**2, leaving), observation, observation.accumulation)
     ends = np.cumsum([REGIONS, len(model._boundaries), REGIONS**2, REGIONS**2])
     kinds = [np.split(column, ends) for column in columns]
@@ -282,7 +306,8 @@ def test_with_everything_seen_readings_are_exact():
     assert readings(equipped(detectors=1.0, probes=1.0, error=0.0))[2] == pytest.approx([estimation.FLOOR] * 5)
     low = readings(equipped(detectors=0.5, error=0.0), mean=0.2, crossings=0.2)[2]
     assert low[0] == pytest.approx(1.0 + estimation.FLOOR) and low[1] == pytest.approx(
-        0.5 * (2.0 + estimation.COUNT_ERROR**2 * 0.04 / 2.0) + estimation.FLOOR)
+        0.5 * (2.0 + estimation.COUNT_ERROR**2 * 0.04 / 2.0) + estimation.FLOOR
+    )
 
 
 def test_probes_move_as_a_share_of_the_vehicles():
@@ -314,8 +339,9 @@ def test_a_detector_is_stuck_at_its_third_same_reading():
     """Two may be chance, and an empty street shows 0 for ever."""
     taken, model = [], Estimator(planning_model(SCENARIO), equipped())
     advance = model._model.advance
-    model._model.advance = lambda belief, demand, perimeter, splits, observation, loops: taken.append(
-        loops[:3].tolist()) or advance(belief, demand, perimeter, splits, observation, loops)
+    model._model.advance = lambda belief, demand, perimeter, splits, observation, loops: (
+        taken.append(loops[:3].tolist()) or advance(belief, demand, perimeter, splits, observation, loops)
+    )
     for first in (7.0, 7.0, 7.0, 7.0, 8.0):
         accumulation = np.full(REGIONS, np.nan)
         accumulation[:3] = first, 0.0, 10.0 + len(taken)
@@ -337,4 +363,3 @@ def test_one_vehicle_changes_what_it_should():
     assert (crossing[:, :turns].sum(axis=0) == 1).all() and not crossing[:, turns:].any()
     np.testing.assert_array_equal(probe[:cells], place)
     assert probe[cells:].sum() == cells and (probe[cells:, turns + REGIONS :] == np.eye(cells)).all()
-

@@ -51,17 +51,26 @@ def ran(monkeypatch):
 
 def made_up(task) -> Result:
     trajectory = trajectories.made(
-        controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=np.ones((3, 7, 7)),
-        backlog=np.zeros((3, 7, 7)), completed=np.zeros(3), perimeter=np.ones((2, 7, 7)),
-        splits=np.zeros((2, 7, 7, 7)), decision_time=np.zeros(2), wall_time=1.0)
-    facts = {name: 0 for name in FACTS} | {
-        "outside_training": "", "controller": task.controller, "seed": task.seed}
+        controller=task.controller,
+        plant="sumo",
+        seed=task.seed,
+        step=90.0,
+        accumulation=np.ones((3, 7, 7)),
+        backlog=np.zeros((3, 7, 7)),
+        completed=np.zeros(3),
+        perimeter=np.ones((2, 7, 7)),
+        splits=np.zeros((2, 7, 7, 7)),
+        decision_time=np.zeros(2),
+        wall_time=1.0,
+    )
+    facts = {name: 0 for name in FACTS} | {"outside_training": "", "controller": task.controller, "seed": task.seed}
     return Result(trajectory=trajectory, record=trajectories.record(2, regions=7), facts=facts)
 
 
 def evaluation(city, tmp_path, *, controllers=("no-control", "pi-gating"), seeds=(2000, 2001), **others):
     return evaluate.Evaluation(
-        scenario=city, controllers=controllers, seeds=seeds, out=tmp_path / "out", steps=2, **others)
+        scenario=city, controllers=controllers, seeds=seeds, out=tmp_path / "out", steps=2, **others
+    )
 
 
 def test_runs_come_seed_by_seed_and_are_kept(city, tmp_path, ran):
@@ -69,13 +78,18 @@ def test_runs_come_seed_by_seed_and_are_kept(city, tmp_path, ran):
     table, failures = evaluate.evaluate(evaluation(city, tmp_path, levels=(0.8, 1.0)))
     assert not failures and list(table["seeds"]) == [2, 2, 2, 2]
     assert tasks[:4] == [
-        ("no-control", 2000, 0.8), ("pi-gating", 2000, 0.8), ("no-control", 2000, 1.0), ("pi-gating", 2000, 1.0)]
+        ("no-control", 2000, 0.8),
+        ("pi-gating", 2000, 0.8),
+        ("no-control", 2000, 1.0),
+        ("pi-gating", 2000, 1.0),
+    ]
     assert [seed for _, seed, _ in tasks] == [2000] * 4 + [2001] * 4
     tasks.clear()
     wider = evaluation(city, tmp_path, seeds=(2000, 2001, 2002), controllers=("mpc-pc", "no-control", "pi-gating"))
     table, _ = evaluate.evaluate(wider)
     assert tasks == [("mpc-pc", 2000, 1.0), ("mpc-pc", 2001, 1.0)] + [
-        (name, 2002, 1.0) for name in ("mpc-pc", "no-control", "pi-gating")]
+        (name, 2002, 1.0) for name in ("mpc-pc", "no-control", "pi-gating")
+    ]
     assert list(table["controller"]) == ["no-control", "pi-gating", "mpc-pc", "no-control", "pi-gating"]
 
 
@@ -118,9 +132,10 @@ def test_another_model_leaves_runs_without_control_alone(city, tmp_path, ran):
     assert {name for name, _, _ in tasks} == {"pi-gating"} and "model_hash" in said[0]
 
 
-@pytest.mark.parametrize("old, new, key", [
-    (r"peak = [\d.]+", "peak = 0.77", "demand_hash"), (r"compliance = [\d.]+", "compliance = 0.5", "sumo"),
-])
+@pytest.mark.parametrize(
+    "old, new, key",
+    [(r"peak = [\d.]+", "peak = 0.77", "demand_hash"), (r"compliance = [\d.]+", "compliance = 0.5", "sumo")],
+)
 def test_another_city_needs_another_folder(city, tmp_path, ran, old, new, key):
     evaluate.evaluate(evaluation(city, tmp_path))
     change(city / "scenario.toml", old, new)
@@ -128,15 +143,20 @@ def test_another_city_needs_another_folder(city, tmp_path, ran, old, new, key):
         evaluate.evaluate(evaluation(city, tmp_path), tell=print)
 
 
-@pytest.mark.parametrize("arguments, expected", [
-    (("--controllers", "no-control,nobody"), "controller 'nobody' is unknown"),
-    (("--controllers", "no-control,no-control"), "--controllers: no-control is there twice"),
-    (("--controllers", "no-control", "--demand", "1,x"),
-     "'--demand': expected a list of distinct numbers above 0 up to 10"),
-    (("--controllers", "no-control", "--demand", "1,1.0"), "'--demand': expected a list of distinct numbers"),
-    (("--controllers", "no-control", "--reference", "mpc-pc", "--out", "{tmp}/none"), "'mpc-pc' is neither among"),
-    (("--controllers", "no-control", "--policy", "dpc-pc=x.pt"), "--policy: 'dpc-pc' is not among --controllers"),
-])
+@pytest.mark.parametrize(
+    "arguments, expected",
+    [
+        (("--controllers", "no-control,nobody"), "controller 'nobody' is unknown"),
+        (("--controllers", "no-control,no-control"), "--controllers: no-control is there twice"),
+        (
+            ("--controllers", "no-control", "--demand", "1,x"),
+            "'--demand': expected a list of distinct numbers above 0 up to 10",
+        ),
+        (("--controllers", "no-control", "--demand", "1,1.0"), "'--demand': expected a list of distinct numbers"),
+        (("--controllers", "no-control", "--reference", "mpc-pc", "--out", "{tmp}/none"), "'mpc-pc' is neither among"),
+        (("--controllers", "no-control", "--policy", "dpc-pc=x.pt"), "--policy: 'dpc-pc' is not among --controllers"),
+    ],
+)
 def test_command_line_errors(tmp_path, arguments, expected):
     result = cosim("evaluate", ROOT / "scenarios" / "grid7_peak", *(a.format(tmp=tmp_path) for a in arguments))
     assert result.exit_code == 2 and expected in result.stderr and result.stderr.count("\n") == 1
@@ -148,8 +168,20 @@ def test_a_small_evaluation_in_sumo(city, tmp_path):
     file.write_text(re.sub(r"ramp_up = [\d.]+", "ramp_up = 60.0", file.read_text()))
     change(file, r"outflow_share = [\d.]+", "set_point = [20.0]")
     out = tmp_path / "out"
-    arguments = ("evaluate", city, "--controllers", "no-control,pi-gating", "--seeds", "1", "--steps", "3", "--workers",
-                 "1", "--out", out)
+    arguments = (
+        "evaluate",
+        city,
+        "--controllers",
+        "no-control,pi-gating",
+        "--seeds",
+        "1",
+        "--steps",
+        "3",
+        "--workers",
+        "1",
+        "--out",
+        out,
+    )
     result = cosim(*arguments)
     assert result.exit_code == 0, result.output + str(result.exception)
     rows = pd.read_csv(out / "runs.csv")
@@ -167,15 +199,23 @@ def test_a_small_evaluation_in_sumo(city, tmp_path):
 def test_titles_name_the_most_teleports():
     rows = pd.DataFrame([{"controller": f"c{n}", "teleports": 0} for n in (1, 2)])
     assert pictures.teleports(rows) == "no teleport in any run"
-    rows = pd.DataFrame([{"controller": name, "teleports": count} for name, count in (
-        ("a", 1), ("b", 9), ("c", 4), ("d", 0), ("b", 2))])
+    rows = pd.DataFrame(
+        [{"controller": name, "teleports": count} for name, count in (("a", 1), ("b", 9), ("c", 4), ("d", 0), ("b", 2))]
+    )
     assert pictures.teleports(rows) == "teleports: b 11, c 4, others fewer"
     assert pictures.teleports(rows[rows["controller"] != "a"]) == "teleports: b 11, c 4"
 
 
-@pytest.mark.parametrize("name, level, said", [
-    ("dpc-pc", 1.3, ""), ("dpc-pc", 1.31, "1.31 is outside of what the policy was trained on, 0.8 to 1.3 times"),
-    ("dpc-pc+rerouting-30", 1.6, ""), ("dpc-pcrg+max-pressure", 0.7, "0.7 is outside"), ("pi-gating", 9.0, "")])
+@pytest.mark.parametrize(
+    "name, level, said",
+    [
+        ("dpc-pc", 1.3, ""),
+        ("dpc-pc", 1.31, "1.31 is outside of what the policy was trained on, 0.8 to 1.3 times"),
+        ("dpc-pc+rerouting-30", 1.6, ""),
+        ("dpc-pcrg+max-pressure", 0.7, "0.7 is outside"),
+        ("pi-gating", 9.0, ""),
+    ],
+)
 def test_a_run_outside_of_what_its_policy_was_trained_on_says_so(name, level, said):
     found = registry.outside_training(name, load_scenario(ROOT / "scenarios" / "grid7_peak"), level)
     assert said in found and bool(said) == bool(found)

@@ -23,9 +23,13 @@ EMITTED = '<emissions CO2_abs="2000000" fuel_abs="1000000"/>'
 
 def test_trips_under_way_and_not_departed_count_with_what_they_have_spent(tmp_path):
     path = tmp_path / "trips.xml"
-    path.write_text("<tripinfos>" + "".join((
-        TRIP.format(10, 5, 110, 100, EMITTED), TRIP.format(50, 0, -1, 70, EMITTED), TRIP.format(-1, 40, -1, 0, ""))
-    ) + "</tripinfos>")
+    path.write_text(
+        "<tripinfos>"
+        + "".join(
+            (TRIP.format(10, 5, 110, 100, EMITTED), TRIP.format(50, 0, -1, 70, EMITTED), TRIP.format(-1, 40, -1, 0, ""))
+        )
+        + "</tripinfos>"
+    )
     read = read_trip_facts(path)
     assert (read.trips, read.completed, read.travel_time, read.departure_delay) == (3, 1, 170.0, 45.0)
     assert (read.co2, read.fuel) == (4.0, 2.0)
@@ -71,10 +75,17 @@ def test_fairness_is_that_of_mean_delays_by_origin():
     departures = np.zeros((2, 2, 2))
     departures[0], departures[1, 1, 0] = [[20.0, 10.0], [0.0, 5.0]], 20.0
     run = trajectories.made(
-        controller="no-control", plant="sumo", seed=0, step=30.0, accumulation=waiting, backlog=waiting,
-        completed=np.zeros(3), perimeter=np.zeros((2, 2, 2)), splits=np.zeros((2, 2, 2, 2)))
-    record = Record(**trajectories.record(2, regions=2) | {
-        "departures": departures, "given_up": np.zeros((2, 2, 2))})
+        controller="no-control",
+        plant="sumo",
+        seed=0,
+        step=30.0,
+        accumulation=waiting,
+        backlog=waiting,
+        completed=np.zeros(3),
+        perimeter=np.zeros((2, 2, 2)),
+        splits=np.zeros((2, 2, 2, 2)),
+    )
+    record = Record(**trajectories.record(2, regions=2) | {"departures": departures, "given_up": np.zeros((2, 2, 2))})
     # 30 trips from region 0 lose 10 s each, 30 from region 1 wait 20 s and lose 10 s each
     assert run_metrics.delay_gini(run, record, np.array([300.0, 300.0])) == pytest.approx((30 - 10) / (2 * (30 + 10)))
     assert metrics.gini(np.array([5.0, 5.0, 5.0]), np.array([1.0, 9.0, 0.0])) == 0.0

@@ -60,9 +60,14 @@ def driven(scenario, controller, *ordered):
     return trajectory
 
 
-@pytest.mark.parametrize("kind, reason", [
-    ("solver-fails", "solver failed (FloatingPointError)"), ("solver-diverges", "not a number"),
-    ("solver-late", "time limit")])
+@pytest.mark.parametrize(
+    "kind, reason",
+    [
+        ("solver-fails", "solver failed (FloatingPointError)"),
+        ("solver-diverges", "not a number"),
+        ("solver-late", "time limit"),
+    ],
+)
 @pytest.mark.parametrize("guidance", [False, True])
 def test_mpc_without_a_solver_uses_its_plan_and_then_gates(scenario, kind, reason, guidance):
     controller = EconomicMpc(planning_model(scenario), guidance=guidance)
@@ -135,6 +140,7 @@ class Diary(NoControl):
 @pytest.fixture
 def seen(scenario):
     """What controllers see with faults: (exact accumulations (T, 2, 2), seen ones, statuses)."""
+
     def look(*ordered):
         diary = Diary(planning_model(scenario))
         trajectory = driven(scenario, diary, *ordered)
@@ -199,13 +205,40 @@ def test_several_faults_at_once_are_all_named(scenario):
     controller = EconomicMpc(planning_model(scenario), guidance=False)
     status = driven(scenario, controller, "off:1.5", "delayed:1", "solver-fails@1-2").note
     assert status[1] == (
-        "measurement off by a factor of 1.5, 1 intervals late; solver failed (FloatingPointError): last plan used")
+        "measurement off by a factor of 1.5, 1 intervals late; solver failed (FloatingPointError): last plan used"
+    )
 
 
-@pytest.mark.parametrize("text", [
-    "", "x", "frozen:3", "missing", "missing:2", "missing:-1", "missing:0.5", "missing:x", "off:", "off:nan", "off:-1",
-    "off:11", "detectors:1.5", "delayed:0", "delayed:1.5", "frozen@5", "frozen@5-5", "frozen@9-3", "frozen@a-b",
-    "solver-fails:1", "closed", "signal", "closed:x@3", "frozen @3-4", "FROZEN"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "x",
+        "frozen:3",
+        "missing",
+        "missing:2",
+        "missing:-1",
+        "missing:0.5",
+        "missing:x",
+        "off:",
+        "off:nan",
+        "off:-1",
+        "off:11",
+        "detectors:1.5",
+        "delayed:0",
+        "delayed:1.5",
+        "frozen@5",
+        "frozen@5-5",
+        "frozen@9-3",
+        "frozen@a-b",
+        "solver-fails:1",
+        "closed",
+        "signal",
+        "closed:x@3",
+        "frozen @3-4",
+        "FROZEN",
+    ],
+)
 def test_wrong_orders(tmp_path, text):
     folder, out = tiny.write(tmp_path), tmp_path / "out"
     result = call("nmfd", "benchmark", folder, "--controllers", "no-control", "--fault", text, "--out", out)
@@ -245,8 +278,18 @@ STEPS = 8
 def city(tmp_path_factory):
     folder = tmp_path_factory.mktemp("city")
     config = tiny_city.city(folder)
-    result = call("cosim", "import", config, "--regions", 3, "--no-run", "--method", "geometric", "--out",
-                  folder / "networks" / "tiny")
+    result = call(
+        "cosim",
+        "import",
+        config,
+        "--regions",
+        3,
+        "--no-run",
+        "--method",
+        "geometric",
+        "--out",
+        folder / "networks" / "tiny",
+    )
     assert result.exit_code == 0, result.output
     return load_scenario(folder / "scenarios" / "tiny")
 
@@ -280,7 +323,7 @@ def test_a_closed_street(city):
     free, shut = (record.edge_vehicles[:, n].astype(float) for record in found.values())
     assert shut[3:5].mean() > 2.0 * free[3:5].mean() + 1.0  # who is on it stands
     assert found[()].arrivals[2:5].sum() > found[(f"closed:{edge}@2-5",)].arrivals[2:5].sum()
-    assert shut[-1] < shut[3:5].max()                       # and goes on afterwards
+    assert shut[-1] < shut[3:5].max()  # and goes on afterwards
 
 
 def loaded(city):
@@ -307,8 +350,7 @@ def test_a_deaf_signal_runs_its_own_programme(city, signals, gateway):
     gateways = {gateway.signal for gateway in loaded(city).gateways}
     name = next(found.id for found in plant.simple_signals if (found.id in gateways) == gateway)
     plant.reset(0)
-    own = [phase.state for phase in plant.session.programme(name).phases
-           for _ in range(round(phase.duration))]
+    own = [phase.state for phase in plant.session.programme(name).phases for _ in range(round(phase.duration))]
     plant.close()
     shown = []
 
@@ -316,8 +358,7 @@ def test_a_deaf_signal_runs_its_own_programme(city, signals, gateway):
         step = plant.session.step
         plant.session.step = lambda: (step(), shown.append(plant.session.signal_state(name)))
 
-    measurements, _, _ = in_sumo(
-        city, f"signal:{name}@3-6", perimeter=city.network.u_min, watch=watch, signals=signals)
+    measurements, _, _ = in_sumo(city, f"signal:{name}@3-6", perimeter=city.network.u_min, watch=watch, signals=signals)
     problems = [m.problem for m in measurements[1:]]
     assert problems == [f"signal {name} took no programme" if 3 <= k < 6 else "" for k in range(STEPS)]
     interval = round(city.step)
@@ -325,7 +366,8 @@ def test_a_deaf_signal_runs_its_own_programme(city, signals, gateway):
     cycles = [[own[(n + k) % len(own)] for k in range(end - begin)] for n in range(len(own))]
     assert shown[begin:end] in cycles
     assert shown[begin - interval : end - interval] not in cycles and shown[-len(own) :] not in [
-        cycle[: len(own)] for cycle in cycles]
+        cycle[: len(own)] for cycle in cycles
+    ]
     for before, after in itertools.pairwise(shown):
         assert not any(a in "Gg" and b == "r" for a, b in zip(before, after, strict=True)), (before, after)
 
@@ -344,17 +386,24 @@ def test_silent_loop_detectors(city):
     assert abs(total[0] - total[1]).max() < 0.5 * total[0].max()
 
 
-@pytest.mark.parametrize("ordered, message", [
-    ("sumo-exits@1-2", "SUMO stopped at .* s: ordered by the fault sumo-exits"),
-    (None, "SUMO stopped at .* s: The vehicle type 'nosuch' for vehicle 'late' is not known")])
+@pytest.mark.parametrize(
+    "ordered, message",
+    [
+        ("sumo-exits@1-2", "SUMO stopped at .* s: ordered by the fault sumo-exits"),
+        (None, "SUMO stopped at .* s: The vehicle type 'nosuch' for vehicle 'late' is not known"),
+    ],
+)
 def test_sumo_exits_in_mid_run(city, tmp_path, ordered, message):
     """Once by order, once by a vehicle that SUMO itself cannot make."""
     shutil.copytree(city.folder.parent.parent, tmp_path / "copy")
     folder = tmp_path / "copy" / "scenarios" / "tiny"
     if ordered is None:
-        (folder / "background.rou.xml.gz").write_bytes(gzip.compress(
-            b"<routes><vehicle id='early' depart='850'><route edges='A1B1 B1C1'/></vehicle>"
-            b"<vehicle id='late' type='nosuch' depart='1200'><route edges='A1B1 B1C1'/></vehicle></routes>"))
+        (folder / "background.rou.xml.gz").write_bytes(
+            gzip.compress(
+                b"<routes><vehicle id='early' depart='850'><route edges='A1B1 B1C1'/></vehicle>"
+                b"<vehicle id='late' type='nosuch' depart='1200'><route edges='A1B1 B1C1'/></vehicle></routes>"
+            )
+        )
     out, faults_ = tmp_path / "out", ("--fault", ordered) if ordered else ()
     result = call("cosim", "run", folder, "--controller", "no-control", "--out", out, *faults_)
     assert result.exit_code == 1 and result.stderr.count("\n") == 1, result.stderr
@@ -362,8 +411,13 @@ def test_sumo_exits_in_mid_run(city, tmp_path, ordered, message):
     assert not out.exists()
 
 
-@pytest.mark.parametrize("ordered, problem", [
-    ("closed:nowhere", "edge 'nowhere' is not in"), ("signal:nobody", "'nobody' is no signal with a gateway movement")])
+@pytest.mark.parametrize(
+    "ordered, problem",
+    [
+        ("closed:nowhere", "edge 'nowhere' is not in"),
+        ("signal:nobody", "'nobody' is no signal with a gateway movement"),
+    ],
+)
 def test_orders_for_what_the_city_does_not_have(city, tmp_path, ordered, problem):
     out = tmp_path / "out"
     result = call("cosim", "run", city.folder, "--controller", "no-control", "--out", out, "--fault", ordered)
@@ -376,16 +430,38 @@ def test_a_path_with_a_comma_is_named_and_one_with_a_space_is_none(city, tmp_pat
     for name, status in (("a, b", 2), ("é b", 0)):
         shutil.copytree(city.folder.parent.parent, tmp_path / name)
         out = tmp_path / name / "out"
-        result = call("cosim", "run", tmp_path / name / "scenarios" / "tiny", "--controller", "no-control", "--steps",
-                      1, "--out", out)
+        result = call(
+            "cosim",
+            "run",
+            tmp_path / name / "scenarios" / "tiny",
+            "--controller",
+            "no-control",
+            "--steps",
+            1,
+            "--out",
+            out,
+        )
         assert result.exit_code == status and out.exists() == (status == 0), result.output
         assert status == 0 or re.search("error: .*a, b/.*: SUMO cannot read a file with a comma", result.stderr)
 
 
 def test_statuses_of_a_city_are_in_its_tables(city, tmp_path):
     out = tmp_path / "out"
-    result = call("cosim", "run", city.folder, "--controller", "mpc-pc", "--steps", 4, "--out", out, "--fault",
-                  "closed:B1C1@1-3", "--fault", "solver-fails@2-3")
+    result = call(
+        "cosim",
+        "run",
+        city.folder,
+        "--controller",
+        "mpc-pc",
+        "--steps",
+        4,
+        "--out",
+        out,
+        "--fault",
+        "closed:B1C1@1-3",
+        "--fault",
+        "solver-fails@2-3",
+    )
     assert result.exit_code == 0, result.output
     facts = pd.read_csv(out / "sumo.csv").loc[0, "notes"]
     assert "1 x edge B1C1 closed" in facts
@@ -422,10 +498,12 @@ def test_a_full_disk(tmp_path):
     trajectory = len(before["no-control-0.nc"])
     status, stderr = with_limit(trajectory // 2, *command, 2)
     assert status == 2 and re.fullmatch(
-        r"nmfd: error: .*/out/no-control-1.nc: cannot be written \(.*\); is the disk full\?\n", stderr), stderr
+        r"nmfd: error: .*/out/no-control-1.nc: cannot be written \(.*\); is the disk full\?\n", stderr
+    ), stderr
     after = {path.name: path.read_bytes() for path in out.iterdir()}
     assert {name: after[name] for name in before if name != "manifest.json"} == {
-        name: content for name, content in before.items() if name != "manifest.json"}
+        name: content for name, content in before.items() if name != "manifest.json"
+    }
     assert call(*command, 2).exit_code == 0
     assert len(run_folder.read_summary(out / "summary.csv")) == 2
 
@@ -441,9 +519,15 @@ def sizes(city, tmp_path_factory):
     return {file.name.split(".")[1]: file.stat().st_size for file in out.glob("*.xml*")}
 
 
-@pytest.mark.parametrize("kind, share", [
-    ("tripinfo", 0.9), pytest.param("edgedata", 0.9, marks=pytest.mark.slow),
-    pytest.param("emission", 0.9, marks=pytest.mark.slow), ("tripinfo", 0.001)])
+@pytest.mark.parametrize(
+    "kind, share",
+    [
+        ("tripinfo", 0.9),
+        pytest.param("edgedata", 0.9, marks=pytest.mark.slow),
+        pytest.param("emission", 0.9, marks=pytest.mark.slow),
+        ("tripinfo", 0.001),
+    ],
+)
 def test_a_disk_that_is_full_before_sumo_has_written_all(city, sizes, tmp_path, kind, share):
     """SUMO says nothing of it, and its files are looked at; or it ends its process (emission). Once even what it reads
     cannot be written."""

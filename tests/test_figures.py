@@ -35,7 +35,8 @@ def test_link_map_colours_by_density_and_parts_the_directions(ax):
     figures.link_densities(ax, shapes, np.array([0.0, 120.0]), np.array([1, 2]), np.array([0, 0]))
     lines = ax.collections[0]
     assert [tuple(colour) for colour in lines.get_colors()] == [
-        tuple(figures.DENSITIES.to_rgba(density)) for density in (0.0, 120.0)]
+        tuple(figures.DENSITIES.to_rgba(density)) for density in (0.0, 120.0)
+    ]
     there, back = (segment[0][1] for segment in lines.get_segments())
     assert there < 0 < back  # each to the right of its direction
 

@@ -51,7 +51,8 @@ def test_good_fits_have_no_warning_and_bad_ones_say_what_is_wrong(network):
     assert doubts(network, [cloud(x, np.ones(200))] * 3)[0] == ("R2 nan",)
     endless = replace(network, mfds=(Mfd(a=0.0, b=-1e-6, c=0.004, jam=1000.0), *network.mfds[1:]))
     assert doubts(endless, [cloud(x, endless.mfds[0].outflow(x))] * 3)[0] == (
-        "no falling branch (jam 1000, critical 1000 veh)",)
+        "no falling branch (jam 1000, critical 1000 veh)",
+    )
 
 
 def test_warnings_are_in_the_table_the_files_and_the_network(network, tmp_path):
@@ -63,8 +64,12 @@ def test_warnings_are_in_the_table_the_files_and_the_network(network, tmp_path):
     write_fits(tmp_path / "fit.csv", fits, None)
     rows = pd.read_csv(tmp_path / "fit.csv")
     assert rows["doubts"].str.endswith("one seed").all() and rows["held_out_ahead_model_rmse_share"].isna().all()
-    doubted = replace(network, doubts=tuple(fit.doubts for fit in fits), placeholder=True,
-                      controllable=np.where(network.adjacency, 0.25, 0.0))
+    doubted = replace(
+        network,
+        doubts=tuple(fit.doubts for fit in fits),
+        placeholder=True,
+        controllable=np.where(network.adjacency, 0.25, 0.0),
+    )
     (tmp_path / "again").mkdir()
     (tmp_path / "again" / "network.toml").write_text(network_toml(doubted, {}, "a test"))
     again = load_network(tmp_path / "again")
@@ -75,8 +80,12 @@ def test_warnings_are_in_the_table_the_files_and_the_network(network, tmp_path):
 def observed(network, states):
     steps, r = len(states) - 1, network.regions
     return Observed(
-        accumulation=states, demand=np.zeros((steps, r, r)), perimeter=np.zeros((steps, r, r)),
-        splits=np.zeros((steps, r, r, r)), crossings=np.zeros((steps, r, r)))
+        accumulation=states,
+        demand=np.zeros((steps, r, r)),
+        perimeter=np.zeros((steps, r, r)),
+        splits=np.zeros((steps, r, r, r)),
+        crossings=np.zeros((steps, r, r)),
+    )
 
 
 def test_persistence_is_what_it_says(network):
@@ -96,8 +105,17 @@ def test_every_table_of_predictions_has_persistence():
     assert {"persistence_rmse_veh", "next_interval_persistence_rmse_veh"} <= set(model_validation.COLUMNS)
     still = np.full((3, 2), 0.25)[:2]
     one = prediction_error.ModelError(
-        demand=1.0, controller="x", runs=1, model=None, critical=np.ones(2), most=np.ones(2), ahead=900.0,
-        errors=0.5 * still, corrected=0.4 * still, persistence=still)
+        demand=1.0,
+        controller="x",
+        runs=1,
+        model=None,
+        critical=np.ones(2),
+        most=np.ones(2),
+        ahead=900.0,
+        errors=0.5 * still,
+        corrected=0.4 * still,
+        persistence=still,
+    )
     line = prediction_error.foresight_table([one]).splitlines()
     assert line[0].count("if nothing changed") == 2 and line[1].count("25.0 %") == 2
     assert line[0].count("corrected") == 2 and line[1].count("10.0 %") == 2
@@ -111,21 +129,28 @@ def test_every_table_of_predictions_has_persistence():
 def crossing(flow, share):
     flow = np.array(flow, dtype=float)
     gateways = (flow >= 0).astype(int) - np.eye(len(flow), dtype=int)
-    return Boundaries(flow=flow, controlled=share * flow, gateways=gateways,
-                      controllable=gateways * int(share > 0))
+    return Boundaries(flow=flow, controlled=share * flow, gateways=gateways, controllable=gateways * int(share > 0))
 
 
 FLOW = [[0, 300, 0], [100, 0, 100], [0, 300, 0]]
 
 
-@pytest.mark.parametrize("most, started, share, answer", [
-    ((0.5, 0.9, 0.2), (10, 10, 10), 1.0, "No: no region is ever critical, region 1 comes nearest with 0.90"),
-    ((0.5, 1.9, 0.2), (10, 10, 10), 0.0, "No: no gateway has a signal"),
-    ((0.5, 1.9, 0.2), (10, 600, 10), 1.0, "It may: region 1 becomes critical, and gateways could hold 50 %"),
-    ((0.5, 1.9, 0.2), (10, 5400, 10), 1.0, "Hardly: regions become critical, but gateways could hold no more than 10"),
-    ((0.5, 1.9, 0.2), (10, 600, 10), 0.06, "No: regions become critical, but gateways could hold no more than 3 %"),
-    (None, None, 1.0, "Unknown: nothing was simulated"),
-])
+@pytest.mark.parametrize(
+    "most, started, share, answer",
+    [
+        ((0.5, 0.9, 0.2), (10, 10, 10), 1.0, "No: no region is ever critical, region 1 comes nearest with 0.90"),
+        ((0.5, 1.9, 0.2), (10, 10, 10), 0.0, "No: no gateway has a signal"),
+        ((0.5, 1.9, 0.2), (10, 600, 10), 1.0, "It may: region 1 becomes critical, and gateways could hold 50 %"),
+        (
+            (0.5, 1.9, 0.2),
+            (10, 5400, 10),
+            1.0,
+            "Hardly: regions become critical, but gateways could hold no more than 10",
+        ),
+        ((0.5, 1.9, 0.2), (10, 600, 10), 0.06, "No: regions become critical, but gateways could hold no more than 3 %"),
+        (None, None, 1.0, "Unknown: nothing was simulated"),
+    ],
+)
 def test_the_verdict_has_reasons_and_numbers(network, most, started, share, answer):
     most, started = (None if part is None else np.array(part, dtype=float) for part in (most, started))
     found = verdict(network, crossing(FLOW, share), most=most, started=started, where="in 2 runs")
@@ -144,15 +169,22 @@ def test_nobody_crosses(network):
 TRAIN = ("--controller", "dpc-pc", "--steps", 1, "--no-compile", "--out")
 
 
-@pytest.mark.parametrize("line, named", [
-    ('placeholder = true\n\n[perimeter]', ("placeholder: is true", "cosim identify")),
-    ('CONTROLLABLE', ("controllable: is 0 at every boundary", "route guidance")),
-])
+@pytest.mark.parametrize(
+    "line, named",
+    [
+        ("placeholder = true\n\n[perimeter]", ("placeholder: is true", "cosim identify")),
+        ("CONTROLLABLE", ("controllable: is 0 at every boundary", "route guidance")),
+    ],
+)
 def test_nothing_is_trained_where_it_cannot_help(tmp_path, line, named):
     text = tiny.row_network()
-    text = (text.replace("[perimeter]", line) if "placeholder" in line else
-            text.replace("adjacent = [1]", "adjacent = [1]\ncontrollable = [0.0]").replace(
-                "adjacent = [0]", "adjacent = [0]\ncontrollable = [0.0]"))
+    text = (
+        text.replace("[perimeter]", line)
+        if "placeholder" in line
+        else text.replace("adjacent = [1]", "adjacent = [1]\ncontrollable = [0.0]").replace(
+            "adjacent = [0]", "adjacent = [0]\ncontrollable = [0.0]"
+        )
+    )
     scenario = tiny.write(tmp_path, network=text)
     said = error_line(nmfd("train", scenario, *TRAIN, tmp_path / "p.pt"), "nmfd")
     assert "network.toml" in said and all(part in said for part in (*named, "--anyway"))
@@ -180,5 +212,7 @@ def test_the_page_tells_doubts_and_verdict(tmp_path):
     run = SimpleNamespace(scenario=scenario, rows=pd.DataFrame({"controller": ["no-control"]}))
     lines = html._models(run)
     assert "is doubtful in region 0: R2 -0.50." in lines[0] and lines[-2:] == [
-        "Can perimeter control help? No: x.", "Of 3 gateways."]
+        "Can perimeter control help? No: x.",
+        "Of 3 gateways.",
+    ]
     assert any(line.startswith("WARNING, R2: ") for line in lines) and fit_quality.meanings([]) == []

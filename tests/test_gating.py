@@ -87,14 +87,20 @@ def test_reset_forgets():
     assert gate(controller.act(seen(0.0))) == NETWORK.u_max
 
 
-@pytest.mark.parametrize("options, problem", [
-    ({"kP": 1.0}, "kP: unknown key"), ({"ki": 0.0}, "ki: expected a number above 0"),
-    ({"kp": -1.0}, "kp: expected a number from 0 up"),
-    ({"set_point": [1.0, 2.0]}, "set_point: expected a list of 1 numbers"),
-    ({"regions": [7]}, "regions: expected a list of regions from 0 to 6"),
-    ({"regions": [2, 2]}, "regions: expected"), ({"regions": []}, "regions: expected a list of regions"),
-    ({"regions": [1, 2], "set_point": [5.0]}, "set_point: expected a list of 2 numbers"),
-    ({"set_point": [-5.0]}, "set_point: expected a list of numbers above 0")])
+@pytest.mark.parametrize(
+    "options, problem",
+    [
+        ({"kP": 1.0}, "kP: unknown key"),
+        ({"ki": 0.0}, "ki: expected a number above 0"),
+        ({"kp": -1.0}, "kp: expected a number from 0 up"),
+        ({"set_point": [1.0, 2.0]}, "set_point: expected a list of 1 numbers"),
+        ({"regions": [7]}, "regions: expected a list of regions from 0 to 6"),
+        ({"regions": [2, 2]}, "regions: expected"),
+        ({"regions": []}, "regions: expected a list of regions"),
+        ({"regions": [1, 2], "set_point": [5.0]}, "set_point: expected a list of 2 numbers"),
+        ({"set_point": [-5.0]}, "set_point: expected a list of numbers above 0"),
+    ],
+)
 def test_wrong_options(options, problem):
     with pytest.raises(InputError, match=f"controllers.pi-gating.{problem}") as caught:
         PiGating(planning_model(with_options(**options)))

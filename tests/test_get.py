@@ -14,8 +14,12 @@ from commands import cosim, error_line, good
 from cosim.importing import catalogue, download
 from cosim.importing.catalogue import Published
 
-CONTENT = {"top-1/city/city.sumocfg": b"<configuration/>", "top-1/city/in/city.net.xml": b"<net/>",
-           "top-1/README": b"-", "top-1/city/../../../escaped": b"out"}
+CONTENT = {
+    "top-1/city/city.sumocfg": b"<configuration/>",
+    "top-1/city/in/city.net.xml": b"<net/>",
+    "top-1/README": b"-",
+    "top-1/city/../../../escaped": b"out",
+}
 
 
 def zipped(content) -> bytes:
@@ -55,8 +59,13 @@ def publish(tmp_path, monkeypatch):
         def put(content: bytes, **changes):
             (folder / "city.pack").write_bytes(content)
             fields = dict(
-                about="a city", owner="https://example.org", licence="MIT, by its authors", folder="top-1/city",
-                address=f"http://127.0.0.1:{server.server_port}/city.pack", start="city.sumocfg --regions 2")
+                about="a city",
+                owner="https://example.org",
+                licence="MIT, by its authors",
+                folder="top-1/city",
+                address=f"http://127.0.0.1:{server.server_port}/city.pack",
+                start="city.sumocfg --regions 2",
+            )
             city = Published(**{**fields, **changes})
             monkeypatch.setitem(catalogue.CITIES, "there", city)
             return city.address
@@ -91,16 +100,21 @@ def test_a_hash_that_nobody_publishes_is_that_of_the_first_download(publish, tmp
     assert not (tmp_path / "all" / "third").exists()
     record.write_text("nonsense")
     assert "expected a hash and an address per line" in error_line(
-        cosim("get", "there", "--out", tmp_path / "all" / "third"))
+        cosim("get", "there", "--out", tmp_path / "all" / "third")
+    )
 
 
-@pytest.mark.parametrize(("content", "changes", "expected"), [
-    (zipped(CONTENT), {"sha256": "0" * 64}, "its publisher says 000"),
-    (zipped(CONTENT), {"address": "http://127.0.0.1:1/city.zip"}, "cannot be fetched"),
-    (zipped(CONTENT), {"folder": "top-1/other"}, "has no folder top-1/other"),
-    (zipped(CONTENT)[:80], {}, "is no .zip or .tar.gz"),
-    (tarred(CONTENT)[:80], {}, "is no .zip or .tar.gz"),
-], ids=("hash", "address", "folder", "zip", "tar"))
+@pytest.mark.parametrize(
+    ("content", "changes", "expected"),
+    [
+        (zipped(CONTENT), {"sha256": "0" * 64}, "its publisher says 000"),
+        (zipped(CONTENT), {"address": "http://127.0.0.1:1/city.zip"}, "cannot be fetched"),
+        (zipped(CONTENT), {"folder": "top-1/other"}, "has no folder top-1/other"),
+        (zipped(CONTENT)[:80], {}, "is no .zip or .tar.gz"),
+        (tarred(CONTENT)[:80], {}, "is no .zip or .tar.gz"),
+    ],
+    ids=("hash", "address", "folder", "zip", "tar"),
+)
 def test_one_line_and_nothing_left(publish, tmp_path, content, changes, expected):
     publish(content, **changes)
     assert expected in error_line(cosim("get", "there", "--out", tmp_path / "mine" / "there"))

@@ -34,17 +34,36 @@ def city():
 def ways(city, request):
     """Out of region 0, with all trees kept or hardly any."""
     first, second, turn, time = city
-    inside, back = (Moves(first, second, allowed=(REGION == 0) ^ outside, reverse=outside)
-                    for outside in (False, True))
-    gates = sorted({(int(REGION[b]), int(a), int(b), n) for n, (a, b) in enumerate(zip(first, second, strict=True))
-                    if REGION[a] == 0 and REGION[b] != 0})
+    inside, back = (Moves(first, second, allowed=(REGION == 0) ^ outside, reverse=outside) for outside in (False, True))
+    gates = sorted(
+        {
+            (int(REGION[b]), int(a), int(b), n)
+            for n, (a, b) in enumerate(zip(first, second, strict=True))
+            if REGION[a] == 0 and REGION[b] != 0
+        }
+    )
     following, gate, entry, move = np.array(gates).T
     searches = Searches(request.param)
     everywhere = Trees(Moves(first, second, allowed=np.full(EDGES, True), reverse=False), time, turn, searches)
-    return Ways(gate, entry, following, inside=inside, outside=back, time=time, turns=turn, crossing=turn[move],
-                leading=inside.leading_to(inside.number[gate]), reached=back.leading_to(back.number[entry]),
-                ahead=back.ahead(back.number[entry], 0.8 * time, 0.7 * turn), searches=searches,
-                everywhere=(everywhere, turn[move], back_to(gate, entry, city))), gate, entry
+    return (
+        Ways(
+            gate,
+            entry,
+            following,
+            inside=inside,
+            outside=back,
+            time=time,
+            turns=turn,
+            crossing=turn[move],
+            leading=inside.leading_to(inside.number[gate]),
+            reached=back.leading_to(back.number[entry]),
+            ahead=back.ahead(back.number[entry], 0.8 * time, 0.7 * turn),
+            searches=searches,
+            everywhere=(everywhere, turn[move], back_to(gate, entry, city)),
+        ),
+        gate,
+        entry,
+    )
 
 
 def least(city, allowed):
@@ -106,7 +125,8 @@ def test_ways_that_come_back_are_found_where_they_are_the_fastest_of_all(city, w
                 way = found.returning_route(here, gateway, target)
                 assert (way[0], way[-1]) == (here, target)
                 assert sum(turns[move] + city[3][move[1]] for move in zip(way[:-1], way[1:], strict=True)) == (
-                    pytest.approx(takes))
+                    pytest.approx(takes)
+                )
                 crossing = max(n for n, edge in enumerate(way) if REGION[edge] == 0)
                 assert (way[crossing], way[crossing + 1]) == (gate[gateway], entry[gateway])
                 assert (REGION[way[:crossing]] != 0).any()
@@ -139,7 +159,8 @@ def test_ways_home_are_the_fastest_up_to_a_limit(city, kept):
                     way = home.route(here, target)
                     assert (way[0], way[-1]) == (here, target)
                     assert sum(turns[move] + time[move[1]] for move in zip(way[:-1], way[1:], strict=True)) == (
-                        pytest.approx(expected))
+                        pytest.approx(expected)
+                    )
 
 
 def test_of_the_trees_the_one_not_asked_for_longest_goes_first():
@@ -184,21 +205,51 @@ def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0, la
     moves = [(e, f) for e, after in AFTER.items() for f in after]
     edges = tuple(sorted(AFTER))
     city = City(
-        net_file=Path(), regions=3, region_of=REGION_OF, edges=edges, length=dict.fromkeys(edges, 10.0) | {"s": side},
-        lanes=dict.fromkeys(edges, 1), lane_ids={}, speed=dict.fromkeys(edges, 1.0), successors=AFTER,
-        turn_time=dict.fromkeys(moves, 0.0), signals={},
-        gateways=tuple(sorted((
-            Gateway(source=REGION_OF[e], target=REGION_OF[f], from_edge=e, to_edge=f, signal=None, links=())
-            for e, f in moves if REGION_OF[e] != REGION_OF[f]), key=lambda g: (g.source, g.target))))
+        net_file=Path(),
+        regions=3,
+        region_of=REGION_OF,
+        edges=edges,
+        length=dict.fromkeys(edges, 10.0) | {"s": side},
+        lanes=dict.fromkeys(edges, 1),
+        lane_ids={},
+        speed=dict.fromkeys(edges, 1.0),
+        successors=AFTER,
+        turn_time=dict.fromkeys(moves, 0.0),
+        signals={},
+        gateways=tuple(
+            sorted(
+                (
+                    Gateway(source=REGION_OF[e], target=REGION_OF[f], from_edge=e, to_edge=f, signal=None, links=())
+                    for e, f in moves
+                    if REGION_OF[e] != REGION_OF[f]
+                ),
+                key=lambda g: (g.source, g.target),
+            )
+        ),
+    )
     routes, road = {"driver": route}, Mock(side_effect=lambda vehicle: routes[vehicle][0])
     session = SimpleNamespace(
-        road=road, route=routes.get, route_index=lambda vehicle: 0, step_length=1.0, **FAR_FROM_THE_END,
-        set_route=lambda vehicle, way: routes.update({vehicle: tuple(way)}) or True)
+        road=road,
+        route=routes.get,
+        route_index=lambda vehicle: 0,
+        step_length=1.0,
+        **FAR_FROM_THE_END,
+        set_route=lambda vehicle, way: routes.update({vehicle: tuple(way)}) or True,
+    )
     own, splits = np.zeros((2, 3, 3, 3))
     own[0, 1:, 2], own[1, 0, 2] = 0.5, 1.0
     splits[0, 1:, 2], splits[1, 0, 2] = (to_region_1, 1.0 - to_region_1), 1.0
-    guide = Guide(session, city, own, compliance=1.0, most_detour=60.0, random=np.random.default_rng(0),
-                  ways_return=ways_return, period=period, lanes=lanes)
+    guide = Guide(
+        session,
+        city,
+        own,
+        compliance=1.0,
+        most_detour=60.0,
+        random=np.random.default_rng(0),
+        ways_return=ways_return,
+        period=period,
+        lanes=lanes,
+    )
     guide.command(splits, None)
     return guide, splits, routes, road
 

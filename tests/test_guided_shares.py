@@ -36,23 +36,52 @@ class Town:
     def __init__(self, *, through_a, through_b, theta, own=0.5, most_detour=1e9, compliance=1.0, seed=0, lanes=True):
         length = dict.fromkeys(EDGES, 10.0) | {"a": through_a, "b": through_b, "u": 5.0}
         city = City(
-            net_file=Path(), regions=4, region_of=REGION_OF, edges=EDGES, length=length,
-            lanes=dict.fromkeys(EDGES, 1), lane_ids={}, speed=dict.fromkeys(EDGES, 1.0), successors=AFTER,
-            turn_time={(e, f): 1.0 for e, after in AFTER.items() for f in after}, signals={},
-            over={("s", "a"): (":s_1",), ("a", "t"): (":a_1",)}, inside={":a_1": 9.0, ":s_1": 9.0},
-            gateways=tuple(sorted((
-                Gateway(source=REGION_OF[e], target=REGION_OF[f], from_edge=e, to_edge=f, signal=None, links=())
-                for e, after in AFTER.items() for f in after if REGION_OF[e] != REGION_OF[f]),
-                key=lambda g: (g.source, g.target))))
+            net_file=Path(),
+            regions=4,
+            region_of=REGION_OF,
+            edges=EDGES,
+            length=length,
+            lanes=dict.fromkeys(EDGES, 1),
+            lane_ids={},
+            speed=dict.fromkeys(EDGES, 1.0),
+            successors=AFTER,
+            turn_time={(e, f): 1.0 for e, after in AFTER.items() for f in after},
+            signals={},
+            over={("s", "a"): (":s_1",), ("a", "t"): (":a_1",)},
+            inside={":a_1": 9.0, ":s_1": 9.0},
+            gateways=tuple(
+                sorted(
+                    (
+                        Gateway(source=REGION_OF[e], target=REGION_OF[f], from_edge=e, to_edge=f, signal=None, links=())
+                        for e, after in AFTER.items()
+                        for f in after
+                        if REGION_OF[e] != REGION_OF[f]
+                    ),
+                    key=lambda g: (g.source, g.target),
+                )
+            ),
+        )
         self.routes, self.takes_it, self.shares = {}, True, np.zeros((2, 4, 4, 4))
         for shares, to_a in zip(self.shares, (own, theta), strict=True):
             shares[0, 1, 3], shares[0, 2, 3] = to_a, 1.0 - to_a
             shares[1, 3, 3] = shares[2, 3, 3] = 1.0
         session = SimpleNamespace(
-            road=lambda vehicle: self.routes[vehicle][0], route=self.routes.get, route_index=lambda vehicle: 0,
-            step_length=1.0, set_route=self._set_route, **FAR_FROM_THE_END)
-        self.guide = Guide(session, city, self.shares[0], compliance=compliance, most_detour=most_detour,
-                           random=np.random.default_rng(seed), lanes=lanes)
+            road=lambda vehicle: self.routes[vehicle][0],
+            route=self.routes.get,
+            route_index=lambda vehicle: 0,
+            step_length=1.0,
+            set_route=self._set_route,
+            **FAR_FROM_THE_END,
+        )
+        self.guide = Guide(
+            session,
+            city,
+            self.shares[0],
+            compliance=compliance,
+            most_detour=most_detour,
+            random=np.random.default_rng(seed),
+            lanes=lanes,
+        )
         self.command()
 
     def _set_route(self, vehicle, way):
@@ -62,8 +91,11 @@ class Town:
 
     def command(self, **speeds):
         """The next control interval, with these speeds [m/s] in the last one; elsewhere nobody was seen."""
-        streets = seen(
-            [speeds.get(edge, np.nan) for edge in EDGES], crossing=(0.0, 0.0), crossed=(0.0, 0.0)) if speeds else None
+        streets = (
+            seen([speeds.get(edge, np.nan) for edge in EDGES], crossing=(0.0, 0.0), crossed=(0.0, 0.0))
+            if speeds
+            else None
+        )
         self.guide.command(self.shares[1], streets)
 
     def drive(self, count, by="a", free=True):
@@ -72,8 +104,7 @@ class Town:
         for n in range(count):
             vehicle = f"{len(self.routes)}-{n}"
             self.routes[vehicle] = ("s", by, "t")
-            self.guide.apply([Event(
-                vehicle=vehicle, source=None, region=0, destination=3, edge="t", free=free)])
+            self.guide.apply([Event(vehicle=vehicle, source=None, region=0, destination=3, edge="t", free=free)])
             assert self.routes[vehicle] in (("s", "a", "t"), ("s", "b", "t"))
             ways += self.routes[vehicle][1]
         return ways
@@ -127,8 +158,10 @@ def test_who_waits_on_a_junction_is_seen(waited, expected):
     """It takes 20 s more by b; by a they wait on the junction before it, behind it, or on both, 1 s in any case."""
     for inside in ((waited, 0.0), (0.0, waited), (waited / 2, waited / 2)):
         town = Town(through_a=30.0, through_b=50.0, theta=0.5)
-        town.guide.command(town.shares[1], seen(
-            np.full(len(EDGES), np.nan), crossing=(0.5 * inside[0], 0.5 * inside[1]), crossed=(0.5, 0.5)))
+        town.guide.command(
+            town.shares[1],
+            seen(np.full(len(EDGES), np.nan), crossing=(0.5 * inside[0], 0.5 * inside[1]), crossed=(0.5, 0.5)),
+        )
         town.routes["new"] = ("s",)
         town.guide.apply([Event(vehicle="new", source=None, region=0, destination=3, edge="t")])
         assert town.routes["new"][1] == expected
@@ -164,8 +197,11 @@ def test_without_a_command_nobody_is_guided():
     assert town.drive(3, by="b") == "bbb"
 
 
-@pytest.mark.parametrize("present, expected", [
-    ("t t2 v", "t u v"), ("t u v", "t u v"), ("t closed v", "t closed v")], ids=["slower", "fastest", "closed to cars"])
+@pytest.mark.parametrize(
+    "present, expected",
+    [("t t2 v", "t u v"), ("t u v", "t u v"), ("t closed v", "t closed v")],
+    ids=["slower", "fastest", "closed to cars"],
+)
 def test_in_the_region_of_the_destination_it_is_the_fastest_way(present, expected):
     """By u it is 5 s less. A way over roads that are closed to cars is left alone."""
     town = Town(through_a=30.0, through_b=90.0, theta=0.5)
@@ -214,14 +250,14 @@ class _Gate:
 
 
 def test_guided_is_guidance_by_travel_times_wherever_the_controller_says_nothing():
-    """The same bytes as of a controller that commands the drivers' own split ratios; and without it nobody is guided.
-    """
+    """The same bytes as of a controller that commands the drivers' own split ratios; and without it nobody is guided."""
     scenario = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
     scenario = replace(scenario, steps=1, demand=scenario.demand[15:16])
     own = scenario.network.nominal_splits
     by_hand, option, off = (
         drive(scenario, parse(name), _Gate(splits), seed=1)
-        for name, splits in (("pi-gating", own), ("pi-gating+guided", None), ("pi-gating", None)))
+        for name, splits in (("pi-gating", own), ("pi-gating+guided", None), ("pi-gating", None))
+    )
     assert option.record["guided"].sum() > 0 and off.record["guided"].sum() == 0
     for key, values in by_hand.record.items():
         np.testing.assert_array_equal(option.record[key], values, err_msg=key)

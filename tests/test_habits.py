@@ -30,20 +30,35 @@ def listed(given):
     return chosen(given, registry.check, lambda: NAMES)
 
 
-@pytest.mark.parametrize("given, expected", [
-    ("no-control", ["no-control"]), (["no-control"], ["no-control"]), ("no-control, pi-gating,", [NAMES[0], NAMES[3]]),
-    ("dpc-*", ["dpc-pc", "dpc-pcrg"]), ("dpc-*,dpc-pc", ["dpc-pcrg", "dpc-pc"]),
-    (["mpc-pc", "*-p[ci]", "dpc-??"], ["mpc-pc", "dpc-pc"]), ("*", list(NAMES)),
-], ids=str)
+@pytest.mark.parametrize(
+    "given, expected",
+    [
+        ("no-control", ["no-control"]),
+        (["no-control"], ["no-control"]),
+        ("no-control, pi-gating,", [NAMES[0], NAMES[3]]),
+        ("dpc-*", ["dpc-pc", "dpc-pcrg"]),
+        ("dpc-*,dpc-pc", ["dpc-pcrg", "dpc-pc"]),
+        (["mpc-pc", "*-p[ci]", "dpc-??"], ["mpc-pc", "dpc-pc"]),
+        ("*", list(NAMES)),
+    ],
+    ids=str,
+)
 def test_one_name_many_and_patterns(given, expected):
     assert listed(given) == expected
 
 
-@pytest.mark.parametrize("given, expected", [
-    ("dcp-*", "controllers: no controller here matches 'dcp-*'; there are no-control, dpc-pc,"),
-    ("pi-gating,,no-control", "expected a name between commas"), ("", "at least one controller"),
-    ([], "at least one controller"), ("dpc-pc,dpc-pc", "dpc-pc is there twice"), ("dpc-prcg", "did you mean dpc-pcrg?"),
-], ids=str)
+@pytest.mark.parametrize(
+    "given, expected",
+    [
+        ("dcp-*", "controllers: no controller here matches 'dcp-*'; there are no-control, dpc-pc,"),
+        ("pi-gating,,no-control", "expected a name between commas"),
+        ("", "at least one controller"),
+        ([], "at least one controller"),
+        ("dpc-pc,dpc-pc", "dpc-pc is there twice"),
+        ("dpc-prcg", "did you mean dpc-pcrg?"),
+    ],
+    ids=str,
+)
 def test_lists_that_are_none(given, expected):
     with pytest.raises(nmfd.InputError, match=re.escape(expected)):
         listed(given)
@@ -82,8 +97,15 @@ def test_a_benchmark_of_one_name_is_a_table_in_every_form(tmp_path, monkeypatch)
 
 def test_results_of_runs_are_tables_and_datasets(tmp_path):
     trajectory = nmfd.run(tiny.write(tmp_path), "pi-gating", steps=3)
-    record = {name: np.ones([{"interval": 3, "region": 2, "destination": 2, "next_region": 2}.get(axis, 4)
-                             for axis in about["dimensions"]]) for name, about in quantities(Record).items()}
+    record = {
+        name: np.ones(
+            [
+                {"interval": 3, "region": 2, "destination": 2, "next_region": 2}.get(axis, 4)
+                for axis in about["dimensions"]
+            ]
+        )
+        for name, about in quantities(Record).items()
+    }
     result = Result(trajectory=trajectory, record=record, facts={"trips": 12, "co2_kg": 3.25, "notes": "a & b"})
     assert result.to_frame().equals(trajectory.to_frame())
     data = result.to_xarray()
@@ -179,11 +201,14 @@ def test_the_map_is_drawn_into_the_axes_it_is_given(city):
     assert not [text for text in cosim.City("networks/grid7").plot(ax).texts if getattr(text, "arrow_patch", None)]
 
 
-@pytest.mark.parametrize("folder, expected", [
-    ("networks/hexagon7", "networks/hexagon7/network.toml: sumo: missing"),
-    ("networks/grid", "networks/grid/network.toml: no such file; did you mean grid7?"),
-    ("scenarios/grid7_peek", "scenarios/grid7_peek/scenario.toml: no such file; did you mean grid7_peak?"),
-])
+@pytest.mark.parametrize(
+    "folder, expected",
+    [
+        ("networks/hexagon7", "networks/hexagon7/network.toml: sumo: missing"),
+        ("networks/grid", "networks/grid/network.toml: no such file; did you mean grid7?"),
+        ("scenarios/grid7_peek", "scenarios/grid7_peek/scenario.toml: no such file; did you mean grid7_peak?"),
+    ],
+)
 def test_no_city(folder, expected):
     with pytest.raises(nmfd.InputError, match=re.escape(expected)):
         cosim.City(folder)

@@ -37,8 +37,10 @@ def test_an_obvious_partition_is_the_best_of_several(tmp_path):
     west = streets.centre[:, 0] < np.median(streets.centre[:, 0])
     held = np.where(west, 0.08, 0.01) * streets.lane_metres * INTERVAL
     held = np.stack([held, held])
-    runs = [Baseline(presence=(1 + share) * held, production=held, ways={}, teleports=0, waiting=0, running=0)
-            for share in (-0.2, 0.0, 0.2)]
+    runs = [
+        Baseline(presence=(1 + share) * held, production=held, ways={}, teleports=0, waiting=0, running=0)
+        for share in (-0.2, 0.0, 0.2)
+    ]
     baseline = averaged(runs)
     assert baseline.presence == pytest.approx(held)
     cut = Clustered(method="density", regions=2)
@@ -46,15 +48,23 @@ def test_an_obvious_partition_is_the_best_of_several(tmp_path):
     others = alternatives(streets, baseline, cut, regions, seed=0)
     assert list(others) == [2, 3, 4]
     (tmp_path / "regions.csv").write_text(
-        "edge,region\n" + "".join(f"{e},{r}\n" for e, r in zip(streets.edges, regions, strict=True)))
-    found = quality.tables(streets, regions, ["west", "east"], load_city(net, tmp_path / "regions.csv", 2), baseline,
-                           {}, others)
+        "edge,region\n" + "".join(f"{e},{r}\n" for e, r in zip(streets.edges, regions, strict=True))
+    )
+    found = quality.tables(
+        streets, regions, ["west", "east"], load_city(net, tmp_path / "regions.csv", 2), baseline, {}, others
+    )
     table = pd.DataFrame(found.partitions).set_index("asked")
     assert table.chosen.to_dict() == {2: 1, 3: 0, 4: 0}
     assert table.ncut_silhouette[2] == table.ncut_silhouette.min() < 0.2 and table.tv_n[2] < 0.2
     whole = found.quality[-1]
     assert whole["ncut_silhouette"] == table.ncut_silhouette[2] and whole["tv_n"] == table.tv_n[2]
     assert sum(row["tv_n"] for row in found.quality[:-1]) == pytest.approx(whole["tv_n"], abs=2e-4)
-    wrong = quality.tables(streets, np.where(streets.centre[:, 1] > np.median(streets.centre[:, 1]), 1, 0), ["a", "b"],
-                           load_city(net, tmp_path / "regions.csv", 2), baseline, {}).quality[-1]
+    wrong = quality.tables(
+        streets,
+        np.where(streets.centre[:, 1] > np.median(streets.centre[:, 1]), 1, 0),
+        ["a", "b"],
+        load_city(net, tmp_path / "regions.csv", 2),
+        baseline,
+        {},
+    ).quality[-1]
     assert wrong["ncut_silhouette"] > 0.9 and wrong["tv_n"] > 0.9

@@ -25,8 +25,14 @@ def scenario():
     """The benchmark with a third of its demand and limited boundaries."""
     loaded = load_scenario(ROOT / "scenarios" / "economic_mpc")
     return replace(
-        loaded, network=tiny.limited(loaded.network), demand=0.4 * loaded.demand, steps=120, protected=(3,),
-        controller_options={}, measurement_std=0.0)
+        loaded,
+        network=tiny.limited(loaded.network),
+        demand=0.4 * loaded.demand,
+        steps=120,
+        protected=(3,),
+        controller_options={},
+        measurement_std=0.0,
+    )
 
 
 def observe(scenario, seed, factor):
@@ -34,14 +40,17 @@ def observe(scenario, seed, factor):
     controller = Probing(planning_model(demanded), guidance=False)
     trajectory = closed_loop.run(NmfdPlant(demanded), controller, demanded, seed=seed)
     return Observed(
-        accumulation=trajectory.accumulation, demand=demanded.demand[:demanded.steps],
-        perimeter=trajectory.perimeter, splits=trajectory.splits,
-        crossings=np.full((demanded.steps, 7, 7), 60.0))
+        accumulation=trajectory.accumulation,
+        demand=demanded.demand[: demanded.steps],
+        perimeter=trajectory.perimeter,
+        splits=trajectory.splits,
+        crossings=np.full((demanded.steps, 7, 7), 60.0),
+    )
 
 
 def first_of(run, intervals):
     kept = {f.name: getattr(run, f.name)[:intervals] for f in fields(run)}
-    return Observed(**{**kept, "accumulation": run.accumulation[:intervals + 1]})
+    return Observed(**{**kept, "accumulation": run.accumulation[: intervals + 1]})
 
 
 @pytest.fixture(scope="module")
@@ -59,13 +68,18 @@ def test_the_true_model_predicts_without_error(scenario, runs):
 
 def test_the_fit_predicts_a_run_that_it_has_not_seen(scenario, runs):
     start = replace(
-        scenario.network, exit_rates=None, capacity=None, storage=None,
-        mfds=(Mfd(a=0.0, b=-2e-7, c=0.004, jam=9000.0),) * 7)
+        scenario.network,
+        exit_rates=None,
+        capacity=None,
+        storage=None,
+        mfds=(Mfd(a=0.0, b=-2e-7, c=0.004, jam=9000.0),) * 7,
+    )
     fitted = identification.fit(start, runs[:3], step=30.0, iterations=250)
     assert all(mfd.problem() is None for mfd in fitted.mfds)
     assert error(fitted, runs[3:], 10) < 0.35 * error(start, runs[3:], 10)
     first, again, other = (
-        identification.fit(start, runs[:3], step=30.0, iterations=5, seed=seed).hash for seed in (0, 0, 1))
+        identification.fit(start, runs[:3], step=30.0, iterations=5, seed=seed).hash for seed in (0, 0, 1)
+    )
     assert first == again != other  # the same seed gives the same model
     used = sum(run.accumulation.sum(axis=0) for run in runs[:3])
     mean = (used * fitted.exit_rates).sum(axis=1) / used.sum(axis=1)
@@ -117,7 +131,8 @@ def test_the_search_begins_where_the_network_and_the_runs_say(scenario, runs):
     np.testing.assert_allclose(p.jam.detach(), 0.7 * largest, rtol=1e-5)
     np.testing.assert_allclose(p.storage.detach(), 2.0 * largest, rtol=1e-5)
     np.testing.assert_allclose(
-        scenario.network.u_max * p.capacity.detach(), 1.2 * 60.0 / 30.0 * scenario.network.adjacency, rtol=1e-5)
+        scenario.network.u_max * p.capacity.detach(), 1.2 * 60.0 / 30.0 * scenario.network.adjacency, rtol=1e-5
+    )
     assert begun.penalty().item() == 0.0
 
 
@@ -155,7 +170,8 @@ def test_shares_are_errors_over_the_critical_accumulation(scenario, runs):
         errors = identification.prediction_errors(network, runs, n, step=30.0)
         assert errors.shape == (4 * (121 - n), 7)
         np.testing.assert_allclose(
-            share * [m.critical for m in network.mfds], np.sqrt((errors**2).mean(axis=0)), rtol=1e-6)
+            share * [m.critical for m in network.mfds], np.sqrt((errors**2).mean(axis=0)), rtol=1e-6
+        )
     assert (shares[1] > shares[0]).all() and shares[0].min() > 0.0
 
 
@@ -186,8 +202,7 @@ def test_what_a_fit_makes_small(scenario, runs, by_origin):
 
 def test_the_sign_of_a_prediction_error(scenario, runs):
     """Predicted minus observed: who lets nobody out predicts too many vehicles."""
-    stuck = replace(scenario.network, mfds=tuple(
-        Mfd(a=0.0, b=0.0, c=1e-9, jam=m.jam) for m in scenario.network.mfds))
+    stuck = replace(scenario.network, mfds=tuple(Mfd(a=0.0, b=0.0, c=1e-9, jam=m.jam) for m in scenario.network.mfds))
     assert identification.prediction_errors(stuck, runs, 5, step=30.0).mean() > 10.0
 
 

@@ -74,6 +74,7 @@ def test_import_gives_every_edge_one_region_and_connected_regions(imported, conf
     region = np.array([int(row["region"]) for row in rows])
     assert set(region) == {0, 1, 2}
     from scipy.sparse.csgraph import connected_components
+
     inside = streets.links[region[streets.links[:, 0]] == region[streets.links[:, 1]]]
     assert connected_components(graph(inside, len(region)), directed=False)[0] == 3
     city = load_city(network / "city.net.xml.gz", network / "regions.csv", 3)
@@ -88,8 +89,11 @@ def test_gateways_and_quality_add_up(imported):
     regions = dict(pd.read_csv(network / "regions.csv").itertuples(index=False))
     assert all(regions[g.from_edge] == g.source and regions[g.to_edge] == g.target for g in gateways.itertuples())
     streets = read_streets(network / "city.net.xml.gz")
-    crossing = {(streets.edges[a], streets.edges[b]) for a, b in streets.links
-                if regions[streets.edges[a]] != regions[streets.edges[b]]}
+    crossing = {
+        (streets.edges[a], streets.edges[b])
+        for a, b in streets.links
+        if regions[streets.edges[a]] != regions[streets.edges[b]]
+    }
     assert crossing == set(zip(gateways.from_edge, gateways.to_edge, strict=True))
     assert set(gateways.control) <= {"controlled", "no signal"} and (gateways.control == "controlled").any()
     whole = quality.iloc[-1]
@@ -131,8 +135,9 @@ def test_scenario_drives_the_original_vehicles(imported, config):
     try:
         plant.reset(0)
         for _ in range(scenario.steps):  # the ledger is checked in every one
-            measurement = plant.step(Controls(
-                perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=network.nominal_splits))
+            measurement = plant.step(
+                Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=network.nominal_splits)
+            )
         record, due = plant.record(), plant.trips
         # every car, and the buses: one, and one per 200 s in ten minutes
         assert due == (traffic.depart < 600.0 + scenario.steps * scenario.step - 10).sum() + 1 + 3
@@ -159,11 +164,27 @@ def test_own_regions_come_back(config, tmp_path, own):
 def test_networks_as_they_are(tmp_path):
     """Left-hand traffic; two signals; none at all: a working result, with a demand that is generated."""
     for name, options, expected in (
-            ("left", ("--lefthand", "true", "--tls.set", "B1,C2"), "left-hand traffic; 2 signals"),
-            ("none", ("--default-junction-type", "priority"), "no gateway has a signal")):
+        ("left", ("--lefthand", "true", "--tls.set", "B1,C2"), "left-hand traffic; 2 signals"),
+        ("none", ("--default-junction-type", "priority"), "no gateway has a signal"),
+    ):
         net = tiny_city.network(tmp_path, *options, name=f"{name}.net.xml")
-        text = good(cosim("import", net, "--regions", 2, "--demand", "peak", "--level", 0.5, "--method", "geometric",
-                          "--no-run", "--out", tmp_path / "networks" / name))
+        text = good(
+            cosim(
+                "import",
+                net,
+                "--regions",
+                2,
+                "--demand",
+                "peak",
+                "--level",
+                0.5,
+                "--method",
+                "geometric",
+                "--no-run",
+                "--out",
+                tmp_path / "networks" / name,
+            )
+        )
         assert expected in text, text
         scenario = replace(load_scenario(tmp_path / "scenarios" / name), steps=3)
         plant = SumoPlant(scenario)
@@ -183,12 +204,25 @@ def test_signals_that_are_left_alone(config, tmp_path):
     net = tmp_path / "city.net.xml"
     text = net.read_text().replace('id="B1" type="static"', 'id="B1" type="actuated"')
     net.write_text(text)
-    timetable = ('<WAUT id="day" startProg="0" refTime="0"><wautSwitch time="900" to="0"/></WAUT>'
-                 '<wautJunction wautID="day" junctionID="C2"/></additional>')
+    timetable = (
+        '<WAUT id="day" startProg="0" refTime="0"><wautSwitch time="900" to="0"/></WAUT>'
+        '<wautJunction wautID="day" junctionID="C2"/></additional>'
+    )
     additional = tmp_path / "city.add.xml"
     additional.write_text(additional.read_text().replace("</additional>", timetable))
-    good(cosim("import", tmp_path / "city.sumocfg", "--regions", 4, "--method", "geometric", "--no-run", "--out",
-               tmp_path / "networks" / "mixed"))
+    good(
+        cosim(
+            "import",
+            tmp_path / "city.sumocfg",
+            "--regions",
+            4,
+            "--method",
+            "geometric",
+            "--no-run",
+            "--out",
+            tmp_path / "networks" / "mixed",
+        )
+    )
     control = pd.read_csv(tmp_path / "networks" / "mixed" / "gateways.csv").set_index("signal").control.to_dict()
     scenario = load_scenario(tmp_path / "scenarios" / "mixed")
     assert control.get("B1", "actuated signal") == "actuated signal"
@@ -219,25 +253,53 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
     """SUMO's short form of values, its scale, its mesoscopic model, files in files; all else is named."""
     for file in config.parent.glob("*.xml*"):
         shutil.copy(file, tmp_path)
-    (tmp_path / "cars.rou.xml").write_text('<routes><include href="more/cars.rou.xml"/><flow id="none" begin="600" '
-                                           'end="900" number="0" from="A0A1" to="D1D2"/></routes>')
+    (tmp_path / "cars.rou.xml").write_text(
+        '<routes><include href="more/cars.rou.xml"/><flow id="none" begin="600" '
+        'end="900" number="0" from="A0A1" to="D1D2"/></routes>'
+    )
     (tmp_path / "more").mkdir()
     (tmp_path / "more" / "cars.rou.xml").write_text(
-        '<routes><flow id="f" begin="600" end="1200" number="60" from="A1B1" to="C1D1"/></routes>')
+        '<routes><flow id="f" begin="600" end="1200" number="60" from="A1B1" to="C1D1"/></routes>'
+    )
     (tmp_path / "city.sumocfg").write_text(
         '<configuration><net-file v="city.net.xml"/><route-files v="cars.rou.xml"/><begin v="600"/><scale v="2.5"/>'
-        '<mesosim v="true"/><max-depart-delay value="60"/><tripinfo-output value="trips.xml"/></configuration>')
+        '<mesosim v="true"/><max-depart-delay value="60"/><tripinfo-output value="trips.xml"/></configuration>'
+    )
     case = read_sumo_input(tmp_path / "city.sumocfg")
     assert case.scale == 2.5 and case.mesoscopic and case.left_out == ["max-depart-delay = 60"]
-    text = good(cosim("import", tmp_path / "city.sumocfg", "--regions", 2, "--method", "geometric", "--no-run",
-                      "--out", tmp_path / "networks" / "x"))
+    text = good(
+        cosim(
+            "import",
+            tmp_path / "city.sumocfg",
+            "--regions",
+            2,
+            "--method",
+            "geometric",
+            "--no-run",
+            "--out",
+            tmp_path / "networks" / "x",
+        )
+    )
     assert "60 vehicles in" in text and "vehicles times 2.5, the scale" in text
     assert "not taken over from city.sumocfg: max-depart-delay = 60" in text
     scenario = load_scenario(tmp_path / "scenarios" / "x")
     assert scenario.demand_factor == 2.5 and scenario.demand.sum() * scenario.step == pytest.approx(150.0)
     assert settings(scenario).mesoscopic
-    good(cosim("import", tmp_path / "city.net.xml", "--routes", tmp_path / "cars.rou.xml", "--regions", 2, "--method",
-               "geometric", "--no-run", "--out", tmp_path / "networks" / "y"))  # without any sumocfg
+    good(
+        cosim(
+            "import",
+            tmp_path / "city.net.xml",
+            "--routes",
+            tmp_path / "cars.rou.xml",
+            "--regions",
+            2,
+            "--method",
+            "geometric",
+            "--no-run",
+            "--out",
+            tmp_path / "networks" / "y",
+        )
+    )  # without any sumocfg
     assert load_scenario(tmp_path / "scenarios" / "y").demand.sum() * scenario.step == pytest.approx(60.0)
     (tmp_path / "more" / "cars.rou.xml").write_text('<routes><include href="../cars.rou.xml"/></routes>')
     with pytest.raises(InputError, match="include each other without end"):
@@ -247,13 +309,15 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
 def test_signal_plans_know_the_city_s_own_vehicles(imported):
     """Turning flows are those of its routes, and of fastest ways; every signal plan runs on its signals."""
     scenario = replace(load_scenario(imported[0] / "scenarios" / "tiny"), steps=2)
-    own, additional = ([scenario.folder / name for name in names] for names in (
-        settings(scenario).routes, settings(scenario).additional))
+    own, additional = (
+        [scenario.folder / name for name in names]
+        for names in (settings(scenario).routes, settings(scenario).additional)
+    )
     files = scenario.network.folder
     city = load_city(files / "city.net.xml.gz", files / "regions.csv", 3)
     flows = own_flows(city, read_recorded_trips(own), read_routes(additional), 2.0)
-    assert flows["A1B1", "B1B0"] >= 2.0 / 900.0                       # the route that one vehicle names
-    assert 2.0 * 75 / 900 <= flows["B1C1", "C1D1"] < 2.0 * 120 / 900   # the flow straight on, of trips
+    assert flows["A1B1", "B1B0"] >= 2.0 / 900.0  # the route that one vehicle names
+    assert 2.0 * 75 / 900 <= flows["B1C1", "C1D1"] < 2.0 * 120 / 900  # the flow straight on, of trips
     assert all(b in city.successors[a] for a, b in flows)
     for plan in ("max-pressure", "webster", "actuated"):
         plant = SumoPlant(scenario, overrides=settings(scenario).changed(signals=plan))
@@ -266,14 +330,21 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
             plant.close()
 
 
-@pytest.mark.parametrize("change, expected", [
-    (lambda folder: (folder / "buses.rou.xml").unlink(), "route-files: no such file"),
-    (lambda folder: (folder / "city.net.xml").write_text("<net><edge"), "is not a"),
-    (lambda folder: (folder / "city.net.xml").write_text("<net></net>"), "has no edge that cars may use"),
-    (lambda folder: (folder / "city.sumocfg").write_text("<routes/>"), "a net.xml or a file of OpenStreetMap"),
-    (lambda folder: (folder / "city.sumocfg").write_text(
-        '<configuration><net-file value="city.net.xml"/></configuration>'), "or add --routes FILE, --od FILE or --d"),
-])
+@pytest.mark.parametrize(
+    "change, expected",
+    [
+        (lambda folder: (folder / "buses.rou.xml").unlink(), "route-files: no such file"),
+        (lambda folder: (folder / "city.net.xml").write_text("<net><edge"), "is not a"),
+        (lambda folder: (folder / "city.net.xml").write_text("<net></net>"), "has no edge that cars may use"),
+        (lambda folder: (folder / "city.sumocfg").write_text("<routes/>"), "a net.xml or a file of OpenStreetMap"),
+        (
+            lambda folder: (folder / "city.sumocfg").write_text(
+                '<configuration><net-file value="city.net.xml"/></configuration>'
+            ),
+            "or add --routes FILE, --od FILE or --d",
+        ),
+    ],
+)
 def test_one_clear_line(config, tmp_path, change, expected):
     for file in config.parent.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
@@ -285,8 +356,21 @@ def test_one_clear_line(config, tmp_path, change, expected):
 
 def test_import_at_a_congested_level(config, tmp_path):
     """The factor reaches the scenario: vehicles, demand and all; mesoscopic too."""
-    text = good(cosim("import", config, "--regions", 2, "--method", "geometric", "--mesoscopic", "--level", "auto",
-                      "--out", tmp_path / "networks" / "busy"))
+    text = good(
+        cosim(
+            "import",
+            config,
+            "--regions",
+            2,
+            "--method",
+            "geometric",
+            "--mesoscopic",
+            "--level",
+            "auto",
+            "--out",
+            tmp_path / "networks" / "busy",
+        )
+    )
     scenario = load_scenario(tmp_path / "scenarios" / "busy")
     assert "level: " in text and settings(scenario).mesoscopic
     assert f"demand times {scenario.demand_factor:g} " in text
@@ -309,19 +393,31 @@ def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
         '<routes><vType id="taxi" vClass="taxi"/><route id="over" edges="A1B1 B1C1 C1D1 D1D2"/>'
         '<flow id="over" type="taxi" begin="0" end="600" period="20" route="over"/>'
         '<flow id="to" type="taxi" begin="0" end="600" period="20" from="A0A1" to="C1D1"/>'
-        '<flow id="car" begin="0" end="600" period="10" from="A0A1" to="D2D3"/></routes>')
+        '<flow id="car" begin="0" end="600" period="10" from="A0A1" to="D2D3"/></routes>'
+    )
     (tmp_path / "city.sumocfg").write_text(
-        '<configuration><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></configuration>')
-    good(cosim("import", tmp_path / "city.sumocfg", "--regions", 2, "--method", "geometric", "--no-run", "--out",
-               tmp_path / "networks" / "taxis"))
+        '<configuration><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></configuration>'
+    )
+    good(
+        cosim(
+            "import",
+            tmp_path / "city.sumocfg",
+            "--regions",
+            2,
+            "--method",
+            "geometric",
+            "--no-run",
+            "--out",
+            tmp_path / "networks" / "taxis",
+        )
+    )
     scenario = replace(load_scenario(tmp_path / "scenarios" / "taxis"), steps=6)
     network = scenario.network
     plant = SumoPlant(scenario)
     try:
         plant.reset(0)
         for _ in range(scenario.steps):
-            plant.step(Controls(
-                perimeter=np.where(network.adjacency, 0.9, 0.0), splits=network.nominal_splits))
+            plant.step(Controls(perimeter=np.where(network.adjacency, 0.9, 0.0), splits=network.nominal_splits))
         assert plant.record().guided.sum() > 10
     finally:
         plant.close()
@@ -335,8 +431,22 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
     file = scenario / "scenario.toml"
     file.write_text(re.sub(r"\nsteps = \d+", "\nsteps = 10", file.read_text()))
     (network.parent / "network.schema.json").touch()
-    text = good(cosim("identify", network, "--levels", "1,2", "--seeds", 1, "--iterations", 3, "--workers", 1, "--out",
-                      tmp_path / "loading"))
+    text = good(
+        cosim(
+            "identify",
+            network,
+            "--levels",
+            "1,2",
+            "--seeds",
+            1,
+            "--iterations",
+            3,
+            "--workers",
+            1,
+            "--out",
+            tmp_path / "loading",
+        )
+    )
     assert "Drivers who go their own ways:" in text and "Drivers who are guided:" in text
     assert f"Written to {network / 'guided' / 'network.toml'}" in text
     assert (tmp_path / "loading" / "guided" / "level-2" / "probing-pcrg-1000.nc").is_file()
@@ -358,10 +468,39 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
 def test_the_chain_in_a_city_without_signals(tmp_path):
     """Nothing for perimeter control to do, and the evaluation says so."""
     net = tiny_city.network(tmp_path, "--default-junction-type", "priority", name="none.net.xml")
-    good(cosim("import", net, "--regions", 2, "--demand", "peak", "--level", 0.5, "--method", "geometric", "--no-run",
-               "--out", tmp_path / "networks" / "none"))
-    good(cosim("evaluate", tmp_path / "scenarios" / "none", "--controllers", "no-control,pi-gating,route-guidance",
-               "--seeds", 1, "--steps", 4, "--workers", 1, "--out", tmp_path / "out"))
+    good(
+        cosim(
+            "import",
+            net,
+            "--regions",
+            2,
+            "--demand",
+            "peak",
+            "--level",
+            0.5,
+            "--method",
+            "geometric",
+            "--no-run",
+            "--out",
+            tmp_path / "networks" / "none",
+        )
+    )
+    good(
+        cosim(
+            "evaluate",
+            tmp_path / "scenarios" / "none",
+            "--controllers",
+            "no-control,pi-gating,route-guidance",
+            "--seeds",
+            1,
+            "--steps",
+            4,
+            "--workers",
+            1,
+            "--out",
+            tmp_path / "out",
+        )
+    )
     for controller in ("dpc-pc", "dpc-pcrg"):  # the reason that identification would not mend comes first
         said = error_line(nmfd("train", tmp_path / "scenarios" / "none", "--controller", controller), "nmfd")
         assert "no gateway has a signal" in said and "route guidance" in said

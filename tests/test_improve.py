@@ -93,10 +93,21 @@ def test_the_splits_that_drivers_followed_are_counted(scenario):
     crossings[3, 0, h, CENTRE] = 30.0
     record = trajectories.record(steps, regions=7) | {"crossings": crossings}
     splits = np.broadcast_to(network.nominal_splits, (steps, 7, 7, 7))
-    result = Result(facts={}, record=record, trajectory=trajectories.made(
-        controller="x", plant="sumo", seed=0, step=90.0, accumulation=np.zeros((steps + 1, 7, 7)),
-        backlog=np.zeros((steps + 1, 7, 7)), completed=np.zeros(steps + 1), perimeter=np.ones((steps, 7, 7)),
-        splits=splits))
+    result = Result(
+        facts={},
+        record=record,
+        trajectory=trajectories.made(
+            controller="x",
+            plant="sumo",
+            seed=0,
+            step=90.0,
+            accumulation=np.zeros((steps + 1, 7, 7)),
+            backlog=np.zeros((steps + 1, 7, 7)),
+            completed=np.zeros(steps + 1),
+            perimeter=np.ones((steps, 7, 7)),
+            splits=splits,
+        ),
+    )
     found = followed(network, result).splits
     told = splits[0, 0, [h, g], CENTRE]
     assert found[0] == pytest.approx(splits[0]) and found[6] == pytest.approx(splits[6])
@@ -128,12 +139,20 @@ def runs(monkeypatch):
         controller = registry.make(variant, scenario, policy=task.policy)
         run = closed_loop.run(NmfdPlant(scenario), controller, scenario, seed=task.seed)
         p, step = dynamics.parameters(scenario.network), scenario.step
-        crossings = [dynamics.flows(p, *map(torch.from_numpy, now))[1].numpy() * step
-                     for now in zip(run.accumulation[:-1], run.perimeter, run.splits, strict=True)]
+        crossings = [
+            dynamics.flows(p, *map(torch.from_numpy, now))[1].numpy() * step
+            for now in zip(run.accumulation[:-1], run.perimeter, run.splits, strict=True)
+        ]
         record = trajectories.record(scenario.steps, regions=7) | {
-            "crossings": np.stack(crossings), "departures": scenario.demand * step}
+            "crossings": np.stack(crossings),
+            "departures": scenario.demand * step,
+        }
         facts = {name: 0 for name in FACTS} | {
-            "outside_training": "", "controller": task.controller, "seed": task.seed, "trips": 100}
+            "outside_training": "",
+            "controller": task.controller,
+            "seed": task.seed,
+            "trips": 100,
+        }
         return Result(trajectory=replace(run, controller=task.controller), record=record, facts=facts)
 
     def outcomes(function, todo, workers, *, fresh, group=None, look=None):
@@ -150,8 +169,13 @@ def runs(monkeypatch):
 
 def order(city, out, *, rounds=3, **others):
     return improve.Improvement(
-        scenario=city, controller=CONTROLLER, rounds=rounds, seeds=(1000,), out=out,
-        **{"levels": (1.0, 1.6), "descent": 6, "learning_rate": 0.1, "iterations": 5, "steps": 30, **others})
+        scenario=city,
+        controller=CONTROLLER,
+        rounds=rounds,
+        seeds=(1000,),
+        out=out,
+        **{"levels": (1.0, 1.6), "descent": 6, "learning_rate": 0.1, "iterations": 5, "steps": 30, **others},
+    )
 
 
 @pytest.mark.slow
@@ -164,7 +188,8 @@ def test_the_best_policy_is_kept_and_an_interrupted_improvement_goes_on(city, tm
     assert whole["kept"].sum() > 1, "nothing was learned"
     best = int(whole.loc[whole["kept"], "round"].max())
     assert (tmp_path / "whole" / "policy.pt").read_bytes() == (
-        tmp_path / "whole" / f"round-{best:02d}" / "policy.pt").read_bytes()
+        tmp_path / "whole" / f"round-{best:02d}" / "policy.pt"
+    ).read_bytes()
     assert not whole[["replayed_veh_s", "foreseen_veh_s"]].loc[1:].isna().any(axis=None)
     failing.add(8 + 5)  # the first run of the third round
     with pytest.raises(RunFailed, match="SUMO fell over"):
@@ -177,9 +202,29 @@ def test_the_best_policy_is_kept_and_an_interrupted_improvement_goes_on(city, tm
 
 
 def test_the_policy_that_comes_out_drives_the_city_with_its_model(city, tmp_path, runs):
-    done = CliRunner().invoke(main, [
-        "improve", str(city), "--controller", CONTROLLER, "--rounds", "1", "--seeds", "1", "--demand", "1.6",
-        "--descent", "4", "--iterations", "3", "--steps", "20", "--out", str(tmp_path / "out")])
+    done = CliRunner().invoke(
+        main,
+        [
+            "improve",
+            str(city),
+            "--controller",
+            CONTROLLER,
+            "--rounds",
+            "1",
+            "--seeds",
+            "1",
+            "--demand",
+            "1.6",
+            "--descent",
+            "4",
+            "--iterations",
+            "3",
+            "--steps",
+            "20",
+            "--out",
+            str(tmp_path / "out"),
+        ],
+    )
     assert done.exit_code == 0, done.stderr
     assert "against round 0" in done.stdout and (tmp_path / "out" / "improve.png").stat().st_size > 10_000
     scenario = load_scenario(city)
@@ -188,11 +233,15 @@ def test_the_policy_that_comes_out_drives_the_city_with_its_model(city, tmp_path
     assert registry.make(CONTROLLER, scenario, policy=tmp_path / "out" / "policy.pt").name == "dpc-pcrg"
 
 
-@pytest.mark.parametrize("arguments, expected", [
-    (["--controller", "pi-gating"], "has no policy that learns; choose one of dpc-pc"),
-    (["--controller", CONTROLLER, "--policy", "none.pt"], "none.pt"),
-    (["--controller", CONTROLLER, "--runs", "none"], "none"),
-    (["--controller", CONTROLLER, "--rounds", "0"], "--rounds")])
+@pytest.mark.parametrize(
+    "arguments, expected",
+    [
+        (["--controller", "pi-gating"], "has no policy that learns; choose one of dpc-pc"),
+        (["--controller", CONTROLLER, "--policy", "none.pt"], "none.pt"),
+        (["--controller", CONTROLLER, "--runs", "none"], "none"),
+        (["--controller", CONTROLLER, "--rounds", "0"], "--rounds"),
+    ],
+)
 def test_one_line_for_what_cannot_be_improved(city, tmp_path, arguments, expected):
     done = CliRunner().invoke(main, ["improve", str(city), *arguments, "--out", str(tmp_path / "out")])
     assert done.exit_code != 0 and expected in done.stderr, done.stderr

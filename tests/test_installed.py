@@ -20,7 +20,8 @@ def called(*command: str | Path, where: Path, **variables: str) -> str:
     """What a command prints, which has to end well; it sees this environment but for its Python's settings."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "COV_", "VIRTUAL"))}
     done = subprocess.run(
-        [*map(str, command)], cwd=where, env=kept | variables, capture_output=True, text=True, encoding="utf-8")
+        [*map(str, command)], cwd=where, env=kept | variables, capture_output=True, text=True, encoding="utf-8"
+    )
     assert done.returncode == 0, f"{command}: {done.stdout}{done.stderr}"
     return done.stdout
 
@@ -32,8 +33,11 @@ def contents(wheel: Path) -> dict[str, str]:
 
 
 def hashes(folder: Path) -> dict[str, str]:
-    return {str(path.relative_to(folder)): sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
-            for path in folder.rglob("*") if "__pycache__" not in path.parts}
+    return {
+        str(path.relative_to(folder)): sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+        for path in folder.rglob("*")
+        if "__pycache__" not in path.parts
+    }
 
 
 @pytest.fixture(scope="module")
@@ -57,10 +61,23 @@ def installed(built, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("a new user")
     called(sys.executable, "-m", "venv", "--without-pip", folder / "venv", where=folder)
     programs = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
-    called(sys.executable, "-m", "pip", "--python", programs / "python", "install", "--no-deps", "--no-index", built[1],
-           where=folder)
-    site = Path(called(programs / "python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))",
-                       where=folder).strip())
+    called(
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        programs / "python",
+        "install",
+        "--no-deps",
+        "--no-index",
+        built[1],
+        where=folder,
+    )
+    site = Path(
+        called(
+            programs / "python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", where=folder
+        ).strip()
+    )
     (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
     return programs
 

@@ -66,13 +66,16 @@ def test_outputs_from_python(peak, tmp_path):
 
 def test_parquet_of_a_benchmark(tmp_path):
     scenario, out = tiny.write(tmp_path), tmp_path / "out"
-    done = CliRunner().invoke(nmfd.cli.main.main, [
-        "benchmark", str(scenario), "--controllers", "no-control,pi-gating", "--parquet", "--out", str(out)])
+    done = CliRunner().invoke(
+        nmfd.cli.main.main,
+        ["benchmark", str(scenario), "--controllers", "no-control,pi-gating", "--parquet", "--out", str(out)],
+    )
     assert done.exit_code == 0, done.output
     summary = pd.read_parquet(out / "summary.parquet")
     assert summary.to_dict("records") == run_folder.read_summary(out / "summary.csv")
     states, controls = pd.read_parquet(out / "states.parquet"), pd.read_parquet(out / "controls.parquet")
     assert len(states) == 2 * 21 * 4 and len(controls) == 2 * 20 * 4
     total = 30.0 * states[states["time_s"] < 600.0].groupby("controller")["accumulation_veh"].sum()
-    assert total["pi-gating"] == pytest.approx(summary.set_index("controller").loc[
-        "pi-gating", "total_time_spent_veh_s"])
+    assert total["pi-gating"] == pytest.approx(
+        summary.set_index("controller").loc["pi-gating", "total_time_spent_veh_s"]
+    )

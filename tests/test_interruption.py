@@ -94,15 +94,21 @@ def test_ctrl_c_at_random_moments(tmp_path):
     assert arrays(out) == arrays(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("command", [
-    ("benchmark", "--controllers", "no-control,mpc-pc", "--seeds", 200),
-    ("bound", "--controller", "bound-pc", "--iterations", 100_000)], ids=["benchmark", "bound"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("benchmark", "--controllers", "no-control,mpc-pc", "--seeds", 200),
+        ("bound", "--controller", "bound-pc", "--iterations", 100_000),
+    ],
+    ids=["benchmark", "bound"],
+)
 def test_sigterm_ends_like_ctrl_c(tmp_path, command):
     scenario, out = tiny.write(tmp_path), tmp_path / "out"
     name, *options = command
     out = tmp_path / "out" if name == "benchmark" else tmp_path / "plan.npz"
     status, said = interrupted(
-        tmp_path / "said", "nmfd", name, scenario, *options, "--out", out, after=1.0, by=signal.SIGTERM)
+        tmp_path / "said", "nmfd", name, scenario, *options, "--out", out, after=1.0, by=signal.SIGTERM
+    )
     assert status == 143 and "Traceback" not in said and said.splitlines()[-1].startswith("nmfd: interrupted"), said
     assert not [path for path in tmp_path.rglob(".*") if path.name == LOCK or TEMPORARY.fullmatch(path.name)]
     if name == "benchmark":
@@ -111,6 +117,7 @@ def test_sigterm_ends_like_ctrl_c(tmp_path, command):
 
 def test_an_interrupt_that_a_compiled_library_made_an_error_of_its_own_of(monkeypatch, capsys):
     """matplotlib's drawing of a path says `Invalid bounding box` where Ctrl-C comes while it reads an array."""
+
     def draw(**_):
         with suppress(KeyboardInterrupt):
             signal.raise_signal(number)
@@ -152,13 +159,19 @@ def test_benchmark_killed_at_random_moments(tmp_path):
         everything_readable(out)
     good(call(*command, out))
     assert arrays(out) == arrays(tmp_path / "whole")
-    rows = [[{**row, "evaluation_time_s": 0, "control_step_ms_median": 0, "control_step_ms_max": 0}
-             for row in run_folder.read_summary(folder / "summary.csv")] for folder in (out, tmp_path / "whole")]
+    rows = [
+        [
+            {**row, "evaluation_time_s": 0, "control_step_ms_median": 0, "control_step_ms_max": 0}
+            for row in run_folder.read_summary(folder / "summary.csv")
+        ]
+        for folder in (out, tmp_path / "whole")
+    ]
     assert rows[0] == rows[1]
 
 
-@pytest.mark.parametrize("kill", [*({"write": n, "behind": behind} for n in (1, 2, 4) for behind in (False, True)),
-                                  {"after": 0.2}])
+@pytest.mark.parametrize(
+    "kill", [*({"write": n, "behind": behind} for n in (1, 2, 4) for behind in (False, True)), {"after": 0.2}]
+)
 def test_training_killed_and_resumed_is_the_uninterrupted_one(tmp_path, monkeypatch, kill):
     monkeypatch.setattr(training, "VALIDATE_EVERY", 1)
     scenario = tiny.write(tmp_path)
@@ -174,15 +187,33 @@ def test_training_killed_and_resumed_is_the_uninterrupted_one(tmp_path, monkeypa
     assert all(torch.equal(whole["weights"][key], mine["weights"][key]) for key in whole["weights"])
     assert out.read_bytes() == (tmp_path / "whole.pt").read_bytes()
     assert {path.name for path in tmp_path.iterdir()} == {
-        "network", "scenario", "whole.pt", "mine.pt", "whole-training.png", "mine-training.png"}
+        "network",
+        "scenario",
+        "whole.pt",
+        "mine.pt",
+        "whole-training.png",
+        "mine-training.png",
+    }
 
 
 @pytest.mark.parametrize("content", [b"", b"x", {"configuration": {}}, {"configuration": 5}, [1], "cut"])
 def test_a_damaged_training_state_is_one_line(tmp_path, monkeypatch, content):
     monkeypatch.setattr(training, "VALIDATE_EVERY", 1)
     scenario, state = tiny.write(tmp_path), tmp_path / "p.pt.resume"
-    command = ("nmfd", "train", scenario, "--controller", "dpc-pc", "--steps", 3, "--no-compile", "--device", "cpu",
-               "--out", tmp_path / "p.pt")
+    command = (
+        "nmfd",
+        "train",
+        scenario,
+        "--controller",
+        "dpc-pc",
+        "--steps",
+        3,
+        "--no-compile",
+        "--device",
+        "cpu",
+        "--out",
+        tmp_path / "p.pt",
+    )
     if isinstance(content, bytes):
         state.write_bytes(content)
     elif content == "cut":
@@ -198,8 +229,20 @@ def test_a_damaged_training_state_is_one_line(tmp_path, monkeypatch, content):
 def city(tmp_path_factory):
     folder = tmp_path_factory.mktemp("city")
     config = tiny_city.city(folder)
-    good(call("cosim", "import", config, "--regions", 3, "--no-run", "--method", "geometric", "--out",
-              folder / "networks" / "tiny"))
+    good(
+        call(
+            "cosim",
+            "import",
+            config,
+            "--regions",
+            3,
+            "--no-run",
+            "--method",
+            "geometric",
+            "--out",
+            folder / "networks" / "tiny",
+        )
+    )
     return folder / "scenarios" / "tiny"
 
 
@@ -217,8 +260,20 @@ def test_a_run_in_sumo_killed_starts_again_from_its_beginning(city, tmp_path):
 
 @pytest.mark.slow
 def test_an_evaluation_killed_goes_on_to_the_same_bytes(city, tmp_path):
-    command = ("cosim", "evaluate", city, "--controllers", "no-control,pi-gating", "--seeds", 2, "--steps", 3,
-               "--workers", 1, "--out")
+    command = (
+        "cosim",
+        "evaluate",
+        city,
+        "--controllers",
+        "no-control,pi-gating",
+        "--seeds",
+        2,
+        "--steps",
+        3,
+        "--workers",
+        1,
+        "--out",
+    )
     good(call(*command, tmp_path / "whole"))
     out, draw = tmp_path / "out", random.Random(3)
     for _ in range(4):
@@ -295,8 +350,9 @@ def test_the_second_of_two_runs_into_one_folder_is_told(tmp_path):
     out.mkdir()
     with files.locked(out / LOCK, out):
         for program, command in (
-                ("nmfd", ("benchmark", scenario, "--controllers", "no-control", "--out", out)),
-                ("nmfd", ("robustness", scenario, "--controllers", "no-control", "--scenarios", 1, "--out", out))):
+            ("nmfd", ("benchmark", scenario, "--controllers", "no-control", "--out", out)),
+            ("nmfd", ("robustness", scenario, "--controllers", "no-control", "--scenarios", 1, "--out", out)),
+        ):
             result = call(program, *command)
             assert result.exit_code == 2 and result.stderr.count("\n") == 1
             assert f"out: process {os.getpid()} on " in result.stderr and "is writing to it" in result.stderr

@@ -42,11 +42,19 @@ class Streets:
         return True
 
 
-@pytest.mark.parametrize("standing, room, expected", [
-    ({"first": 130.0, "second": 150.0, "third": 200.0}, (50.0, 50.0), {"first": "a_0", "third": "b_0"}),  # one per lane
-    ({"first": 130.0, "second": 20.0}, (50.0, 0.0), {"first": "a_0"}),  # who has just come is not asked
-    ({"first": 130.0, "second": 130.0}, (50.0, 9.0), {}),  # one street behind is full: a real lock
-    ({"first": STOOD - 1.0}, (50.0, 50.0), {})])
+@pytest.mark.parametrize(
+    "standing, room, expected",
+    [
+        (
+            {"first": 130.0, "second": 150.0, "third": 200.0},
+            (50.0, 50.0),
+            {"first": "a_0", "third": "b_0"},
+        ),  # one per lane
+        ({"first": 130.0, "second": 20.0}, (50.0, 0.0), {"first": "a_0"}),  # who has just come is not asked
+        ({"first": 130.0, "second": 130.0}, (50.0, 9.0), {}),  # one street behind is full: a real lock
+        ({"first": STOOD - 1.0}, (50.0, 50.0), {}),
+    ],
+)
 def test_vehicles_are_set_down_where_all_have_room(standing, room, expected):
     streets = Streets(standing, dict(zip(("a_0", "b_0"), room, strict=True)))
     junctions = Junctions(streets, SimpleNamespace(region_of=dict.fromkeys(EDGES, 0)))

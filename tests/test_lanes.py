@@ -22,8 +22,8 @@ EDGES = """<edges><edge id="ab" from="a" to="b" numLanes="2"/>
 CONNECTIONS = """<connections><connection from="ab" to="br" fromLane="0" toLane="0"/>
 <connection from="ab" to="bl" fromLane="1" toLane="0"/></connections>"""
 QUEUE = 12  # vehicles on each lane, all of whom want to be on the other one
-VEHICLE = '''<vehicle id="{way}{n}" depart="0" departLane="{lane}" departPos="{at}" departSpeed="0">
-<route edges="ab {edges}"/></vehicle>'''
+VEHICLE = """<vehicle id="{way}{n}" depart="0" departLane="{lane}" departPos="{at}" departSpeed="0">
+<route edges="ab {edges}"/></vehicle>"""
 TARGETS = {"left": "le", "right": "re"}
 LEADERS = {f"{way}0": target for way, target in TARGETS.items()}
 
@@ -34,8 +34,17 @@ def network(tmp_path_factory):
     files = {"nod": NODES, "edg": EDGES, "con": CONNECTIONS}
     for kind, text in files.items():
         (folder / f"{kind}.xml").write_text(text)
-    tiny_city.run("netconvert", "--node-files", folder / "nod.xml", "--edge-files", folder / "edg.xml",
-                  "--connection-files", folder / "con.xml", "--output-file", folder / "net.xml")
+    tiny_city.run(
+        "netconvert",
+        "--node-files",
+        folder / "nod.xml",
+        "--edge-files",
+        folder / "edg.xml",
+        "--connection-files",
+        folder / "con.xml",
+        "--output-file",
+        folder / "net.xml",
+    )
     return folder
 
 
@@ -43,10 +52,15 @@ def network(tmp_path_factory):
 def session(network, request):
     """A queue on both lanes, each in that of the other, its leader at the given place [m], from the end if negative."""
     routes = network / f"at{request.param}.rou.xml"
-    routes.write_text("<routes>" + "".join(
-        VEHICLE.format(way=way, n=n, lane=lane, at=request.param - 7.5 * n, edges=edges)
-        for n in range(QUEUE) for lane, (way, edges) in enumerate({"left": "bl le", "right": "br re"}.items())
-    ) + "</routes>")
+    routes.write_text(
+        "<routes>"
+        + "".join(
+            VEHICLE.format(way=way, n=n, lane=lane, at=request.param - 7.5 * n, edges=edges)
+            for n in range(QUEUE)
+            for lane, (way, edges) in enumerate({"left": "bl le", "right": "br re"}.items())
+        )
+        + "</routes>"
+    )
     session = Session(network / "net.xml", routes, seed=1)
     session.step()
     yield session
@@ -65,14 +79,39 @@ def drive(session, seconds):
 def guide_of(session, *, period, turn_late=False):
     """Of the whole network as one region."""
     after = {
-        "ab": ("bl", "br"), "bl": ("le", "lr"), "br": ("re", "rl"), "lr": ("re",), "rl": ("le",), "le": (), "re": ()}
+        "ab": ("bl", "br"),
+        "bl": ("le", "lr"),
+        "br": ("re", "rl"),
+        "lr": ("re",),
+        "rl": ("le",),
+        "le": (),
+        "re": (),
+    }
     of_all = {edge: 0 for edge in after}
     city = City(
-        net_file=Path(), edges=tuple(after), region_of=of_all, length=dict.fromkeys(after, 300.0),
-        lanes=dict.fromkeys(after, 1), lane_ids={}, speed=dict.fromkeys(after, 13.9), gateways=(), signals={},
-        successors=after, regions=1, turn_time={(e, f): 0.0 for e, following in after.items() for f in following})
-    return Guide(session, city, np.zeros((1, 1, 1)), compliance=1.0, most_detour=60.0, period=period,
-                 turn_late=turn_late, random=np.random.default_rng(0))
+        net_file=Path(),
+        edges=tuple(after),
+        region_of=of_all,
+        length=dict.fromkeys(after, 300.0),
+        lanes=dict.fromkeys(after, 1),
+        lane_ids={},
+        speed=dict.fromkeys(after, 13.9),
+        gateways=(),
+        signals={},
+        successors=after,
+        regions=1,
+        turn_time={(e, f): 0.0 for e, following in after.items() for f in following},
+    )
+    return Guide(
+        session,
+        city,
+        np.zeros((1, 1, 1)),
+        compliance=1.0,
+        most_detour=60.0,
+        period=period,
+        turn_late=turn_late,
+        random=np.random.default_rng(0),
+    )
 
 
 @pytest.mark.parametrize("session", [-0.5], indirect=True)
@@ -119,9 +158,12 @@ def test_from_before_the_stop_line_they_are_sent_elsewhere_only_if_they_are_led_
 def test_guided_drivers_are_led_on(session):
     guide = guide_of(session, period=60.0)
     guide.command(np.zeros((1, 1, 1)), None)
-    guide.apply([
-        Event(vehicle=vehicle, source=None, edge=TARGETS[vehicle.rstrip("0123456789")], region=0, destination=0)
-        for vehicle in session.running()])
+    guide.apply(
+        [
+            Event(vehicle=vehicle, source=None, edge=TARGETS[vehicle.rstrip("0123456789")], region=0, destination=0)
+            for vehicle in session.running()
+        ]
+    )
     for _ in range(1800):
         session.step()
         guide.apply([])

@@ -29,15 +29,21 @@ from nmfd.ledger import LedgerError
 
 COUNT_EVERY, STEPS = 25, 250
 REGION = {"A": 0, "B": 0, "C": 1, "D": 2}  # by the junction that an edge leads to: 0 and 2 do not touch
-CALIBRATOR = ('<calibrator id="c{0}" edge="{0}" pos="{1}" freq="10" jamThreshold="0.99"><flow begin="0" end="900" {2}/>'
-              "</calibrator>")
-REROUTER = ('<rerouter id="r" edges="A1B1 B1C1 B2C2 C2B2 C1B1 B1B2 C1C2"><interval begin="0" end="900">{}</interval>'
-            "</rerouter>")
-RECKLESS = ('jmIgnoreFoeProb="1" jmIgnoreFoeSpeed="99" jmIgnoreJunctionFoeProb="1" jmDriveAfterRedTime="999" '
-            'collisionMinGapFactor="0"')
+CALIBRATOR = (
+    '<calibrator id="c{0}" edge="{0}" pos="{1}" freq="10" jamThreshold="0.99"><flow begin="0" end="900" {2}/>'
+    "</calibrator>"
+)
+REROUTER = (
+    '<rerouter id="r" edges="A1B1 B1C1 B2C2 C2B2 C1B1 B1B2 C1C2"><interval begin="0" end="900">{}</interval></rerouter>'
+)
+RECKLESS = (
+    'jmIgnoreFoeProb="1" jmIgnoreFoeSpeed="99" jmIgnoreJunctionFoeProb="1" jmDriveAfterRedTime="999" '
+    'collisionMinGapFactor="0"'
+)
 PARKING = "".join(
     f'<parkingArea id="p{n}" lane="{lane}_0" startPos="20" endPos="60" roadsideCapacity="{n % 2}"/>'
-    for n, lane in enumerate(("B1C1", "B2C2", "C1D1", "C2D2")))
+    for n, lane in enumerate(("B1C1", "B2C2", "C1D1", "C2D2"))
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +70,7 @@ def remove(*reasons):
     def script(step, random):
         for vehicle in some(random) if step % 5 == 0 else ():
             libsumo.vehicle.remove(vehicle, int(random.choice(reasons)))
+
     return script
 
 
@@ -71,7 +78,7 @@ def shorten(step, random):
     for vehicle in some(random) if step % 5 == 0 else ():
         route, index = libsumo.vehicle.getRoute(vehicle), libsumo.vehicle.getRouteIndex(vehicle)
         if index >= 0 and not libsumo.vehicle.getRoadID(vehicle).startswith(":"):
-            libsumo.vehicle.setRoute(vehicle, route[index:index + int(random.integers(1, 4))])
+            libsumo.vehicle.setRoute(vehicle, route[index : index + int(random.integers(1, 4))])
 
 
 def change_target(step, random):
@@ -135,16 +142,26 @@ CASES = {
     "plain": Case(expects=("arrivals", "crossings")),
     "calibrators": Case(additional=CALIBRATORS, expects=("arrivals", "removals")),
     "calibrator-that-inserts": Case(
-        additional='<route id="in" edges="A1B1 B1C1 C1D1"/><vType id="car"/>' + INSERTING, trips=10,
-        expects=("arrivals",)),
+        additional='<route id="in" edges="A1B1 B1C1 C1D1"/><vType id="car"/>' + INSERTING,
+        trips=10,
+        expects=("arrivals",),
+    ),
     "calibrators-on-last-edges": Case(
         additional="".join(CALIBRATOR.format(edge, 5, flow(20)) for edge in ("C1D1", "C2D2")),
-        vehicles='<flow id="f" begin="0" end="150" period="2" from="A1B1" to="C1D1"/>', trips=20,
-        expects=("removals",)),
-    "collisions": Case(type=RECKLESS, trips=300, session={"collision_action": "remove"},
-        options=("--collision.check-junctions",), expects=("removals",)),
-    "collisions-teleport": Case(type=RECKLESS, trips=300, session={"collision_action": "teleport"},
-        options=("--collision.check-junctions",)),
+        vehicles='<flow id="f" begin="0" end="150" period="2" from="A1B1" to="C1D1"/>',
+        trips=20,
+        expects=("removals",),
+    ),
+    "collisions": Case(
+        type=RECKLESS,
+        trips=300,
+        session={"collision_action": "remove"},
+        options=("--collision.check-junctions",),
+        expects=("removals",),
+    ),
+    "collisions-teleport": Case(
+        type=RECKLESS, trips=300, session={"collision_action": "teleport"}, options=("--collision.check-junctions",)
+    ),
     "removed-by-program": Case(script=remove(3), expects=("arrivals", "removals")),
     "removed-as-arrived": Case(script=remove(2), expects=("removals",)),
     "removed-as-teleport": Case(script=remove(0, 4), expects=("removals",)),
@@ -156,71 +173,142 @@ CASES = {
     "ids-used-again": Case(script=reuse, expects=("removals",)),
     "moved-by-program": Case(script=move, expects=("jumps",)),
     "taken-back": Case(script=forget, expects=("given_up",)),
-    "destination-rerouter": Case(additional=REROUTER.format(
-        '<destProbReroute id="C3D3" probability="0.5"/><destProbReroute id="B2A2" probability="0.5"/>'),
-        expects=("arrivals", "redirected")),
+    "destination-rerouter": Case(
+        additional=REROUTER.format(
+            '<destProbReroute id="C3D3" probability="0.5"/><destProbReroute id="B2A2" probability="0.5"/>'
+        ),
+        expects=("arrivals", "redirected"),
+    ),
     "ending-rerouter": Case(additional=REROUTER.format('<destProbReroute id="terminateRoute" probability="1"/>')),
-    "route-rerouter": Case(additional='<route id="other" edges="B1C1 C1C2"/>' + REROUTER.replace(
-        "A1B1 B1C1 B2C2 C2B2 C1B1 B1B2 C1C2", "B1C1").format('<routeProbReroute id="other" probability="1"/>'),
-        expects=("arrivals", "redirected")),
-    "closing-rerouter": Case(additional=REROUTER.format(
-        '<closingReroute id="C1D1" disallow="all"/><closingReroute id="B2C2" disallow="all"/>'),
-        options=("--ignore-route-errors",), expects=("given_up",)),
-    "closing-rerouter-that-diverts": Case(additional=REROUTER.format(
-        '<closingReroute id="C1D1" disallow="all"/><destProbReroute id="C3D3" probability="1"/>'),
-        options=("--ignore-route-errors",), expects=("arrivals",)),
+    "route-rerouter": Case(
+        additional='<route id="other" edges="B1C1 C1C2"/>'
+        + REROUTER.replace("A1B1 B1C1 B2C2 C2B2 C1B1 B1B2 C1C2", "B1C1").format(
+            '<routeProbReroute id="other" probability="1"/>'
+        ),
+        expects=("arrivals", "redirected"),
+    ),
+    "closing-rerouter": Case(
+        additional=REROUTER.format(
+            '<closingReroute id="C1D1" disallow="all"/><closingReroute id="B2C2" disallow="all"/>'
+        ),
+        options=("--ignore-route-errors",),
+        expects=("given_up",),
+    ),
+    "closing-rerouter-that-diverts": Case(
+        additional=REROUTER.format(
+            '<closingReroute id="C1D1" disallow="all"/><destProbReroute id="C3D3" probability="1"/>'
+        ),
+        options=("--ignore-route-errors",),
+        expects=("arrivals",),
+    ),
     "parking-rerouter": Case(
-        additional=PARKING + '<rerouter id="r" edges="B1C1 B2C2 C1D1 C2D2"><interval begin="0" end="900">' + "".join(
-            f'<parkingAreaReroute id="p{n}"/>' for n in range(4)) + "</interval></rerouter>",
+        additional=PARKING
+        + '<rerouter id="r" edges="B1C1 B2C2 C1D1 C2D2"><interval begin="0" end="900">'
+        + "".join(f'<parkingAreaReroute id="p{n}"/>' for n in range(4))
+        + "</interval></rerouter>",
         vehicles="".join(
             f'<trip id="park{n}" depart="{3 * n}" from="A{1 + n % 2}B{1 + n % 2}" to="B{1 + n % 2}C{1 + n % 2}">'
-            f'<stop parkingArea="p{n % 2}" duration="40"/></trip>' for n in range(30)), trips=40,
-        expects=("arrivals",)),
-    "stops-beside-the-road": Case(vehicles="".join(
-        f'<trip id="s{n}" depart="{5 * n}" from="A1B1" to="C1D1"><stop lane="B1C1_0" endPos="60" duration="40" '
-        f'parking="{n % 2}"/></trip>' for n in range(20)), trips=40, expects=("arrivals",)),
+            f'<stop parkingArea="p{n % 2}" duration="40"/></trip>'
+            for n in range(30)
+        ),
+        trips=40,
+        expects=("arrivals",),
+    ),
+    "stops-beside-the-road": Case(
+        vehicles="".join(
+            f'<trip id="s{n}" depart="{5 * n}" from="A1B1" to="C1D1"><stop lane="B1C1_0" endPos="60" duration="40" '
+            f'parking="{n % 2}"/></trip>'
+            for n in range(20)
+        ),
+        trips=40,
+        expects=("arrivals",),
+    ),
     "teleports": Case(script=block, session={"time_to_teleport": 8.0}),
     "teleports-off-the-net": Case(
-        script=block, session={"time_to_teleport": 8.0}, options=("--time-to-teleport.remove",), expects=("removals",)),
+        script=block, session={"time_to_teleport": 8.0}, options=("--time-to-teleport.remove",), expects=("removals",)
+    ),
     "disconnected-teleports": Case(
-        vehicles="".join(f'<vehicle id="gap{n}" depart="{4 * n}"><route edges="A1B1 C2D2"/></vehicle>'
-                         for n in range(20)),
-        session={"time_to_teleport": 8.0}, options=("--ignore-route-errors", "--time-to-teleport.disconnected", "1"),
-        expects=("jumps",)),
+        vehicles="".join(
+            f'<vehicle id="gap{n}" depart="{4 * n}"><route edges="A1B1 C2D2"/></vehicle>' for n in range(20)
+        ),
+        session={"time_to_teleport": 8.0},
+        options=("--ignore-route-errors", "--time-to-teleport.disconnected", "1"),
+        expects=("jumps",),
+    ),
     "disconnected": Case(
-        vehicles="".join(f'<vehicle id="gap{n}" depart="{4 * n}"><route edges="A1B1 C2D2"/></vehicle>'
-                         for n in range(20)), options=("--ignore-route-errors",)),
-    "long-waits": Case(vehicles='<flow id="f" begin="0" end="99" period="0.3" from="A1B1" to="C1D1"/>', options=(
-        "--max-depart-delay", "10"), expects=("arrivals", "given_up")),
-    "persons-cars": Case(vehicles="".join(
-        f'<trip id="own{n}" depart="triggered" from="A1B1" to="C1D1"/><person id="p{n}" depart="{3 * n}">'
-        f'<ride from="A1B1" to="C1D1" lines="own{n}"/></person>' for n in range(30)), trips=20,
-        expects=("arrivals",)),
-    "from-the-middle-of-a-route": Case(vehicles="".join(
-        f'<vehicle id="m{n}" depart="{2 * n}" departEdge="2"><route edges="A1B1 B1C1 C1D1 D1D2"/></vehicle>'
-        for n in range(20)), trips=40, expects=("arrivals",)),
-    "rerouting-drivers": Case(options=("--device.rerouting.probability", "0.5", "--device.rerouting.period", "20"),
-                              expects=("arrivals",)),
+        vehicles="".join(
+            f'<vehicle id="gap{n}" depart="{4 * n}"><route edges="A1B1 C2D2"/></vehicle>' for n in range(20)
+        ),
+        options=("--ignore-route-errors",),
+    ),
+    "long-waits": Case(
+        vehicles='<flow id="f" begin="0" end="99" period="0.3" from="A1B1" to="C1D1"/>',
+        options=("--max-depart-delay", "10"),
+        expects=("arrivals", "given_up"),
+    ),
+    "persons-cars": Case(
+        vehicles="".join(
+            f'<trip id="own{n}" depart="triggered" from="A1B1" to="C1D1"/><person id="p{n}" depart="{3 * n}">'
+            f'<ride from="A1B1" to="C1D1" lines="own{n}"/></person>'
+            for n in range(30)
+        ),
+        trips=20,
+        expects=("arrivals",),
+    ),
+    "from-the-middle-of-a-route": Case(
+        vehicles="".join(
+            f'<vehicle id="m{n}" depart="{2 * n}" departEdge="2"><route edges="A1B1 B1C1 C1D1 D1D2"/></vehicle>'
+            for n in range(20)
+        ),
+        trips=40,
+        expects=("arrivals",),
+    ),
+    "rerouting-drivers": Case(
+        options=("--device.rerouting.probability", "0.5", "--device.rerouting.period", "20"), expects=("arrivals",)
+    ),
     "zones": Case(
         additional='<taz id="w" edges="A1B1 A2B2"/><taz id="e"><tazSink id="C1D1" weight="1"/>'
         '<tazSink id="B1C1" weight="1"/><tazSource id="D1C1" weight="1"/></taz>',
-        vehicles='<flow id="z" begin="0" end="200" period="4" fromTaz="w" toTaz="e"/>', trips=40,
-        expects=("arrivals",)),
+        vehicles='<flow id="z" begin="0" end="200" period="4" fromTaz="w" toTaz="e"/>',
+        trips=40,
+        expects=("arrivals",),
+    ),
     "everything": Case(
-        additional=CALIBRATORS + REROUTER.format('<destProbReroute id="C3D3" probability="0.3"/>'), type=RECKLESS,
+        additional=CALIBRATORS + REROUTER.format('<destProbReroute id="C3D3" probability="0.3"/>'),
+        type=RECKLESS,
         session={"collision_action": "remove", "time_to_teleport": 10.0},
-        options=("--collision.check-junctions", "--max-depart-delay", "20"), trips=300,
-        script=lambda step, random: [tried(part, step, random) for part in (
-            remove(0, 1, 2, 3, 4), shorten, change_target, add, reuse, move, block)],
-        expects=("arrivals", "removals", "redirected")),
+        options=("--collision.check-junctions", "--max-depart-delay", "20"),
+        trips=300,
+        script=lambda step, random: [
+            tried(part, step, random)
+            for part in (remove(0, 1, 2, 3, 4), shorten, change_target, add, reuse, move, block)
+        ],
+        expects=("arrivals", "removals", "redirected"),
+    ),
 }
 # What SUMO's mesoscopic model does not have: collisions, standing drivers, places on edges, parking rerouters.
 MICRO_ONLY = {"collisions", "collisions-teleport", "teleports", "teleports-off-the-net", "moved-by-program"}
 QUICK = {  # in the default suite
-    ("calibrators", False), ("collisions", False), ("removed-as-anything", False), ("another-target", True),
-    ("calibrators", True), ("ids-used-again", False), ("long-waits", True), ("moved-by-program", False)}
-MANY = [pytest.param(name, meso, id=f"{name}-{'meso' if meso else 'micro'}", marks=() if (name, meso) in QUICK else (
-    pytest.mark.slow,)) for name in CASES for meso in (False, True) if not (meso and name in MICRO_ONLY)]
+    ("calibrators", False),
+    ("collisions", False),
+    ("removed-as-anything", False),
+    ("another-target", True),
+    ("calibrators", True),
+    ("ids-used-again", False),
+    ("long-waits", True),
+    ("moved-by-program", False),
+}
+MANY = [
+    pytest.param(
+        name,
+        meso,
+        id=f"{name}-{'meso' if meso else 'micro'}",
+        marks=() if (name, meso) in QUICK else (pytest.mark.slow,),
+    )
+    for name in CASES
+    for meso in (False, True)
+    if not (meso and name in MICRO_ONLY)
+]
 
 
 @pytest.fixture(scope="module")
@@ -229,16 +317,23 @@ def city(tmp_path_factory):
     net = tiny_city.network(folder, "--tls.set", "B1,B2,C1")
     edges = [edge.get("id") for edge in ElementTree.parse(net).getroot().iter("edge") if not edge.get("function")]
     (folder / "regions.csv").write_text(
-        "edge,region\n" + "".join(f"{edge},{REGION[edge[2]]}\n" for edge in sorted(edges)))
+        "edge,region\n" + "".join(f"{edge},{REGION[edge[2]]}\n" for edge in sorted(edges))
+    )
     return load_city(net, folder / "regions.csv", 3)
 
 
 def trips(city, case: Case, seed: int) -> str:
     random = np.random.default_rng(seed)
     pairs = random.choice(city.edges, (case.trips, 2))
-    return f'<routes><vType id="DEFAULT_VEHTYPE" {case.type}/>' + case.vehicles + "".join(
-        f'<trip id="t{n}" depart="{150 * n / case.trips:.1f}" from="{a}" to="{b}"/>'
-        for n, (a, b) in enumerate(pairs)) + "</routes>"
+    return (
+        f'<routes><vType id="DEFAULT_VEHTYPE" {case.type}/>'
+        + case.vehicles
+        + "".join(
+            f'<trip id="t{n}" depart="{150 * n / case.trips:.1f}" from="{a}" to="{b}"/>'
+            for n, (a, b) in enumerate(pairs)
+        )
+        + "</routes>"
+    )
 
 
 def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int, prompt: bool = True):
@@ -247,9 +342,20 @@ def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int, prompt: 
     (folder / "more.add.xml").write_text(f"<additional>{case.additional}</additional>")
     out, random = folder / "tripinfo.xml", np.random.default_rng(seed)
     session = Session(
-        city.net_file, folder / "trips.rou.xml", seed=seed, **case.session, options=(
-            *trip_options(out), "--additional-files", str(folder / "more.add.xml"), "--ignore-junction-blocker", "20",
-            *case.options, *(MESOSCOPIC if mesoscopic else ())))
+        city.net_file,
+        folder / "trips.rou.xml",
+        seed=seed,
+        **case.session,
+        options=(
+            *trip_options(out),
+            "--additional-files",
+            str(folder / "more.add.xml"),
+            "--ignore-junction-blocker",
+            "20",
+            *case.options,
+            *(MESOSCOPIC if mesoscopic else ()),
+        ),
+    )
     states = []
     try:
         reader = TripReader(out, session.flush if prompt else lambda: False)
@@ -288,9 +394,14 @@ def check(city, meter, states, infos, count):
     ended = infos[:count]  # what is written after that is of those under way
     good = [not trip.get("vaporized") for trip in ended]
     assert (meter.arrivals.sum(), meter.removals.sum()) == (sum(good), count - sum(good))
-    arrived = np.bincount([
-        city.region_of[trip.get("arrivalLane").rpartition("_")[0]] for trip, there in zip(ended, good, strict=True)
-        if there and trip.get("arrivalLane")], minlength=3)
+    arrived = np.bincount(
+        [
+            city.region_of[trip.get("arrivalLane").rpartition("_")[0]]
+            for trip, there in zip(ended, good, strict=True)
+            if there and trip.get("arrivalLane")
+        ],
+        minlength=3,
+    )
     assert (meter.arrivals >= arrived).all()
     departed = sum(float(trip.get("depart")) >= 0 for trip in infos)
     assert meter.departures.sum() == departed
@@ -317,9 +428,14 @@ def test_nobody_goes_unnoticed(city, tmp_path, name, mesoscopic):
         assert getattr(meter, what).any(), what
 
 
-@pytest.mark.parametrize("name, mesoscopic", [
-    ("removed-as-anything", False), pytest.param("everything", False, marks=pytest.mark.slow),
-    pytest.param("everything", True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name, mesoscopic",
+    [
+        ("removed-as-anything", False),
+        pytest.param("everything", False, marks=pytest.mark.slow),
+        pytest.param("everything", True, marks=pytest.mark.slow),
+    ],
+)
 def test_where_sumo_writes_late_the_books_are_right_in_the_end(city, tmp_path, name, mesoscopic):
     """As in the window, which nobody can ask to write at once: about ten trips are not told of until then."""
     meter, _, infos, count = run(tmp_path, city, CASES[name], mesoscopic=mesoscopic, seed=1, prompt=False)
@@ -327,11 +443,16 @@ def test_where_sumo_writes_late_the_books_are_right_in_the_end(city, tmp_path, n
 
 
 def test_a_vehicle_that_sumo_tells_nothing_of_is_an_error(city, tmp_path):
-    silent = Case(vehicles='<vType id="s"><param key="has.tripinfo.device" value="false"/></vType>'
-                  '<flow id="f" type="s" begin="0" end="50" period="5" from="A1B1" to="B1C1"/>', trips=5)
+    silent = Case(
+        vehicles='<vType id="s"><param key="has.tripinfo.device" value="false"/></vType>'
+        '<flow id="f" type="s" begin="0" end="50" period="5" from="A1B1" to="B1C1"/>',
+        trips=5,
+    )
     for prompt in (True, False):
-        with pytest.raises(LedgerError, match=(
-            r"such as f\.\d\): is the disk full\? Or does their type have has\.tripinfo\.device = false")):
+        with pytest.raises(
+            LedgerError,
+            match=(r"such as f\.\d\): is the disk full\? Or does their type have has\.tripinfo\.device = false"),
+        ):
             run(tmp_path, city, silent, mesoscopic=False, seed=1, prompt=prompt)
 
 
@@ -361,8 +482,9 @@ def test_a_run_says_who_was_removed_and_gains_nothing_by_it(tmp_path):
     scenario = copies.peak(tmp_path)
     built = tmp_path / "networks" / "grid7" / "build"
     city = load_city(built / "grid7.net.xml", built / "regions.csv", 7)
-    (scenario / "more.add.xml").write_text("<additional>" + "".join(
-        CALIBRATOR.format(edge, 5, flow(1)) for edge in city.edges[::5]) + "</additional>")
+    (scenario / "more.add.xml").write_text(
+        "<additional>" + "".join(CALIBRATOR.format(edge, 5, flow(1)) for edge in city.edges[::5]) + "</additional>"
+    )
     text = (scenario / "scenario.toml").read_text()
     (scenario / "scenario.toml").write_text(text.replace("[sumo]", '[sumo]\nadditional = ["more.add.xml"]'))
     (tmp_path / "mine.py").write_text(MEDDLER)

@@ -24,21 +24,61 @@ from nmfd.runs import run_folder
 from nmfd.studies import bound
 
 SCENARIO_KEYS = {
-    "name": "x", "network": "../network", "step": 30.0, "steps": 20, "integrator": "euler", "substeps": 1,
-    "protected": [1], "demand_factor": 1.0, "demand_file": "demand.csv", "base": "../scenario", "noise": {},
-    "forecast": {"error": 0.1}, "sumo": {}, "controllers": {"mpc-pc": {"horizon": 4}, "dpc-pc": {"batch": 4}}}
-DEMAND_KEYS = {"from": 0, "to": 1, "start": 0.0, "peak": 1.0, "ramp_up": 1.0, "flat": 1.0, "ramp_down": 1.0,
-               "both_ways": True}
-REGION_KEYS = {"name": "a", "position": [0.0, 0.0], "adjacent": [1], "no_way_to": [], "exit_rates": [1.0, 1.0],
-               "capacity": [1.0], "storage": 900.0, "mfd": {"a": 4.1e-9, "b": -8.2e-6, "c": 0.0042, "jam": 1000.0}}
+    "name": "x",
+    "network": "../network",
+    "step": 30.0,
+    "steps": 20,
+    "integrator": "euler",
+    "substeps": 1,
+    "protected": [1],
+    "demand_factor": 1.0,
+    "demand_file": "demand.csv",
+    "base": "../scenario",
+    "noise": {},
+    "forecast": {"error": 0.1},
+    "sumo": {},
+    "controllers": {"mpc-pc": {"horizon": 4}, "dpc-pc": {"batch": 4}},
+}
+DEMAND_KEYS = {
+    "from": 0,
+    "to": 1,
+    "start": 0.0,
+    "peak": 1.0,
+    "ramp_up": 1.0,
+    "flat": 1.0,
+    "ramp_down": 1.0,
+    "both_ways": True,
+}
+REGION_KEYS = {
+    "name": "a",
+    "position": [0.0, 0.0],
+    "adjacent": [1],
+    "no_way_to": [],
+    "exit_rates": [1.0, 1.0],
+    "capacity": [1.0],
+    "storage": 900.0,
+    "mfd": {"a": 4.1e-9, "b": -8.2e-6, "c": 0.0042, "jam": 1000.0},
+}
 VALUES = st.recursive(
     st.one_of(
-        st.booleans(), st.integers(), st.integers(-3, 30), st.floats(), st.floats(-2.0, 2000.0), st.text(max_size=12),
-        st.sampled_from(["../network", "euler", "mpc-pc", "", ".", "/", "\x00", 10**30, -1, 0])),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3), max_leaves=5)
+        st.booleans(),
+        st.integers(),
+        st.integers(-3, 30),
+        st.floats(),
+        st.floats(-2.0, 2000.0),
+        st.text(max_size=12),
+        st.sampled_from(["../network", "euler", "mpc-pc", "", ".", "/", "\x00", 10**30, -1, 0]),
+    ),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=5,
+)
 examples = settings(
-    max_examples=60, derandomize=True, deadline=None, database=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+    max_examples=60,
+    derandomize=True,
+    deadline=None,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
 
 
 def toml(value) -> str:
@@ -95,7 +135,8 @@ def test_scenarios(tmp_path, table, demand):
     if not (tmp_path / "network").exists():
         tiny.write(tmp_path)
     scenario = good_or_one_line(
-        load_scenario, written(tmp_path / "other", "scenario.toml", table | {"demand": [demand]}))
+        load_scenario, written(tmp_path / "other", "scenario.toml", table | {"demand": [demand]})
+    )
     if scenario is not None:
         assert scenario.demand.shape == (scenario.steps, 2, 2)
         assert np.isfinite(scenario.demand).all() and (scenario.demand >= 0).all() and scenario.step > 0
@@ -106,7 +147,8 @@ def test_scenarios(tmp_path, table, demand):
 def test_networks(tmp_path, table, first):
     second = REGION_KEYS | {"adjacent": [0], "position": [1.0, 0.0]}
     network = good_or_one_line(
-        load_network, written(tmp_path / "network", "network.toml", table | {"regions": [first, second]}))
+        load_network, written(tmp_path / "network", "network.toml", table | {"regions": [first, second]})
+    )
     if network is not None:
         assert network.regions == 2 and 0.0 <= network.u_min < network.u_max <= 1.0
         assert all(np.isfinite(mfd.capacity) and mfd.capacity > 0 for mfd in network.mfds)
@@ -128,11 +170,13 @@ def test_any_bytes(tmp_path, network, content, kind):
         (tmp_path / "n").mkdir(exist_ok=True)
         (tmp_path / "n" / "network.toml").write_bytes(bytes_)
         loaders = {
-            "nc": [run_folder.read_trajectory], "pt": [lambda path: load_policy(path, network)],
+            "nc": [run_folder.read_trajectory],
+            "pt": [lambda path: load_policy(path, network)],
             "csv": [run_folder.read_summary, lambda path: load_city(tmp_path / "none.net.xml", path, 2)],
             "xml": [read_originals_of, lambda path: load_city(path, tmp_path / "none.csv", 2)],
             "xml.gz": [read_originals_of, lambda path: load_city(path, tmp_path / "none.csv", 2)],
-            "toml": [lambda path: load_network(tmp_path / "n")]}
+            "toml": [lambda path: load_network(tmp_path / "n")],
+        }
         for load in loaders[kind]:
             assert good_or_one_line(load, file) is None
 
@@ -145,6 +189,10 @@ def read_originals_of(path: Path):
 @examples
 @given(text=st.text(max_size=30) | st.from_regex(r"[a-z0-9,.+=:-]{0,20}", fullmatch=True))
 def test_texts_of_the_command_line(text):
-    for load in (parse, lambda value: policy_files((value,), ["a"]), lambda value: seconds(value, "--begin"),
-                 bound.check):
+    for load in (
+        parse,
+        lambda value: policy_files((value,), ["a"]),
+        lambda value: seconds(value, "--begin"),
+        bound.check,
+    ):
         good_or_one_line(load, text)

@@ -41,9 +41,16 @@ def test_the_programme_s_own_way_is_kept():
     assert transition(phases, 5, 0) == [Phase(duration=3, state="yrr")]
 
 
-@pytest.mark.parametrize("states, kept", [
-    ("Gr yr rG rG ry", [0, 2]), ("GGr Gyr Grr yrr rrG rry", [0, 4]), ("GGg yyg rrG rry", [0, 2]),
-    ("Ggr yyr GrG Grr", [0, 2])], ids=["twice", "a part goes on", "protected later", "the last of two"])
+@pytest.mark.parametrize(
+    "states, kept",
+    [
+        ("Gr yr rG rG ry", [0, 2]),
+        ("GGr Gyr Grr yrr rrG rry", [0, 4]),
+        ("GGg yyg rrG rry", [0, 2]),
+        ("Ggr yyr GrG Grr", [0, 2]),
+    ],
+    ids=["twice", "a part goes on", "protected later", "the last of two"],
+)
 def test_stages_that_serve_nothing_more_are_left_out(states, kept):
     assert list(stages_of(signal([(state, 5) for state in states.split()]))) == kept
 
@@ -99,11 +106,19 @@ LANES = dict.fromkeys("acdefx", 1) | {"b": 2}
 AFTER = {"x": ("a",), "a": ("b",), "c": ("d",), "b": ("e", "f"), "d": (), "e": (), "f": ()}
 LANE_IDS = {edge: tuple(f"{edge}_{n}" for n in range(lanes)) for edge, lanes in LANES.items()}
 TOWN = SimpleNamespace(
-    edges=tuple("abcdefx"), lanes=LANES, lane_ids=LANE_IDS, length=dict.fromkeys(LANES, 200.0), successors=AFTER,
-    gateways=())
+    edges=tuple("abcdefx"),
+    lanes=LANES,
+    lane_ids=LANE_IDS,
+    length=dict.fromkeys(LANES, 200.0),
+    successors=AFTER,
+    gateways=(),
+)
 CROSSING = signal(CROSS, (link(0, "a", "b"), link(1, "c", "d")), "s")
-END = signal([("GGg", 30), ("yyy", 3), ("rrG", 30), ("rry", 3)], (
-    link(0, "b", "e", lane=1), link(1, "b", "e"), link(2, "b", "f")), "t")
+END = signal(
+    [("GGg", 30), ("yyy", 3), ("rrG", 30), ("rry", 3)],
+    (link(0, "b", "e", lane=1), link(1, "b", "e"), link(2, "b", "f")),
+    "t",
+)
 FLOWS = {("b", "e"): 3.0, ("b", "f"): 1.0}
 
 
@@ -143,8 +158,9 @@ def test_who_waits_behind_a_piece_too_short_to_be_seen_on_is_seen():
     town = SimpleNamespace(**{**vars(TOWN), "length": {**TOWN.length, "a": 5.0}})
     session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"x": 1.0, "c": 9.0}.get(lane[0], 0.0))
     shown = []
-    control = MaxPressure(session, town, [CROSSING], FLOWS, min_green=5.0, max_green=40.0,
-                          show=lambda name, state: shown.append(state))
+    control = MaxPressure(
+        session, town, [CROSSING], FLOWS, min_green=5.0, max_green=40.0, show=lambda name, state: shown.append(state)
+    )
     for _ in range(100):
         control.play(session.time)
         session.time += 1.0
@@ -217,8 +233,15 @@ def shown_by(crossing, vehicles, seconds, *, town=TOWN, **limits):
     """(time, state) of all that max-pressure shows at one signal, with so many vehicles on every lane of an edge."""
     session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane.partition("_")[0], 0.0))
     shown = []
-    control = MaxPressure(session, town, [crossing], FLOWS, min_green=5.0,
-                          show=lambda name, state: shown.append((session.time, state)), **limits)
+    control = MaxPressure(
+        session,
+        town,
+        [crossing],
+        FLOWS,
+        min_green=5.0,
+        show=lambda name, state: shown.append((session.time, state)),
+        **limits,
+    )
     for _ in range(seconds):
         control.play(session.time)
         session.time += 1.0
@@ -228,6 +251,7 @@ def shown_by(crossing, vehicles, seconds, *, town=TOWN, **limits):
 @pytest.mark.parametrize("cyclic", [False, True])
 def test_no_green_outlasts_the_maximum_while_others_wait(cyclic):
     """A single vehicle waits on c, a hundred on a; nobody anywhere else: then a keeps its green."""
+
     def greens(**vehicles):
         shown = shown_by(CROSSING, vehicles, 200, max_green=40.0, cyclic=cyclic)
         return [time for time, state in shown if state == "rG"]
@@ -245,8 +269,16 @@ def test_stages_keep_their_order_if_cyclic(cyclic, order):
     town = SimpleNamespace(**{**vars(TOWN), "successors": after})
     session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 1.0, "c": 0.5, "x": 9.0}.get(lane[0], 0.0))
     shown = []
-    control = MaxPressure(session, town, [three], {}, min_green=5.0, max_green=40.0, cyclic=cyclic,
-                          show=lambda name, state: shown.append(state))
+    control = MaxPressure(
+        session,
+        town,
+        [three],
+        {},
+        min_green=5.0,
+        max_green=40.0,
+        cyclic=cyclic,
+        show=lambda name, state: shown.append(state),
+    )
     for _ in range(110):
         control.play(session.time)
         session.time += 1.0
@@ -295,11 +327,19 @@ def test_the_green_goes_where_the_pressure_is_after_the_minimum(junctions):
     assert play(60.0)[3:] == [(35.0, "s", "ry"), (38.0, "s", "Gr")]
 
 
-@pytest.mark.parametrize("a, b, c, state", [
-    (5.0, 0.0, 4.9, "Gr"), (5.0, 0.0, 6.4, "Gr"), (5.0, 0.0, 6.6, "rG"), (9.0, 3.0, 6.4, "rG"), (9.0, 0.0, 8.9, "Gr"),
-    (0.0, 4.0, 0.1, "rG"), (0.0, 4.0, 0.0, "Gr")],
-    ids=["less", "not worth it", "more", "less but nothing ahead", "more and nothing ahead", "negative",
-         "nobody"])
+@pytest.mark.parametrize(
+    "a, b, c, state",
+    [
+        (5.0, 0.0, 4.9, "Gr"),
+        (5.0, 0.0, 6.4, "Gr"),
+        (5.0, 0.0, 6.6, "rG"),
+        (9.0, 3.0, 6.4, "rG"),
+        (9.0, 0.0, 8.9, "Gr"),
+        (0.0, 4.0, 0.1, "rG"),
+        (0.0, 4.0, 0.0, "Gr"),
+    ],
+    ids=["less", "not worth it", "more", "less but nothing ahead", "more and nothing ahead", "negative", "nobody"],
+)
 def test_the_higher_pressure_wins_and_the_green_stays_in_doubt(junctions, a, b, c, state):
     """The pressure of a is what waits there less what stands on b: 9 - 0.75 * 5.25 - 0.25 * 0.75 = 4.9 - at b = 3. That
     of c has to be higher by 3 s of yellow in 10 s."""
@@ -310,11 +350,13 @@ def test_the_higher_pressure_wins_and_the_green_stays_in_doubt(junctions, a, b, 
 
 def test_a_spent_ration_exerts_no_pressure():
     """The gateway a -> b has 10 s of green in a cycle; then it is red, and c gets the green for a single vehicle."""
-    town = SimpleNamespace(**{**vars(TOWN), "gateways": (
-        Gateway(source=0, target=1, from_edge="a", to_edge="b", signal="s", links=(0,)),)})
+    town = SimpleNamespace(
+        **{**vars(TOWN), "gateways": (Gateway(source=0, target=1, from_edge="a", to_edge="b", signal="s", links=(0,)),)}
+    )
     shown, session = [], SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 50.0, "c": 1.0}.get(lane[0], 0.0))
     control = MaxPressure(
-        session, town, [CROSSING], FLOWS, min_green=5.0, max_green=99.0, show=lambda name, state: shown.append(state))
+        session, town, [CROSSING], FLOWS, min_green=5.0, max_green=99.0, show=lambda name, state: shown.append(state)
+    )
     control.command(np.full((2, 2), 5.0 / 61.0), {})  # 5 s, and so much of the other 61 s
     assert control.green_time() == {"s": {0: 0.0}}
     for second in range(66):

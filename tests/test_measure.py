@@ -17,11 +17,22 @@ GATEWAYS = (("a0", "b0"), ("b1", "c0"), ("c0", "a0"))
 
 def city(length=100.0, speed=10.0):
     return City(
-        net_file=Path("none"), regions=3, region_of={**EDGES, ":j_0": 1}, edges=tuple(EDGES),
-        length=dict.fromkeys(EDGES, length), lanes=dict.fromkeys(EDGES, 1), lane_ids={}, successors={}, turn_time={},
-        speed=dict.fromkeys(EDGES, speed), signals={}, gateways=tuple(
+        net_file=Path("none"),
+        regions=3,
+        region_of={**EDGES, ":j_0": 1},
+        edges=tuple(EDGES),
+        length=dict.fromkeys(EDGES, length),
+        lanes=dict.fromkeys(EDGES, 1),
+        lane_ids={},
+        successors={},
+        turn_time={},
+        speed=dict.fromkeys(EDGES, speed),
+        signals={},
+        gateways=tuple(
             Gateway(source=EDGES[a], target=EDGES[b], from_edge=a, to_edge=b, signal=None, links=())
-            for a, b in GATEWAYS))
+            for a, b in GATEWAYS
+        ),
+    )
 
 
 class Streets:
@@ -325,12 +336,21 @@ def test_a_city_without_boundaries_is_measured_too():
     assert len(meter.observe()) == 1 and meter.accumulation().sum() == 1
 
 
-@pytest.mark.parametrize("break_it, numbers", [
-    (lambda play: play.session.places.pop("v"), r"1 vehicles are in the city, but 2 departures minus 0 arrivals are 2; "
-     r"in region 0 bound for 2 there are 0, and 1 were followed there"),
-    (lambda play: play.meter.departures.__setitem__((0, 0), 1), "2 vehicles are in the city, but 3 departures minus 0"),
-    (lambda play: play.meter._running.__setitem__((1, 1), 1), "region 1 bound for 1 there are 0, and 1 were"),
-])
+@pytest.mark.parametrize(
+    "break_it, numbers",
+    [
+        (
+            lambda play: play.session.places.pop("v"),
+            r"1 vehicles are in the city, but 2 departures minus 0 arrivals are 2; "
+            r"in region 0 bound for 2 there are 0, and 1 were followed there",
+        ),
+        (
+            lambda play: play.meter.departures.__setitem__((0, 0), 1),
+            "2 vehicles are in the city, but 3 departures minus 0",
+        ),
+        (lambda play: play.meter._running.__setitem__((1, 1), 1), "region 1 bound for 1 there are 0, and 1 were"),
+    ],
+)
 def test_the_ledger_names_step_and_numbers(play, break_it, numbers):
     play.session.routes = {"v": ("a0", "b0", "b1", "c0"), "w": ("a0", "b0")}
     play.step(new=["v", "w"])

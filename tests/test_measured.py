@@ -24,10 +24,22 @@ REGIONS = ("north", "south")
 def tables(folder: Path, *, days: int = 3, most: float = 900.0) -> tuple[pd.DataFrame, pd.DataFrame]:
     """(counts, detectors) of two regions with ten links each, all of which follow CURVE exactly."""
     random, rows = np.random.default_rng(0), []
-    detectors = pd.DataFrame([
-        {"detid": f"{region}{n}", "length": 0.25 + 0.05 * n, "lanes": 2, "pos": 0.1, "linkid": f"{region}-{n}",
-         "long": 8.5 + 0.01 * (n % 5), "lat": 47.4 - 0.03 * r - 0.01 * (n // 5), "region": region}
-        for r, region in enumerate(REGIONS) for n in range(10)])
+    detectors = pd.DataFrame(
+        [
+            {
+                "detid": f"{region}{n}",
+                "length": 0.25 + 0.05 * n,
+                "lanes": 2,
+                "pos": 0.1,
+                "linkid": f"{region}-{n}",
+                "long": 8.5 + 0.01 * (n % 5),
+                "lat": 47.4 - 0.03 * r - 0.01 * (n // 5),
+                "region": region,
+            }
+            for r, region in enumerate(REGIONS)
+            for n in range(10)
+        ]
+    )
     detectors["length"] *= LANE_KM / 2.0 / 4.75
     for day in range(days):
         load = most * np.sin(np.linspace(0.05, np.pi - 0.05, 40)) * random.uniform(0.9, 1.0)
@@ -37,10 +49,20 @@ def tables(folder: Path, *, days: int = 3, most: float = 900.0) -> tuple[pd.Data
             for region in REGIONS:  # links differ, regions keep their mean
                 own = (detectors["region"] == region).to_numpy()
                 spread[own] /= np.average(spread[own], weights=detectors["length"][own])
-            rows.append(pd.DataFrame({
-                "day": f"2019-05-{day + 1:02d}", "interval": 300 * k, "detid": detectors["detid"],
-                "flow": flow * spread, "occ": n / LANE_KM / 1000.0 * VEHICLE * spread, "error": 0, "city": "made up",
-                "speed": np.nan}))
+            rows.append(
+                pd.DataFrame(
+                    {
+                        "day": f"2019-05-{day + 1:02d}",
+                        "interval": 300 * k,
+                        "detid": detectors["detid"],
+                        "flow": flow * spread,
+                        "occ": n / LANE_KM / 1000.0 * VEHICLE * spread,
+                        "error": 0,
+                        "city": "made up",
+                        "speed": np.nan,
+                    }
+                )
+            )
     return pd.concat(rows, ignore_index=True), detectors
 
 
@@ -72,7 +94,8 @@ def test_the_curve_that_made_the_tables_comes_back(tmp_path, made):
     frame = found.to_frame()
     assert len(frame) == 2 * 3 * 40 and frame["reporting"].between(0.999, 1.001).all()
     assert frame["production_veh_km_h"].to_numpy() == pytest.approx(
-        3.6 * TRIP * CURVE.outflow(frame["accumulation_veh"].to_numpy()), rel=1e-6)
+        3.6 * TRIP * CURVE.outflow(frame["accumulation_veh"].to_numpy()), rel=1e-6
+    )
     again = nmfd.load_network(tmp_path / "city")
     assert again.region_names == REGIONS and again.adjacency.tolist() == [[False, True], [True, False]]
     assert again.doubts == found.network.doubts and not again.placeholder
@@ -90,11 +113,15 @@ def test_what_is_given_replaces_what_is_assumed(tmp_path, made):
     (tmp_path / "about.csv").write_text("region,lane_km,trip_length\nnorth,40,600\nsouth,,1200\n")
     (tmp_path / "adjacency.csv").write_text("region,neighbour\nnorth,south\n")
     found = nmfd.identify(
-        **files, regions=tmp_path / "regions.csv", about=tmp_path / "about.csv", adjacency=tmp_path / "adjacency.csv",
-        out=tmp_path / "city")
+        **files,
+        regions=tmp_path / "regions.csv",
+        about=tmp_path / "about.csv",
+        adjacency=tmp_path / "adjacency.csv",
+        out=tmp_path / "city",
+    )
     north, south = found.network.mfds
-    assert north.critical == pytest.approx(4.0 * south.critical, rel=0.02)       # four times the streets
-    assert north.capacity == pytest.approx(8.0 * south.capacity, rel=0.02)       # and trips half as long
+    assert north.critical == pytest.approx(4.0 * south.critical, rel=0.02)  # four times the streets
+    assert north.capacity == pytest.approx(8.0 * south.capacity, rel=0.02)  # and trips half as long
     assert found.fits[0].doubts == ("low coverage 25 %",) and found.fits[1].doubts == ("coverage unknown",)
 
 
@@ -104,7 +131,8 @@ def test_regions_and_adjacency_of_another_network(tmp_path, made):
     tiny.write(tmp_path, network=tiny.row_network(2))
     files = written(tmp_path, counts, detectors.assign(region=detectors["region"].map({"north": 1, "south": 0})))
     found = nmfd.identify(
-        **files, adjacency=tmp_path / "network" / "network.toml", out=tmp_path / "city", trip_length=TRIP)
+        **files, adjacency=tmp_path / "network" / "network.toml", out=tmp_path / "city", trip_length=TRIP
+    )
     base = nmfd.load_network(tmp_path / "network")
     assert found.network.region_names == base.region_names and (found.network.positions == base.positions).all()
     assert found.network.mfds != base.mfds
@@ -117,7 +145,12 @@ def test_doubts_of_few_days_free_flow_and_loops_at_stop_lines(tmp_path):
     found = nmfd.identify(**files, out=tmp_path / "city")
     text = " ".join(found.fits[0].doubts)
     for doubt in (
-            "no falling branch", "coverage unknown", "loops at stop lines (100 %)", "trip length assumed", "days: 1"):
+        "no falling branch",
+        "coverage unknown",
+        "loops at stop lines (100 %)",
+        "trip length assumed",
+        "days: 1",
+    ):
         assert doubt in text and f"WARNING, {doubt.split(' (')[0].split(':')[0]}" in found.text, doubt
     assert found.network.mfds[0].outflow(800.0) == pytest.approx(found.network.mfds[0].capacity, rel=0.06)
 
@@ -125,8 +158,18 @@ def test_doubts_of_few_days_free_flow_and_loops_at_stop_lines(tmp_path):
 @pytest.mark.slow
 def test_it_benchmarks_and_trains_like_any_other(tmp_path, made):
     files = written(tmp_path, *made)
-    told = good(command("identify", files["counts"], "--detectors", files["detectors"], "--trip-length", TRIP, "--out",
-                        tmp_path / "network"))
+    told = good(
+        command(
+            "identify",
+            files["counts"],
+            "--detectors",
+            files["detectors"],
+            "--trip-length",
+            TRIP,
+            "--out",
+            tmp_path / "network",
+        )
+    )
     assert "R2" in told and "What such data do not say" in told
     (tmp_path / "scenario").mkdir()
     (tmp_path / "scenario" / "scenario.toml").write_text(tiny.SCENARIO)
@@ -138,6 +181,7 @@ def test_it_benchmarks_and_trains_like_any_other(tmp_path, made):
 
 def changed(**columns):
     """A change of the first row of the counts, whose values are texts then."""
+
     def change(counts, detectors):
         counts = counts.astype(object)
         for name, value in columns.items():
@@ -148,8 +192,11 @@ def changed(**columns):
 
 
 MISTAKES = {
-    "a column is missing": (lambda c, d: (c.drop(columns="occ").rename(columns={"speed": "occc"}), d), (),
-                            "counts.csv: column occ is missing; did you mean occc?"),
+    "a column is missing": (
+        lambda c, d: (c.drop(columns="occ").rename(columns={"speed": "occc"}), d),
+        (),
+        "counts.csv: column occ is missing; did you mean occc?",
+    ),
     "nan": (changed(flow=np.nan), (), "line 5: flow: expected vehicles per hour and lane, from 0 to 3600, got nothing"),
     "negative": (changed(flow=-3.0), (), "line 5: flow: expected"),
     "a word": (changed(occ="much"), (), "line 5: occ: expected a share of the time, from 0 to 1, got 'much' instead"),
@@ -164,17 +211,26 @@ MISTAKES = {
     "no such city": (lambda c, d: (c, d), ("--city", "madeup"), "did you mean made up?"),
     "a detector without a row": (lambda c, d: (c, d[1:]), (), "detector north0, which"),
     "a detector without a region": (
-        lambda c, d: (c, d.assign(region=d["region"].where(d["detid"] != "north4"))), (), "north4, which"),
+        lambda c, d: (c, d.assign(region=d["region"].where(d["detid"] != "north4"))),
+        (),
+        "north4, which",
+    ),
     "no regions": (lambda c, d: (c, d.drop(columns="region")), (), "has no column region"),
     "metres": (lambda c, d: (c, d.assign(length=1000 * d["length"])), (), "km of its link, from 0.001 to 30, got"),
     "a detector twice": (lambda c, d: (c, pd.concat([d, d[:1]])), (), "detid north0 is there twice"),
     "no positions": (
-        lambda c, d: (c, d.drop(columns=["long", "lat"])), ("--trip-length", "900"), "give a table region,"),
+        lambda c, d: (c, d.drop(columns=["long", "lat"])),
+        ("--trip-length", "900"),
+        "give a table region,",
+    ),
     "no positions and no trip length": (lambda c, d: (c, d.drop(columns=["long", "lat"])), (), "give --trip-length"),
     "too few intervals": (lambda c, d: (c[: 20 * 5], d), (), "fewer than 10 intervals"),
     "a name too long": (lambda c, d: (c, d), ("--name", 101 * "x"), "network.toml: name: expected text in quotes"),
     "a region's name too long": (
-        lambda c, d: (c, d.assign(region=d["region"] + 100 * "x")), (), "regions[0].name: expected text in quotes"),
+        lambda c, d: (c, d.assign(region=d["region"] + 100 * "x")),
+        (),
+        "regions[0].name: expected text in quotes",
+    ),
     "a trip length in km": (lambda c, d: (c, d), ("--trip-length", "1.2"), "'--trip-length'"),
 }
 
@@ -182,21 +238,28 @@ MISTAKES = {
 @pytest.mark.parametrize("change, options, expected", MISTAKES.values(), ids=MISTAKES)
 def test_malformed_tables_end_in_one_line(tmp_path, made, change, options, expected):
     files = written(tmp_path, *change(*made))
-    line = error_line(command(
-        "identify", files["counts"], "--detectors", files["detectors"], "--out", tmp_path / "city", *options), "nmfd")
+    line = error_line(
+        command("identify", files["counts"], "--detectors", files["detectors"], "--out", tmp_path / "city", *options),
+        "nmfd",
+    )
     assert expected in line and not (tmp_path / "city").exists()
 
 
-@pytest.mark.parametrize("name, text, expected", [
-    ("about", "region,lane_km\nnorth,2\n", "lane_km: 2 is less than the 10 km that its detectors stand for"),
-    ("about", "region,lane_km\nnorht,20\n", "region 'norht' has no detector; did you mean north?"),
-    ("about", "region,trip_length\nnorth,1.5\n", "line 2: trip_length: expected m, from 10"),
-    ("adjacency", "region,neighbour\nnorth,north\n", "line 2: region 'north' is no neighbour of itself"),
-    ("adjacency", "region,neighbour\nnorth,west\n", "line 2: region 'west' has no detector"),
-    ("adjacency", "region,neighbour\n", "region south cannot be reached from north"),
-    ("adjacency", "a,b\n", "column region is missing"), ("about", "", "is empty"),
-    ("regions", "detid,region\n", "has a column region already"),
-], ids=str)
+@pytest.mark.parametrize(
+    "name, text, expected",
+    [
+        ("about", "region,lane_km\nnorth,2\n", "lane_km: 2 is less than the 10 km that its detectors stand for"),
+        ("about", "region,lane_km\nnorht,20\n", "region 'norht' has no detector; did you mean north?"),
+        ("about", "region,trip_length\nnorth,1.5\n", "line 2: trip_length: expected m, from 10"),
+        ("adjacency", "region,neighbour\nnorth,north\n", "line 2: region 'north' is no neighbour of itself"),
+        ("adjacency", "region,neighbour\nnorth,west\n", "line 2: region 'west' has no detector"),
+        ("adjacency", "region,neighbour\n", "region south cannot be reached from north"),
+        ("adjacency", "a,b\n", "column region is missing"),
+        ("about", "", "is empty"),
+        ("regions", "detid,region\n", "has a column region already"),
+    ],
+    ids=str,
+)
 def test_other_tables_end_in_one_line(tmp_path, made, name, text, expected):
     files = {**written(tmp_path, *made), name: tmp_path / f"{name}.csv"}
     files[name].write_text(text)

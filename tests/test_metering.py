@@ -28,8 +28,12 @@ def metering(depart, origin, level=1.2, way=None):
     session = SimpleNamespace(time=0.0, step_length=1.0)
     session.begin_trip = lambda order: begun.append((session.time, order["vehID"], order["routeID"]))
     trips = Trips(
-        depart=np.array(depart, dtype=float), origin=np.array(origin, dtype=int), destination=np.ones(count, dtype=int),
-        routes=(("a", "b"),) * count, arrival=np.zeros(count))
+        depart=np.array(depart, dtype=float),
+        origin=np.array(origin, dtype=int),
+        destination=np.ones(count, dtype=int),
+        routes=(("a", "b"),) * count,
+        arrival=np.zeros(count),
+    )
     return Metering(session, held(trips), CRITICAL, level=level, step=90.0, way=way), session, begun
 
 
@@ -44,7 +48,12 @@ def test_trips_begin_in_turn_at_the_rate_and_what_is_not_used_is_not_saved():
     meters.command(np.array([0.1, 0.0]), CRITICAL)
     played(meters, session, 60)
     assert [(time, vehicle) for time, vehicle, _ in begun] == [
-        (0.0, "v0"), (0.0, "v1"), (10.0, "v2"), (20.0, "v3"), (30.0, "v4")]
+        (0.0, "v0"),
+        (0.0, "v1"),
+        (10.0, "v2"),
+        (20.0, "v3"),
+        (30.0, "v4"),
+    ]
     assert all(vehicle[1:] == route[1:] for _, vehicle, route in begun)
     assert meters.backlog().tolist() == [[0.0, 0.0], [0.0, 1.0]] and meters.waiting() == (1, 60.0)
     assert meters.waited == 10.0 + 20.0 + 30.0
@@ -57,7 +66,12 @@ def test_who_has_a_short_way_begins_first_where_that_is_asked_for():
     meters.command(np.array([0.1, 0.0]), CRITICAL)
     played(meters, session, 60)
     assert [(time, vehicle) for time, vehicle, _ in begun] == [
-        (0.0, "v0"), (10.0, "v2"), (20.0, "v4"), (30.0, "v3"), (40.0, "v1")]
+        (0.0, "v0"),
+        (10.0, "v2"),
+        (20.0, "v4"),
+        (30.0, "v3"),
+        (40.0, "v1"),
+    ]
 
 
 def test_short_first_needs_metering(tmp_path):
@@ -98,8 +112,7 @@ def test_in_a_city_the_books_hold_and_waiting_counts():
     """grid7 with hardly anybody let in: the same trips, due at the same times, wait."""
     scenario = replace(load_scenario("grid7_peak"), steps=3)
     network = scenario.network
-    opened = Controls(
-        perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None, metering=np.full(7, 0.02))
+    opened = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None, metering=np.full(7, 0.02))
     runs = []
     for chosen in (settings(scenario), settings(scenario).changed(metering=True)):
         plant = SumoPlant(scenario, overrides=chosen)
@@ -140,11 +153,15 @@ def ran(scenario, seed=5, **changes):
 def test_a_citys_own_vehicles_wait_as_well(own):
     scenario = replace(load_scenario(own), steps=6)
     regions, step = scenario.network.regions, scenario.step
-    (free, _, due), *metered = (ran(scenario), *(
-        ran(scenario, metering=True, rate=np.full(regions, rate)) for rate in (100.0, 0.0, 1.0 / step)))
+    (free, _, due), *metered = (
+        ran(scenario),
+        *(ran(scenario, metering=True, rate=np.full(regions, rate)) for rate in (100.0, 0.0, 1.0 / step)),
+    )
     (fast, _, again), (closed, _, _), (held_back, facts, count) = metered
-    inside = [[state.accumulation.sum() + state.backlog.sum() + state.completed for state in states]
-              for states in (free, fast, closed, held_back)]
+    inside = [
+        [state.accumulation.sum() + state.backlog.sum() + state.completed for state in states]
+        for states in (free, fast, closed, held_back)
+    ]
     assert inside[0] == inside[1] == inside[2] == inside[3] and due == again == count
     assert fast[-1].accumulation.sum() == pytest.approx(free[-1].accumulation.sum(), rel=0.15)
     began = closed[-1].backlog.sum() - held_back[-1].backlog.sum()  # some of the file do not wait, whatever the rate
@@ -156,8 +173,10 @@ def test_a_citys_own_vehicles_wait_as_well(own):
 
 def test_how_far_those_have_to_go_who_wait():
     city = SimpleNamespace(
-        length={"a": 100.0, "b": 50.0, "c": 30.0}, speed={"a": 10.0, "b": 10.0, "c": 10.0},
-        successors={"a": ("b",), "b": ("c",), "c": ()})
+        length={"a": 100.0, "b": 50.0, "c": 30.0},
+        speed={"a": 10.0, "b": 10.0, "c": 10.0},
+        successors={"a": ("b",), "b": ("c",), "c": ()},
+    )
     session = SimpleNamespace(fastest=lambda start, end: (77.0, (start, "b", end)))
     routes = (("a", "b"), ("a", "c"), ("b", "c"), ("a", "bus lane", "c"), ("bus lane", "c"), ("c",))
     assert ways(session, city, SimpleNamespace(routes=routes)).tolist() == [15.0, 77.0, 8.0, 13.0, 3.0, 3.0]

@@ -13,7 +13,8 @@ X = TRUTH.jam * (np.arange(24) + 0.5) / 23.5
 
 def same(curve, expected, rel=1e-3):
     assert (curve.a, curve.b, curve.c, curve.jam) == pytest.approx(
-        (expected.a, expected.b, expected.c, expected.jam), rel=rel)
+        (expected.a, expected.b, expected.c, expected.jam), rel=rel
+    )
 
 
 def test_a_parabola_in_closed_form():
@@ -33,9 +34,16 @@ def test_beyond_the_jam_the_outflow_is_constant():
     np.testing.assert_allclose(TRUTH.rate(4000.0), at_jam / 4000.0)
 
 
-@pytest.mark.parametrize("change, expected", [
-    ({"c": 0.0}, "c must be positive"), ({"jam": 0.0}, "jam must be positive"), ({"b": -9e-6}, "is not positive at"),
-    ({"a": 1e308}, "is not finite up to")], ids=lambda value: next(iter(value)) if isinstance(value, dict) else "")
+@pytest.mark.parametrize(
+    "change, expected",
+    [
+        ({"c": 0.0}, "c must be positive"),
+        ({"jam": 0.0}, "jam must be positive"),
+        ({"b": -9e-6}, "is not positive at"),
+        ({"a": 1e308}, "is not finite up to"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
 def test_what_is_no_curve(change, expected):
     assert TRUTH.problem() is None
     assert expected in Mfd(**{"a": TRUTH.a, "b": TRUTH.b, "c": TRUTH.c, "jam": TRUTH.jam, **change}).problem()
@@ -48,8 +56,10 @@ def test_a_fit_to_exact_samples_gives_the_coefficients_back():
 @pytest.mark.parametrize("scale", [0.02, 50.0])
 def test_a_city_of_another_size_has_the_same_curve_on_other_axes(scale):
     """x and g both times s: c stays, b falls with s, a with its square."""
-    same(fit(scale * X, scale * TRUTH.outflow(X)),
-         Mfd(a=TRUTH.a / scale**2, b=TRUTH.b / scale, c=TRUTH.c, jam=scale * TRUTH.jam))
+    same(
+        fit(scale * X, scale * TRUTH.outflow(X)),
+        Mfd(a=TRUTH.a / scale**2, b=TRUTH.b / scale, c=TRUTH.c, jam=scale * TRUTH.jam),
+    )
 
 
 def test_what_is_no_sample_does_not_count():

@@ -33,7 +33,8 @@ def states():
     trajectory = run(NmfdPlant(SCENARIO), NoControl(planning_model(SCENARIO)), replace(SCENARIO, steps=50), seed=0)
     return [
         Observation(step=k, time=30.0 * k, accumulation=x, backlog=np.zeros((7, 7)))
-        for k, x in enumerate(trajectory.accumulation)]
+        for k, x in enumerate(trajectory.accumulation)
+    ]
 
 
 def with_options(scenario=SCENARIO, **options):
@@ -69,7 +70,7 @@ def test_no_random_plan_nearby_or_far_is_better(states, guidance, k):
     for _ in range(300):
         other = np.stack([controller.admissible.decision(*random_controls(random, NETWORK)) for _ in plan])
         if not guidance:
-            other[:, len(controller._model.edges):] = plan[:, len(controller._model.edges):]
+            other[:, len(controller._model.edges) :] = plan[:, len(controller._model.edges) :]
         share = 10.0 ** random.uniform(-3.0, 0.0)
         assert controller.cost(*forecast, plan + share * (other - plan)) >= best - share * TOLERANCE * best
     without = controller.cost(*forecast, controller._open)
@@ -88,7 +89,9 @@ def test_two_decisions_against_brute_force(tmp_path):
     assert plan.shape == (5, 2)  # u and the one share, 1
     best = min(
         controller.cost(*forecast, np.array([[first, 1.0]] * 2 + [[second, 1.0]] * 3))
-        for first in np.linspace(0.1, 0.9, 41) for second in np.linspace(0.1, 0.9, 41))
+        for first in np.linspace(0.1, 0.9, 41)
+        for second in np.linspace(0.1, 0.9, 41)
+    )
     assert controller.cost(*forecast, plan) <= best + 1.0
 
 
@@ -98,15 +101,25 @@ def test_the_plan_costs_what_the_regional_model_says(states, guidance):
         controller = EconomicMpc(planning_model(scenario), guidance=guidance)
         start, demand = controller.forecast(states[20])
         random = np.random.default_rng(7)
-        plan = controller.admissible.project(np.stack([
-            controller.admissible.decision(*random_controls(random, NETWORK)) for _ in range(controller._moves)]))
+        plan = controller.admissible.project(
+            np.stack(
+                [controller.admissible.decision(*random_controls(random, NETWORK)) for _ in range(controller._moves)]
+            )
+        )
         p, x, total = dynamics.parameters(NETWORK), torch.from_numpy(states[20].accumulation), 0.0
         for k in range(8):
             perimeter, splits = controller.admissible.controls(plan[min(k, len(plan) - 1)])
             splits = NETWORK.nominal_splits if splits is None else splits
             x = dynamics.advance(
-                p, x, torch.from_numpy(scenario.demand[20 + k]), torch.from_numpy(perimeter), torch.from_numpy(splits),
-                scenario.step, substeps=scenario.substeps, integrator=scenario.integrator)
+                p,
+                x,
+                torch.from_numpy(scenario.demand[20 + k]),
+                torch.from_numpy(perimeter),
+                torch.from_numpy(splits),
+                scenario.step,
+                substeps=scenario.substeps,
+                integrator=scenario.integrator,
+            )
             total += scenario.step * x.sum().item()
         # Region 3 holds no destination: the measured columns without demand are empty.
         assert controller.cost(start, demand, plan) == pytest.approx(total, rel=1e-12)
@@ -180,20 +193,26 @@ def test_reset_forgets_the_plan(states):
     assert (controller.act(states[25]).perimeter == first).all()
 
 
-@pytest.mark.parametrize("options, problem", [
-    ({"horizen": 8}, "horizen: unknown key"), ({"horizon": 1}, "horizon: expected a whole number from 2"),
-    ({"max_iterations": -1}, "max_iterations: expected a whole number from 0"),
-    ({"control_horizon": 0}, "control_horizon: expected a whole number from 1"),
-    ({"control_horizon": 2, "solver": "ipopt"}, "control_horizon: ipopt has controls of its own"),
-    ({"time_limit": 0.0}, "time_limit: expected a number above 0")])
+@pytest.mark.parametrize(
+    "options, problem",
+    [
+        ({"horizen": 8}, "horizen: unknown key"),
+        ({"horizon": 1}, "horizon: expected a whole number from 2"),
+        ({"max_iterations": -1}, "max_iterations: expected a whole number from 0"),
+        ({"control_horizon": 0}, "control_horizon: expected a whole number from 1"),
+        ({"control_horizon": 2, "solver": "ipopt"}, "control_horizon: ipopt has controls of its own"),
+        ({"time_limit": 0.0}, "time_limit: expected a number above 0"),
+    ],
+)
 def test_wrong_options(options, problem):
     with pytest.raises(InputError, match=f"controllers.mpc-pc.{problem}") as caught:
         EconomicMpc(planning_model(with_options(**options)), guidance=False)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("guidance, most", [
-    pytest.param(False, 1.381e8, id="pc"), pytest.param(True, 9.0e7, id="pcrg")])
+@pytest.mark.parametrize(
+    "guidance, most", [pytest.param(False, 1.381e8, id="pc"), pytest.param(True, 9.0e7, id="pcrg")]
+)
 def test_benchmark_row(guidance, most):
     row = summary(run(NmfdPlant(SCENARIO), EconomicMpc(planning_model(SCENARIO), guidance=guidance), SCENARIO, seed=0))
     assert row["total_time_spent_veh_s"] < most
@@ -243,8 +262,9 @@ def test_a_decision_that_came_late_is_late_in_the_books(tmp_path):
 
     scenario = replace(load_scenario(tiny.write(tmp_path)), steps=3)
     for controller, kinds, note in (
-            (Slow(planning_model(scenario)), [Status.OK, Status.LATE, Status.OK], "later than its deadline of 0.2 s"),
-            (NoControl(planning_model(scenario)), [Status.OK] * 3, "")):
+        (Slow(planning_model(scenario)), [Status.OK, Status.LATE, Status.OK], "later than its deadline of 0.2 s"),
+        (NoControl(planning_model(scenario)), [Status.OK] * 3, ""),
+    ):
         trajectory = run(NmfdPlant(scenario), controller, scenario, seed=0)
         assert list(trajectory.status) == [kind.value for kind in kinds] and trajectory.note[1] == note
         assert summary(trajectory)["late_decisions"] == kinds.count(Status.LATE)

@@ -19,16 +19,25 @@ from nmfd.studies.benchmark import interval
 
 @pytest.fixture
 def rows() -> pd.DataFrame:
-    return rows_of({
-        (level, name): {1: 0.0, 2: time} for level in (1.0, 1.3)
-        for name, time in (("no-control", 0.0), ("pi-gating", 0.0), ("mpc-pc", 5.0))})
+    return rows_of(
+        {
+            (level, name): {1: 0.0, 2: time}
+            for level in (1.0, 1.3)
+            for name, time in (("no-control", 0.0), ("pi-gating", 0.0), ("mpc-pc", 5.0))
+        }
+    )
 
 
-@pytest.mark.parametrize("command", [
-    "benchmark scenario --controllers no-control,pi-gating,mpc-pcrg --seeds 2 --out out",
-    "robustness scenario --controllers pi-gating --scenarios 2 --out out",
-    "ablation horizon scenario --horizons 2,3 --out out", "show scenario --out out",
-    "bound scenario --controller bound-pc --iterations 1 --out plan.npz"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "benchmark scenario --controllers no-control,pi-gating,mpc-pcrg --seeds 2 --out out",
+        "robustness scenario --controllers pi-gating --scenarios 2 --out out",
+        "ablation horizon scenario --horizons 2,3 --out out",
+        "show scenario --out out",
+        "bound scenario --controller bound-pc --iterations 1 --out plan.npz",
+    ],
+)
 def test_commands_without_demand(tmp_path, monkeypatch, command):
     tiny.write(tmp_path, scenario=tiny.SCENARIO.replace("peak = 2.0", "peak = 0.0"))
     monkeypatch.chdir(tmp_path)
@@ -42,8 +51,11 @@ def test_tables(rows, tmp_path):
     table = statistics.write_tables(tmp_path, rows, "pi-gating")
     assert table["change_percent"].isna().all() and not table["change_excludes_zero"].astype(bool).any()
     text = statistics.text(table, "pi-gating")
-    assert "nan" not in text and "inf" not in text and text.splitlines()[3].split()[:6] == [
-        "pi-gating", "2", "0.000e+00", "±", "0.0e+00", "-"]
+    assert (
+        "nan" not in text
+        and "inf" not in text
+        and text.splitlines()[3].split()[:6] == ["pi-gating", "2", "0.000e+00", "±", "0.0e+00", "-"]
+    )
     facts = rows[rows["demand"] == 1.0].assign(trips=0.0, overhead_share=0.5)
     assert "nan" not in overview_table(facts)
 

@@ -73,8 +73,15 @@ def test_three_formats_say_the_same(tmp_path, name, text):
 def test_the_same_trips_as_od2trips(net, tmp_path, name, text):
     (tmp_path / name).write_text(text)
     option = "--tazrelation-files" if name == "a.xml" else "--od-matrix-files"
-    tiny_city.run("od2trips", "--taz-files", net.with_name("zones.taz.xml"), option, tmp_path / name, "--output-file",
-                  tmp_path / "trips.xml")
+    tiny_city.run(
+        "od2trips",
+        "--taz-files",
+        net.with_name("zones.taz.xml"),
+        option,
+        tmp_path / name,
+        "--output-file",
+        tmp_path / "trips.xml",
+    )
     theirs = list(ElementTree.parse(tmp_path / "trips.xml").getroot().iter("trip"))
     ours = trips(read_od(tmp_path / name), np.random.default_rng(0), (), lambda *_: None)
     assert abs(len(theirs) - len(ours)) <= 1
@@ -97,14 +104,28 @@ def test_trips_are_even_and_half_a_vehicle_is_a_chance(tmp_path):
 def test_import_of_a_matrix(net, tmp_path):
     """It begins when the matrix does, weights of sources count, and the vehicles run between the zones."""
     (tmp_path / "morning.od").write_text(O_FORMAT)
-    result = cosim("import", net, "--regions", 2, "--method", "geometric", "--od", tmp_path / "morning.od", "--zones",
-                   net.with_name("zones.taz.xml"), "--no-run", "--out", tmp_path / "networks" / "od")
+    result = cosim(
+        "import",
+        net,
+        "--regions",
+        2,
+        "--method",
+        "geometric",
+        "--od",
+        tmp_path / "morning.od",
+        "--zones",
+        net.with_name("zones.taz.xml"),
+        "--no-run",
+        "--out",
+        tmp_path / "networks" / "od",
+    )
     assert result.exit_code == 0, result.output
     scenario = load_scenario(tmp_path / "scenarios" / "od")
     assert "begin = 27000.0" in (scenario.folder / "scenario.toml").read_text()
     vehicles = read_recorded_trips([scenario.folder / "vehicles.rou.xml.gz"])
     assert len(vehicles.depart) in (120, 121) and scenario.demand.sum() * scenario.step == pytest.approx(
-        len(vehicles.depart), rel=1e-4)
+        len(vehicles.depart), rel=1e-4
+    )
     ends = pd.DataFrame([(e.get("from"), e.get("to")) for e in vehicles.elements], columns=["from", "to"])
     there = ends[ends["from"].str.startswith("A")]
     assert len(there) == 90 and set(there["to"]) == {"D1D2", "D2D1"}
@@ -115,19 +136,25 @@ def test_import_of_a_matrix(net, tmp_path):
 def test_relations_in_an_additional_file(net, tmp_path):
     (tmp_path / "city.add.xml").write_text(ZONES.replace("</additional>", RELATIONS[6:-7] + "</additional>"))
     (tmp_path / "city.sumocfg").write_text(
-        f'<configuration><net-file value="{net}"/><additional-files value="city.add.xml"/></configuration>')
+        f'<configuration><net-file value="{net}"/><additional-files value="city.add.xml"/></configuration>'
+    )
     case = read_sumo_input(tmp_path / "city.sumocfg")
     traffic = read_traffic(case, read_streets(case.net), seed=0)
     assert len(traffic.vehicles) in (120, 121) and "interval" not in [element.tag for element in traffic.shared]
 
 
-@pytest.mark.parametrize("text, expected", [
-    ("nothing", "is no OD matrix"), ("<data/>", "is no OD matrix"),
-    ("$OR;D2\n7.00 8.00\n", "ends before the line with"),
-    ("$OR;D2\n7.00\n1\n", "from-time and to-time"), ("$OR;D2\n8.00 7.00\n1\n1 2 3\n", "an interval ends at 25200 s"),
-    ("$OR;D2\n7.00 8.00\n1\n1 2 -3\n", "1 to 2: expected a number from 0 up"),
-    ("$V;D2\n7.00 8.00\n1\n2\n1 2\n1 2 3\n", "expected 2 names and 2 x 2 numbers"),
-])
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        ("nothing", "is no OD matrix"),
+        ("<data/>", "is no OD matrix"),
+        ("$OR;D2\n7.00 8.00\n", "ends before the line with"),
+        ("$OR;D2\n7.00\n1\n", "from-time and to-time"),
+        ("$OR;D2\n8.00 7.00\n1\n1 2 3\n", "an interval ends at 25200 s"),
+        ("$OR;D2\n7.00 8.00\n1\n1 2 -3\n", "1 to 2: expected a number from 0 up"),
+        ("$V;D2\n7.00 8.00\n1\n2\n1 2\n1 2 3\n", "expected 2 names and 2 x 2 numbers"),
+    ],
+)
 def test_broken_matrices(tmp_path, text, expected):
     (tmp_path / "a.od").write_text(text)
     with pytest.raises(InputError, match=expected):
@@ -137,7 +164,16 @@ def test_broken_matrices(tmp_path, text, expected):
 def test_unknown_zone_and_vehicles_beside_a_matrix(net, tmp_path):
     (tmp_path / "a.od").write_text(O_FORMAT)
     arguments = (
-        "--regions", 2, "--method", "geometric", "--od", tmp_path / "a.od", "--no-run", "--out", tmp_path / "n")
+        "--regions",
+        2,
+        "--method",
+        "geometric",
+        "--od",
+        tmp_path / "a.od",
+        "--no-run",
+        "--out",
+        tmp_path / "n",
+    )
     result = cosim("import", net, *arguments)
     assert result.exit_code == 2 and "TAZ 'west' is unknown; define it in a file for --zones" in result.stderr
     result = cosim("import", tiny_city.city(tmp_path), *arguments)

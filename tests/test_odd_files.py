@@ -44,8 +44,13 @@ def loop(path):
     path.symlink_to(path.name)
 
 
-KINDS = {fifo: "is a pipe, no file", device: "is a device, no file", unix_socket: "is a socket, no file",
-         Path.mkdir: "is a folder, no file", loop: "symbolic link"}
+KINDS = {
+    fifo: "is a pipe, no file",
+    device: "is a device, no file",
+    unix_socket: "is a socket, no file",
+    Path.mkdir: "is a folder, no file",
+    loop: "symbolic link",
+}
 
 
 @pytest.mark.parametrize("make", KINDS)
@@ -64,40 +69,62 @@ def test_whatever_is_read_is_no_pipe(place):
     for suffix in (".py", ".xml", ".nc"):
         fifo(pipe.with_suffix(suffix))
     for read in (
-            lambda: files.file_hash(pipe), lambda: files.read_rows(pipe, {"a": int}),
-            lambda: run_folder.read_manifest(pipe), lambda: run_folder.read_trajectory(pipe.with_suffix(".nc")),
-            lambda: policy_file.load_policy(pipe, scenario.network),
-            lambda: open_loop.read(pipe, scenario, guidance=False),
-            lambda: custom.check("pipe.py:Mine"), lambda: experiment.read_facts(pipe),
-            lambda: read_xml(pipe.with_suffix(".xml"))):
+        lambda: files.file_hash(pipe),
+        lambda: files.read_rows(pipe, {"a": int}),
+        lambda: run_folder.read_manifest(pipe),
+        lambda: run_folder.read_trajectory(pipe.with_suffix(".nc")),
+        lambda: policy_file.load_policy(pipe, scenario.network),
+        lambda: open_loop.read(pipe, scenario, guidance=False),
+        lambda: custom.check("pipe.py:Mine"),
+        lambda: experiment.read_facts(pipe),
+        lambda: read_xml(pipe.with_suffix(".xml")),
+    ):
         with pytest.raises(InputError, match="is a pipe, no file"):
             read()
     Path("scenario/scenario.toml").write_text(
-        tiny.SCENARIO.replace("[noise]", 'demand_file = "../pipe"\n\n[noise]'), encoding="utf-8")
+        tiny.SCENARIO.replace("[noise]", 'demand_file = "../pipe"\n\n[noise]'), encoding="utf-8"
+    )
     assert "is a pipe, no file" in error_line(nmfd(*COMMAND, "out"), "nmfd")
 
 
-@pytest.mark.parametrize("content, expected", [
-    (b"steps = " + b"9" * 5000, "a number of thousands of digits"),
-    (b"steps = -" + b"9" * 5000, "a number of thousands of digits"),
-    (tiny.SCENARIO.replace("step = 30.0", "step = 1e999").encode(), "step: expected a number above 0"),
-    (b"name = \"\xff\"", "is not UTF-8"), (b"\xff\xfe" + tiny.SCENARIO.encode("utf-16-le"), "is not UTF-8"),
-    (b"name = \"\0\"", "is not valid TOML"), (b"", "missing"), (b"\0" * 100, "is not valid TOML"),
-    (b"a = " + b"[" * 100_000, "nested too deeply|is not valid TOML"),
-    (b"a = " + b"{b = " * 20_000, "nested too deeply|is not valid TOML"),
-    (b"a" + b".a" * 100_000 + b" = 1", "unknown key|nested too deeply|is not valid TOML"),
-    (b"[" + b"a." * 2000 + b"a]", "unknown key|nested too deeply"),
-], ids=range(12))
+@pytest.mark.parametrize(
+    "content, expected",
+    [
+        (b"steps = " + b"9" * 5000, "a number of thousands of digits"),
+        (b"steps = -" + b"9" * 5000, "a number of thousands of digits"),
+        (tiny.SCENARIO.replace("step = 30.0", "step = 1e999").encode(), "step: expected a number above 0"),
+        (b'name = "\xff"', "is not UTF-8"),
+        (b"\xff\xfe" + tiny.SCENARIO.encode("utf-16-le"), "is not UTF-8"),
+        (b'name = "\0"', "is not valid TOML"),
+        (b"", "missing"),
+        (b"\0" * 100, "is not valid TOML"),
+        (b"a = " + b"[" * 100_000, "nested too deeply|is not valid TOML"),
+        (b"a = " + b"{b = " * 20_000, "nested too deeply|is not valid TOML"),
+        (b"a" + b".a" * 100_000 + b" = 1", "unknown key|nested too deeply|is not valid TOML"),
+        (b"[" + b"a." * 2000 + b"a]", "unknown key|nested too deeply"),
+    ],
+    ids=range(12),
+)
 def test_what_is_no_scenario(place, content, expected):
     Path("scenario/scenario.toml").write_bytes(content)
     line = error_line(nmfd(*COMMAND, "out"), "nmfd")
     assert "scenario.toml: " in line and any(part in line for part in expected.split("|")) and len(line) < 800, line
 
 
-@pytest.mark.parametrize("out, expected", [
-    (os.fsdecode(b"o\xff"), "o?: is not UTF-8 text"), ("a\0b", "holds a zero byte"), ("x" * 300, "File name too long"),
-    ("/dev/full", "is a file; choose another"), ("/dev/full/x", "Not a directory"), ("pipe", "is a file"),
-    ("loop", "loop"), ("/proc/x", "/proc/x: "), ("\x1b[2Jx/" + "y" * 300, "?[2Jx/")])
+@pytest.mark.parametrize(
+    "out, expected",
+    [
+        (os.fsdecode(b"o\xff"), "o?: is not UTF-8 text"),
+        ("a\0b", "holds a zero byte"),
+        ("x" * 300, "File name too long"),
+        ("/dev/full", "is a file; choose another"),
+        ("/dev/full/x", "Not a directory"),
+        ("pipe", "is a file"),
+        ("loop", "loop"),
+        ("/proc/x", "/proc/x: "),
+        ("\x1b[2Jx/" + "y" * 300, "?[2Jx/"),
+    ],
+)
 def test_places_that_cannot_be_written_to(place, out, expected):
     fifo(Path("pipe"))
     loop(Path("loop"))
@@ -116,6 +143,7 @@ def test_names_that_are_no_text(place):
 
 def test_a_full_disk_is_one_line(place, monkeypatch):
     """What is written does not fit: nothing is left half-written."""
+
     def full(*_):
         raise OSError(28, "No space left on device")
 

@@ -46,8 +46,10 @@ def test_a_committed_policy(tmp_path, onnxruntime):
     assert session.get_modelmeta().custom_metadata_map["network_hash"] == network.hash
 
 
-@pytest.mark.parametrize("architecture", [
-    Architecture(width=8, activation="soft-exponential"), Architecture(width=8, guidance=True, sparse=True)])
+@pytest.mark.parametrize(
+    "architecture",
+    [Architecture(width=8, activation="soft-exponential"), Architecture(width=8, guidance=True, sparse=True)],
+)
 def test_other_architectures_and_a_policy_elsewhere(tmp_path, architecture):
     scenario = load_scenario(tiny.write(tmp_path, network=tiny.row_network(3)))
     torch.manual_seed(0)

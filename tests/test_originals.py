@@ -12,9 +12,15 @@ from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
 
-VEHICLES = "<routes>" + "".join(
-    f'<vehicle id="v{n}" type="lorry" depart="{100 + 2 * n}"><route edges="a b"/><stop lane="a_0" duration="5"/>'
-    "</vehicle>" for n in range(200)) + "</routes>"
+VEHICLES = (
+    "<routes>"
+    + "".join(
+        f'<vehicle id="v{n}" type="lorry" depart="{100 + 2 * n}"><route edges="a b"/><stop lane="a_0" duration="5"/>'
+        "</vehicle>"
+        for n in range(200)
+    )
+    + "</routes>"
+)
 
 
 @pytest.fixture
@@ -33,7 +39,8 @@ def test_seed_moves_departures_and_nothing_else(originals, tmp_path):
     assert written("a") == written("b") != written("c", seed=2)
     plain = ElementTree.fromstring(written("d", jitter=0.0))
     assert [ElementTree.tostring(e).strip() for e in plain] == [
-        ElementTree.tostring(replaced).strip() for replaced in _with_cents(originals.elements)]
+        ElementTree.tostring(replaced).strip() for replaced in _with_cents(originals.elements)
+    ]
     departs = {e.get("id"): float(e.get("depart")) for e in ElementTree.fromstring(written("e"))}
     shift = np.array([departs[f"v{n}"] - (100 + 2 * n) for n in range(200)])
     assert np.abs(shift).max() <= 10.01 and shift.std() > 3.0 and min(departs.values()) >= 100.0
@@ -70,9 +77,13 @@ def test_whom_a_program_can_let_begin(tmp_path):
     assert held.orders == (
         {"vehID": "own", "routeID": "held.0", "typeID": "car", "departLane": "best", "arrivalPos": "-1"},
         {"vehID": "own.1", "routeID": "held.0", "typeID": "car", "departLane": "best", "arrivalPos": "-1"},
-        {"vehID": "shared", "routeID": "morning"}, {"vehID": "shared.1", "routeID": "morning"},
-        {"vehID": "trip", "routeID": "held.9"}, {"vehID": "trip.1", "routeID": "held.9"},
-        {"vehID": "round", "routeID": "held.10"}, {"vehID": "round.1", "routeID": "held.10"})
+        {"vehID": "shared", "routeID": "morning"},
+        {"vehID": "shared.1", "routeID": "morning"},
+        {"vehID": "trip", "routeID": "held.9"},
+        {"vehID": "trip.1", "routeID": "held.9"},
+        {"vehID": "round", "routeID": "held.10"},
+        {"vehID": "round.1", "routeID": "held.10"},
+    )
     assert held.depart.tolist() == [1.0, 1.0, 2.0, 2.0, 10.0, 10.0, 11.0, 11.0]
     assert held.routes[::2] == held.routes[1::2] == (("a", "b"), ("b", "c"), ("a", "c"), ("c",))
     assert held.origin[::2].tolist() == [0, 1, 0, 2] and held.destination[::2].tolist() == [1, 2, 2, 2]
@@ -80,8 +91,10 @@ def test_whom_a_program_can_let_begin(tmp_path):
     routes, others = ([e for e in written if (e.tag == "route") == held] for held in (True, False))
     assert [(e.get("id"), e.get("edges")) for e in routes] == [("held.0", "a b"), ("held.9", "a c"), ("held.10", "c")]
     assert sorted(e.get("id") for e in others) == sorted(
-        f"{name}{copy}" for name in ("unknown", "stops", "line", "repeats", "parks", "nowhere", "tells", "via", "zone")
-        for copy in ("", ".1"))
+        f"{name}{copy}"
+        for name in ("unknown", "stops", "line", "repeats", "parks", "nowhere", "tells", "via", "zone")
+        for copy in ("", ".1")
+    )
     assert others[2].find("stop") is not None
 
 
@@ -94,11 +107,14 @@ def test_factor_thins_and_duplicates(originals, factor, count):
     assert copies.max(initial=0) <= np.ceil(factor) and copies.min() >= np.floor(factor)
 
 
-@pytest.mark.parametrize("text, expected", [
-    ("<routes><flow id='f'/></routes>", "expected vehicle and trip elements only, got flow"),
-    ("<routes><trip id='t' depart='triggered'/></routes>", "expected a time from 0 s up, got 'triggered'"),
-    ("<routes><trip", "is not an XML file that SUMO could read"),
-])
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        ("<routes><flow id='f'/></routes>", "expected vehicle and trip elements only, got flow"),
+        ("<routes><trip id='t' depart='triggered'/></routes>", "expected a time from 0 s up, got 'triggered'"),
+        ("<routes><trip", "is not an XML file that SUMO could read"),
+    ],
+)
 def test_route_files_that_are_none(tmp_path, text, expected):
     (tmp_path / "cars.rou.xml").write_text(text)
     with pytest.raises(InputError, match=expected):
@@ -106,8 +122,10 @@ def test_route_files_that_are_none(tmp_path, text, expected):
 
 
 def with_demand_file(folder, rows):
-    scenario = tiny.write(folder, scenario=tiny.SCENARIO.split("[[demand]]")[0].replace(
-        "protected", 'demand_file = "demand.csv"\nprotected'))
+    scenario = tiny.write(
+        folder,
+        scenario=tiny.SCENARIO.split("[[demand]]")[0].replace("protected", 'demand_file = "demand.csv"\nprotected'),
+    )
     (scenario / "demand.csv").write_text("interval,from,to,veh_s\n" + rows)
     return scenario
 
@@ -140,7 +158,8 @@ def test_scenario_on_a_base_finds_its_files(tmp_path):
 def ring(barred=""):
     """Regions 0, 1, 2, each adjacent to the others; `barred` is a line for region 0."""
     text = tiny.NETWORK.format(name="ring") + "".join(
-        tiny.REGION.format(position=n, adjacent=[h for h in range(3) if h != n]) for n in range(3))
+        tiny.REGION.format(position=n, adjacent=[h for h in range(3) if h != n]) for n in range(3)
+    )
     return text.replace("adjacent = [1, 2]\n", f"adjacent = [1, 2]\n{barred}\n", 1)
 
 
@@ -155,9 +174,10 @@ def test_one_way_neighbours(tmp_path):
     assert load_network(full / "network").adjacency[0, 1]
 
 
-@pytest.mark.parametrize("barred, expected", [
-    ("no_way_to = [2, 1]", "cannot be reached from region 0"), ("no_way_to = [0]", "expected some of the adjacent"),
-])
+@pytest.mark.parametrize(
+    "barred, expected",
+    [("no_way_to = [2, 1]", "cannot be reached from region 0"), ("no_way_to = [0]", "expected some of the adjacent")],
+)
 def test_one_way_errors(tmp_path, barred, expected):
     tiny.write(tmp_path, network=ring(barred))
     with pytest.raises(InputError, match=expected):

@@ -27,8 +27,10 @@ def street_map() -> bytes:
     ways += [([10 * y + x for y in range(SIDE)], "primary" if x == 2 else "residential") for x in range(SIDE)]
     ways += [([0, 11], "footway"), ([98, 99], "residential")]
     for n, (nodes, kind) in enumerate(ways, start=1):
-        lines.append(f"<way id='{n}'>{''.join(f'<nd ref={chr(39)}{node}{chr(39)}/>' for node in nodes)}"
-                     f"<tag k='highway' v='{kind}'/></way>")
+        lines.append(
+            f"<way id='{n}'>{''.join(f'<nd ref={chr(39)}{node}{chr(39)}/>' for node in nodes)}"
+            f"<tag k='highway' v='{kind}'/></way>"
+        )
     return "\n".join([*lines, "</osm>"]).encode()
 
 
@@ -78,29 +80,52 @@ def test_import_makes_a_scenario_and_names_the_licence(tmp_path):
     with gzip.open(tmp_path / "city.osm.gz", "wb") as stream:
         stream.write(street_map())
     net, scenario = tmp_path / "networks" / "mycity", tmp_path / "scenarios" / "mycity"
-    good(cosim("import", tmp_path / "city.osm.gz", "--regions", 2, "--demand", "peak", "--level", 0.1,
-               "--iterations", 1, "--seeds", 1, "--out", net))
+    good(
+        cosim(
+            "import",
+            tmp_path / "city.osm.gz",
+            "--regions",
+            2,
+            "--demand",
+            "peak",
+            "--level",
+            0.1,
+            "--iterations",
+            1,
+            "--seeds",
+            1,
+            "--out",
+            net,
+        )
+    )
     assert "OpenStreetMap contributors" in (net / "NOTICE.txt").read_text()
     assert "4 signals that cars see" in (net / "import.txt").read_text()
     good(cosim("run", scenario, "--controller", "pi-gating", "--steps", 3, "--out", tmp_path / "run"))
 
 
-@pytest.mark.parametrize(("arguments", "expected"), [
-    (("--bbox", "11.3,44.4,11.4,44.5"), "osmGet.py got nothing from OpenStreetMap (urllib.error.URLError"),
-    (("--bbox", "11.3,44.4,11.4"), "expected west,south,east,north in degrees"),
-    (("--bbox", "11.4,44.4,11.3,44.5"), "expected west,south,east,north in degrees"),
-    ((), "or else --bbox"),
-    (("empty.osm", "--bbox", "11.3,44.4,11.4,44.5"), "or else --bbox"),
-    (("empty.osm",), "netconvert cannot run it: Error: No nodes loaded"),
-    (("city.osm.pbf",), "osmium cat city.osm.pbf -o city.osm"),
-    (("city.net.xml", "--left-hand"), "says itself where it drives"),
-    (("other.xml",), "expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of <html>"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--bbox", "11.3,44.4,11.4,44.5"), "osmGet.py got nothing from OpenStreetMap (urllib.error.URLError"),
+        (("--bbox", "11.3,44.4,11.4"), "expected west,south,east,north in degrees"),
+        (("--bbox", "11.4,44.4,11.3,44.5"), "expected west,south,east,north in degrees"),
+        ((), "or else --bbox"),
+        (("empty.osm", "--bbox", "11.3,44.4,11.4,44.5"), "or else --bbox"),
+        (("empty.osm",), "netconvert cannot run it: Error: No nodes loaded"),
+        (("city.osm.pbf",), "osmium cat city.osm.pbf -o city.osm"),
+        (("city.net.xml", "--left-hand"), "says itself where it drives"),
+        (("other.xml",), "expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of <html>"),
+    ],
+)
 def test_one_line(tmp_path, monkeypatch, arguments, expected):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(osm, "SERVERS", "http://127.0.0.1:1/")
-    for name, content in (("empty.osm", "<osm/>"), ("city.osm.pbf", ""), ("city.net.xml", "<net/>"),
-                          ("other.xml", "<html/>")):
+    for name, content in (
+        ("empty.osm", "<osm/>"),
+        ("city.osm.pbf", ""),
+        ("city.net.xml", "<net/>"),
+        ("other.xml", "<html/>"),
+    ):
         (tmp_path / name).write_text(content)
     assert expected in error_line(cosim("import", *arguments, "--regions", 2, "--out", "networks/x"))
     assert not (tmp_path / "networks" / "x").exists() and not (tmp_path / "scenarios").exists()

@@ -32,14 +32,17 @@ def net(tmp_path_factory):
 @pytest.fixture
 def city(net, tmp_path):
     """city(routes, additional, options, net) writes a sumocfg with these contents."""
+
     def write(routes=FLOW, additional="", options="", net_file=net):
         (tmp_path / "c.rou.xml").write_text(f"<routes>{routes}</routes>")
         (tmp_path / "c.add.xml").write_text(f"<additional>{additional}</additional>")
         config = tmp_path / "c.sumocfg"
         config.write_text(
             f'<configuration><net-file value="{net_file}"/><route-files value="c.rou.xml"/>'
-            f'<additional-files value="c.add.xml"/>{options}</configuration>')
+            f'<additional-files value="c.add.xml"/>{options}</configuration>'
+        )
         return config
+
     return write
 
 
@@ -74,7 +77,7 @@ def test_files_are_found_wherever_they_are(net, tmp_path, monkeypatch):
     monkeypatch.setenv("MY_CITY", str(below.parent))
     config = below / "\u57ce.sumocfg"
     config.write_text('<configuration><n v="../../n\u00e9t 1.net.xml"/><r v="${MY_CITY}/c.rou.xml"/></configuration>')
-    out = tmp_path / "networks" / "d'\"x\" \\ y"
+    out = tmp_path / "networks" / 'd\'"x" \\ y'
     result = cosim("import", config, "--regions", 2, *FAST, "--out", out)
     assert result.exit_code == 0, result.stderr
     scenario = load_scenario(tmp_path / "scenarios" / out.name)
@@ -84,12 +87,18 @@ def test_files_are_found_wherever_they_are(net, tmp_path, monkeypatch):
     assert result.exit_code == 2 and "no such file" in result.stderr and "${NO_SUCH}" in result.stderr
 
 
-@pytest.mark.parametrize("options, expected", [
-    ('<begin value="-10"/>', "c.sumocfg: begin: expected a time from 0 s up, got -10"),
-    ('<begin value="600"/><end value="300"/>', "c.sumocfg: end: expected a time after the beginning at 600 s, got 300"),
-    ('<time-to-teleport value="abc"/>', "c.sumocfg: time-to-teleport: expected seconds"),
-    ('<step-length value="abc"/>', "c.sumocfg: step-length: expected seconds"),
-])
+@pytest.mark.parametrize(
+    "options, expected",
+    [
+        ('<begin value="-10"/>', "c.sumocfg: begin: expected a time from 0 s up, got -10"),
+        (
+            '<begin value="600"/><end value="300"/>',
+            "c.sumocfg: end: expected a time after the beginning at 600 s, got 300",
+        ),
+        ('<time-to-teleport value="abc"/>', "c.sumocfg: time-to-teleport: expected seconds"),
+        ('<step-length value="abc"/>', "c.sumocfg: step-length: expected seconds"),
+    ],
+)
 def test_options_that_are_wrong(city, options, expected):
     assert expected in refused(city(options=options), *FAST)
 
@@ -115,8 +124,11 @@ def test_an_id_twice(city):
 
 
 def test_copies_of_vehicles_get_ids_of_their_own(tmp_path):
-    (tmp_path / "a.rou.xml").write_text("<routes>" + "".join(
-        f'<trip id="{name}" depart="1" from="a" to="b"/>' for name in ("0", "0.1", "0.1.1", "1")) + "</routes>")
+    (tmp_path / "a.rou.xml").write_text(
+        "<routes>"
+        + "".join(f'<trip id="{name}" depart="1" from="a" to="b"/>' for name in ("0", "0.1", "0.1.1", "1"))
+        + "</routes>"
+    )
     drawn = draw(read_recorded_trips([tmp_path / "a.rou.xml"]), seed=0, factor=3.0, jitter=0.0, begin=0.0)
     names = [name for _, _, name in drawn]
     assert len(names) == len(set(names)) == 12 and {"0", "0.1", "0.1.1", "1", "1.1", "1.2", "0.2"} <= set(names)
@@ -126,12 +138,16 @@ def test_cars_for_streets_that_are_closed_to_them(net, city, tmp_path):
     """SUMO would keep them waiting for ever: they are left out, with a word; lorries that may go there are not."""
     text = re.sub(r'(<lane id="C1D1_\d" index="\d") ', r'\1 allow="bus truck" ', net.read_text())
     (tmp_path / "closed.net.xml").write_text(text)
-    said, scenario = imported(city(
-        FLOW + '<vType id="lorry" vClass="truck"/><trip id="lorry" type="lorry" depart="9" from="A1B1" to="C1D1"/>'
-        '<vehicle id="over" depart="10"><route edges="B1C1 C1D1 D1D2"/></vehicle>'
-        '<trip id="by" depart="11" from="A1B1" to="D1D2" via="C1D1"/>'
-        '<trip id="car" depart="12" from="A1B1" to="D1D2"/>',
-        net_file="closed.net.xml"), *FAST)
+    said, scenario = imported(
+        city(
+            FLOW + '<vType id="lorry" vClass="truck"/><trip id="lorry" type="lorry" depart="9" from="A1B1" to="C1D1"/>'
+            '<vehicle id="over" depart="10"><route edges="B1C1 C1D1 D1D2"/></vehicle>'
+            '<trip id="by" depart="11" from="A1B1" to="D1D2" via="C1D1"/>'
+            '<trip id="car" depart="12" from="A1B1" to="D1D2"/>',
+            net_file="closed.net.xml",
+        ),
+        *FAST,
+    )
     assert "2 vehicles in" in said and "cars on streets that are closed to cars, left out: 62" in said
     due, departed, *_, backlog = driven(scenario, 2, 0.4)
     assert due == departed == 2 and backlog == 0
@@ -142,7 +158,8 @@ def test_routes_of_a_nested_distribution(city):
     config = city(
         '<flow id="f" begin="0" end="600" number="200" fromTaz="1" toTaz="2"><routeDistribution>'
         '<route probability="150" edges="A1B1 B1C1"/><route probability="50" edges="D1C1 C1B1"/></routeDistribution>'
-        "</flow>")
+        "</flow>"
+    )
     vehicles = traffic_of(config).vehicles
     edges = [vehicle.find("route").get("edges") for vehicle in vehicles]
     assert len(edges) == 200 and 120 < edges.count("A1B1 B1C1") < 180 and "D1C1 C1B1" in edges
@@ -163,14 +180,20 @@ def test_what_else_changes_routes_and_vehicles(city, tmp_path, monkeypatch):
         '<rerouter id="r" edges="B1C1"><interval begin="0" end="600"><routeProbReroute id="other" probability="1"/>'
         '</interval></rerouter><rerouter id="s" edges="C2D2"><interval begin="0" end="600"><closingReroute id="C2D2" '
         'disallow="passenger"/></interval></rerouter><calibrator id="c" edge="B2C2" pos="0" output="calibrator.xml" '
-        'routeProbe="probe" freq="60"><flow begin="0" end="600" route="more" vehsPerHour="600"/></calibrator>')
+        'routeProbe="probe" freq="60"><flow begin="0" end="600" route="more" vehsPerHour="600"/></calibrator>',
+    )
     text, scenario = imported(config)
     assert "61 vehicles never drove" not in text and "1 vehicles never drove" in text
     assert {element.get("id") for element in traffic_of(config).vehicles} >= {"begins", "shut"}
     due, departed, arrived, inside, _ = driven(scenario, 5, 0.4, rerouting=0.5)
     assert departed - arrived == inside and departed > 40
     assert {path.name for path in tmp_path.iterdir()} == {
-        "c.rou.xml", "c.add.xml", "c.sumocfg", "networks", "scenarios"}
+        "c.rou.xml",
+        "c.add.xml",
+        "c.sumocfg",
+        "networks",
+        "scenarios",
+    }
 
 
 def test_signals_that_cannot_be_controlled(net, city, tmp_path):
@@ -210,16 +233,18 @@ def test_cycles_shorter_than_half_a_second(net, tmp_path):
 def test_a_city_along_a_straight_road(tmp_path):
     """It has no width: k-means and the map must do without."""
     nodes = "".join(f'<node id="{n}" x="{200 * n}" y="0" type="traffic_light"/>' for n in range(9))
-    edges = "".join(f'<edge id="f{n}" from="{n}" to="{n + 1}"/><edge id="b{n}" from="{n + 1}" to="{n}"/>'
-                    for n in range(8))
+    edges = "".join(
+        f'<edge id="f{n}" from="{n}" to="{n + 1}"/><edge id="b{n}" from="{n + 1}" to="{n}"/>' for n in range(8)
+    )
     (tmp_path / "n.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
     (tmp_path / "e.edg.xml").write_text(f"<edges>{edges}</edges>")
     net = tmp_path / "road.net.xml"
     tiny_city.run("netconvert", "-n", tmp_path / "n.nod.xml", "-e", tmp_path / "e.edg.xml", "-o", net)
     text, scenario = imported(net, "--demand", "peak", "--level", 0.2)
     assert "2 regions by method density" in text and scenario.network.adjacency.sum() == 2
-    sizes = np.bincount(np.loadtxt(
-        tmp_path / "networks" / "x" / "regions.csv", dtype=int, delimiter=",", skiprows=1, usecols=1))
+    sizes = np.bincount(
+        np.loadtxt(tmp_path / "networks" / "x" / "regions.csv", dtype=int, delimiter=",", skiprows=1, usecols=1)
+    )
     assert sizes.min() >= 4
 
 
@@ -272,25 +297,38 @@ def test_a_vehicle_that_sumo_gives_up_at_once(net, city):
         plant.close()
 
 
-@pytest.mark.parametrize("routes, expected", [
-    ('<taz id="z"><tazSource id="A0A1" weight="x"/></taz>', "taz z: weight or probability: expected a number"),
-    ('<routeDistribution id="z"><route edges="A0A1" probability="x"/></routeDistribution>',
-     "routeDistribution z: weight or probability: expected a number"),
-    ('<vehicle id="v" depart="1"><routeDistribution><route edges="A0A1" probability="x"/></routeDistribution>'
-     "</vehicle>", "vehicle v: weight or probability: expected a number"),
-])
+@pytest.mark.parametrize(
+    "routes, expected",
+    [
+        ('<taz id="z"><tazSource id="A0A1" weight="x"/></taz>', "taz z: weight or probability: expected a number"),
+        (
+            '<routeDistribution id="z"><route edges="A0A1" probability="x"/></routeDistribution>',
+            "routeDistribution z: weight or probability: expected a number",
+        ),
+        (
+            '<vehicle id="v" depart="1"><routeDistribution><route edges="A0A1" probability="x"/></routeDistribution>'
+            "</vehicle>",
+            "vehicle v: weight or probability: expected a number",
+        ),
+    ],
+)
 def test_numbers_that_are_none(city, routes, expected):
     assert f"c.rou.xml: {expected}" in refused(city(FLOW + routes), *FAST)
 
 
 def test_speeds_and_coordinates(city):
     """A fixed speed is deadly before a signal under control; trips between coordinates are not silently lost."""
-    traffic = traffic_of(city(
-        '<trip id="a" depart="1" from="A1B1" to="C1D1" departSpeed="13.9"/><trip id="b" depart="1" fromXY="1,1" '
-        'toXY="9,9"/><trip id="c" depart="1" from="A1B1" to="C1D1" departSpeed="random"/>'))
+    traffic = traffic_of(
+        city(
+            '<trip id="a" depart="1" from="A1B1" to="C1D1" departSpeed="13.9"/><trip id="b" depart="1" fromXY="1,1" '
+            'toXY="9,9"/><trip id="c" depart="1" from="A1B1" to="C1D1" departSpeed="random"/>'
+        )
+    )
     assert [vehicle.get("departSpeed") for vehicle in traffic.vehicles] == ["max", "random"]
-    assert traffic.notes == {"fixed speeds at the departure, made the highest safe ones": 1,
-                             "trips between coordinates, left out: give them edges with duarouter": 1}
+    assert traffic.notes == {
+        "fixed speeds at the departure, made the highest safe ones": 1,
+        "trips between coordinates, left out: give them edges with duarouter": 1,
+    }
 
 
 def test_a_generated_peak_beside_types_of_the_city(net, city):

@@ -42,7 +42,11 @@ def test_the_template_runs_beside_the_others_and_a_changed_file_does_not_count(p
     assert f"--controllers no-control,pi-gating,{name}" in (place / "sub" / "mine.py").read_text()
     rows = run_folder.read_summary(place / "out" / "summary.csv")
     assert [(row["controller"], row["seed"]) for row in rows] == [
-        ("no-control", 0), ("no-control", 1), (name, 0), (name, 1)]
+        ("no-control", 0),
+        ("no-control", 1),
+        (name, 0),
+        (name, 1),
+    ]
     assert nmfd(*command, "--controllers", name, "--workers", "2").exit_code == 0  # all there, under its own name
     assert nmfd("new-controller", "sub/mine.py").exit_code == 2
     with (place / "sub" / "mine.py").open("a") as file:
@@ -56,8 +60,9 @@ def test_the_template_holds_regions_at_their_set_points():
     controller = custom.make(f"{custom.__file__.replace('custom.py', 'template.py')}:MyController", scenario)
     accumulation = np.zeros((7, 7))
     accumulation[3, 0] = 2 * scenario.network.mfds[3].critical
-    perimeter = controller.act(custom.Observation(
-        step=0, time=0.0, accumulation=accumulation, backlog=np.zeros((7, 7)))).perimeter
+    perimeter = controller.act(
+        custom.Observation(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros((7, 7)))
+    ).perimeter
     entries = scenario.network.adjacency[:, 3]
     assert (perimeter[entries, 3] == scenario.network.u_min).all()
     assert (perimeter[3, entries] == scenario.network.u_max).all()
@@ -78,8 +83,10 @@ def test_it_has_a_table_of_its_own(place):
 def test_processes_and_sumo_take_it(place):
     (place / "mine.py").write_text(GOOD)
     copies.peak(place)
-    done = CliRunner().invoke(cosim.cli.main.main, [
-        "run", "scenarios/peak", "--controller", "mine.py:Mine+max-pressure", "--steps", "2", "--out", "out"])
+    done = CliRunner().invoke(
+        cosim.cli.main.main,
+        ["run", "scenarios/peak", "--controller", "mine.py:Mine+max-pressure", "--steps", "2", "--out", "out"],
+    )
     assert done.exit_code == 0 and "mine.py:Mine+max-pressure" in done.output, done.output
     name = run_folder.run_name("mine.py:Mine+max-pressure", 0)
     trajectory = run_folder.read_trajectory(place / "out" / f"{name}.nc")
@@ -88,10 +95,13 @@ def test_processes_and_sumo_take_it(place):
     assert benchmark.exit_code == 0, benchmark.output
 
 
-@pytest.mark.parametrize("name, controller, options", [
-    ("a.py:Gate", "a.py:Gate", {}),
-    ("a+b/c d.py:Gate+actuated+rerouting-30", "a+b/c d.py:Gate", {"signals": "actuated", "rerouting": 0.3}),
-])
+@pytest.mark.parametrize(
+    "name, controller, options",
+    [
+        ("a.py:Gate", "a.py:Gate", {}),
+        ("a+b/c d.py:Gate+actuated+rerouting-30", "a+b/c d.py:Gate", {"signals": "actuated", "rerouting": 0.3}),
+    ],
+)
 def test_in_strategies(place, name, controller, options):
     path = place / controller.split(":")[0]
     path.parent.mkdir(exist_ok=True)
@@ -101,29 +111,47 @@ def test_in_strategies(place, name, controller, options):
     assert "/" not in run_folder.run_name(name, 0)
 
 
-@pytest.mark.parametrize("source, expected", [
-    (None, "mine.py: no such file for controller mine.py:Mine; write one with: nmfd new-controller mine.py"),
-    ("class Other:\n    act = None\n", "mine.py: has no class Mine; choose from Other"),
-    ("x = 1\n", "mine.py: has no class Mine; it has none with a method act: write one"),
-    ("Mine = 3\n", "mine.py:Mine: expected a class, got 3 instead"),
-    ("import numpy\n\nclass Mine(:\n", r"mine\.py:3: mine\.py:Mine: import: SyntaxError: invalid syntax"),
-    ("\nimport nothing_of_the_kind\n", r"mine\.py:2: mine\.py:Mine: import: ModuleNotFoundError: No module named"),
-    ("import sys\nsys.exit('bye')\n", r"mine\.py:2: mine\.py:Mine: import: SystemExit: bye"),
-    (GOOD.replace("self, scenario", "self"), "made with one argument, the planning model, but too many positional"),
-    (GOOD.replace("def act", "def acts"), "mine.py:Mine: has no method act"),
-    (GOOD.replace("def reset", "def rest"), "mine.py:Mine: has no method reset"),
-    (GOOD.replace("pass", "1 / 0"), r"mine\.py:8: mine\.py:Mine: reset: ZeroDivisionError"),
-    (GOOD.replace("0.5,", "measurement.nothing,"), r"mine\.py:10: mine\.py:Mine: act: AttributeError"),
-    (GOOD.replace("self.shape, 0.5", "3, 0.5"), r"mine\.py:10: mine\.py:Mine: act|act: perimeter: expected finite"),
-    (GOOD.replace("0.5", "np.nan"), "act: perimeter: expected finite numbers of shape (2, 2), got numbers that are"),
-    (GOOD.replace("0.5", "1.5"), "act: perimeter[0, 1]: expected a number in [0.1, 0.9], got 1.5 instead"),
-    (GOOD.replace("splits=None", "splits=np.zeros((2, 2))"), "act: splits: expected finite numbers of shape (2, 2, 2)"),
-    (GOOD.replace("splits=None", "splits=np.zeros((2, 2, 2))"), "splits[0, :, 1]: expected shares with sum 1, got 0"),
-    (GOOD.replace("splits=None", "splits=np.ones((2, 2, 2))"), "splits[0, 0, 0]: expected 0 (no way), got 1 instead"),
-    (GOOD.replace("splits=None", "splits=None, prices=np.array([0.0, -1.0])"), "prices[1]: expected a number from 0"),
-    (GOOD.replace("splits=None", "splits=None, prices=1.0"), "act: prices: expected finite numbers of shape (2,)"),
-    (GOOD.replace("return Controls(", "return dict("), "act: expected nmfd.Controls, got dict instead"),
-])
+@pytest.mark.parametrize(
+    "source, expected",
+    [
+        (None, "mine.py: no such file for controller mine.py:Mine; write one with: nmfd new-controller mine.py"),
+        ("class Other:\n    act = None\n", "mine.py: has no class Mine; choose from Other"),
+        ("x = 1\n", "mine.py: has no class Mine; it has none with a method act: write one"),
+        ("Mine = 3\n", "mine.py:Mine: expected a class, got 3 instead"),
+        ("import numpy\n\nclass Mine(:\n", r"mine\.py:3: mine\.py:Mine: import: SyntaxError: invalid syntax"),
+        ("\nimport nothing_of_the_kind\n", r"mine\.py:2: mine\.py:Mine: import: ModuleNotFoundError: No module named"),
+        ("import sys\nsys.exit('bye')\n", r"mine\.py:2: mine\.py:Mine: import: SystemExit: bye"),
+        (GOOD.replace("self, scenario", "self"), "made with one argument, the planning model, but too many positional"),
+        (GOOD.replace("def act", "def acts"), "mine.py:Mine: has no method act"),
+        (GOOD.replace("def reset", "def rest"), "mine.py:Mine: has no method reset"),
+        (GOOD.replace("pass", "1 / 0"), r"mine\.py:8: mine\.py:Mine: reset: ZeroDivisionError"),
+        (GOOD.replace("0.5,", "measurement.nothing,"), r"mine\.py:10: mine\.py:Mine: act: AttributeError"),
+        (GOOD.replace("self.shape, 0.5", "3, 0.5"), r"mine\.py:10: mine\.py:Mine: act|act: perimeter: expected finite"),
+        (
+            GOOD.replace("0.5", "np.nan"),
+            "act: perimeter: expected finite numbers of shape (2, 2), got numbers that are",
+        ),
+        (GOOD.replace("0.5", "1.5"), "act: perimeter[0, 1]: expected a number in [0.1, 0.9], got 1.5 instead"),
+        (
+            GOOD.replace("splits=None", "splits=np.zeros((2, 2))"),
+            "act: splits: expected finite numbers of shape (2, 2, 2)",
+        ),
+        (
+            GOOD.replace("splits=None", "splits=np.zeros((2, 2, 2))"),
+            "splits[0, :, 1]: expected shares with sum 1, got 0",
+        ),
+        (
+            GOOD.replace("splits=None", "splits=np.ones((2, 2, 2))"),
+            "splits[0, 0, 0]: expected 0 (no way), got 1 instead",
+        ),
+        (
+            GOOD.replace("splits=None", "splits=None, prices=np.array([0.0, -1.0])"),
+            "prices[1]: expected a number from 0",
+        ),
+        (GOOD.replace("splits=None", "splits=None, prices=1.0"), "act: prices: expected finite numbers of shape (2,)"),
+        (GOOD.replace("return Controls(", "return dict("), "act: expected nmfd.Controls, got dict instead"),
+    ],
+)
 @pytest.mark.usefixtures("unchecked")
 def test_mistakes(place, source, expected):
     if source is not None:
@@ -141,8 +169,10 @@ def test_a_mistake_in_mid_run_is_a_failed_run_with_its_line(place):
     assert [row["controller"] for row in run_folder.read_summary(place / "out" / "summary.csv")] == ["no-control"]
 
 
-@pytest.mark.parametrize("name, expected", [
-    ("mine.py", "controller 'mine.py' is unknown"), ("mine.py:", "is unknown"), ("mine.py:1a", "or file.py:Class")])
+@pytest.mark.parametrize(
+    "name, expected",
+    [("mine.py", "controller 'mine.py' is unknown"), ("mine.py:", "is unknown"), ("mine.py:1a", "or file.py:Class")],
+)
 def test_names_that_mean_nothing(place, name, expected):
     for parsed in (registry.check, parse):
         with pytest.raises(InputError, match=expected):

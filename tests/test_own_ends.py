@@ -77,33 +77,38 @@ class Word(str):
 """
 
 
-@pytest.mark.parametrize("place, code, expected", [
-    *((place, "raise BaseException('one\\ntwo')", "BaseException: one two") for place in PLACES),
-    *((place, "while True: pass", f"took longer than {LIMIT} s; make it faster, or allow more with --time-limit")
-      for place in PLACES),
-    ("ACT", "time.sleep(1e6)", "took longer than"),
-    ("ACT", "threading.Event().wait()", "took longer than"),
-    ("ACT", "raise SystemExit(3)", "SystemExit: 3"),
-    ("ACT", "raise GeneratorExit", "GeneratorExit"),
-    ("ACT", ODD + "raise Odd", "Odd: (which cannot be printed)"),
-    ("ACT", ODD + "raise KeyError(Word('a'))", "KeyError: 'a'"),
-    ("ACT", "raise ValueError('x' * 10**6)", "x..."),
-    ("ACT", "raise ValueError('\\x1b[2J\\ud800')", "?[2J?"),
-    ("ACT", "from nmfd.errors import InputError\nraise InputError('a\\nb')", "a b"),
-    ("TOP", "os.chdir('/')", "left the folder"),
-    ("ACT", "os.chdir('/')", "left the folder"),
-    ("ACT", "perimeter = perimeter + 0.1j", "expected real numbers of shape (2, 2), got complex128 ones instead"),
-    ("ACT", "perimeter = perimeter.astype(object) + 0.1j", "expected numbers of shape (2, 2)"),
-    ("ACT", "perimeter = perimeter.astype(str)", "got str"),
-    ("ACT", "perimeter = np.ma.masked_all((2, 2))", "got masked ones"),
-    ("ACT", "perimeter = (x for x in 'ab')", "expected finite numbers of shape (2, 2), got shape () instead"),
-    ("ACT", "perimeter = np.broadcast_to(0.5, (10**6, 10**6))", "got shape (1000000, 1000000) instead"),
-    ("ACT", "perimeter = [[0.5], [0.5, 0.5]]", "expected numbers of shape (2, 2), got list"),
-    ("ACT", "perimeter[0, 1] = -np.inf", "numbers that are not finite"),
-    ("ACT", "import torch\nperimeter = torch.ones(2, 2, requires_grad=True)", "expected numbers of shape (2, 2)"),
-    ("ACT", "class Lazy:\n    def __array__(self, *a, **b): raise SystemExit\nperimeter = Lazy()", "SystemExit"),
-    ("ACT", ODD + "note = Odd()", ""),
-])
+@pytest.mark.parametrize(
+    "place, code, expected",
+    [
+        *((place, "raise BaseException('one\\ntwo')", "BaseException: one two") for place in PLACES),
+        *(
+            (place, "while True: pass", f"took longer than {LIMIT} s; make it faster, or allow more with --time-limit")
+            for place in PLACES
+        ),
+        ("ACT", "time.sleep(1e6)", "took longer than"),
+        ("ACT", "threading.Event().wait()", "took longer than"),
+        ("ACT", "raise SystemExit(3)", "SystemExit: 3"),
+        ("ACT", "raise GeneratorExit", "GeneratorExit"),
+        ("ACT", ODD + "raise Odd", "Odd: (which cannot be printed)"),
+        ("ACT", ODD + "raise KeyError(Word('a'))", "KeyError: 'a'"),
+        ("ACT", "raise ValueError('x' * 10**6)", "x..."),
+        ("ACT", "raise ValueError('\\x1b[2J\\ud800')", "?[2J?"),
+        ("ACT", "from nmfd.errors import InputError\nraise InputError('a\\nb')", "a b"),
+        ("TOP", "os.chdir('/')", "left the folder"),
+        ("ACT", "os.chdir('/')", "left the folder"),
+        ("ACT", "perimeter = perimeter + 0.1j", "expected real numbers of shape (2, 2), got complex128 ones instead"),
+        ("ACT", "perimeter = perimeter.astype(object) + 0.1j", "expected numbers of shape (2, 2)"),
+        ("ACT", "perimeter = perimeter.astype(str)", "got str"),
+        ("ACT", "perimeter = np.ma.masked_all((2, 2))", "got masked ones"),
+        ("ACT", "perimeter = (x for x in 'ab')", "expected finite numbers of shape (2, 2), got shape () instead"),
+        ("ACT", "perimeter = np.broadcast_to(0.5, (10**6, 10**6))", "got shape (1000000, 1000000) instead"),
+        ("ACT", "perimeter = [[0.5], [0.5, 0.5]]", "expected numbers of shape (2, 2), got list"),
+        ("ACT", "perimeter[0, 1] = -np.inf", "numbers that are not finite"),
+        ("ACT", "import torch\nperimeter = torch.ones(2, 2, requires_grad=True)", "expected numbers of shape (2, 2)"),
+        ("ACT", "class Lazy:\n    def __array__(self, *a, **b): raise SystemExit\nperimeter = Lazy()", "SystemExit"),
+        ("ACT", ODD + "note = Odd()", ""),
+    ],
+)
 @pytest.mark.usefixtures("unchecked")
 def test_one_line(tmp_path, scenario, place, code, expected):
     before = os.getcwd()
@@ -124,8 +129,11 @@ def test_what_all_share_stays_as_it_is(tmp_path, scenario):
 
 LETHAL = {
     "exits": ("ACT", "os._exit(0)", "act: its process died (status 0)"),
-    "swallows": ("ACT", "while True:\n    try:\n        while True: pass\n    except BaseException: pass",
-                 "act: took longer"),
+    "swallows": (
+        "ACT",
+        "while True:\n    try:\n        while True: pass\n    except BaseException: pass",
+        "act: took longer",
+    ),
     "counts": ("ACT", "sum(itertools.count())", "act: took longer than its time limit, and its process was ended"),
     "closes": ("ACT", "os.closerange(0, 100)", "its process died (status 1)"),
     "leaves": ("ACT", "threading.Thread(target=time.sleep, args=[1e6]).start(); raise ValueError", "act: ValueError"),
@@ -159,9 +167,11 @@ def test_commands_name_it_and_keep_the_others(tmp_path, monkeypatch):
     written(Path("hangs.py"), "TOP", "sum(itertools.count())")
     command = ("benchmark", "scenario", "--out", "out", "--controllers")
     assert "never.py:Mine: Mine(): its process died (status 0)" in error_line(
-        nmfd(*command, "no-control,never.py:Mine"), "nmfd")
+        nmfd(*command, "no-control,never.py:Mine"), "nmfd"
+    )
     assert "hangs.py:Mine: import: took longer" in error_line(
-        nmfd(*command, "no-control,hangs.py:Mine", "--time-limit", 0.2), "nmfd")
+        nmfd(*command, "no-control,hangs.py:Mine", "--time-limit", 0.2), "nmfd"
+    )
     assert not Path("out").exists()
     line = error_line(nmfd(*command, "exits.py:Mine,fails.py:Mine,no-control"), "nmfd")
     assert "exits.py:Mine, seed 0: exits.py:Mine: act: its process died (status 0)" in line

@@ -102,7 +102,8 @@ def test_no_script_runs_but_those_of_the_page(content):
     scripts = Page(content).scripts
     assert "sort" in scripts[-1] and len(scripts) == 5 and any("dpc-pcrg" in text for text in scripts)
     assert allowed == [
-        f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" for text in scripts]
+        f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" for text in scripts
+    ]
 
 
 def test_every_column_says_what_it_is(content):
@@ -111,8 +112,11 @@ def test_every_column_says_what_it_is(content):
 
 
 def test_the_card_has_the_figures_of_the_best_strategy(evaluation):
-    rows = results.read(evaluation).level(1.0).rows.assign(
-        mean_trip_time_s=0.0, mean_departure_delay_s=0.0, co2_kg=float("nan"))
+    rows = (
+        results.read(evaluation)
+        .level(1.0)
+        .rows.assign(mean_trip_time_s=0.0, mean_departure_delay_s=0.0, co2_kg=float("nan"))
+    )
     rows.loc[rows["controller"] == "no-control", "mean_trip_time_s"] = 600.0
     rows.loc[rows["controller"] == "dpc-pcrg", "mean_trip_time_s"] = [269.0, 271.0]
     rows.loc[rows["controller"] == "dpc-pcrg", "mean_departure_delay_s"] = 30.0
@@ -131,8 +135,10 @@ def test_the_card_has_the_figures_of_the_best_strategy(evaluation):
 
 def test_a_single_seed_claims_nothing(evaluation):
     rows = results.read(evaluation).level(1.0).rows
-    assert all(figure.better is None and figure.change.endswith("on one seed")
-               for figure in card.card(rows[rows["seed"] == 2000])[1])
+    assert all(
+        figure.better is None and figure.change.endswith("on one seed")
+        for figure in card.card(rows[rows["seed"] == 2000])[1]
+    )
 
 
 def test_names_are_escaped(content, evaluation, tmp_path, blind):
@@ -172,7 +178,8 @@ def test_every_number_of_the_tables_is_there(content, evaluation):
             half = row["change_half_interval_percent"]
             assert f"{row['mean_' + tables.TTS]:.3e} ± {row['half_interval_' + tables.TTS]:.1e}" in cells
             assert row["controller"] == "no-control" or any(
-                cell.startswith(f"{row['change_percent']:+.1f} ± {half:.1f} %") for cell in cells)
+                cell.startswith(f"{row['change_percent']:+.1f} ± {half:.1f} %") for cell in cells
+            )
     assert "against pi-gating" in read.tables["What came of it, demand times 1"][0]
     for word in ("demand_hash", "libsumo", "2000 to 2001", "outflow_share"):
         assert word in read.words
@@ -221,13 +228,16 @@ def test_a_failure_leaves_the_old_page(evaluation, tmp_path, monkeypatch):
     assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
 
 
-@pytest.mark.parametrize("name, arguments, expected", [
-    ("none", (), "holds no finished runs; give a folder of `cosim run` or `cosim evaluate`"),
-    ("one", ("--reference", "mpc-pc"), "--reference: 'mpc-pc' is not in these runs; did you mean dpc-pcrg"),
-    ("one", ("--scenario", made_up.SCENARIO.with_name("economic_mpc")), "the runs are of grid7_peak"),
-    ("lost", (), "scenario_folder: there is no gone; give it with --scenario"),
-    ("broken", (), "manifest.json: is no manifest of runs in SUMO"),
-])
+@pytest.mark.parametrize(
+    "name, arguments, expected",
+    [
+        ("none", (), "holds no finished runs; give a folder of `cosim run` or `cosim evaluate`"),
+        ("one", ("--reference", "mpc-pc"), "--reference: 'mpc-pc' is not in these runs; did you mean dpc-pcrg"),
+        ("one", ("--scenario", made_up.SCENARIO.with_name("economic_mpc")), "the runs are of grid7_peak"),
+        ("lost", (), "scenario_folder: there is no gone; give it with --scenario"),
+        ("broken", (), "manifest.json: is no manifest of runs in SUMO"),
+    ],
+)
 def test_error_lines(evaluation, tmp_path, name, arguments, expected):
     folder = tmp_path / name
     if name != "none":
@@ -242,8 +252,12 @@ def test_error_lines(evaluation, tmp_path, name, arguments, expected):
 
 
 DAMAGED = {
-    "runs.csv": "is no table of runs", "demand-1/sumo.csv": "is no table of runs", "demand-1/summary.csv": "delete",
-    "demand-1/manifest.json": "is no manifest of runs", "demand-1/pi-gating-2000.nc": "is no run"}
+    "runs.csv": "is no table of runs",
+    "demand-1/sumo.csv": "is no table of runs",
+    "demand-1/summary.csv": "delete",
+    "demand-1/manifest.json": "is no manifest of runs",
+    "demand-1/pi-gating-2000.nc": "is no run",
+}
 
 
 @pytest.mark.parametrize("name, expected", DAMAGED.items())
@@ -252,8 +266,11 @@ def test_damaged_files_are_one_line(evaluation, tmp_path, blind, name, expected)
     folder = tmp_path / "runs"
     shutil.copytree(evaluation, folder, ignore=shutil.ignore_patterns("demand-0.8", "report.html"))
     whole = (folder / name).read_bytes()
-    contents = [b"\0\xff\xfe" * 100, whole[: len(whole) // 2]] if name.endswith((".nc", ".json")) else [
-        b"", b"\0\xff\xfe" * 100, b"a,b\n1,2\n"]
+    contents = (
+        [b"\0\xff\xfe" * 100, whole[: len(whole) // 2]]
+        if name.endswith((".nc", ".json"))
+        else [b"", b"\0\xff\xfe" * 100, b"a,b\n1,2\n"]
+    )
     for content in contents:
         (folder / name).write_bytes(content)
         line = error_line(cosim("report", folder))
@@ -283,7 +300,8 @@ def test_a_run_whose_row_is_gone_is_not_shown(evaluation, tmp_path, monkeypatch)
 
 def rows(**times):
     return rows_of({(1.0, name.replace("_", "-")): values for name, values in times.items()}).assign(
-        trips=100, completed_veh=100.0, teleports=0)
+        trips=100, completed_veh=100.0, teleports=0
+    )
 
 
 def test_the_words_of_worked_examples():
@@ -291,8 +309,9 @@ def test_the_words_of_worked_examples():
     text = summary_text.best(three)  # -20 ± 4.302653 * 10 / sqrt(3) %
     assert "best strategy was pi-gating" in text and "20.0 % less than without control" in text
     assert "paired over 3 seeds, is -44.8 to +4.8 % and includes zero" in text and "flattered" not in text
-    sure = summary_text.best(rows(
-        no_control={1: 100.0, 2: 200.0}, pi_gating={1: 50.0, 2: 101.0}, mpc_pc={1: 99.0, 2: 199.0}))
+    sure = summary_text.best(
+        rows(no_control={1: 100.0, 2: 200.0}, pi_gating={1: 50.0, 2: 101.0}, mpc_pc={1: 99.0, 2: 199.0})
+    )
     assert "excludes zero: more than chance" in sure and "chosen among 2 on these very runs (seeds 1 to 2)" in sure
     assert "there is no interval" in summary_text.best(rows(no_control={1: 100.0}, pi_gating={1: 90.0}))
     worse = summary_text.best(rows(no_control={1: 100.0, 2: 100.0}, pi_gating={1: 110.0, 2: 112.0}))

@@ -79,7 +79,8 @@ def test_a_pair_of_which_none_is_better():
     rows = rows_of({(1.0, "actuated"): {1: 100.0, 2: 100.0}, (1.0, "webster"): {1: 120.0, 2: 121.0}})
     assert "No strategy was better than actuated; the nearest was webster" in summary_text.best(rows)
     assert "+20.5 %" in experiment.overview_table(rows) and "TTS against actuated" in " ".join(
-        experiment.overview_table(rows).split())
+        experiment.overview_table(rows).split()
+    )
 
 
 def test_one_controller_alone_says_so(tmp_path):
@@ -89,8 +90,9 @@ def test_one_controller_alone_says_so(tmp_path):
     assert experiment.overview_table(rows)
     alone = made_up.folder(tmp_path / "one", controllers=("pi-gating",), seeds=(1,))
     assert "pi-gating has no common seed with no-control" in (alone / "evaluate.md").read_text()
-    assert explain.at(1.0, results.read(alone).level(1.0).folder, results.read(alone).scenario.network,
-                      results.read(alone).rows)[0].startswith("Signals under control see")
+    assert explain.at(
+        1.0, results.read(alone).level(1.0).folder, results.read(alone).scenario.network, results.read(alone).rows
+    )[0].startswith("Signals under control see")
 
 
 def test_the_benchmark_compares_with_the_first(tmp_path):
@@ -102,8 +104,13 @@ def test_the_benchmark_compares_with_the_first(tmp_path):
 def test_run_compares_with_what_against_names(tmp_path, monkeypatch):
     """`--controller A --against B`: the change of A is against B."""
     asked = []
-    monkeypatch.setattr(experiment, "experiment", lambda tasks, **_: asked.extend(
-        task.controller for task in tasks) or rows_of({(1.0, t.controller): {1: 1.0} for t in tasks}))
+    monkeypatch.setattr(
+        experiment,
+        "experiment",
+        lambda tasks, **_: (
+            asked.extend(task.controller for task in tasks) or rows_of({(1.0, t.controller): {1: 1.0} for t in tasks})
+        ),
+    )
     for controller, against in (("pi-gating", "actuated"), ("pi-gating", "no-control")):
         asked.clear()
         good(cosim("run", made_up.SCENARIO, "--controller", controller, "--against", against, "--out", tmp_path))

@@ -17,8 +17,20 @@ from cosim.importing.streets import read_streets
 def streets(tmp_path_factory):
     """A grid of 9 x 9 junctions, 150 m apart."""
     path = tmp_path_factory.mktemp("grid") / "grid.net.xml"
-    tiny_city.run("netgenerate", "--grid", "--grid.number", 9, "--grid.length", 150, "--no-turnarounds", "true",
-                  "--seed", 1, "--output-file", path)
+    tiny_city.run(
+        "netgenerate",
+        "--grid",
+        "--grid.number",
+        9,
+        "--grid.length",
+        150,
+        "--no-turnarounds",
+        "true",
+        "--seed",
+        1,
+        "--output-file",
+        path,
+    )
     return read_streets(path)
 
 
@@ -74,7 +86,7 @@ def test_refinement_moves_the_boundary_to_the_signals(streets):
     where = streets.junctions[streets.links[:, 0], 1]
     columns = np.array([name[0] for name in sorted(streets.places, key=streets.places.get)])
     better = refine(blocks, labels, feature, prices(streets, blocks, columns[where] == "E", None))
-    crossing = (better[blocks.of[streets.links]][:, 0] != better[blocks.of[streets.links]][:, 1])
+    crossing = better[blocks.of[streets.links]][:, 0] != better[blocks.of[streets.links]][:, 1]
     before = labels[blocks.of[streets.links]]
     before = (columns[where][before[:, 0] != before[:, 1]] == "E").mean()
     assert (columns[where][crossing] == "E").mean() > max(before, 0.95)
@@ -88,7 +100,7 @@ def test_the_best_of_several_starts(streets):
     feature = features(blocks, np.zeros(len(blocks.weight)))[:, 1:]
     where = streets.junctions[streets.links[:, 0], 1]
     rows = np.array([name[1] for name in sorted(streets.places, key=streets.places.get)])
-    price = prices(streets, blocks, rows[where] == "4", None)   # row 4 runs west to east, in the middle
+    price = prices(streets, blocks, rows[where] == "4", None)  # row 4 runs west to east, in the middle
     starts = [(blocks.position[:, axis] > 650.0).astype(int) for axis in (0, 1)]
     alone, found = refine(blocks, starts[0], feature, price), best(blocks, starts, feature, price)
     assert cut(found, price) < 0.5 * cut(alone, price)
@@ -98,8 +110,8 @@ def test_the_best_of_several_starts(streets):
 
 def test_finish_repairs_what_is_torn(streets):
     labels = (streets.centre[:, 0] > 600.0).astype(int)
-    labels[streets.number["A0B0"]] = 1     # an island, far from its region
-    labels[streets.number["I8H8"]] = -1    # forgotten
+    labels[streets.number["A0B0"]] = 1  # an island, far from its region
+    labels[streets.number["I8H8"]] = -1  # forgotten
     found = finish(streets, labels)
     assert all(pieces(streets, found == region) == 1 for region in range(2))
     assert found[streets.number["A0B0"]] == found[streets.number["B0A0"]]
@@ -108,14 +120,33 @@ def test_finish_repairs_what_is_torn(streets):
 
 def test_a_region_without_return_goes_to_its_neighbour(tmp_path):
     """A way in and a way out, both one-way, cannot be regions: nobody could come back."""
-    nodes = '<nodes>' + "".join(f'<node id="{n}" x="{x}" y="{y}"/>' for n, x, y in (
-        ("in", 0, 0), ("a", 300, 0), ("b", 600, 0), ("c", 450, 200), ("out", 900, 0))) + "</nodes>"
-    edges = "<edges>" + "".join(f'<edge id="{a}-{b}" from="{a}" to="{b}" numLanes="1" speed="13.9"/>' for a, b in (
-        ("in", "a"), ("a", "b"), ("b", "c"), ("c", "a"), ("b", "out"))) + "</edges>"
+    nodes = (
+        "<nodes>"
+        + "".join(
+            f'<node id="{n}" x="{x}" y="{y}"/>'
+            for n, x, y in (("in", 0, 0), ("a", 300, 0), ("b", 600, 0), ("c", 450, 200), ("out", 900, 0))
+        )
+        + "</nodes>"
+    )
+    edges = (
+        "<edges>"
+        + "".join(
+            f'<edge id="{a}-{b}" from="{a}" to="{b}" numLanes="1" speed="13.9"/>'
+            for a, b in (("in", "a"), ("a", "b"), ("b", "c"), ("c", "a"), ("b", "out"))
+        )
+        + "</edges>"
+    )
     (tmp_path / "n.xml").write_text(nodes)
     (tmp_path / "e.xml").write_text(edges)
-    tiny_city.run("netconvert", "--node-files", tmp_path / "n.xml", "--edge-files", tmp_path / "e.xml", "--output-file",
-                  tmp_path / "net.xml")
+    tiny_city.run(
+        "netconvert",
+        "--node-files",
+        tmp_path / "n.xml",
+        "--edge-files",
+        tmp_path / "e.xml",
+        "--output-file",
+        tmp_path / "net.xml",
+    )
     streets = read_streets(tmp_path / "net.xml")
     assert streets.core.sum() == 3 and streets.main_part.all()
     labels = np.array([{"in-a": 0, "b-out": 2}.get(edge, 1) for edge in streets.edges])

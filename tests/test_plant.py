@@ -97,7 +97,9 @@ def test_open_gateways_leave_sumo_alone(scenario, plant_of):
         states = []
         step = plant.session.step
         plant.session.step = lambda step=step, states=states, session=plant.session: (
-            step(), states.append([session.signal_state(s) for s in session.signals()]))
+            step(),
+            states.append([session.signal_state(s) for s in session.signals()]),
+        )
         final = [plant.step(open_gateways) for _ in range(3)][-1]
         shown.append((states, final.accumulation.tolist()))
     assert shown[0] == shown[1]
@@ -133,16 +135,22 @@ def test_the_samples_are_those_of_every_edge(scenario, plant_of):
         np.testing.assert_allclose(speeds, [np.mean(one) if one else 0.0 for one in there], atol=1e-9)
         sampler.sample()
         means = sampler.finish(np.full(len(edges), False))
-        routed = [libsumo.edge.getLastStepMeanSpeed(edge) if one else np.nan
-                  for edge, one in zip(edges, there, strict=True)]
+        routed = [
+            libsumo.edge.getLastStepMeanSpeed(edge) if one else np.nan for edge, one in zip(edges, there, strict=True)
+        ]
         np.testing.assert_allclose(means.speed, routed)  # guidance goes by what SUMO's own drivers have
         assert means.production.sum() == pytest.approx(sum(map(sum, there)))
         on_junctions = [session.vehicles_on(edge) for edge in plant.city.inside]
         assert means.crossing.tolist() == [len(there) for there in on_junctions]
         lengths = plant.city.inside.values()
-        np.testing.assert_allclose(means.crossed, [
-            sum(map(libsumo.vehicle.getSpeed, there)) / length
-            for there, length in zip(on_junctions, lengths, strict=True)], atol=1e-9)
+        np.testing.assert_allclose(
+            means.crossed,
+            [
+                sum(map(libsumo.vehicle.getSpeed, there)) / length
+                for there, length in zip(on_junctions, lengths, strict=True)
+            ],
+            atol=1e-9,
+        )
         crossing.append(int(means.crossing.sum()))
 
     for _ in range(18):
@@ -222,12 +230,15 @@ def test_guided_vehicles_are_asked_again(scenario, plant_of):
     assert [m.accumulation.tolist() for m in first] == [m.accumulation.tolist() for m in second]
 
 
-@pytest.mark.parametrize("signals, late", [
-    ("fixed", True), ("webster", True), ("actuated", True), ("max-pressure", False), ("max-pressure-cyclic", False)])
+@pytest.mark.parametrize(
+    "signals, late",
+    [("fixed", True), ("webster", True), ("actuated", True), ("max-pressure", False), ("max-pressure-cyclic", False)],
+)
 def test_before_the_stop_line_nobody_is_sent_elsewhere_only_under_max_pressure(plant_of, monkeypatch, signals, late):
     told = {}
     monkeypatch.setattr(
-        "cosim.plant.plant.Guide", lambda *args, **options: told.update(options) or Guide(*args, **options))
+        "cosim.plant.plant.Guide", lambda *args, **options: told.update(options) or Guide(*args, **options)
+    )
     plant_of(signals=signals, guidance_period=60.0).reset(1)
     assert told["turn_late"] is late
 

@@ -33,7 +33,8 @@ def completions(network, accumulation):
     rates = np.ones((7, 7)) if network.exit_rates is None else network.exit_rates
     return sum(
         rates[i, i] * mfd.rate(row.sum()) * row[i]
-        for i, (mfd, row) in enumerate(zip(network.mfds, accumulation, strict=True)))
+        for i, (mfd, row) in enumerate(zip(network.mfds, accumulation, strict=True))
+    )
 
 
 @pytest.mark.parametrize("network", [SCENARIO.network, LIMITED], ids=["published", "limited"])
@@ -82,8 +83,7 @@ def test_no_control_forces_no_move():
 
 
 def test_the_acyclic_plant_is_fast():
-    plant, (perimeter, splits) = AcyclicPlant(SCENARIO), random_controls(
-        np.random.default_rng(4), SCENARIO.network)
+    plant, (perimeter, splits) = AcyclicPlant(SCENARIO), random_controls(np.random.default_rng(4), SCENARIO.network)
     plant.reset(0)
     begin = time.process_time()
     for _ in range(SCENARIO.steps):
@@ -103,8 +103,7 @@ def test_no_way_leads_back_to_the_origin_or_the_previous_region():
 
 
 def test_shares_sum_to_one_and_are_theta_renormalised():
-    model, (_, splits) = acyclic.build(SCENARIO.network), random_controls(
-        np.random.default_rng(5), SCENARIO.network)
+    model, (_, splits) = acyclic.build(SCENARIO.network), random_controls(np.random.default_rng(5), SCENARIO.network)
     theta, forced = acyclic.shares(model, splits)
     sums = np.bincount(model.move_from, theta, minlength=len(model.region))
     np.testing.assert_allclose(sums, model.region != model.destination, atol=1e-12)
@@ -119,8 +118,13 @@ def test_shares_sum_to_one_and_are_theta_renormalised():
 
 def test_what_theta_leaves_no_way_on_is_forced_and_counted(tmp_path):
     """In a row of regions 0-1-2, trips from 1 to 0 that are sent into the dead end 2 must turn back there."""
-    scenario = load_scenario(tiny.write(tmp_path, network=tiny.row_network(3), scenario=tiny.SCENARIO.replace(
-        "from = 0\nto = 1", "from = 1\nto = 0")))
+    scenario = load_scenario(
+        tiny.write(
+            tmp_path,
+            network=tiny.row_network(3),
+            scenario=tiny.SCENARIO.replace("from = 0\nto = 1", "from = 1\nto = 0"),
+        )
+    )
     splits = scenario.network.nominal_splits.copy()
     splits[1, :, 0] = [0.0, 0.0, 1.0]
     controls = Controls(perimeter=scenario.network.adjacency * 0.9, splits=splits)

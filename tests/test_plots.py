@@ -29,10 +29,21 @@ def ax():
 def runs_of(scenario, *, plants=("nmfd",), controllers=("no-control",), seeds=(0,), hours=2.0):
     steps, regions = int(hours * 120), scenario.network.regions
     return [
-        made(controller=controller, plant=plant, seed=seed, step=30.0, completed=np.zeros(steps + 1),
-             accumulation=np.full((steps + 1, regions, regions), 10.0), backlog=np.ones((steps + 1, regions, regions)),
-             perimeter=np.zeros((steps, regions, regions)), splits=np.zeros((steps, regions, regions, regions)))
-        for plant in plants for controller in controllers for seed in seeds]
+        made(
+            controller=controller,
+            plant=plant,
+            seed=seed,
+            step=30.0,
+            completed=np.zeros(steps + 1),
+            accumulation=np.full((steps + 1, regions, regions), 10.0),
+            backlog=np.ones((steps + 1, regions, regions)),
+            perimeter=np.zeros((steps, regions, regions)),
+            splits=np.zeros((steps, regions, regions, regions)),
+        )
+        for plant in plants
+        for controller in controllers
+        for seed in seeds
+    ]
 
 
 def test_every_controller_has_its_own_colour():
@@ -111,7 +122,8 @@ def test_region_map_names_every_region(ax, scenario):
 def test_the_legend_fits_the_figure(scenario, width):
     drawing = plots.figure(width, 4)
     ax = plots.region_accumulation(
-        drawing.subplots(), scenario.network, 3, runs_of(scenario, controllers=registry.names()))
+        drawing.subplots(), scenario.network, 3, runs_of(scenario, controllers=registry.names())
+    )
     plots.legend_below(drawing, [ax], columns=8)
     assert len(drawing.legends) == 1 and len(drawing.legends[0].get_texts()) == len(registry.names()) + 1  # critical
     assert drawing.legends[0].get_window_extent(drawing.canvas.get_renderer()).width <= drawing.bbox.width

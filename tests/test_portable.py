@@ -28,8 +28,9 @@ def without_encoding(source: str) -> list[int]:
                 if name == "TemporaryFile" and not call.args:  # binary
                     continue
                 method = name == "open" and isinstance(call.func, ast.Attribute)  # of a path: the mode comes first
-                words = call.args[not method and name != "TemporaryFile":] + [
-                    keyword.value for keyword in call.keywords if keyword.arg == "mode"]
+                words = call.args[not method and name != "TemporaryFile" :] + [
+                    keyword.value for keyword in call.keywords if keyword.arg == "mode"
+                ]
                 mode = words[0] if words else ast.Constant("r")
                 if isinstance(mode, ast.Constant) and isinstance(mode.value, str) and "b" not in mode.value:
                     found.append(call.lineno)
@@ -43,16 +44,25 @@ def test_what_is_looked_for():
 
 @pytest.mark.parametrize("package", ["nmfd", "cosim"])
 def test_every_text_has_an_encoding(package):
-    found = {str(file): lines for file in (ROOT / package).rglob("*.py")
-             if (lines := without_encoding(file.read_text(encoding="utf-8")))}
+    found = {
+        str(file): lines
+        for file in (ROOT / package).rglob("*.py")
+        if (lines := without_encoding(file.read_text(encoding="utf-8")))
+    }
     assert not found
 
 
 def test_every_system_takes_the_names_of_all_files():
     names = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout.decode()
     paths = [name for name in names.split("\0") if name]
-    bad = [path for path in paths if re.search(r'[<>:"|?*\\]', path) or not path.isascii() or len(path) > 120 or any(
-        RESERVED.fullmatch(part) for part in path.split("/"))]
+    bad = [
+        path
+        for path in paths
+        if re.search(r'[<>:"|?*\\]', path)
+        or not path.isascii()
+        or len(path) > 120
+        or any(RESERVED.fullmatch(part) for part in path.split("/"))
+    ]
     assert paths and not bad
     assert len({path.lower() for path in paths}) == len(paths), "names that differ in case only"
 

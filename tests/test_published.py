@@ -24,7 +24,7 @@ from nmfd.studies import bound
 from nmfd.types import Observation
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
-INITIAL = '\n[[initial]]\nregion = 0\nto = 1\nvehicles = 100.0\n\n[[initial]]\nregion = 1\nto = 1\nvehicles = 50.0\n'
+INITIAL = "\n[[initial]]\nregion = 0\nto = 1\nvehicles = 100.0\n\n[[initial]]\nregion = 1\nto = 1\nvehicles = 50.0\n"
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +40,9 @@ def begun(tmp_path):
 
 def seen(inside):
     """A measurement with so many vehicles in every region."""
-    return Observation(step=0, time=0.0, accumulation=np.diag(np.array(inside, dtype=float)),
-                       backlog=np.zeros((len(inside),) * 2))
+    return Observation(
+        step=0, time=0.0, accumulation=np.diag(np.array(inside, dtype=float)), backlog=np.zeros((len(inside),) * 2)
+    )
 
 
 def test_the_curve_of_2013():
@@ -53,9 +54,16 @@ def test_the_curve_of_2013():
         assert mfd.critical == pytest.approx(3400.0, abs=10.0) and mfd.capacity == pytest.approx(6.3, abs=0.05)
 
 
-@pytest.mark.parametrize("inside, u12, u21", [
-    ((3000, 2000), 0.9, 0.9), ((3000, 4000), 0.1, 0.9), ((4000, 3000), 0.9, 0.1), ((5400, 4000), 0.9, 0.1),
-    ((4000, 5400), 0.1, 0.9)])
+@pytest.mark.parametrize(
+    "inside, u12, u21",
+    [
+        ((3000, 2000), 0.9, 0.9),
+        ((3000, 4000), 0.1, 0.9),
+        ((4000, 3000), 0.9, 0.1),
+        ((5400, 4000), 0.9, 0.1),
+        ((4000, 5400), 0.1, 0.9),
+    ],
+)
 def test_greedy_decides_by_table_1(two_regions, inside, u12, u21):
     controls = registry.make("greedy", two_regions).act(seen(inside))
     np.testing.assert_array_equal(controls.perimeter, [[0.0, u12], [u21, 0.0]])
@@ -156,17 +164,25 @@ def test_policies_are_trained_and_bounds_sought_from_the_same_start(begun):
     np.testing.assert_array_equal(x[2], quiet.initial)
     gates, splits = bound.neutral_starts(quiet.network, quiet.steps, guidance=False)["open"]
     (total,) = bound._total_time_spent(
-        quiet, dynamics.parameters(quiet.network), torch.from_numpy(quiet.demand), torch.tensor(gates).unsqueeze(1),
-        torch.tensor(splits).unsqueeze(1))
+        quiet,
+        dynamics.parameters(quiet.network),
+        torch.from_numpy(quiet.demand),
+        torch.tensor(gates).unsqueeze(1),
+        torch.tensor(splits).unsqueeze(1),
+    )
     uncontrolled = total_time_spent(run(NmfdPlant(quiet), registry.make("no-control", quiet), quiet, seed=0))
     assert float(total) == pytest.approx(uncontrolled, rel=1e-12)
     assert registry.make("mpc-pc", quiet).act(seen([100.0, 50.0])).note == ""
 
 
-@pytest.mark.parametrize("change, problem", [
-    (("region = 1", "region = 2"), r"initial\[1\]\.region: region 2 is unknown"),
-    (("vehicles = 50.0", "vehicles = -1.0"), r"initial\[1\]\.vehicles: expected a number"),
-    (("vehicles = 50.0", ""), r"initial\[1\]\.vehicles: missing")])
+@pytest.mark.parametrize(
+    "change, problem",
+    [
+        (("region = 1", "region = 2"), r"initial\[1\]\.region: region 2 is unknown"),
+        (("vehicles = 50.0", "vehicles = -1.0"), r"initial\[1\]\.vehicles: expected a number"),
+        (("vehicles = 50.0", ""), r"initial\[1\]\.vehicles: missing"),
+    ],
+)
 def test_wrong_initial_vehicles(tmp_path, change, problem):
     with pytest.raises(InputError, match=problem):
         load_scenario(tiny.write(tmp_path, scenario=tiny.SCENARIO + INITIAL.replace(*change)))

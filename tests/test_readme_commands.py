@@ -10,36 +10,63 @@ from documents import FILES, NOTEBOOKS, ROOT, read
 
 STEPS = ["--steps", 2]
 REDUCED = {  # what is added; of an option that is there already the last counts. The city is tiny_city
-    "nmfd benchmark": ["--seeds", 1], "nmfd train": ["--steps", 1, "--no-compile", "--anyway"], "nmfd show": [],
-    "nmfd new-controller": [], "nmfd export": [],
-    "cosim run": STEPS, "cosim compare": [], "cosim report": [],
+    "nmfd benchmark": ["--seeds", 1],
+    "nmfd train": ["--steps", 1, "--no-compile", "--anyway"],
+    "nmfd show": [],
+    "nmfd new-controller": [],
+    "nmfd export": [],
+    "cosim run": STEPS,
+    "cosim compare": [],
+    "cosim report": [],
     "cosim evaluate": [*STEPS, "--seeds", 1, "--demand", 1],
     "cosim sweep": ["--steps", 1, "--seeds", 1, "--compliance", 100],
     "cosim import": ["--regions", 3, "--no-run", "--method", "geometric"],
-    "cosim identify": ["--levels", 6, "--seeds", 1, "--own", "--iterations", 10], "cosim list": [], "nmfd list": []}
+    "cosim identify": ["--levels", 6, "--seeds", 1, "--own", "--iterations", 10],
+    "cosim list": [],
+    "nmfd list": [],
+}
 NOT_RUN = {  # what takes long or needs more, and where it is tested
-    "cosim watch": "test_watch.py", "cosim video": "test_video.py", "cosim tune": "test_tuning.py",
-    "cosim improve": "test_improve.py", "cosim frontier": "test_tuning.py",
-    "cosim bound": "test_schedules.py", "nmfd bound": "test_bound.py",
-    "nmfd value": "test_terminal.py", "nmfd robustness": "test_robustness.py", "nmfd scaling": "test_scaling.py",
-    "nmfd ablation": "test_ablation.py", "nmfd adaptation": "test_adaptation.py", "cosim compete": "test_compete.py",
-    "cosim verify": "test_compete.py", "cosim get": "test_get.py", "cosim demo": "test_demo.py",
-    "nmfd identify": "test_measured.py"}
+    "cosim watch": "test_watch.py",
+    "cosim video": "test_video.py",
+    "cosim tune": "test_tuning.py",
+    "cosim improve": "test_improve.py",
+    "cosim frontier": "test_tuning.py",
+    "cosim bound": "test_schedules.py",
+    "nmfd bound": "test_bound.py",
+    "nmfd value": "test_terminal.py",
+    "nmfd robustness": "test_robustness.py",
+    "nmfd scaling": "test_scaling.py",
+    "nmfd ablation": "test_ablation.py",
+    "nmfd adaptation": "test_adaptation.py",
+    "cosim compete": "test_compete.py",
+    "cosim verify": "test_compete.py",
+    "cosim get": "test_get.py",
+    "cosim demo": "test_demo.py",
+    "nmfd identify": "test_measured.py",
+}
 LONG = ("scenarios/grid7_peak", "networks/grid7", "scenarios/demo")  # whose loading runs and training take minutes
-DESCRIBED = {"scenarios/r100": """base = "../grid7_peak"
+DESCRIBED = {
+    "scenarios/r100": """base = "../grid7_peak"
 [controllers."dpc-pc+rerouting-100"]
 model = "../../networks/grid7_rerouting"
-"""}  # of a user's own, as the text says that it is
+"""
+}  # of a user's own, as the text says that it is
 FIRST = ["README.md", "nmfd/README.md", "cosim/README.md"]  # with every controller that they name
-HERE = [str(file.relative_to(ROOT).as_posix()) for file in FILES if file not in NOTEBOOKS and any(
-    words[0] in MAINS and "..." not in words and " ".join(words[:2]) not in NOT_RUN for words in read(file).commands)]
+HERE = [
+    str(file.relative_to(ROOT).as_posix())
+    for file in FILES
+    if file not in NOTEBOOKS
+    and any(
+        words[0] in MAINS and "..." not in words and " ".join(words[:2]) not in NOT_RUN for words in read(file).commands
+    )
+]
 
 
 def reduced(name: str, kind: str, words: list[str]) -> list[str]:
     """Of lists of controllers the first two, and what REDUCED has."""
     if "--controllers" in words and name not in FIRST:
         at = words.index("--controllers") + 1
-        words = [*words[:at], ",".join(words[at].split(",")[:2]), *words[at + 1:]]
+        words = [*words[:at], ",".join(words[at].split(",")[:2]), *words[at + 1 :]]
     return [*words, *map(str, REDUCED[kind])]
 
 
@@ -62,8 +89,11 @@ def instead(words: list[str]) -> list[str]:
 def test_the_commands_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for folder in ("networks", "scenarios"):
-        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns(
-            "reference", "tutorials", "build", "*.md", "ppo.*"))
+        shutil.copytree(
+            ROOT / folder,
+            tmp_path / folder,
+            ignore=shutil.ignore_patterns("reference", "tutorials", "build", "*.md", "ppo.*"),
+        )
     tiny_city.city(tmp_path)  # city.sumocfg
     done, ran = set(), 0
     for program, command, *words in (words for words in read(ROOT / name).commands if words[0] in MAINS):

@@ -27,9 +27,18 @@ def run(network, load, u):
     state[6:] = np.diag(load * critical)
     perimeter = np.broadcast_to(np.where(network.adjacency, u, 0.0), (10, count, count))
     return trajectories.made(
-        controller="x", plant="sumo", seed=0, step=90.0, accumulation=state, backlog=np.zeros_like(state),
-        completed=np.zeros(11), perimeter=perimeter, splits=np.zeros((10, count, count, count)),
-        decision_time=np.zeros(10), wall_time=1.0)
+        controller="x",
+        plant="sumo",
+        seed=0,
+        step=90.0,
+        accumulation=state,
+        backlog=np.zeros_like(state),
+        completed=np.zeros(11),
+        perimeter=perimeter,
+        splits=np.zeros((10, count, count, count)),
+        decision_time=np.zeros(10),
+        wall_time=1.0,
+    )
 
 
 def record(network, started, came, guided=0.0):
@@ -37,29 +46,50 @@ def record(network, started, came, guided=0.0):
     count = network.regions
     crossings = np.zeros((1, count, count, count))
     crossings[0, ..., 0] = np.where(network.adjacency, came / np.maximum(network.adjacency.sum(axis=0), 1), 0.0)
-    return {"departures": np.full((1, count, count), started / count), "crossings": crossings,
-            "guided": np.array([guided])}
+    return {
+        "departures": np.full((1, count, count), started / count),
+        "crossings": crossings,
+        "guided": np.array([guided]),
+    }
 
 
 def table(percent, full=0.01):
-    rows = [{"demand": 1.0, "controller": name, "seed": 2000 + n, "total_time_spent_veh_s": tts,
-             "gateway_full_share": share}
-            for name, values, share in (("no-control", [100.0, 110.0, 105.0], 0.01), ("pi-gating", percent, full))
-            for n, tts in enumerate(values)]
+    rows = [
+        {
+            "demand": 1.0,
+            "controller": name,
+            "seed": 2000 + n,
+            "total_time_spent_veh_s": tts,
+            "gateway_full_share": share,
+        }
+        for name, values, share in (("no-control", [100.0, 110.0, 105.0], 0.01), ("pi-gating", percent, full))
+        for n, tts in enumerate(values)
+    ]
     return pd.DataFrame(rows)
 
 
 BETTER, WORSE, ALIKE = [80.0, 88.0, 84.1], [120.0, 132.0, 126.1], [101.0, 108.0, 105.0]
 
 
-@pytest.mark.parametrize("values, most, leaking, u, started, full, expected", [
-    (BETTER, 2.0, 0.0, 0.3, 1, 0.01, "gains (-20.0 % in total time spent ± 0.1 over 3 seeds); it held back in 100 %"),
-    (ALIKE, 0.5, 0.0, 0.9, 1, 0.01, "no region is ever critical"),
-    (ALIKE, 2.0, 0.8, 0.3, 1, 0.01, "no control authority at the boundaries, 80 % of the flow"),
-    (ALIKE, 2.0, 0.0, 0.9, 1, 0.01, "it never held back and never guided"),
-    (WORSE, 2.0, 0.0, 0.3, 900, 0.01, "starts there, where no gateway holds it back"),
-    (WORSE, 2.0, 0.0, 0.3, 1, 0.20, "fill the streets before the gateways (20 % of the time, 1 % without"),
-])
+@pytest.mark.parametrize(
+    "values, most, leaking, u, started, full, expected",
+    [
+        (
+            BETTER,
+            2.0,
+            0.0,
+            0.3,
+            1,
+            0.01,
+            "gains (-20.0 % in total time spent ± 0.1 over 3 seeds); it held back in 100 %",
+        ),
+        (ALIKE, 0.5, 0.0, 0.9, 1, 0.01, "no region is ever critical"),
+        (ALIKE, 2.0, 0.8, 0.3, 1, 0.01, "no control authority at the boundaries, 80 % of the flow"),
+        (ALIKE, 2.0, 0.0, 0.9, 1, 0.01, "it never held back and never guided"),
+        (WORSE, 2.0, 0.0, 0.3, 900, 0.01, "starts there, where no gateway holds it back"),
+        (WORSE, 2.0, 0.0, 0.3, 1, 0.20, "fill the streets before the gateways (20 % of the time, 1 % without"),
+    ],
+)
 def test_known_reasons(network, values, most, leaking, u, started, full, expected):
     rows = table(values, full)
     found = explain.load(network, [run(network, most, 0.9)], [record(network, started, 100)])
@@ -88,12 +118,15 @@ def test_load_and_deeds_are_counted(network):
     trips = 6 * network.regions
     assert done.waited == pytest.approx(10.0 * 180.0 / trips)
     assert str(done) == (
-        f"it held back in 50 % of its commands and its trips waited {1800 / trips:.0f} s before they began")
+        f"it held back in 50 % of its commands and its trips waited {1800 / trips:.0f} s before they began"
+    )
     assert explain.deeds(network, waiting, [record(network, 6, 1)] * 2).waited == 0.0
 
 
-@pytest.mark.parametrize("city, name, waits", [
-    ({}, "pi-gating", False), ({"metering": True}, "pi-gating", True), ({}, "pi-gating+metering", True)])
+@pytest.mark.parametrize(
+    "city, name, waits",
+    [({}, "pi-gating", False), ({"metering": True}, "pi-gating", True), ({}, "pi-gating+metering", True)],
+)
 def test_trips_can_wait_by_the_strategy_or_everywhere_in_a_city(tmp_path, city, name, waits):
     sumo = {"configuration": {"sumo": city}, "controllers": {}, "sessions": []}
     (tmp_path / "manifest.json").write_text(json.dumps(sumo), encoding="utf-8")
@@ -109,8 +142,14 @@ def test_nothing_to_compare_with(network):
 
 def test_why_max_pressure_costs_time(network):
     """A sentence with the numbers, in the evaluation and beside the table of a run; none where it gains."""
-    facts = {"signal_lanes": 33, "split_lanes": 19, "never_whole_lanes": 2, "intergreen_share": 0.3,
-             "programmed_intergreen_share": 0.1, "signals_left_alone": 4}
+    facts = {
+        "signal_lanes": 33,
+        "split_lanes": 19,
+        "never_whole_lanes": 2,
+        "intergreen_share": 0.3,
+        "programmed_intergreen_share": 0.1,
+        "signals_left_alone": 4,
+    }
     rows = table(WORSE).replace("pi-gating", "max-pressure")
     for key, value in facts.items():
         rows[key] = np.where(rows["controller"] == "max-pressure", value, np.nan)

@@ -20,8 +20,11 @@ def test_the_committed_pages_and_schemas_are_up_to_date():
     assert not stale, f"{stale}: write them anew with: cosim reference"
 
 
-@pytest.mark.parametrize("file", [*ROOT.glob("scenarios/*/scenario.toml"), *ROOT.glob("networks/*/network.toml")],
-                         ids=lambda file: file.parent.name)
+@pytest.mark.parametrize(
+    "file",
+    [*ROOT.glob("scenarios/*/scenario.toml"), *ROOT.glob("networks/*/network.toml")],
+    ids=lambda file: file.parent.name,
+)
 def test_every_committed_file_names_its_schema_and_has_only_keys_of_it(file):
     line, _ = file.read_text().split("\n", 1)
     root = json.loads((file.parent / line.removeprefix("#:schema ")).read_text())

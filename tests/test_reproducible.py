@@ -25,8 +25,11 @@ def here(program, *arguments):
 def elsewhere(program, *arguments):
     """In a process of its own, with another order of sets and dictionaries."""
     subprocess.run(
-        [sys.executable, "-m", program, *map(str, arguments)], check=True, stdout=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONHASHSEED": "77", "PYTHONPATH": str(ROOT)})
+        [sys.executable, "-m", program, *map(str, arguments)],
+        check=True,
+        stdout=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONHASHSEED": "77", "PYTHONPATH": str(ROOT)},
+    )
 
 
 def arrays(folder: Path) -> dict[str, bytes]:
@@ -52,8 +55,18 @@ def test_trainings(tmp_path):
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
     folder = tmp_path_factory.mktemp("city")
-    here("cosim", "import", tiny_city.city(folder), "--regions", 3, "--no-run", "--method", "geometric", "--out",
-         folder / "networks" / "tiny")
+    here(
+        "cosim",
+        "import",
+        tiny_city.city(folder),
+        "--regions",
+        3,
+        "--no-run",
+        "--method",
+        "geometric",
+        "--out",
+        folder / "networks" / "tiny",
+    )
     return folder / "scenarios" / "tiny"
 
 
@@ -63,6 +76,19 @@ def test_runs_in_sumo_and_workers(city, tmp_path):
     names = ("route-guidance+rerouting-50", "probing-pcrg")
     for name in names:
         here("cosim", "run", city, "--controller", name, "--seed", 5, "--steps", 3, "--out", tmp_path / "a")
-    here("cosim", "run", city, "--controller", names[0], "--against", names[1], "--seed", 5, "--steps", 3, "--out",
-         tmp_path / "b")
+    here(
+        "cosim",
+        "run",
+        city,
+        "--controller",
+        names[0],
+        "--against",
+        names[1],
+        "--seed",
+        5,
+        "--steps",
+        3,
+        "--out",
+        tmp_path / "b",
+    )
     assert arrays(tmp_path / "a") == arrays(tmp_path / "b") and len(arrays(tmp_path / "a")) == 2

@@ -35,8 +35,18 @@ def imported(folder, name, *options, signals):
     tiny_city.network(folder, *signals)
     (folder / "cars.rou.xml").write_text(CARS)
     (folder / "city.sumocfg").write_text(CONFIG)
-    done = cosim("import", folder / "city.sumocfg", "--regions", 2, "--method", "geometric", "--no-run", "--out",
-                 folder / "networks" / name, *options)
+    done = cosim(
+        "import",
+        folder / "city.sumocfg",
+        "--regions",
+        2,
+        "--method",
+        "geometric",
+        "--no-run",
+        "--out",
+        folder / "networks" / name,
+        *options,
+    )
     assert done.exit_code == 0, done.output + str(done.exception)
     return folder / "scenarios" / name
 
@@ -45,8 +55,10 @@ def imported(folder, name, *options, signals):
 def town(request, tmp_path_factory):
     """The kind of all signals, and the scenario."""
     return request.param, imported(
-        tmp_path_factory.mktemp("town") / request.param, "town",
-        signals=("--tls.set", "B1,B2,C1,C2", "--tls.default-type", request.param))
+        tmp_path_factory.mktemp("town") / request.param,
+        "town",
+        signals=("--tls.set", "B1,B2,C1,C2", "--tls.default-type", request.param),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -74,8 +86,13 @@ def drive(folder, gates, faults=(), **overrides):
         for gate in gates:
             plant.step(Controls(perimeter=np.where(scenario.network.adjacency, gate, 0.0), splits=None))
         return SimpleNamespace(
-            shown=shown, plans=plans, record=plant.record(), leaks=plant.leaks(), gateways=plant.city.gateways,
-            programmes={name: session.programme_id(name) for name in plans})
+            shown=shown,
+            plans=plans,
+            record=plant.record(),
+            leaks=plant.leaks(),
+            gateways=plant.city.gateways,
+            programmes={name: session.programme_id(name) for name in plans},
+        )
     finally:
         plant.close()
 
@@ -126,8 +143,11 @@ def test_rationed_under_max_pressure(town, signals, opened):
 def test_a_deaf_signal_runs_its_own_programme_and_can_be_held_again(town):
     """Green to red by way of yellow all the time."""
     run = drive(town[1], [0.1, 0.1, 0.1], faults=("signal:B2@1-2",))
-    assert not any(a in "Gg" and b == "r" for before, after in pairwise(run.shown["B2"])
-                   for a, b in zip(before, after, strict=True))
+    assert not any(
+        a in "Gg" and b == "r"
+        for before, after in pairwise(run.shown["B2"])
+        for a, b in zip(before, after, strict=True)
+    )
     green = run.record.gateway_green[:, [n for n, g in enumerate(run.gateways) if g.signal == "B2"]]
     held = ~np.isnan(green[0])
     assert (green[[0, 2]][:, held] <= MIN_GREEN + 1.0).all() and (green[1, held] > 2 * MIN_GREEN).all()
@@ -138,26 +158,33 @@ def places(tmp_path_factory):
     """Scenarios: a city in SUMO's queue model, and one without any signal."""
     folder, made = tmp_path_factory.mktemp("places"), {}
     for name, signals, options in (
-            ("queues", ("--tls.set", "B1,B2"), ("--mesoscopic",)),
-            ("bare", ("--default-junction-type", "priority"), ())):
+        ("queues", ("--tls.set", "B1,B2"), ("--mesoscopic",)),
+        ("bare", ("--default-junction-type", "priority"), ()),
+    ):
         made[name] = imported(folder / name, name, *options, signals=signals)
     return made
 
 
-@pytest.mark.parametrize("command, name, city, said", [
-    ("run", "max-pressure", "queues", "max-pressure counts vehicles lane by lane"),
-    ("sweep", "pi-gating+max-pressure-cyclic", "queues", "max-pressure-cyclic counts vehicles lane by lane"),
-    ("evaluate", "route-guidance+estimate", "queues", "needs loop detectors on lanes"),
-    ("evaluate", "mine.py:Mine+max-pressure", "queues", "counts vehicles lane by lane"),
-    ("run", "webster", "bare", "webster needs fixed-time signals"),
-    ("evaluate", "pi-gating+max-pressure", "bare", "max-pressure needs signals")])
-def test_what_cannot_run_here_is_refused_before_the_first_run(
-        places, tmp_path, monkeypatch, command, name, city, said):
+@pytest.mark.parametrize(
+    "command, name, city, said",
+    [
+        ("run", "max-pressure", "queues", "max-pressure counts vehicles lane by lane"),
+        ("sweep", "pi-gating+max-pressure-cyclic", "queues", "max-pressure-cyclic counts vehicles lane by lane"),
+        ("evaluate", "route-guidance+estimate", "queues", "needs loop detectors on lanes"),
+        ("evaluate", "mine.py:Mine+max-pressure", "queues", "counts vehicles lane by lane"),
+        ("run", "webster", "bare", "webster needs fixed-time signals"),
+        ("evaluate", "pi-gating+max-pressure", "bare", "max-pressure needs signals"),
+    ],
+)
+def test_what_cannot_run_here_is_refused_before_the_first_run(places, tmp_path, monkeypatch, command, name, city, said):
     """One line that names it, though another strategy comes first; nothing is written."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(tiny.CONTROLLER)
-    names = ("--controller", "no-control", "--against", name) if command == "run" else (
-        "--controllers", f"no-control,{name}")
+    names = (
+        ("--controller", "no-control", "--against", name)
+        if command == "run"
+        else ("--controllers", f"no-control,{name}")
+    )
     done = cosim(command, places[city], *names, "--steps", 1, "--out", "out")
     assert done.exit_code != 0 and len(done.stderr.strip().splitlines()) == 1, done.stderr
     assert f"controller {name} cannot run here: " in done.stderr and said in done.stderr

@@ -75,28 +75,49 @@ def test_training_noise_is_that_of_the_evaluation(scenario):
 
 def command(folder, out, *more):
     return [
-        "robustness", folder, "--controllers", "pi-gating", "--sigmas", "0,1", "--scenarios", 2, "--out", out, *more]
+        "robustness",
+        folder,
+        "--controllers",
+        "pi-gating",
+        "--sigmas",
+        "0,1",
+        "--scenarios",
+        2,
+        "--out",
+        out,
+        *more,
+    ]
 
 
 def test_command_writes_rows_figure_and_manifest(folder, tmp_path):
     result = nmfd(*command(folder, tmp_path / "out"))
     assert result.exit_code == 0, result.stderr
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "robustness.csv", "robustness.png", "manifest.json"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"robustness.csv", "robustness.png", "manifest.json"}
     rows = robustness.read(tmp_path / "out" / "robustness.csv")
     assert [tuple(row.values())[:3] for row in rows] == [
-        (sigma, number, name) for sigma in (0.0, 1.0) for number in (0, 1) for name in ("no-control", "pi-gating")]
+        (sigma, number, name) for sigma in (0.0, 1.0) for number in (0, 1) for name in ("no-control", "pi-gating")
+    ]
     assert rows[0]["trips_veh"] == pytest.approx(360.0) and rows[-1]["trips_veh"] > 400.0
     assert "pi-gating" in result.stdout and "±" in result.stdout
 
 
 def test_improvement_is_over_no_control_in_the_same_scenario():
     rows = [
-        {"sigma_veh_per_s": 1.0, "scenario": number, "controller": name, "trips_veh": 1.0,
-         "total_time_spent_veh_s": total}
+        {
+            "sigma_veh_per_s": 1.0,
+            "scenario": number,
+            "controller": name,
+            "trips_veh": 1.0,
+            "total_time_spent_veh_s": total,
+        }
         for number, name, total in (
-            (0, "no-control", 100.0), (0, "pi-gating", 50.0), (1, "no-control", 1000.0), (1, "pi-gating", 700.0),
-            (2, "pi-gating", 1.0))]
+            (0, "no-control", 100.0),
+            (0, "pi-gating", 50.0),
+            (1, "no-control", 1000.0),
+            (1, "pi-gating", 700.0),
+            (2, "pi-gating", 1.0),
+        )
+    ]
     mean, half = robustness.improvements(rows, "pi-gating")[1.0]
     assert mean == pytest.approx(40.0) and half == pytest.approx(12.706 * 10.0, rel=1e-3)
 
@@ -160,7 +181,8 @@ def guard(scenario, spread=0.1):
 def at(scenario, value, step=0):
     critical = scenario.network.mfds[0].critical
     return Observation(
-        step=step, time=30.0 * step, accumulation=np.full((2, 2), value * critical), backlog=np.zeros((2, 2)))
+        step=step, time=30.0 * step, accumulation=np.full((2, 2), value * critical), backlog=np.zeros((2, 2))
+    )
 
 
 def test_the_guard_takes_over_outside_and_hands_back_inside(scenario, monkeypatch):
@@ -212,9 +234,15 @@ def foreseen(policy, gates):
     return fallback.Foreseen(policy=policy * ahead, gates=gates * ahead, none=gates * ahead)
 
 
-@pytest.mark.parametrize(("with_them", "without", "kept"), [
-    pytest.param(1.0, 1.0, True, id="as foreseen"), pytest.param(1.2, 1.0, False, id="worse than foreseen"),
-    pytest.param(1.2, 1.2, True, id="model wrong either way"), pytest.param(1.05, 1.0, True, id="half the gain")])
+@pytest.mark.parametrize(
+    ("with_them", "without", "kept"),
+    [
+        pytest.param(1.0, 1.0, True, id="as foreseen"),
+        pytest.param(1.2, 1.0, False, id="worse than foreseen"),
+        pytest.param(1.2, 1.2, True, id="model wrong either way"),
+        pytest.param(1.05, 1.0, True, id="half the gain"),
+    ],
+)
 def test_split_ratios_stay_while_they_pay(with_them, without, kept):
     """Foreseen: 90 vehicles instead of 100, after a time when more were expected with them, so that both are seen.
     Measured: so many times what was foreseen, with them and without."""
@@ -250,7 +278,8 @@ def test_split_ratios_that_cost_time_are_left_to_the_drivers():
     watched = fallback.Guarded(astray, fallback.statistics(states), planning_model(benchmark))
     alone, kept, guided = (
         total_time_spent(closed_loop.run(NmfdPlant(benchmark), controller, benchmark, seed=0))
-        for controller in (dpc.DpcController(astray), watched, registry.make("route-guidance", benchmark)))
+        for controller in (dpc.DpcController(astray), watched, registry.make("route-guidance", benchmark))
+    )
     assert alone > 1.05 * guided and kept < 1.01 * guided
 
 
@@ -266,8 +295,16 @@ def test_the_guard_reads_the_statistics_of_a_trained_policy(folder, scenario, tm
     controller = registry.make("dpc-pc-guarded", scenario, policy=file)
     assert controller.name == "dpc-pc-guarded" and controller.distance(at(scenario, 0.0).accumulation) < 1.0
     torch.save(checkpoint(Policy(scenario.network, Architecture(width=4)), scenario.network, {}), tmp_path / "old.pt")
-    result = nmfd("benchmark", folder, "--controllers", "dpc-pc-guarded", "--policy",
-                  f"dpc-pc-guarded={tmp_path / 'old.pt'}", "--out", tmp_path / "out")
+    result = nmfd(
+        "benchmark",
+        folder,
+        "--controllers",
+        "dpc-pc-guarded",
+        "--policy",
+        f"dpc-pc-guarded={tmp_path / 'old.pt'}",
+        "--out",
+        tmp_path / "out",
+    )
     assert result.exit_code == 2 and "holds no statistics of its training states" in result.stderr
 
 

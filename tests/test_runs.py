@@ -62,7 +62,14 @@ def test_xarray_opens_a_run_with_names_and_units(tmp_path):
     run_folder.write_trajectory(tmp_path / "a.nc", original, quantities.variables(Record, record))
     with xr.open_dataset(tmp_path / "a.nc") as data:
         assert dict(data.sizes) == {
-            "time": 5, "interval": 4, "region": 2, "destination": 2, "next_region": 2, "gateway": 3, "edge": 5}
+            "time": 5,
+            "interval": 4,
+            "region": 2,
+            "destination": 2,
+            "next_region": 2,
+            "gateway": 3,
+            "edge": 5,
+        }
         assert data.attrs == {"controller": "no-control", "plant": "nmfd", "seed": 0, "step": 30.0, "estimated": 1}
         assert set(data.data_vars) == {*quantities.quantities(Trajectory), *record} - {"decision_time"}
         for name, values in data.variables.items():
@@ -80,9 +87,13 @@ def test_xarray_opens_a_run_with_names_and_units(tmp_path):
 
 @pytest.mark.parametrize("page, kind", [("nmfd/runs/README.md", Trajectory), ("cosim/plant/record.md", Record)])
 def test_the_pages_list_what_is_in_a_file(page, kind):
-    table = markdown_table(("variable", "dimensions", "unit", "what"), (
-        (name, ", ".join(about["dimensions"]), about["attributes"].get("units", ""), about["text"])
-        for name, about in quantities.quantities(kind).items()))
+    table = markdown_table(
+        ("variable", "dimensions", "unit", "what"),
+        (
+            (name, ", ".join(about["dimensions"]), about["attributes"].get("units", ""), about["text"])
+            for name, about in quantities.quantities(kind).items()
+        ),
+    )
     assert table in (ROOT / page).read_text()
 
 
@@ -90,25 +101,46 @@ def test_the_tables_of_a_run_row_by_row():
     run = trajectory()
     states, controls = run.to_frame(), run.controls_frame()
     assert list(states.columns) == [
-        "controller", "plant", "seed", "time_s", "region", "destination", "accumulation_veh", "backlog_veh"]
+        "controller",
+        "plant",
+        "seed",
+        "time_s",
+        "region",
+        "destination",
+        "accumulation_veh",
+        "backlog_veh",
+    ]
     assert list(controls.columns) == ["controller", "plant", "seed", "time_s", "region", "next_region", "perimeter"]
     for n, (k, i, j) in enumerate(np.ndindex(5, 2, 2)):
         assert tuple(states.loc[n]) == ("no-control", "nmfd", 0, 30.0 * k, i, j, run.accumulation[k, i, j], 0.0)
     assert (controls["perimeter"] == run.perimeter.ravel()).all() and controls["time_s"].max() == 90.0
 
 
-@pytest.mark.parametrize("plant, command", [
-    ("nmfd", "nmfd benchmark scenarios/x, with no-control, pi-gating"),
-    ("sumo", "cosim run, evaluate or sweep scenarios/x, with no-control, pi-gating"),
-    (None, "the command that made it")])
+@pytest.mark.parametrize(
+    "plant, command",
+    [
+        ("nmfd", "nmfd benchmark scenarios/x, with no-control, pi-gating"),
+        ("sumo", "cosim run, evaluate or sweep scenarios/x, with no-control, pi-gating"),
+        (None, "the command that made it"),
+    ],
+)
 def test_a_folder_of_an_older_version_says_what_to_run(tmp_path, plant, command):
     (tmp_path / "no-control-0.npz").write_bytes(b"PK")
     if plant:
-        (tmp_path / "manifest.json").write_text(json.dumps({
-            "configuration": {"plant": plant}, "controllers": {"no-control": {}, "pi-gating": {}},
-            "sessions": [{"scenario_folder": "scenarios/x"}]}))
-    for use in (lambda: run_folder.read_trajectory(tmp_path / "no-control-0.nc"), lambda: opened(tmp_path).__enter__(),
-                lambda: run_folder.read_summary(tmp_path / "summary.csv")):
+        (tmp_path / "manifest.json").write_text(
+            json.dumps(
+                {
+                    "configuration": {"plant": plant},
+                    "controllers": {"no-control": {}, "pi-gating": {}},
+                    "sessions": [{"scenario_folder": "scenarios/x"}],
+                }
+            )
+        )
+    for use in (
+        lambda: run_folder.read_trajectory(tmp_path / "no-control-0.nc"),
+        lambda: opened(tmp_path).__enter__(),
+        lambda: run_folder.read_summary(tmp_path / "summary.csv"),
+    ):
         with pytest.raises(InputError, match=f"older version .*; delete it and run again: {command}$"):
             use()
 
@@ -136,8 +168,14 @@ def test_a_netcdf_file_of_somebody_else(tmp_path):
 
 
 def test_no_module_of_one_system_is_imported_at_the_top_of_a_file():
-    found = [(path.name, name.name) for folder in ("nmfd", "cosim") for path in (ROOT / folder).rglob("*.py")
-             for line in ast.parse(path.read_text()).body if isinstance(line, ast.Import) for name in line.names]
+    found = [
+        (path.name, name.name)
+        for folder in ("nmfd", "cosim")
+        for path in (ROOT / folder).rglob("*.py")
+        for line in ast.parse(path.read_text()).body
+        if isinstance(line, ast.Import)
+        for name in line.names
+    ]
     assert len(found) > 100 and not [pair for pair in found if pair[1] in ("fcntl", "grp", "pwd", "resource")]
 
 
@@ -278,10 +316,16 @@ def half_way(task):
 @pytest.mark.slow
 def test_who_waits_for_workers_sees_how_far_they_are():
     seen, told = [], []
-    tally = Tally(lambda *what: told.append(what), [1, 2], steps=lambda run: 10 * run, label=lambda run: f"run {run}",
-                  at=lambda run, share: f" at {share:.0%}")
-    for task, _ in workers.outcomes(half_way, [1, 2], workers=2, look=lambda running: (
-            seen.append(list(running)), tally.look(running))):
+    tally = Tally(
+        lambda *what: told.append(what),
+        [1, 2],
+        steps=lambda run: 10 * run,
+        label=lambda run: f"run {run}",
+        at=lambda run, share: f" at {share:.0%}",
+    )
+    for task, _ in workers.outcomes(
+        half_way, [1, 2], workers=2, look=lambda running: (seen.append(list(running)), tally.look(running))
+    ):
         tally.end(task, failed=task == 2)
     assert [(1, 0.5), (2, 0.5)] in seen
     assert told[0] == (0, 30, "0/2 runs") and (15, 30, "0/2 runs; run 1 at 50%; run 2 at 50%") in told

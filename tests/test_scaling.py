@@ -57,7 +57,8 @@ def test_cases_are_kept_added_and_drawn(tmp_path):
     assert "mpc-pc" in first.stdout and f"Written to {out}" in first.stdout
     row = files.read_rows(out / "scaling.csv", scaling.COLUMNS)[0]
     second = nmfd(
-        "scaling", "--regions", "3,4", "--controllers", "mpc-pc", "--out", out, "--workers", 2, "--family", "hexagonal")
+        "scaling", "--regions", "3,4", "--controllers", "mpc-pc", "--out", out, "--workers", 2, "--family", "hexagonal"
+    )
     assert second.exit_code == 0, second.output
     rows = files.read_rows(out / "scaling.csv", scaling.COLUMNS)
     assert [(r["family"], r["regions"]) for r in rows] == [("complete", 3), ("hexagonal", 3), ("hexagonal", 4)]
@@ -83,16 +84,24 @@ def test_fresh_processes_and_their_time_limit():
     assert len({results[task] for task in "abc"}) == 3
 
 
-@pytest.mark.parametrize("arguments, fragment", [
-    (["--regions", "1,2"],
-     "'--regions': expected a list of distinct whole numbers from 2 to 1000000, separated by commas, got '1,2'"),
-    (["--regions", "2,2"], "'--regions': expected a list of distinct"), (["--regions", "a"], "'--regions': expected"),
-    (["--controllers", "pi-gating"], "'pi-gating' is not measured; choose from dpc-pc, dpc-pcrg, mpc-pc, mpc-pcrg"),
-    (["--controllers", "x"], "controller 'x' is unknown"),
-    (["--family", "cube"], "expected one of complete, hexagonal, got 'cube'"),
-    (["--load", "none"], "expected one of published, congested, got 'none'"),
-    (["--memory", "0"], "'--memory': expected a number above 0"),
-    (["--workers", "0"], "'--workers'"), (["--out", "/dev/null/x"], "/dev/null/x: Not a directory")])
+@pytest.mark.parametrize(
+    "arguments, fragment",
+    [
+        (
+            ["--regions", "1,2"],
+            "'--regions': expected a list of distinct whole numbers from 2 to 1000000, separated by commas, got '1,2'",
+        ),
+        (["--regions", "2,2"], "'--regions': expected a list of distinct"),
+        (["--regions", "a"], "'--regions': expected"),
+        (["--controllers", "pi-gating"], "'pi-gating' is not measured; choose from dpc-pc, dpc-pcrg, mpc-pc, mpc-pcrg"),
+        (["--controllers", "x"], "controller 'x' is unknown"),
+        (["--family", "cube"], "expected one of complete, hexagonal, got 'cube'"),
+        (["--load", "none"], "expected one of published, congested, got 'none'"),
+        (["--memory", "0"], "'--memory': expected a number above 0"),
+        (["--workers", "0"], "'--workers'"),
+        (["--out", "/dev/null/x"], "/dev/null/x: Not a directory"),
+    ],
+)
 def test_errors_are_one_line(tmp_path, arguments, fragment):
     out = [] if "--out" in arguments else ["--out", tmp_path / "out"]
     result = nmfd("scaling", *arguments, *out)

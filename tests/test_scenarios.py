@@ -48,11 +48,14 @@ def test_a_base_in_another_folder(base):
     assert load_scenario(deeper).network.hash == load_scenario(base).network.hash
 
 
-@pytest.mark.parametrize("text, message", [
-    ('name = "x"\nbase = "../nowhere"\n', "nowhere/scenario.toml: no such file"),
-    ('name = "x"\nbase = "."\n', "base: the scenarios are each other's base"),
-    ('name = "x"\nbase = "../scenario"\ndemand_factor = -1.0\n', "demand_factor: expected a number in"),
-])
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ('name = "x"\nbase = "../nowhere"\n', "nowhere/scenario.toml: no such file"),
+        ('name = "x"\nbase = "."\n', "base: the scenarios are each other's base"),
+        ('name = "x"\nbase = "../scenario"\ndemand_factor = -1.0\n', "demand_factor: expected a number in"),
+    ],
+)
 def test_errors_of_a_base(base, text, message):
     with pytest.raises(InputError, match=message):
         load_scenario(beside(base, text))
@@ -75,10 +78,13 @@ def test_guiding_controllers_find_the_model_of_guided_drivers(base, tmp_path):
     (network / "guided" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 800.0"))
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 700.0"))
-    scenario = load_scenario(beside(
-        base, 'name = "x"\nbase = "../scenario"\n[controllers."dpc-pcrg+max-pressure"]\nmodel = "../model"\n'))
-    jam = {name: planning_model(scenario, name).network.mfds[0].jam for name in (
-        "dpc-pcrg", "mpc-pcrg", "dpc-pcrg-robust", "dpc-pc", "bound-pcrg", "dpc-pcrg+max-pressure")}
+    scenario = load_scenario(
+        beside(base, 'name = "x"\nbase = "../scenario"\n[controllers."dpc-pcrg+max-pressure"]\nmodel = "../model"\n')
+    )
+    jam = {
+        name: planning_model(scenario, name).network.mfds[0].jam
+        for name in ("dpc-pcrg", "mpc-pcrg", "dpc-pcrg-robust", "dpc-pc", "bound-pcrg", "dpc-pcrg+max-pressure")
+    }
     assert list(jam.values()) == [800.0, 800.0, 800.0, 1000.0, 1000.0, 700.0]
     (network / "guided" / "network.toml").write_text(tiny.row_network(3))
     with pytest.raises(InputError, match="guided/network.toml: network .* has other regions"):
@@ -99,7 +105,9 @@ def test_an_inherited_model_lies_where_the_base_says(base, tmp_path):
 def test_a_variant_has_options_model_and_policy_of_its_own(base, tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 800.0"))
-    folder = beside(base, """name = "x"
+    folder = beside(
+        base,
+        """name = "x"
 base = "../scenario"
 [controllers.dpc-pc]
 steps = 3
@@ -108,7 +116,8 @@ layers = 1
 [controllers."dpc-pc+max-pressure"]
 model = "../model"
 width = 16
-""")
+""",
+    )
     scenario = load_scenario(folder)
     chosen = training.settings(scenario, "dpc-pc+max-pressure")
     assert (chosen.steps, chosen.width, chosen.layers) == (3, 16, 1)

@@ -47,13 +47,15 @@ class Fixed:
 
 
 def controls(planning, *, prices=None, metering=None):
-    return Controls(perimeter=np.where(planning.network.adjacency, 0.5, 0.0), splits=None, prices=prices,
-                    metering=metering)
+    return Controls(
+        perimeter=np.where(planning.network.adjacency, 0.5, 0.0), splits=None, prices=prices, metering=metering
+    )
 
 
 def act(controller, step):
-    return controller.act(Observation(step=step, time=90.0 * step, accumulation=np.zeros((7, 7)),
-                                      backlog=np.zeros((7, 7))))
+    return controller.act(
+        Observation(step=step, time=90.0 * step, accumulation=np.zeros((7, 7)), backlog=np.zeros((7, 7)))
+    )
 
 
 def test_gates_into_protected_regions_are_shifted_and_stay_within_their_bounds(planning):
@@ -80,7 +82,8 @@ def test_prices_of_protected_regions_are_raised_and_never_negative(planning):
 def test_rates_are_multiplied_and_what_is_not_commanded_stays_so(planning):
     rates = np.arange(7.0)
     controller = Scheduled(
-        Fixed(controls(planning, metering=rates)), {"entries": (math.log(2.0),), "prices": (1.0,)}, planning)
+        Fixed(controls(planning, metering=rates)), {"entries": (math.log(2.0),), "prices": (1.0,)}, planning
+    )
     now = act(controller, 5)
     assert now.metering == pytest.approx(2.0 * rates) and now.prices is None
     assert act(Scheduled(Fixed(controls(planning)), {"entries": (1.0,)}, planning), 5).metering is None
@@ -98,14 +101,17 @@ def test_a_schedule_of_zeros_is_the_controller_itself(planning):
 
 def test_channels_are_those_that_the_controller_commands(planning):
     scenario = load_scenario(PEAK)
-    found = {name: channels(registry.make(name, scenario), planning_model(scenario, name))
-             for name in (METERED, "dpc-pcrg+max-pressure+guidance-period-60", "pi-gating")}
+    found = {
+        name: channels(registry.make(name, scenario), planning_model(scenario, name))
+        for name in (METERED, "dpc-pcrg+max-pressure+guidance-period-60", "pi-gating")
+    }
     assert found[METERED] == ("gates", "prices", "entries")
     assert found["dpc-pcrg+max-pressure+guidance-period-60"] == ("gates", "prices")
     assert found["pi-gating"] == ("gates",)
     open_city = load_scenario(Path(PEAK.parent, "economic_mpc"))
     assert channels(registry.make("no-control", open_city), planning_model(open_city)) == (
-        ("gates",) if open_city.protected else ())
+        ("gates",) if open_city.protected else ()
+    )
 
 
 @pytest.fixture(scope="module")
@@ -125,10 +131,21 @@ def runs(monkeypatch):
         for task in todo:
             tasks.append(task)
             schedule = dict(task.schedule)
-            away = (np.square(np.add(schedule.get("gates", 0.0), 0.2)).mean()
-                    + np.square(np.subtract(schedule.get("prices", 0.0), 1.0)).mean())
-            yield task, in_city(task, 1e6 * task.demand_factor * (
-                2.0 if task.controller == "max-pressure" else 1.0 + 0.1 * away + task.seed / 1e6), TRIPS, TRIPS)
+            away = (
+                np.square(np.add(schedule.get("gates", 0.0), 0.2)).mean()
+                + np.square(np.subtract(schedule.get("prices", 0.0), 1.0)).mean()
+            )
+            yield (
+                task,
+                in_city(
+                    task,
+                    1e6
+                    * task.demand_factor
+                    * (2.0 if task.controller == "max-pressure" else 1.0 + 0.1 * away + task.seed / 1e6),
+                    TRIPS,
+                    TRIPS,
+                ),
+            )
 
     monkeypatch.setattr(experiment, "outcomes", outcomes)
     return tasks
@@ -153,7 +170,8 @@ def test_every_seed_has_a_search_that_begins_with_the_controller_itself(city, tm
         assert row["room_pct"] == pytest.approx(100.0 * (row["bound_veh_s"] / row["controller_veh_s"] - 1.0))
         saved = [3.2e6 - row[name] for name in ("controller_veh_s", "bound_veh_s")]
         assert row["against_veh_s"] == pytest.approx(3.2e6) and row["used_pct"] == pytest.approx(
-            100.0 * saved[0] / saved[1])
+            100.0 * saved[0] / saved[1]
+        )
         assert row["prices[0]"] == pytest.approx(1.0, abs=0.35) and row["gates[0]"] == pytest.approx(-0.2, abs=0.25)
     kept = pd.read_csv(tmp_path / "out" / "bound.csv")
     pd.testing.assert_frame_equal(kept[list(table.columns)], table, check_exact=False)
@@ -177,12 +195,12 @@ def test_runs_with_another_schedule_are_runs_of_another_controller(city, runs):
     task = Task(scenario=city, controller="pi-gating", seed=1000)
     plain = experiment.shared_configuration([task])
     added = experiment.shared_configuration(
-        [Task(scenario=city, controller="pi-gating", seed=1000, schedule=(("gates", (0.1, 0.2)),))])
+        [Task(scenario=city, controller="pi-gating", seed=1000, schedule=(("gates", (0.1, 0.2)),))]
+    )
     assert plain[0] == added[0] and plain[1] != added[1]
 
 
-@pytest.mark.parametrize(("options", "said"), [
-    ({"knots": 11}, "--knots"), ({"against": "pi-gatin"}, "pi-gatin")])
+@pytest.mark.parametrize(("options", "said"), [({"knots": 11}, "--knots"), ({"against": "pi-gatin"}, "pi-gatin")])
 def test_what_cannot_be_searched_is_said_before_anything_is_run(city, tmp_path, runs, options, said):
     with pytest.raises(InputError, match=said):
         bound.bound(order(city, tmp_path / "out", **options))
@@ -193,6 +211,7 @@ def test_controllers_without_anything_to_add_to_are_refused(city, tmp_path):
     own = tmp_path / "mine.py"
     own.write_text("class Mine: pass\n")
     for controller, said in ((f"{own}:Mine", "of your own"), ("dpc-pcgr", "dpc-pcrg")):
-        answer = CliRunner().invoke(main, [
-            "bound", str(city), "--controller", controller, "--out", str(tmp_path / "out")])
+        answer = CliRunner().invoke(
+            main, ["bound", str(city), "--controller", controller, "--out", str(tmp_path / "out")]
+        )
         assert answer.exit_code and said in answer.output + str(answer.exception) and not (tmp_path / "out").exists()

@@ -29,8 +29,12 @@ ROOT = Path(__file__).parents[1]
 def installed(tmp_path, monkeypatch):
     """As in an installed package: data of its own, far from where the user is."""
     data = tmp_path / "site packages" / "nmfd" / "data"
-    for kind, name in (("scenarios", "economic_mpc"), ("scenarios", "grid7_peak"), ("networks", "hexagon7"), *(
-            ("networks", f"grid7{variant}") for variant in ("", "_guided", "_max_pressure", "_rerouting"))):
+    for kind, name in (
+        ("scenarios", "economic_mpc"),
+        ("scenarios", "grid7_peak"),
+        ("networks", "hexagon7"),
+        *(("networks", f"grid7{variant}") for variant in ("", "_guided", "_max_pressure", "_rerouting")),
+    ):
         shutil.copytree(ROOT / kind / name, data / kind / name, ignore=shutil.ignore_patterns("reference", "build"))
     monkeypatch.setattr(shipped, "_DATA", data)
     monkeypatch.setenv(shipped.CACHE, str(tmp_path / "cache"))
@@ -43,8 +47,11 @@ def installed(tmp_path, monkeypatch):
 
 def test_the_lists_of_packages_are_complete():
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
-    there = {".".join(file.parent.relative_to(ROOT).parts)
-             for name in ("nmfd", "cosim") for file in (ROOT / name).rglob("__init__.py")}
+    there = {
+        ".".join(file.parent.relative_to(ROOT).parts)
+        for name in ("nmfd", "cosim")
+        for file in (ROOT / name).rglob("__init__.py")
+    }
     assert set(listed["packages"]) == there | set(listed["package-dir"])
     assert not (ROOT / "nmfd" / "data").exists(), "the data of a checkout are its folders scenarios and networks"
 
@@ -67,9 +74,15 @@ def test_a_path_goes_before_a_name(installed):
     assert load_scenario("economic_mpc").name == "tiny"
 
 
-@pytest.mark.parametrize("load, name, near", [
-    (load_scenario, "grid7_peek", "grid7_peak"), (load_network, "hexagon", "hexagon7"), (load_scenario, "myne", "mine"),
-], ids=["scenario", "network", "one of one's own"])
+@pytest.mark.parametrize(
+    "load, name, near",
+    [
+        (load_scenario, "grid7_peek", "grid7_peak"),
+        (load_network, "hexagon", "hexagon7"),
+        (load_scenario, "myne", "mine"),
+    ],
+    ids=["scenario", "network", "one of one's own"],
+)
 def test_a_misspelt_name(installed, load, name, near):
     tiny.write(Path())
     Path("scenario").rename("mine")
@@ -83,16 +96,24 @@ def test_a_scenario_based_on_a_name_with_a_network_by_name(installed):
     assert load_scenario("mine").network.folder.resolve() == installed / "networks" / "hexagon7"
     Path("mine/scenario.toml").write_text(
         tiny.SCENARIO.replace("../network", "hexagon7") + '[controllers.route-guidance]\nmodel = "hexagon7"\n',
-        encoding="utf-8")
+        encoding="utf-8",
+    )
     assert registry.make("route-guidance", load_scenario("mine")) and load_scenario("mine").network.regions == 7
 
 
-@pytest.mark.parametrize("command, remedy", [
-    ((nmfd, "train", "economic_mpc", "--controller", "dpc-pc"), 'give --out FILE, or make .* base = "economic_mpc"'),
-    ((nmfd, "bound", "economic_mpc", "--controller", "bound-pc"), "give --out FILE"),
-    ((cosim, "identify", "grid7_peak"), "give another folder with --network"),
-    ((cosim, "identify", "grid7"), "give another folder with --network"),
-], ids=["train", "bound", "identify", "identify by network"])
+@pytest.mark.parametrize(
+    "command, remedy",
+    [
+        (
+            (nmfd, "train", "economic_mpc", "--controller", "dpc-pc"),
+            'give --out FILE, or make .* base = "economic_mpc"',
+        ),
+        ((nmfd, "bound", "economic_mpc", "--controller", "bound-pc"), "give --out FILE"),
+        ((cosim, "identify", "grid7_peak"), "give another folder with --network"),
+        ((cosim, "identify", "grid7"), "give another folder with --network"),
+    ],
+    ids=["train", "bound", "identify", "identify by network"],
+)
 def test_nothing_is_written_into_the_package(installed, command, remedy):
     program, *words = command
     line = error_line(program(*words), "nmfd" if program is nmfd else "cosim")

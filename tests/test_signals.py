@@ -29,8 +29,11 @@ SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
 
 def street(**after):
     """A city of roads of 200 m at 10 m/s; `after`: the edges that follow one."""
-    return SimpleNamespace(length=dict.fromkeys("abcdefg", 200.0), speed=dict.fromkeys("abcdefg", 10.0),
-                           successors={edge: after.get(edge, ()) for edge in "abcdefg"})
+    return SimpleNamespace(
+        length=dict.fromkeys("abcdefg", 200.0),
+        speed=dict.fromkeys("abcdefg", 10.0),
+        successors={edge: after.get(edge, ()) for edge in "abcdefg"},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +65,7 @@ def plant_of(scenario):
 @pytest.fixture(scope="module")
 def driven(scenario):
     """The first four intervals at u with these overrides, for all tests that ask for the same: `drive`, and leaks."""
+
     @cache
     def run(u, **overrides):
         plant = SumoPlant(scenario, overrides=Settings(**overrides))
@@ -217,8 +221,11 @@ def test_cycle_is_near_webster_s_formula(flow):
 
 def test_green_wave_along_a_street():
     """The signal at the end turns green when the platoon gets there, 1.15 times 20 s later."""
-    second = signal(CROSS, (Link(index=0, from_edge="b", lane=0, to_edge="e"),
-                            Link(index=1, from_edge="f", lane=0, to_edge="g")), "t")
+    second = signal(
+        CROSS,
+        (Link(index=0, from_edge="b", lane=0, to_edge="e"), Link(index=1, from_edge="f", lane=0, to_edge="g")),
+        "t",
+    )
     flows = {("a", "b"): 0.2, ("c", "d"): 0.2, ("b", "e"): 0.2, ("f", "g"): 0.2}
     first, last = offsets(street(), [cross(), second], flows, SATURATION)
     assert abs((last.offset - first.offset) % 66 - 23) <= 2

@@ -18,8 +18,13 @@ def first_booked(inside, waiting, left, trips, steps):
     """The control step from which on the rest is booked, of a run with these numbers of vehicles; None for none."""
     watched = Standstill(trips, 90.0, steps)
     for k in range(steps):
-        state = State(step=k, time=90.0 * k, accumulation=np.array([[float(inside[k])]]),
-                      backlog=np.array([[float(waiting[k])]]), completed=float(left[k]))
+        state = State(
+            step=k,
+            time=90.0 * k,
+            accumulation=np.array([[float(inside[k])]]),
+            backlog=np.array([[float(waiting[k])]]),
+            completed=float(left[k]),
+        )
         if watched.reached(state, float(left[k])):
             return k
     return None
@@ -67,7 +72,8 @@ def test_what_is_booked(tmp_path, monkeypatch):
     np.testing.assert_array_equal(trajectory.accumulation, there[[0, 1, 2, 2, 2]])
     inside, waiting = there[2].sum(), simulated.trajectory.backlog[2].sum()
     assert inside > 0 and total_time_spent(trajectory) == 90.0 * (
-        trajectory.accumulation[:4].sum() + trajectory.backlog[:4].sum())
+        trajectory.accumulation[:4].sum() + trajectory.backlog[:4].sum()
+    )
     for key in ("departures", "arrivals", "crossings", "gateway_flow"):
         assert not booked.record[key][2:].any(), key
         np.testing.assert_array_equal(booked.record[key][:2], simulated.record[key][:2], err_msg=key)

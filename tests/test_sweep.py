@@ -49,9 +49,18 @@ def ran(monkeypatch):
 
 def made_up(task) -> Result:
     trajectory = trajectories.made(
-        controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=np.ones((3, 7, 7)),
-        backlog=np.zeros((3, 7, 7)), completed=np.arange(3.0), perimeter=np.zeros((2, 7, 7)),
-        splits=np.zeros((2, 7, 7, 7)), decision_time=np.ones(2), wall_time=1.0)
+        controller=task.controller,
+        plant="sumo",
+        seed=task.seed,
+        step=90.0,
+        accumulation=np.ones((3, 7, 7)),
+        backlog=np.zeros((3, 7, 7)),
+        completed=np.arange(3.0),
+        perimeter=np.zeros((2, 7, 7)),
+        splits=np.zeros((2, 7, 7, 7)),
+        decision_time=np.ones(2),
+        wall_time=1.0,
+    )
     facts = {**dict.fromkeys(FACTS, 1.0), "outside_training": "", "controller": task.controller, "seed": task.seed}
     return Result(trajectory=trajectory, record=trajectories.record(2, regions=7), facts=facts)
 
@@ -60,8 +69,18 @@ def test_a_failed_run_is_a_row_and_is_tried_again(peak, tmp_path, ran):
     tasks, failing = ran
     failing.add(("probing-pcrg+compliance-50", 1))
     arguments = (
-        peak, "--controllers", "route-guidance,probing-pcrg", "--seeds", 2, "--demand", "0.8,1.0",
-        "--compliance", "50,100", "--out", tmp_path / "out")
+        peak,
+        "--controllers",
+        "route-guidance,probing-pcrg",
+        "--seeds",
+        2,
+        "--demand",
+        "0.8,1.0",
+        "--compliance",
+        "50,100",
+        "--out",
+        tmp_path / "out",
+    )
     done = sweep(*arguments)
     assert done.exit_code == 0 and "2 of 16 runs failed" in done.stderr, done.output + str(done.exception)
     rows = pd.read_parquet(tmp_path / "out" / "sweep.parquet")
@@ -106,8 +125,12 @@ def test_who_guides_nobody_is_run_once(peak, tmp_path, ran):
     names = ["no-control", "rerouting-30+webster", "pi-gating+max-pressure", "dpc-pc", "route-guidance", f"{own}:Mine"]
     order = sweeps.Sweep(scenario=peak, controllers=tuple(names), seeds=[0], out=tmp_path, compliance=(0.0, 0.5))
     assert list(order.strategies()) == [
-        *names[:4], "route-guidance+compliance-0", "route-guidance+compliance-50",
-        f"{own}:Mine+compliance-0", f"{own}:Mine+compliance-50"]
+        *names[:4],
+        "route-guidance+compliance-0",
+        "route-guidance+compliance-50",
+        f"{own}:Mine+compliance-0",
+        f"{own}:Mine+compliance-50",
+    ]
     assert len(order.plan()) == 8
     tasks, _ = ran
     done = sweep(peak, "--controllers", "no-control", "--compliance", "0,50", "--out", tmp_path / "out")
@@ -140,13 +163,16 @@ def test_one_run_for_real(peak, tmp_path):
     assert row["status"] == "ok" and row["departed_veh"] - row["completed_veh"] == row["final_accumulation_veh"] > 0
 
 
-@pytest.mark.parametrize("arguments, expected", [
-    (("--controllers", "nobody"), "'nobody' is unknown"),
-    (("--controllers", "no-control", "--compliance", "0.5"), "'--compliance': expected a list of distinct whole"),
-    (("--controllers", "no-control", "--compliance", "5,05"), "'--compliance': expected a list of distinct"),
-    (("--controllers", "dpc-pcrg+compliance-50", "--compliance", "0"), "exclude each other"),
-    (("--controllers", "no-control", "--workers", "2", "--scheduler", "tcp://x:1"), "omit one"),
-])
+@pytest.mark.parametrize(
+    "arguments, expected",
+    [
+        (("--controllers", "nobody"), "'nobody' is unknown"),
+        (("--controllers", "no-control", "--compliance", "0.5"), "'--compliance': expected a list of distinct whole"),
+        (("--controllers", "no-control", "--compliance", "5,05"), "'--compliance': expected a list of distinct"),
+        (("--controllers", "dpc-pcrg+compliance-50", "--compliance", "0"), "exclude each other"),
+        (("--controllers", "no-control", "--workers", "2", "--scheduler", "tcp://x:1"), "omit one"),
+    ],
+)
 def test_mistakes(peak, tmp_path, arguments, expected):
     done = sweep(peak, *arguments, "--out", tmp_path / "out")
     assert done.exit_code == 2 and expected in done.stderr and done.stderr.count("\n") == 1

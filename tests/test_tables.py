@@ -32,10 +32,15 @@ def test_only_common_seeds_count_and_one_alone_proves_nothing():
 
 @pytest.fixture
 def rows():
-    return rows_of({
-        (1.0, "no-control"): {2000: 100.0, 2001: 110.0}, (1.0, "dpc-pc"): {2000: 50.0, 2001: 56.0},
-        (1.0, "pi-gating"): {2000: 60.0}, (1.3, "no-control"): {2000: 300.0, 2001: 330.0},
-        (1.3, "dpc-pc"): {2000: 330.0, 2001: 320.0}})
+    return rows_of(
+        {
+            (1.0, "no-control"): {2000: 100.0, 2001: 110.0},
+            (1.0, "dpc-pc"): {2000: 50.0, 2001: 56.0},
+            (1.0, "pi-gating"): {2000: 60.0},
+            (1.3, "no-control"): {2000: 300.0, 2001: 330.0},
+            (1.3, "dpc-pc"): {2000: 330.0, 2001: 320.0},
+        }
+    )
 
 
 def test_statistics_pair_within_a_demand_level(rows):
@@ -67,8 +72,10 @@ def test_tables_show_a_line_per_controller_and_the_teleports(rows, tmp_path):
 
 
 def test_numbers_stand_to_the_right_and_captions_are_wrapped():
-    rows = [{"controller": "no-control", "TTS": "1.50e8 ± 2e5", "change": ""},
-            {"controller": "a", "TTS": "9e7", "change": "-1.0 %"}]
+    rows = [
+        {"controller": "no-control", "TTS": "1.50e8 ± 2e5", "change": ""},
+        {"controller": "a", "TTS": "9e7", "change": "-1.0 %"},
+    ]
     head, first, second, *caption = text_table(rows, "words " * 50 + "\n  more: " + "words " * 30).splitlines()
     assert head == "controller           TTS  change" and first == "no-control  1.50e8 ± 2e5"
     assert second == "a                    9e7  -1.0 %"

@@ -64,7 +64,8 @@ def test_the_plan_descends_on_both_sums(scenario, learned):
 
     def total(plan, **chosen):
         return edge_model.vehicle_steps(
-            model, start, demand, plan, planning.step, beyond=lambda x: learned(x, 100), **chosen)
+            model, start, demand, plan, planning.step, beyond=lambda x: learned(x, 100), **chosen
+        )
 
     without = edge_model.vehicle_steps(model, start, demand, plan, planning.step)[0]
     value, slope = total(plan, gradient=True)
@@ -81,7 +82,8 @@ def test_mpc_looks_beyond_its_horizon(scenario, learned):
     planning = planning_model(scenario, NAME)
     plain, far = (
         closed_loop.run(NmfdPlant(scenario), EconomicMpc(planning, guidance=False, terminal=known), scenario, seed=1)
-        for known in (None, learned))
+        for known in (None, learned)
+    )
     assert far.accumulation.sum() < 0.9 * plain.accumulation.sum()
     assert (plain.controller, far.controller) == ("mpc-pc", NAME) and not far.status.any()
 
@@ -100,8 +102,10 @@ def test_the_same_seed_learns_the_same_and_the_file_keeps_it(scenario, learned, 
     terminal.write(learned, tmp_path / "value.npz")
     read = terminal.read(tmp_path / "value.npz", planning, NAME)
     np.testing.assert_allclose(read(x, 50)[1], learned(x, 50)[1])
-    for wrong, expected in ((replace(planning, network=replace(planning.network, u_min=0.2)), "network_hash"),
-                            (replace(planning, forecast=planning.forecast + 1.0), "other destinations")):
+    for wrong, expected in (
+        (replace(planning, network=replace(planning.network, u_min=0.2)), "network_hash"),
+        (replace(planning, forecast=planning.forecast + 1.0), "other destinations"),
+    ):
         with pytest.raises(InputError, match=expected):
             terminal.read(tmp_path / "value.npz", wrong, NAME)
     with pytest.raises(InputError, match="of mpc-pc-terminal, not of mpc-pcrg-terminal"):
@@ -113,19 +117,52 @@ def test_the_same_seed_learns_the_same_and_the_file_keeps_it(scenario, learned, 
 
 def test_the_command_writes_what_the_benchmark_reads(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    said = good(nmfd("value", "economic_mpc", "--controller", NAME, "--samples", "128", "--rounds", "2", "--steps", "2",
-                     "--out", "value.npz"))
+    said = good(
+        nmfd(
+            "value",
+            "economic_mpc",
+            "--controller",
+            NAME,
+            "--samples",
+            "128",
+            "--rounds",
+            "2",
+            "--steps",
+            "2",
+            "--out",
+            "value.npz",
+        )
+    )
     assert "Written to value.npz" in said
-    said = good(nmfd("benchmark", "economic_mpc", "--controllers", NAME, "--seeds", "1", "--policy",
-                     f"{NAME}=value.npz", "--out", "out"))
+    said = good(
+        nmfd(
+            "benchmark",
+            "economic_mpc",
+            "--controllers",
+            NAME,
+            "--seeds",
+            "1",
+            "--policy",
+            f"{NAME}=value.npz",
+            "--out",
+            "out",
+        )
+    )
     assert NAME in said
 
 
-@pytest.mark.parametrize("arguments, expected", [
-    (["value", "economic_mpc", "--controller", "dpc-pc"], "has no terminal cost; choose mpc-pc-terminal or"),
-    (["value", "economic_mpc", "--controller", NAME, "--policy", "none.pt"], "none.pt: no such policy"),
-    (["value", "economic_mpc", "--controller", NAME, "--out", "no/value.npz"], "no such folder for the value function"),
-    (["benchmark", "economic_mpc_figure4", "--controllers", NAME], "learn one with: nmfd value")])
+@pytest.mark.parametrize(
+    "arguments, expected",
+    [
+        (["value", "economic_mpc", "--controller", "dpc-pc"], "has no terminal cost; choose mpc-pc-terminal or"),
+        (["value", "economic_mpc", "--controller", NAME, "--policy", "none.pt"], "none.pt: no such policy"),
+        (
+            ["value", "economic_mpc", "--controller", NAME, "--out", "no/value.npz"],
+            "no such folder for the value function",
+        ),
+        (["benchmark", "economic_mpc_figure4", "--controllers", NAME], "learn one with: nmfd value"),
+    ],
+)
 def test_one_line_for_what_cannot_be(tmp_path, monkeypatch, arguments, expected):
     monkeypatch.chdir(tmp_path)
     assert expected in error_line(nmfd(*arguments), "nmfd") and not list(Path().glob("**/*.npz"))

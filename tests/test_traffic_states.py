@@ -25,13 +25,23 @@ def of(accumulation, outflow, mfd=MFD):
     return [TrafficState(kind) for kind in states(mfd, STEP, [x], [np.broadcast_to(outflow, (T,)).astype(float)])[0]]
 
 
-@pytest.mark.parametrize("held, share, expected", [
-    (339, 1.0, TrafficState.NEAR_CAPACITY), (339, 0.0, TrafficState.STANDING), (339, 0.05, TrafficState.STANDING),
-    (380, 0.6, TrafficState.CONGESTED), (700, 0.4, TrafficState.CONGESTED), (700, 1.0, TrafficState.NEAR_CAPACITY),
-    (2000, 0.0, TrafficState.STANDING), (100, 0.5, TrafficState.FLOWING), (100, 0.15, TrafficState.CONGESTED),
-    (100, 0.0, TrafficState.STANDING),
-    (0, 0.0, TrafficState.FLOWING), (2, 0.0, TrafficState.FLOWING),  # nobody, and too few to tell from chance
-])
+@pytest.mark.parametrize(
+    "held, share, expected",
+    [
+        (339, 1.0, TrafficState.NEAR_CAPACITY),
+        (339, 0.0, TrafficState.STANDING),
+        (339, 0.05, TrafficState.STANDING),
+        (380, 0.6, TrafficState.CONGESTED),
+        (700, 0.4, TrafficState.CONGESTED),
+        (700, 1.0, TrafficState.NEAR_CAPACITY),
+        (2000, 0.0, TrafficState.STANDING),
+        (100, 0.5, TrafficState.FLOWING),
+        (100, 0.15, TrafficState.CONGESTED),
+        (100, 0.0, TrafficState.STANDING),
+        (0, 0.0, TrafficState.FLOWING),
+        (2, 0.0, TrafficState.FLOWING),  # nobody, and too few to tell from chance
+    ],
+)
 def test_the_outflow_decides_not_the_accumulation(held, share, expected):
     assert set(of(held, share * MFD.capacity)) == {expected}
 
@@ -75,9 +85,17 @@ def standing_run(scenario, share, controller="no-control"):
     """A run that holds `share` of the critical accumulation in every region all the time."""
     regions = scenario.network.regions
     state = np.repeat(np.diag([share * mfd.critical for mfd in scenario.network.mfds])[None], T + 1, axis=0)
-    return made(controller=controller, plant="sumo", seed=0, step=STEP, accumulation=state,
-                backlog=np.zeros_like(state), completed=np.zeros(T + 1), perimeter=np.zeros((T, regions, regions)),
-                splits=np.zeros((T, regions, regions, regions)))
+    return made(
+        controller=controller,
+        plant="sumo",
+        seed=0,
+        step=STEP,
+        accumulation=state,
+        backlog=np.zeros_like(state),
+        completed=np.zeros(T + 1),
+        perimeter=np.zeros((T, regions, regions)),
+        splits=np.zeros((T, regions, regions, regions)),
+    )
 
 
 def colours_in(ax):
@@ -91,7 +109,8 @@ def test_a_region_that_nothing_leaves_is_not_green(scenario):
     network, held = scenario.network, standing_run(scenario, 1.0)
     for out, kind in ((0.0, TrafficState.STANDING), (network.mfds[0].capacity, TrafficState.NEAR_CAPACITY)):
         ax = plots.region_accumulation(
-            plots.figure(4, 3).subplots(), network, 0, [held], outflow=lambda t, out=out: np.full((T, 7), out))
+            plots.figure(4, 3).subplots(), network, 0, [held], outflow=lambda t, out=out: np.full((T, 7), out)
+        )
         green = {to_rgb(traffic_states.LOOKS[TrafficState.NEAR_CAPACITY][1]), to_rgb(plots.GREEN)}
         assert bool(green & colours_in(ax)) == (kind == TrafficState.NEAR_CAPACITY)
         assert to_rgb(traffic_states.LOOKS[kind][1]) in colours_in(ax)
@@ -100,11 +119,20 @@ def test_a_region_that_nothing_leaves_is_not_green(scenario):
 def test_strips_hide_no_curve_and_need_an_outflow(scenario):
     runs = [standing_run(scenario, 1.3, controller) for controller in ("no-control", "pi-gating", "dpc-pc")]
     ax = plots.region_accumulation(
-        plots.figure(4, 3).subplots(), scenario.network, 0, runs, outflow=lambda t: np.zeros((T, 7)))
+        plots.figure(4, 3).subplots(), scenario.network, 0, runs, outflow=lambda t: np.zeros((T, 7))
+    )
     below = ax.get_ylim()[1] * (1.0 - 3 * traffic_states.STRIP)
     assert max(line.get_ydata().max() for line in ax.lines) < below
-    assert len(colours_in(plots.region_accumulation(
-        plots.figure(4, 3).subplots(), scenario.network, 0, runs, outflow=lambda t: None))) == 0
+    assert (
+        len(
+            colours_in(
+                plots.region_accumulation(
+                    plots.figure(4, 3).subplots(), scenario.network, 0, runs, outflow=lambda t: None
+                )
+            )
+        )
+        == 0
+    )
 
 
 def test_a_run_on_the_regional_model_shows_the_outflow_of_its_gates(tmp_path):

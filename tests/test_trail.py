@@ -16,8 +16,12 @@ from nmfd.runs import command, files, frames, run_folder, trail
 from nmfd.studies import plots
 
 ROOT = Path(__file__).parents[1]
-PUBLISHED = [file for pattern in ("scenarios/*/reference/**/*", "networks/*/map.png") for file in ROOT.glob(pattern)
-             if file.suffix in (".csv", ".md", ".png", ".gif") and file.name != "README.md"]
+PUBLISHED = [
+    file
+    for pattern in ("scenarios/*/reference/**/*", "networks/*/map.png")
+    for file in ROOT.glob(pattern)
+    if file.suffix in (".csv", ".md", ".png", ".gif") and file.name != "README.md"
+]
 
 
 def shown(file: Path) -> dict:
@@ -43,24 +47,40 @@ def _comment(file: Path) -> str:
     content = file.read_bytes()
     at, text = content.rindex(b"\x21\xfe") + 2, b""
     while size := content[at]:
-        text += content[at + 1:at + 1 + size]
+        text += content[at + 1 : at + 1 + size]
         at += 1 + size
-    assert content[at + 1:] == b";"
+    assert content[at + 1 :] == b";"
     return text.decode()
 
 
 def test_sessions_of_a_folder_are_in_its_tables(tmp_path):
     """A session that only went on is no other one; where it was written, and on how many processes, is not told."""
+
     def opened(seeds: int, *more: str) -> dict:
         runs = [("mine", seed) for seed in range(seeds)]
-        with (command.called("nmfd", ["benchmark", "a city", "--seeds", str(seeds), *more]),
-              run_folder.open_folder(tmp_path / "out", configuration={"plant": "nmfd", "network_hash": "n"}, order=runs,
-                                     controllers={"mine": {"policy_hash": "p", "source_hash": None}}) as folder):
+        with (
+            command.called("nmfd", ["benchmark", "a city", "--seeds", str(seeds), *more]),
+            run_folder.open_folder(
+                tmp_path / "out",
+                configuration={"plant": "nmfd", "network_hash": "n"},
+                order=runs,
+                controllers={"mine": {"policy_hash": "p", "source_hash": None}},
+            ) as folder,
+        ):
             for seed in range(seeds):
-                folder.add(trajectories.made(
-                    controller="mine", plant="nmfd", seed=seed, step=30.0, accumulation=np.zeros((2, 1, 1)),
-                    backlog=np.zeros((2, 1, 1)), completed=np.zeros(2), perimeter=np.zeros((1, 1, 1)),
-                    splits=np.zeros((1, 1, 1, 1))))
+                folder.add(
+                    trajectories.made(
+                        controller="mine",
+                        plant="nmfd",
+                        seed=seed,
+                        step=30.0,
+                        accumulation=np.zeros((2, 1, 1)),
+                        backlog=np.zeros((2, 1, 1)),
+                        completed=np.zeros(2),
+                        perimeter=np.zeros((1, 1, 1)),
+                        splits=np.zeros((1, 1, 1, 1)),
+                    )
+                )
         return shown(tmp_path / "out" / "summary.csv")
 
     found = opened(2, "--out", str(tmp_path), "--workers=3")

@@ -21,15 +21,43 @@ from nmfd.model.planning import planning_model
 
 # One value that is no default for every setting, and one beyond each end of what is allowed.
 CHOSEN = {
-    "width": 8, "layers": 1, "activation": "relu", "steps": 3, "batch": 4, "learning_rate": 0.25, "alternating": False,
-    "demand_spread": 0.5, "demand_low": 0.75, "demand_high": 1.5, "initial_share": 0.25, "noise": 0.125,
-    "noise_all": 0.0625, "mfd_spread": 0.375, "mfd_scale": 0.875, "detour_cost": 20.0, "swing_cost": 3.0,
-    "from_no_control": True, "local": True}
+    "width": 8,
+    "layers": 1,
+    "activation": "relu",
+    "steps": 3,
+    "batch": 4,
+    "learning_rate": 0.25,
+    "alternating": False,
+    "demand_spread": 0.5,
+    "demand_low": 0.75,
+    "demand_high": 1.5,
+    "initial_share": 0.25,
+    "noise": 0.125,
+    "noise_all": 0.0625,
+    "mfd_spread": 0.375,
+    "mfd_scale": 0.875,
+    "detour_cost": 20.0,
+    "swing_cost": 3.0,
+    "from_no_control": True,
+    "local": True,
+}
 BEYOND = {
-    "width": (0, 10**9), "layers": (0, 10**9), "steps": (0, 10**9), "batch": (0, 10**9), "learning_rate": (0.0, 1.1),
-    "demand_spread": (-0.1, 1.1), "demand_low": (0.0, 1.1), "demand_high": (0.9, 101.0), "initial_share": (-0.1, 1.1),
-    "noise": (-0.1, 1e7), "noise_all": (-0.1, 1e7), "mfd_spread": (-0.1, 1.1), "mfd_scale": (0.05, 1.1),
-    "detour_cost": (-0.1, 1e7), "swing_cost": (-0.1, 1e10)}
+    "width": (0, 10**9),
+    "layers": (0, 10**9),
+    "steps": (0, 10**9),
+    "batch": (0, 10**9),
+    "learning_rate": (0.0, 1.1),
+    "demand_spread": (-0.1, 1.1),
+    "demand_low": (0.0, 1.1),
+    "demand_high": (0.9, 101.0),
+    "initial_share": (-0.1, 1.1),
+    "noise": (-0.1, 1e7),
+    "noise_all": (-0.1, 1e7),
+    "mfd_spread": (-0.1, 1.1),
+    "mfd_scale": (0.05, 1.1),
+    "detour_cost": (-0.1, 1e7),
+    "swing_cost": (-0.1, 1e10),
+}
 
 
 @pytest.fixture
@@ -94,8 +122,10 @@ def test_a_share_of_the_rollouts_starts_later_in_a_random_state(scenario, genera
     filling = x[:3000].sum(-1) / 1000.0
     assert filling.min() >= 0.0 and 0.7 < filling.max() <= 0.8 and filling.mean() == pytest.approx(0.2, abs=0.01)
     padded = np.concatenate([scenario.demand, np.zeros_like(scenario.demand)])
-    later = {n: [shift for shift in range(11) if (demand[:, n].numpy() == padded[shift : shift + 20]).all()]
-             for n in (*range(50), 3500)}
+    later = {
+        n: [shift for shift in range(11) if (demand[:, n].numpy() == padded[shift : shift + 20]).all()]
+        for n in (*range(50), 3500)
+    }
     assert later[3500] == [0] and all(later.values())
     assert {0, 1, 2, 3} <= {shift for found in later.values() for shift in found}
 
@@ -144,8 +174,10 @@ def test_no_drawn_model_is_too_fast_for_the_step(scenario, generator, rates):
     """A free rate of 0.9 per integration step, half of the draws above it: all above 1 are cut down to 1."""
     fastest = 0.9 / scenario.step * scenario.substeps
     network = replace(
-        scenario.network, exit_rates=None if rates is None else np.array([[1.0, rates], [rates, 0.5]]),
-        mfds=tuple(replace(m, c=fastest / (rates or 1.0)) for m in scenario.network.mfds))
+        scenario.network,
+        exit_rates=None if rates is None else np.array([[1.0, rates], [rates, 0.5]]),
+        mfds=tuple(replace(m, c=fastest / (rates or 1.0)) for m in scenario.network.mfds),
+    )
     rollout = Rollout(planning_model(replace(scenario, network=network)), dtype=torch.float64)
     rollout.draw_model(500, 0.8, generator)
     drawn = rollout.parameters.c * (rates or 1.0) * scenario.step / scenario.substeps
@@ -156,8 +188,11 @@ def test_no_drawn_model_is_too_fast_for_the_step(scenario, generator, rates):
 @pytest.mark.parametrize("rates", [1.0, 2.0])
 def test_half_of_the_moved_shares_are_diverted(scenario, rates):
     """100 vehicles leave at 0.003 / s; own shares are all to 1, theta sends 0.4 of them elsewhere."""
-    network = replace(scenario.network, exit_rates=np.full((2, 2), rates),
-                      mfds=tuple(replace(m, a=0.0, b=0.0, c=0.003) for m in scenario.network.mfds))
+    network = replace(
+        scenario.network,
+        exit_rates=np.full((2, 2), rates),
+        mfds=tuple(replace(m, a=0.0, b=0.0, c=0.003) for m in scenario.network.mfds),
+    )
     rollout = Rollout(planning_model(replace(scenario, network=network)), dtype=torch.float64)
     x = torch.zeros(1, 2, 2, dtype=torch.float64)
     x[0, 0, 1] = 100.0
@@ -221,21 +256,25 @@ def test_a_validation_is_the_scenario_itself(scenario):
     rollout = Rollout(planning_model(quiet))
     with torch.no_grad():
         expected = rollout.total_time_spent(
-            policy, torch.zeros(1, 2, 2), rollout.demand[:, None], torch.Generator()).item()
+            policy, torch.zeros(1, 2, 2), rollout.demand[:, None], torch.Generator()
+        ).item()
     for seed in (0, 1):
         assert training.validate(policy, rollout, seed, training.Training()) == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.parametrize("chosen", [
-    {"noise": 1.0}, {"noise_all": 1.0}, {"mfd_spread": 0.3}, {"demand_high": 2.0}, {"demand_low": 0.5}],
-    ids=lambda chosen: next(iter(chosen)))
+@pytest.mark.parametrize(
+    "chosen",
+    [{"noise": 1.0}, {"noise_all": 1.0}, {"mfd_spread": 0.3}, {"demand_high": 2.0}, {"demand_low": 0.5}],
+    ids=lambda chosen: next(iter(chosen)),
+)
 def test_a_validation_is_perturbed_as_the_training(scenario, chosen):
     """18 rollouts instead of 2; the same seed gives the same number, and more demand or noise means more vehicles."""
     quiet, policy = replace(scenario, measurement_std=0.0), made(scenario)
     rollout, asked = Rollout(planning_model(quiet)), []
     total = rollout.total_time_spent
-    rollout.total_time_spent = lambda policy, x, demand, generator: asked.append(demand) or total(
-        policy, x, demand, generator)
+    rollout.total_time_spent = lambda policy, x, demand, generator: (
+        asked.append(demand) or total(policy, x, demand, generator)
+    )
     plain = training.validate(policy, rollout, 0, training.Training())
     values = [training.validate(policy, rollout, seed, training.Training(**chosen)) for seed in (0, 0, 1)]
     assert [demand.shape[1] for demand in asked] == [2, 18, 18, 18]
@@ -259,8 +298,13 @@ def steps(monkeypatch):
     class Noted(torch.optim.Adam):
         def step(self):
             [group] = self.param_groups
-            seen.append((group["lr"], [weights.grad is not None for weights in group["params"]],
-                         math.sqrt(sum((w.grad**2).sum().item() for w in group["params"] if w.grad is not None))))
+            seen.append(
+                (
+                    group["lr"],
+                    [weights.grad is not None for weights in group["params"]],
+                    math.sqrt(sum((w.grad**2).sum().item() for w in group["params"] if w.grad is not None)),
+                )
+            )
             super().step()
 
     monkeypatch.setattr(torch.optim, "Adam", Noted)
@@ -280,8 +324,9 @@ def test_the_learning_rate_falls_to_a_tenth_along_a_cosine(tmp_path, scenario, s
 def test_decoders_are_trained_in_turn(tmp_path, scenario, steps, alternating):
     """First the perimeter's, then that of the split ratios; the backbone always."""
     options = {"alternating": alternating, "batch": 2, "width": 4}
-    training.train(replace(scenario, controller_options={"dpc-pcrg": options}), "dpc-pcrg", seed=0,
-                   out=tmp_path / "p.pt", steps=2)
+    training.train(
+        replace(scenario, controller_options={"dpc-pcrg": options}), "dpc-pcrg", seed=0, out=tmp_path / "p.pt", steps=2
+    )
     names = [name for name, _ in made(scenario, guidance=True).named_parameters()]
     for (_, given, _), left in zip(steps, ("splits_decoder", "perimeter_decoder"), strict=True):
         for name, has in zip(names, given, strict=True):
@@ -294,24 +339,41 @@ def test_the_best_validation_is_kept_and_told(tmp_path, scenario, monkeypatch):
     monkeypatch.setattr(training, "validate", lambda *_: next(scores))
     options = {"batch": 2, "width": 4}
     out = training.train(
-        replace(scenario, controller_options={"dpc-pc": options}), "dpc-pc", seed=3, out=tmp_path / "p.pt", steps=5,
+        replace(scenario, controller_options={"dpc-pc": options}),
+        "dpc-pc",
+        seed=3,
+        out=tmp_path / "p.pt",
+        steps=5,
         log=lambda done, loss, score: logged.append((done, score, loss > 0.0)),
-        progress=lambda *note: notes.append(note))
+        progress=lambda *note: notes.append(note),
+    )
     assert logged == [(2, 7.0, True), (4, 5.0, True), (5, 6.0, True)]
-    assert notes == [(1, 5, "best inf veh s"), (2, 5, "best 7 veh s"), (3, 5, "best 7 veh s"), (4, 5, "best 5 veh s"),
-                     (5, 5, "best 5 veh s")]
+    assert notes == [
+        (1, 5, "best inf veh s"),
+        (2, 5, "best 7 veh s"),
+        (3, 5, "best 7 veh s"),
+        (4, 5, "best 5 veh s"),
+        (5, 5, "best 5 veh s"),
+    ]
     configuration = torch.load(out, weights_only=True)["configuration"]
     assert configuration["validation_veh_s"] == 5.0
     assert {key: configuration[key] for key in ("controller", "scenario", "seed", "compiled", "steps", "batch")} == {
-        "controller": "dpc-pc", "scenario": "tiny", "seed": 3, "compiled": False, "steps": 5, "batch": 2}
+        "controller": "dpc-pc",
+        "scenario": "tiny",
+        "seed": 3,
+        "compiled": False,
+        "steps": 5,
+        "batch": 2,
+    }
 
 
 def test_a_training_that_diverges_says_so(tmp_path, scenario, monkeypatch):
     monkeypatch.setattr(training, "validate", lambda *_: math.nan)
     options = {"batch": 2, "width": 4}
     with pytest.raises(RunFailed, match="dpc-pc: every validation of 2 steps diverged; lower the learning rate"):
-        training.train(replace(scenario, controller_options={"dpc-pc": options}), "dpc-pc", seed=0,
-                       out=tmp_path / "p.pt", steps=2)
+        training.train(
+            replace(scenario, controller_options={"dpc-pc": options}), "dpc-pc", seed=0, out=tmp_path / "p.pt", steps=2
+        )
 
 
 def test_the_states_that_a_policy_sees(scenario):

@@ -18,10 +18,21 @@ def times():
     """Into b one turns over two internal edges, of which the first is shared with c."""
     edges = ("a", "b", "c")
     city = City(
-        net_file=Path(), regions=1, region_of=dict.fromkeys(edges, 0), edges=edges, length=dict.fromkeys(edges, 100.0),
-        lanes=dict.fromkeys(edges, 1), lane_ids={}, speed=dict.fromkeys(edges, 10.0),
-        successors={"a": ("b", "c"), "b": (), "c": ()}, turn_time={("a", "b"): 2.0, ("a", "c"): 1.0}, gateways=(),
-        signals={}, over={("a", "b"): (":1", ":2"), ("a", "c"): (":1",)}, inside={":1": 8.0, ":2": 4.0})
+        net_file=Path(),
+        regions=1,
+        region_of=dict.fromkeys(edges, 0),
+        edges=edges,
+        length=dict.fromkeys(edges, 100.0),
+        lanes=dict.fromkeys(edges, 1),
+        lane_ids={},
+        speed=dict.fromkeys(edges, 10.0),
+        successors={"a": ("b", "c"), "b": (), "c": ()},
+        turn_time={("a", "b"): 2.0, ("a", "c"): 1.0},
+        gateways=(),
+        signals={},
+        over={("a", "b"): (":1", ":2"), ("a", "c"): (":1",)},
+        inside={":1": 8.0, ":2": 4.0},
+    )
     return TravelTimes(city)
 
 
@@ -62,8 +73,7 @@ def test_a_long_interval_leaves_less_of_an_empty_street(times):
     learn(times, 2.0, 2.0, 2.0, duration=60.0)
     learn(times, NOBODY, NOBODY, NOBODY, duration=900.0)
     kept = math.exp(-900.0 / WINDOW)
-    assert times.edges[0] == pytest.approx(
-        100.0 * (120.0 * kept + UNSEEN) / (240.0 * kept + 10.0 * UNSEEN))
+    assert times.edges[0] == pytest.approx(100.0 * (120.0 * kept + UNSEEN) / (240.0 * kept + 10.0 * UNSEEN))
 
 
 def test_closed_and_standing_streets_are_so_at_once(times):

@@ -47,7 +47,8 @@ def test_vehicles_depart_when_the_demand_says(trips, scenario):
 
 def test_routes_lead_from_region_to_region(trips, city):
     for origin, destination, route, arrival in zip(
-            trips.origin, trips.destination, trips.routes, trips.arrival, strict=True):
+        trips.origin, trips.destination, trips.routes, trips.arrival, strict=True
+    ):
         assert city.region_of[route[0]] == origin
         assert city.region_of[route[-1]] == destination
         assert route[0] != route[-1]
@@ -72,8 +73,10 @@ def test_drivers_spread(trips):
 
 def test_seeds(city, scenario, tmp_path):
     paths = [tmp_path / f"{n}.rou.xml" for n in range(3)]
-    count = [write_trips(city, scenario.demand, scenario.step, seed, path)
-             for seed, path in zip((1, 1, 2), paths, strict=True)]
+    count = [
+        write_trips(city, scenario.demand, scenario.step, seed, path)
+        for seed, path in zip((1, 1, 2), paths, strict=True)
+    ]
     first, again, other = (path.read_bytes() for path in paths)
     assert first == again != other
     vehicles = list(ElementTree.fromstring(first).iter("vehicle"))

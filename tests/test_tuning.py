@@ -44,8 +44,12 @@ def runs(monkeypatch):
             tasks.append(task)
             options = dict(task.options)
             away = (options["set_point"][0] - 300.0) ** 2 / 1e4 + math.log(options["kp"] / 2.0) ** 2
-            yield task, Failure("SUMO fell over") if len(tasks) in failing else in_city(
-                task, 1e6 * task.demand_factor * (1.0 + task.seed / 1e4) * (1.0 + away), TRIPS, TRIPS)
+            yield (
+                task,
+                Failure("SUMO fell over")
+                if len(tasks) in failing
+                else in_city(task, 1e6 * task.demand_factor * (1.0 + task.seed / 1e4) * (1.0 + away), TRIPS, TRIPS),
+            )
 
     monkeypatch.setattr(experiment, "outcomes", outcomes)
     return tasks, failing
@@ -53,9 +57,16 @@ def runs(monkeypatch):
 
 def order(city, out, *, candidates=37, levels=(1.6,), **others):
     return tuning.Tuning(
-        scenario=city, controller="pi-gating+guided+max-pressure", candidates=candidates, seeds=(1000,), out=out,
-        knobs=(tuning.knob("set_point[0]=200:600"), tuning.knob("kp=0.1:10")), levels=levels, population=6,
-        **others)
+        scenario=city,
+        controller="pi-gating+guided+max-pressure",
+        candidates=candidates,
+        seeds=(1000,),
+        out=out,
+        knobs=(tuning.knob("set_point[0]=200:600"), tuning.knob("kp=0.1:10")),
+        levels=levels,
+        population=6,
+        **others,
+    )
 
 
 def test_the_best_options_are_found_and_written(city, tmp_path, runs):
@@ -75,8 +86,13 @@ def test_the_best_options_are_found_and_written(city, tmp_path, runs):
 
 def test_numbers_of_a_list_without_a_range_stay_as_they_are(city, tmp_path):
     tuned = tuning.Tuning(
-        scenario=city, controller="dpc-pcrg+max-pressure+guidance-period-60", candidates=1, seeds=(1000,), out=tmp_path,
-        knobs=(tuning.knob("numbers[3]=2:12"), tuning.knob("numbers[6]=1:2")))
+        scenario=city,
+        controller="dpc-pcrg+max-pressure+guidance-period-60",
+        candidates=1,
+        seeds=(1000,),
+        out=tmp_path,
+        knobs=(tuning.knob("numbers[3]=2:12"), tuning.knob("numbers[6]=1:2")),
+    )
     assert dict(tuned.options((0.5, 0.0)))["numbers"] == (9.0, 1.0, 0.0, 7.0, 0.6, 0.5, 1.0, 1.2)
 
 
@@ -105,17 +121,24 @@ def test_a_candidate_whose_run_failed_has_no_score(city, tmp_path, runs):
     assert tuning.best(table)["candidate"] not in (1, 2)
 
 
-@pytest.mark.parametrize("arguments, expected", [
-    (["--option", "kp"], "expected KEY=LOW:HIGH"), (["--option", "kp=2:1"], "LOW below HIGH"),
-    (["--option", "kp=1:nan"], "LOW below HIGH"), (["--option", "kp[x]=1:2"], "expected KEY=LOW:HIGH"),
-    (["--option", "kP=1:2"], "controllers.pi-gating.kP: unknown key; allowed here: regions, set_point"),
-    (["--option", "kp=1:2", "--option", "kp=1:3"], "kp is there twice"),
-    (["--option", "set_point[1]=1:2"], "set_point[0], set_point[1]"),
-    (["--option", "kp=-1:2"], "kp: expected a number from 0 up"),
-    (["--option", "kp=1:2", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "--workers")])
+@pytest.mark.parametrize(
+    "arguments, expected",
+    [
+        (["--option", "kp"], "expected KEY=LOW:HIGH"),
+        (["--option", "kp=2:1"], "LOW below HIGH"),
+        (["--option", "kp=1:nan"], "LOW below HIGH"),
+        (["--option", "kp[x]=1:2"], "expected KEY=LOW:HIGH"),
+        (["--option", "kP=1:2"], "controllers.pi-gating.kP: unknown key; allowed here: regions, set_point"),
+        (["--option", "kp=1:2", "--option", "kp=1:3"], "kp is there twice"),
+        (["--option", "set_point[1]=1:2"], "set_point[0], set_point[1]"),
+        (["--option", "kp=-1:2"], "kp: expected a number from 0 up"),
+        (["--option", "kp=1:2", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "--workers"),
+    ],
+)
 def test_one_line_for_what_cannot_be_tuned(city, tmp_path, arguments, expected):
-    done = CliRunner().invoke(main, [
-        "tune", str(city), "--controller", "pi-gating", *arguments, "--out", str(tmp_path / "out")])
+    done = CliRunner().invoke(
+        main, ["tune", str(city), "--controller", "pi-gating", *arguments, "--out", str(tmp_path / "out")]
+    )
     assert done.exit_code != 0 and expected in done.stderr, done.stderr
     assert len(done.stderr.strip().splitlines()) == 1 and not (tmp_path / "out").exists()
 
@@ -129,11 +152,18 @@ def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_pat
             yield task, in_city(task, 1e6 * dict(task.options)["mfd_scale"], TRIPS, TRIPS)
 
     monkeypatch.setattr(experiment, "outcomes", outcomes)
-    monkeypatch.setattr(tuning, "outcomes", lambda function, todo, workers, look: [
-        (task, function(task)) for task in todo])
+    monkeypatch.setattr(
+        tuning, "outcomes", lambda function, todo, workers, look: [(task, function(task)) for task in todo]
+    )
     asked = tuning.Tuning(
-        scenario=city, controller="dpc-pcrg", candidates=2, seeds=(1000,), out=tmp_path / "out", population=2,
-        knobs=(tuning.knob("mfd_scale=0.6:1"), tuning.knob("steps=1:1.4")))
+        scenario=city,
+        controller="dpc-pcrg",
+        candidates=2,
+        seeds=(1000,),
+        out=tmp_path / "out",
+        population=2,
+        knobs=(tuning.knob("mfd_scale=0.6:1"), tuning.knob("steps=1:1.4")),
+    )
     table = tuning.tune(asked)
     assert list(table["steps"]) == [1.0, 1.0]  # a whole number
     assert len(set(seen)) == 2 and all(path.is_file() for path in seen)
@@ -141,7 +171,10 @@ def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_pat
 
 
 SERVED = {  # demand -> of four seeds, how many serve all trips
-    "max-pressure": {1.0: 4, 1.5: 0, 2.0: 0}, "pi-gating": {1.0: 4, 1.5: 2, 2.0: 4}, "dpc-pc": {1.0: 4, 1.5: 4, 2.0: 1}}
+    "max-pressure": {1.0: 4, 1.5: 0, 2.0: 0},
+    "pi-gating": {1.0: 4, 1.5: 2, 2.0: 4},
+    "dpc-pc": {1.0: 4, 1.5: 4, 2.0: 1},
+}
 
 
 @pytest.fixture
@@ -160,8 +193,20 @@ def demanded(monkeypatch):
 
 def test_the_frontier_ends_where_nobody_is_served(city, tmp_path, demanded):
     out = tmp_path / "out"
-    arguments = ["frontier", str(city), "--controllers", ",".join(SERVED), "--demand", "2,1,1.5", "--seeds", "4",
-                 "--steps", "1", "--out", str(out)]
+    arguments = [
+        "frontier",
+        str(city),
+        "--controllers",
+        ",".join(SERVED),
+        "--demand",
+        "2,1,1.5",
+        "--seeds",
+        "4",
+        "--steps",
+        "1",
+        "--out",
+        str(out),
+    ]
     done = CliRunner().invoke(main, arguments)
     assert done.exit_code == 0, done.output + str(done.exception)
     assert ("max-pressure", 1.5) in demanded and ("max-pressure", 2.0) not in demanded
@@ -179,10 +224,26 @@ def test_the_frontier_ends_where_nobody_is_served(city, tmp_path, demanded):
 
 def test_rows_of_an_earlier_table_count_too(city, tmp_path, demanded):
     """Of runs that are not kept any more; they are named in the trail."""
+
     def invoke(name, demand, *more):
-        return CliRunner().invoke(main, [
-            "frontier", str(city), "--controllers", "pi-gating", "--demand", demand, "--seeds", "4", "--steps", "1",
-            "--out", str(tmp_path / name), *more])
+        return CliRunner().invoke(
+            main,
+            [
+                "frontier",
+                str(city),
+                "--controllers",
+                "pi-gating",
+                "--demand",
+                demand,
+                "--seeds",
+                "4",
+                "--steps",
+                "1",
+                "--out",
+                str(tmp_path / name),
+                *more,
+            ],
+        )
 
     assert invoke("before", "1").exit_code == 0
     before = tmp_path / "before" / "runs.csv"
@@ -201,10 +262,26 @@ def test_rows_of_an_earlier_table_count_too(city, tmp_path, demanded):
 
 def test_what_was_run_again_may_be_another_one(city, tmp_path, demanded):
     """Then only what the others depend on must be the same."""
+
     def invoke(name, controllers, *more):
-        return CliRunner().invoke(main, [
-            "frontier", str(city), "--controllers", controllers, "--demand", "1", "--seeds", "1", "--steps", "1",
-            "--out", str(tmp_path / name), *more])
+        return CliRunner().invoke(
+            main,
+            [
+                "frontier",
+                str(city),
+                "--controllers",
+                controllers,
+                "--demand",
+                "1",
+                "--seeds",
+                "1",
+                "--steps",
+                "1",
+                "--out",
+                str(tmp_path / name),
+                *more,
+            ],
+        )
 
     assert invoke("before", "pi-gating,max-pressure").exit_code == 0
     before = tmp_path / "before" / "runs.csv"
@@ -218,9 +295,24 @@ def test_what_was_run_again_may_be_another_one(city, tmp_path, demanded):
 @pytest.mark.parametrize("first", ["5", "7"])
 def test_of_a_run_in_two_tables_the_first_one_counts(city, tmp_path, demanded, first):
     def invoke(name, controller, *more):
-        return CliRunner().invoke(main, [
-            "frontier", str(city), "--controllers", controller, "--demand", "1", "--seeds", "1", "--steps", "1",
-            "--out", str(tmp_path / name), *more])
+        return CliRunner().invoke(
+            main,
+            [
+                "frontier",
+                str(city),
+                "--controllers",
+                controller,
+                "--demand",
+                "1",
+                "--seeds",
+                "1",
+                "--steps",
+                "1",
+                "--out",
+                str(tmp_path / name),
+                *more,
+            ],
+        )
 
     assert invoke("before", "pi-gating").exit_code == 0
     made = (tmp_path / "before" / "runs.csv").read_text()
@@ -236,12 +328,28 @@ def test_of_a_run_in_two_tables_the_first_one_counts(city, tmp_path, demanded, f
         assert table.to_dict() == {"max-pressure": 1e6, "pi-gating": float(first) * 1e6}
 
 
-@pytest.mark.parametrize("old, new, said", [
-    ('""demand_hash"":""', '""demand_hash"":""0', "demand-1 demand_hash (0"),
-    ("demand,controller", "level,controller", "is no table of runs")])
+@pytest.mark.parametrize(
+    "old, new, said",
+    [
+        ('""demand_hash"":""', '""demand_hash"":""0', "demand-1 demand_hash (0"),
+        ("demand,controller", "level,controller", "is no table of runs"),
+    ],
+)
 def test_a_table_of_other_runs_is_refused(city, tmp_path, demanded, old, new, said):
-    arguments = ["frontier", str(city), "--controllers", "pi-gating", "--demand", "1", "--seeds", "1", "--steps", "1",
-                 "--out", str(tmp_path / "out")]
+    arguments = [
+        "frontier",
+        str(city),
+        "--controllers",
+        "pi-gating",
+        "--demand",
+        "1",
+        "--seeds",
+        "1",
+        "--steps",
+        "1",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert CliRunner().invoke(main, arguments).exit_code == 0
     other = tmp_path / "other.csv"
     other.write_text((tmp_path / "out" / "runs.csv").read_text().replace(old, new))
@@ -251,8 +359,9 @@ def test_a_table_of_other_runs_is_refused(city, tmp_path, demanded, old, new, sa
 
 
 def test_the_interval_of_a_share_is_never_empty():
-    rows = pd.DataFrame({"demand": 1.0, "controller": "a", "completed_veh": [9, 9], "trips": [9, 9],
-                         frontier.TTS: [1.0, 3.0]})
+    rows = pd.DataFrame(
+        {"demand": 1.0, "controller": "a", "completed_veh": [9, 9], "trips": [9, 9], frontier.TTS: [1.0, 3.0]}
+    )
     (row,) = frontier.shares(rows).to_dict("records")
     assert row["served_share_low"] == pytest.approx(1.0 / (1.0 + 1.96**2 / 2), rel=1e-3)  # Wilson, both of two
     assert row["served_share_high"] == pytest.approx(1.0)

@@ -26,12 +26,15 @@ def problem(model, *, moves=3, horizon=4, seed=0, guidance=True):
     random, cells = np.random.default_rng(seed), len(model.region)
     plan = random.uniform(0.0, 1.0, (moves, len(model.edges) + len(model.turns)))
     return (
-        random.uniform(0.0, 2e4 / len(model.destinations), cells), random.uniform(0.0, 3.0, (horizon, cells)),
-        Admissible(NETWORK, model, guidance=guidance).project(plan))
+        random.uniform(0.0, 2e4 / len(model.destinations), cells),
+        random.uniform(0.0, 3.0, (horizon, cells)),
+        Admissible(NETWORK, model, guidance=guidance).project(plan),
+    )
 
 
 def by_dynamics(network, model, start, demand, plan, *, step, substeps, integrator):
     """The same sum by nmfd.model.dynamics, as a tensor that knows its gradient with respect to `plan`."""
+
     def cells(vector):
         full = torch.zeros(7, 7, dtype=torch.float64)
         full[:, model.destinations] = torch.from_numpy(vector.reshape(7, -1))
@@ -41,9 +44,11 @@ def by_dynamics(network, model, start, demand, plan, *, step, substeps, integrat
     for k in range(len(demand)):
         row = plan[min(k, len(plan) - 1)]
         perimeter = torch.zeros(7, 7, dtype=torch.float64).index_put(
-            tuple(torch.from_numpy(model.edges.T)), row[:edges])
+            tuple(torch.from_numpy(model.edges.T)), row[:edges]
+        )
         splits = torch.zeros(7, 7, 7, dtype=torch.float64).index_put(
-            tuple(torch.from_numpy(model.turns.T)), row[edges:])
+            tuple(torch.from_numpy(model.turns.T)), row[edges:]
+        )
         x = dynamics.advance(p, x, cells(demand[k]), perimeter, splits, step, integrator=integrator, substeps=substeps)
         total = total + x.sum()
     return total
@@ -52,9 +57,14 @@ def by_dynamics(network, model, start, demand, plan, *, step, substeps, integrat
 @BOTH
 @pytest.mark.parametrize("network", [NETWORK, LIMITED], ids=["published", "limited"])
 @pytest.mark.parametrize("used", [EVERY, SOME], ids=["every", "some"])
-@pytest.mark.parametrize("scheme", [
-    {"step": 30.0, "substeps": 1, "integrator": "euler"}, {"step": 90.0, "substeps": 3, "integrator": "euler"},
-    {"step": 60.0, "substeps": 2, "integrator": "rk4"}])
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        {"step": 30.0, "substeps": 1, "integrator": "euler"},
+        {"step": 90.0, "substeps": 3, "integrator": "euler"},
+        {"step": 60.0, "substeps": 2, "integrator": "rk4"},
+    ],
+)
 def test_the_twin_of_dynamics_and_its_gradient(scheme, used, network, guidance):
     model = edge_model.build(network, used, guidance=guidance)
     start, demand, plan = problem(model, guidance=guidance)
@@ -75,8 +85,7 @@ def test_the_gradient_of_the_rounded_kink():
     random = np.random.default_rng(1)
     for _ in range(5):
         way = random.standard_normal(plan.shape)
-        ahead, behind = (
-            edge_model.vehicle_steps(model, start, demand, plan + s * way, 30.0)[0] for s in (1e-5, -1e-5))
+        ahead, behind = (edge_model.vehicle_steps(model, start, demand, plan + s * way, 30.0)[0] for s in (1e-5, -1e-5))
         assert (ahead - behind) / 2e-5 == pytest.approx((gradient * way).sum(), rel=1e-5)
 
 
@@ -138,6 +147,7 @@ def test_the_gap_is_what_the_best_plan_saves(guidance):
 def quadratic(curvature, centre):
     def function(x):
         return 1.0 + float((curvature * (x - centre) ** 2).sum()), 2.0 * curvature * (x - centre)
+
     return function
 
 
@@ -152,8 +162,16 @@ def box_gap(x, gradient):
 def test_minimise_a_quadratic_in_a_box():
     curvature, centre = 10.0 ** np.linspace(-2, 2, 30), np.linspace(-1.0, 2.0, 30)
     for metric in (1.0, curvature):
-        found = minimise(quadratic(curvature, centre), in_box, box_gap, np.full(30, 0.5), metric=metric,
-                         tolerance=1e-10, iterations=1000, seconds=10.0)
+        found = minimise(
+            quadratic(curvature, centre),
+            in_box,
+            box_gap,
+            np.full(30, 0.5),
+            metric=metric,
+            tolerance=1e-10,
+            iterations=1000,
+            seconds=10.0,
+        )
         assert found.reason is None
         np.testing.assert_allclose(found.point, in_box(centre), atol=1e-3)
         few = found.evaluations
@@ -169,6 +187,7 @@ def test_minimise_says_why_it_stopped():
     assert search(hard, iterations=1).reason == "iteration limit"
     assert search(hard, seconds=0.0).reason == "time limit"
     assert search(lambda x: (np.nan, x)).reason == "not a number"
+
     def rising(x):  # from everywhere: the line search would go on for long
         time.sleep(0.01)
         return float((x != 0.0).any()), -np.ones(2)

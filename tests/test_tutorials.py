@@ -39,7 +39,8 @@ def test_it_runs(file, tmp_path, monkeypatch):
     folder.mkdir()
     notebook = nbformat.read(file, 4)
     nbclient.NotebookClient(
-        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(folder)}}).execute()
+        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+    ).execute()
     printed = [output for cell in notebook.cells for output in cell.get("outputs", ())]
     assert any("image/png" in output.get("data", {}) for output in printed)
     assert not [out for out in printed if out.output_type == "stream" and "Warning" in out.text]

@@ -73,12 +73,17 @@ def test_an_interruption_leaves_nothing(folder, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("arguments, expected", [
-    (("--controller", "mpc-pc"), "--controller: "), (("--against", "mpc-pc"), "choose from no-control, pi-gating"),
-    (("--seed", "7"), "with seed 7; choose from 2000, 2001"), (("--demand", "2"), "choose one of 0.8, 1"),
-    (("--out", "{tmp}/x.avi"), "expected a name that ends in .gif or .mp4"),
-    (("--out", "{tmp}/x.mp4"), "there is no ffmpeg for mp4; install ffmpeg, or pip install"),
-])
+@pytest.mark.parametrize(
+    "arguments, expected",
+    [
+        (("--controller", "mpc-pc"), "--controller: "),
+        (("--against", "mpc-pc"), "choose from no-control, pi-gating"),
+        (("--seed", "7"), "with seed 7; choose from 2000, 2001"),
+        (("--demand", "2"), "choose one of 0.8, 1"),
+        (("--out", "{tmp}/x.avi"), "expected a name that ends in .gif or .mp4"),
+        (("--out", "{tmp}/x.mp4"), "there is no ffmpeg for mp4; install ffmpeg, or pip install"),
+    ],
+)
 def test_error_lines(folder, tmp_path, monkeypatch, arguments, expected):
     monkeypatch.setattr(video, "ffmpeg", lambda: None)
     assert expected in error_line(cosim("video", folder, *(a.format(tmp=tmp_path) for a in arguments)))

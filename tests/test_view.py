@@ -40,8 +40,12 @@ EVIL = "<script>alert(1)</script>"
 @pytest.fixture(scope="module")
 def task(tmp_path_factory):
     """A tiny city with gates that are closed to half."""
-    return Task(scenario=tiny_city.imported(tmp_path_factory.mktemp("view")), controller="no-control+guided", seed=3,
-                steps=STEPS)
+    return Task(
+        scenario=tiny_city.imported(tmp_path_factory.mktemp("view")),
+        controller="no-control+guided",
+        seed=3,
+        steps=STEPS,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -159,9 +163,22 @@ def test_gates_by_hand_one_after_the_other():
     assert faults.by_hand([(2, 0, 1, 0.0), (2, 0, 1, None)]) == []
 
 
-@pytest.mark.parametrize("text", [
-    "gate", "gate:", "gate:0-1", "gate:0-0=1", "gate:0-2=1", "gate:0-1=2", "gate:0-1=-1", "gate:0-1=nan", "gate:0-1=x",
-    "gate:0>1=1", "gate:x-1=0"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "gate",
+        "gate:",
+        "gate:0-1",
+        "gate:0-0=1",
+        "gate:0-2=1",
+        "gate:0-1=2",
+        "gate:0-1=-1",
+        "gate:0-1=nan",
+        "gate:0-1=x",
+        "gate:0>1=1",
+        "gate:x-1=0",
+    ],
+)
 def test_gates_that_cannot_be_held(text):
     with pytest.raises(InputError, match="here: "):
         faults.parse(text, "here", 2)
@@ -173,16 +190,34 @@ def test_a_gate_where_no_street_leads(task, city, tmp_path):
     if not missing:
         missing = [(0, 7)]
     i, h = missing[0]
-    line = error_line(cosim("run", task.scenario, "--controller", "no-control", "--out", tmp_path / "out", "--fault",
-                            f"gate:{i}-{h}=0"))
+    line = error_line(
+        cosim(
+            "run", task.scenario, "--controller", "no-control", "--out", tmp_path / "out", "--fault", f"gate:{i}-{h}=0"
+        )
+    )
     assert "gate" in line and not (tmp_path / "out").exists()
 
 
 def test_looking_back():
-    frames = [Frame(
-        time=60.0 * k, intervals=k, whole=True, **dict.fromkeys(("density", "speed"), np.zeros(1, np.float16)),
-        accumulation=np.zeros(1), outflow=np.zeros(1), waiting=0.0, completed=k, removed=0.0, time_spent=0.0,
-        perimeter=np.zeros((1, 1)), green=np.zeros(0), queue=np.zeros(0), guided=np.zeros((1, 1))) for k in range(4)]
+    frames = [
+        Frame(
+            time=60.0 * k,
+            intervals=k,
+            whole=True,
+            **dict.fromkeys(("density", "speed"), np.zeros(1, np.float16)),
+            accumulation=np.zeros(1),
+            outflow=np.zeros(1),
+            waiting=0.0,
+            completed=k,
+            removed=0.0,
+            time_spent=0.0,
+            perimeter=np.zeros((1, 1)),
+            green=np.zeros(0),
+            queue=np.zeros(0),
+            guided=np.zeros((1, 1)),
+        )
+        for k in range(4)
+    ]
     seen = Seen("x")
     assert seen.at(100.0) is None
     for frame in frames:
@@ -224,8 +259,9 @@ def test_a_page_shows_every_street_and_trusts_no_name(task, city, seen):
     assert city.edges[busiest] in page.curves.street.title.text
     assert list(page.maps[1].chosen.data["xs"][0]) == list(page.maps[0].streets.data["xs"][busiest])
     assert len(page.curves.lines[0].data["time"]) == STEPS + 1 and len(page.curves.lines[1].data["time"]) == 2
-    html = file_html(document, CDN, title=document.title, template=document.template,
-                     template_variables=document.template_variables)
+    html = file_html(
+        document, CDN, title=document.title, template=document.template, template_variables=document.template_variables
+    )
     assert EVIL not in html and html.count("<script") == html.count("</script") and "&lt;script&gt;" in html
     for plot in (*page.maps, *page.loads):
         assert plot.plot.name
@@ -236,8 +272,10 @@ def test_a_page_shows_every_street_and_trusts_no_name(task, city, seen):
 
 def test_finished_runs_on_one_page_with_a_slider(task, city, plain, switched):
     drawn = replace(CityPicture.of(scenario_of(task), city), name=EVIL)
-    runs = {"plain": picture.frames(drawn, plain.trajectory, plain.record),
-            EVIL: picture.frames(drawn, switched[0].trajectory, switched[0].record)}
+    runs = {
+        "plain": picture.frames(drawn, plain.trajectory, plain.record),
+        EVIL: picture.frames(drawn, switched[0].trajectory, switched[0].record),
+    }
     models, _ = replay.layout(drawn, runs)
     callback = models["time"].js_property_callbacks["change:value"][0]
     film, choices = callback.args["film"].data, callback.args["choices"].data
@@ -282,14 +320,27 @@ def guards():
         server._tornado.stop()
 
 
-@pytest.mark.parametrize("good, asked", [
-    (True, {}), (True, {"host": "localhost:8080"}), (True, {"host": "[::1]:5006"}),
-    (True, {"Origin": "http://127.0.0.1:5006"}), (False, {"path": "/ws", "Origin": "http://127.0.0.1:5006"}),
-    (False, {"host": "evil.example"}), (False, {"host": "127.0.0.1.evil.example:5006"}), (False, {"host": ""}),
-    (False, {"host": "[::1"}), (False, {"host": "10.0.0.1:5006"}),
-    (False, {"Origin": "http://evil.example"}), (False, {"Origin": "null"}), (False, {"Origin": "http://localhost:5006"}),
-    (False, {"path": "/ws", "Origin": "http://127.0.0.1:3000"}), (False, {"path": "/ws", "host": "evil.example"}),
-    (False, {"path": "/static/js/bokeh.min.js", "host": "evil.example"})])
+@pytest.mark.parametrize(
+    "good, asked",
+    [
+        (True, {}),
+        (True, {"host": "localhost:8080"}),
+        (True, {"host": "[::1]:5006"}),
+        (True, {"Origin": "http://127.0.0.1:5006"}),
+        (False, {"path": "/ws", "Origin": "http://127.0.0.1:5006"}),
+        (False, {"host": "evil.example"}),
+        (False, {"host": "127.0.0.1.evil.example:5006"}),
+        (False, {"host": ""}),
+        (False, {"host": "[::1"}),
+        (False, {"host": "10.0.0.1:5006"}),
+        (False, {"Origin": "http://evil.example"}),
+        (False, {"Origin": "null"}),
+        (False, {"Origin": "http://localhost:5006"}),
+        (False, {"path": "/ws", "Origin": "http://127.0.0.1:3000"}),
+        (False, {"path": "/ws", "host": "evil.example"}),
+        (False, {"path": "/static/js/bokeh.min.js", "host": "evil.example"}),
+    ],
+)
 def test_who_may_ask_on_this_machine(guards, good, asked):
     assert guards[0].allowed(request(**asked)) == good
 
@@ -299,8 +350,16 @@ def test_beyond_this_machine_nothing_without_the_token(guards):
     assert len(token) >= 24
     for host in ("192.168.1.7:5006", "localhost:5006"):
         assert guard.allowed(request(f"/?token={token}", host=host))
-        for path in ("/", "/?token=", f"/?token={token[:-1]}", f"/?token={token}x", f"/?token={token}&token=x",
-                     "/autoload.js", "/metadata", "/?token=%ff%ff"):
+        for path in (
+            "/",
+            "/?token=",
+            f"/?token={token[:-1]}",
+            f"/?token={token}x",
+            f"/?token={token}&token=x",
+            "/autoload.js",
+            "/metadata",
+            "/?token=%ff%ff",
+        ):
             assert not guard.allowed(request(path, host=host)), path
     assert not guard.allowed(request(f"/?token={token}", host="evil.example"))
     assert guard.sign_sessions and guard.secret_key  # so that a websocket needs what only the page gives out
@@ -338,8 +397,13 @@ def test_the_guard_stands_before_everything():
         connection.close()
         return found
 
-    upgrade = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec_WebSocket_Version": "13",
-               "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec_WebSocket_Protocol": "bokeh, made-up"}
+    upgrade = {
+        "Upgrade": "websocket",
+        "Connection": "Upgrade",
+        "Sec_WebSocket_Version": "13",
+        "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
+        "Sec_WebSocket_Protocol": "bokeh, made-up",
+    }
     try:
         status, page = ask("/")
         assert status == 200 and b"cdn." not in page and b"https://" not in page.replace(b"https://bokeh", b"")

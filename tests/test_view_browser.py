@@ -56,8 +56,23 @@ def browser():
 def report(scenario, tmp_path_factory):
     """The page of two runs."""
     out = tmp_path_factory.mktemp("report") / "run"
-    for command in (("run", scenario, "--controller", "no-control+guided", "--against", "no-control", "--seed", 3,
-                     "--steps", 6, "--out", out), ("report", out)):
+    for command in (
+        (
+            "run",
+            scenario,
+            "--controller",
+            "no-control+guided",
+            "--against",
+            "no-control",
+            "--seed",
+            3,
+            "--steps",
+            6,
+            "--out",
+            out,
+        ),
+        ("report", out),
+    ):
         good(call("cosim", *command))
     return out / "report.html"
 
@@ -110,8 +125,22 @@ def test_the_page_of_finished_runs(report, browser, width):
 
 @pytest.mark.parametrize("width", [1400, 390])
 def test_the_page_lives(scenario, browser, width):
-    command = [sys.executable, "-m", "cosim", "watch", str(scenario), "--controller", "no-control", "--against",
-               "no-control+guided", "--seed", "3", "--no-open", "--delay", "20"]
+    command = [
+        sys.executable,
+        "-m",
+        "cosim",
+        "watch",
+        str(scenario),
+        "--controller",
+        "no-control",
+        "--against",
+        "no-control+guided",
+        "--seed",
+        "3",
+        "--no-open",
+        "--delay",
+        "20",
+    ]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         address = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())[0]
@@ -146,8 +175,11 @@ def test_the_page_lives(scenario, browser, width):
         page.wait_for_function(f"before => ({TEXT})() !== before", arg=page.evaluate(TEXT), timeout=10_000)
         page.wait_for_timeout(1500)
         stepped = minutes()
-        assert before < stepped <= before + 2 * scenario_of(
-            Task(scenario=scenario, controller="no-control", seed=3)).step / 60
+        assert (
+            before
+            < stepped
+            <= before + 2 * scenario_of(Task(scenario=scenario, controller="no-control", seed=3)).step / 60
+        )
         press("Faster")  # while it waits: at the end these buttons are off
         press("Close gate")
         press("Go on")

@@ -99,20 +99,25 @@ def test_without_a_screen_one_line_points_to_the_film(monkeypatch):
     line = error_line(cosim("watch", ROOT / "scenarios" / "grid7_peak", "--controller", "pi-gating", "--gui"))
     assert "no screen" in line and "`cosim video RUN`" in line
     monkeypatch.setenv("DISPLAY", ":9876")
-    line = error_line(cosim(
-        "watch", ROOT / "scenarios" / "grid7_peak", "--controller", "no-control", "--steps", "1", "--gui"))
+    line = error_line(
+        cosim("watch", ROOT / "scenarios" / "grid7_peak", "--controller", "no-control", "--steps", "1", "--gui")
+    )
     assert "sumo-gui cannot show" in line and "unable to open display :9876" in line
 
 
 @pytest.mark.skipif(XVFB is None, reason="no Xvfb")
 def test_in_a_window(task, monkeypatch):
-    server = subprocess.Popen([XVFB, "-displayfd", "1", "-screen", "0", "1000x800x24"], stdout=subprocess.PIPE,
-                              stderr=subprocess.DEVNULL, text=True)
+    server = subprocess.Popen(
+        [XVFB, "-displayfd", "1", "-screen", "0", "1000x800x24"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
     try:
         monkeypatch.setenv("DISPLAY", f":{server.stdout.readline().strip()}")
         result = cosim(
-            "watch", task.scenario, "--controller", "pi-gating", "--seed", "3", "--steps", "1", "--delay", "1",
-            "--gui")
+            "watch", task.scenario, "--controller", "pi-gating", "--seed", "3", "--steps", "1", "--delay", "1", "--gui"
+        )
         assert result.exit_code == 0, result.output + str(result.exception)
         assert "pi-gating, seed 3: total time spent" in result.stdout
     finally:

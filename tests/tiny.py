@@ -62,7 +62,8 @@ def row_network(regions: int = 2) -> str:
     """network.toml of `regions` regions in a row."""
     return NETWORK.format(name=f"row{regions}") + "".join(
         REGION.format(position=region, adjacent=[h for h in (region - 1, region + 1) if 0 <= h < regions])
-        for region in range(regions))
+        for region in range(regions)
+    )
 
 
 def write(folder: Path, *, scenario: str = SCENARIO, network: str | None = None) -> Path:
@@ -78,9 +79,11 @@ def limited(network: RegionalModel, *, seed: int = 0) -> RegionalModel:
     random, shape = np.random.default_rng(seed), network.adjacency.shape
     most = max(mfd.capacity for mfd in network.mfds)
     return replace(
-        network, exit_rates=random.uniform(0.5, 1.5, shape),
+        network,
+        exit_rates=random.uniform(0.5, 1.5, shape),
         capacity=random.uniform(0.1, 0.6, shape) * most * network.adjacency,
-        storage=random.uniform(0.8, 1.6, network.regions) * np.array([m.jam for m in network.mfds]))
+        storage=random.uniform(0.8, 1.6, network.regions) * np.array([m.jam for m in network.mfds]),
+    )
 
 
 def random_controls(random, network, batch=()):

@@ -54,15 +54,31 @@ BUSES = """<routes>
 
 def run(program: str, *arguments) -> None:
     done = subprocess.run(
-        [str(Path(sumo.SUMO_HOME) / "bin" / program), *map(str, arguments)], capture_output=True, text=True)
+        [str(Path(sumo.SUMO_HOME) / "bin" / program), *map(str, arguments)], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
 
 
 def network(folder: Path, *options: str, name: str = "city.net.xml") -> Path:
     """A grid of 4 x 4 junctions A0 to D3, 200 m apart, with signals at all inner ones unless told otherwise."""
     options = options or ("--tls.set", "B1,B2,C1,C2,B3,C0")
-    run("netgenerate", "--grid", "--grid.number", 4, "--grid.length", 200, "--default.lanenumber", 2,
-        "--no-turnarounds", "true", "--seed", 1, "--output-file", folder / name, *options)
+    run(
+        "netgenerate",
+        "--grid",
+        "--grid.number",
+        4,
+        "--grid.length",
+        200,
+        "--default.lanenumber",
+        2,
+        "--no-turnarounds",
+        "true",
+        "--seed",
+        1,
+        "--output-file",
+        folder / name,
+        *options,
+    )
     return folder / name
 
 
@@ -79,8 +95,19 @@ def city(folder: Path, *options: str) -> Path:
 
 def imported(folder: Path) -> Path:
     """The scenario of the city with demand in `folder`, which is cut into three regions and not run first."""
-    good(cosim("import", city(folder), "--regions", 3, "--no-run", "--method", "geometric", "--out",
-               folder / "networks" / "tiny"))
+    good(
+        cosim(
+            "import",
+            city(folder),
+            "--regions",
+            3,
+            "--no-run",
+            "--method",
+            "geometric",
+            "--out",
+            folder / "networks" / "tiny",
+        )
+    )
     return folder / "scenarios" / "tiny"
 
 
@@ -92,10 +119,18 @@ def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tup
     try:
         plant.reset(0)
         for _ in range(intervals):
-            measured = plant.step(Controls(
-                perimeter=np.where(scenario.network.adjacency, gates, 0.0), splits=scenario.network.nominal_splits))
+            measured = plant.step(
+                Controls(
+                    perimeter=np.where(scenario.network.adjacency, gates, 0.0), splits=scenario.network.nominal_splits
+                )
+            )
         record = plant.record()
-        return (plant.trips, record.departures.sum(), record.arrivals.sum(), measured.accumulation.sum(),
-                measured.backlog.sum())
+        return (
+            plant.trips,
+            record.departures.sum(),
+            record.arrivals.sum(),
+            measured.accumulation.sum(),
+            measured.backlog.sum(),
+        )
     finally:
         plant.close()

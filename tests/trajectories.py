@@ -12,26 +12,43 @@ def made(**fields) -> Trajectory:
     """A Trajectory of `fields`; what they do not say is as in a run without noise, faults or failures."""
     steps = len(fields["perimeter"])
     usual = {
-        "observed": fields["accumulation"], "observed_backlog": fields["backlog"], "estimated": False,
-        "decision_time": np.zeros(steps), "status": np.zeros(steps, dtype=int), "note": ("",) * steps, "wall_time": 1.0}
+        "observed": fields["accumulation"],
+        "observed_backlog": fields["backlog"],
+        "estimated": False,
+        "decision_time": np.zeros(steps),
+        "status": np.zeros(steps, dtype=int),
+        "note": ("",) * steps,
+        "wall_time": 1.0,
+    }
     return Trajectory(**usual | fields)
 
 
 def record(steps: int, *, regions: int, gateways: int = 3, edges: int = 5) -> dict[str, np.ndarray]:
     """The arrays of a Record, at random."""
     sizes, random = {"interval": steps, "gateway": gateways, "edge": edges}, np.random.default_rng(0)
-    return {name: random.random([sizes.get(axis, regions) for axis in about["dimensions"]])
-            for name, about in quantities(Record).items()}
+    return {
+        name: random.random([sizes.get(axis, regions) for axis in about["dimensions"]])
+        for name, about in quantities(Record).items()
+    }
 
 
 def trajectory(controller="no-control", seed=0, steps=4):
     rng = np.random.default_rng(seed)
     return made(
-        controller=controller, plant="nmfd", seed=seed, step=30.0, accumulation=rng.random((steps + 1, 2, 2)),
-        backlog=np.zeros((steps + 1, 2, 2)), completed=np.arange(steps + 1.0), perimeter=rng.random((steps, 2, 2)),
-        splits=rng.random((steps, 2, 2, 2)), decision_time=rng.random(steps), note=("",) * (steps - 1) + ("no",),
+        controller=controller,
+        plant="nmfd",
+        seed=seed,
+        step=30.0,
+        accumulation=rng.random((steps + 1, 2, 2)),
+        backlog=np.zeros((steps + 1, 2, 2)),
+        completed=np.arange(steps + 1.0),
+        perimeter=rng.random((steps, 2, 2)),
+        splits=rng.random((steps, 2, 2, 2)),
+        decision_time=rng.random(steps),
+        note=("",) * (steps - 1) + ("no",),
         status=np.array([0] * (steps - 1) + [(Status.SOLVER_FAILURE | Status.FALLBACK).value]),
-        wall_time=1.0)
+        wall_time=1.0,
+    )
 
 
 def in_city(task: Task, tts: float, trips: int, completed: int) -> Result:
@@ -39,9 +56,22 @@ def in_city(task: Task, tts: float, trips: int, completed: int) -> Result:
     accumulation = np.zeros((2, 7, 7))
     accumulation[0, 0, 0] = tts / 90.0
     run = made(
-        controller=task.controller, plant="sumo", seed=task.seed, step=90.0, accumulation=accumulation,
-        backlog=np.zeros((2, 7, 7)), completed=np.array([0.0, completed]), perimeter=np.ones((1, 7, 7)),
-        splits=np.zeros((1, 7, 7, 7)), decision_time=np.zeros(1), wall_time=1.0)
+        controller=task.controller,
+        plant="sumo",
+        seed=task.seed,
+        step=90.0,
+        accumulation=accumulation,
+        backlog=np.zeros((2, 7, 7)),
+        completed=np.array([0.0, completed]),
+        perimeter=np.ones((1, 7, 7)),
+        splits=np.zeros((1, 7, 7, 7)),
+        decision_time=np.zeros(1),
+        wall_time=1.0,
+    )
     facts = {name: 0 for name in FACTS} | {
-        "outside_training": "", "controller": task.controller, "seed": task.seed, "trips": trips}
+        "outside_training": "",
+        "controller": task.controller,
+        "seed": task.seed,
+        "trips": trips,
+    }
     return Result(trajectory=run, record=record(1, regions=7), facts=facts)

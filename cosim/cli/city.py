@@ -24,18 +24,41 @@ from nmfd.runs.workers import at_a_time
 @declared("cosim.evaluation.settings:Identification", "levels", "seeds", "iterations")
 @declared("cosim.evaluation.settings:Identification", "workers", instead="one per core")
 @scheduler_options
-@click.option("--guided/--own", default=None,
-              help="Only the model of guided drivers, or only that of drivers who go their own ways. [default: both]")
-@click.option("--with", "options", metavar="OPTION[+...]",
-              help="Of a city with such signals or drivers: max-pressure, rerouting-30, ... as in a strategy's name.")
-@click.option("--network", "target", type=FOLDER, metavar="DIR",
-              help="The folder whose network.toml is written, for one model. [default: the scenario's network]")
+@click.option(
+    "--guided/--own",
+    default=None,
+    help="Only the model of guided drivers, or only that of drivers who go their own ways. [default: both]",
+)
+@click.option(
+    "--with",
+    "options",
+    metavar="OPTION[+...]",
+    help="Of a city with such signals or drivers: max-pressure, rerouting-30, ... as in a strategy's name.",
+)
+@click.option(
+    "--network",
+    "target",
+    type=FOLDER,
+    metavar="DIR",
+    help="The folder whose network.toml is written, for one model. [default: the scenario's network]",
+)
 @RUNS
 @out_option("identify", "Samples and pictures.")
 def identify(
-    scenario: Path, levels: tuple[float, ...], seeds: int, workers: int | None, scheduler: str | None,
-    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, guided: bool | None,
-    options: str | None, target: Path | None, iterations: int, runs: tuple[Path, ...], out: Path | None,
+    scenario: Path,
+    levels: tuple[float, ...],
+    seeds: int,
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_ca: Path | None,
+    scheduler_cert: Path | None,
+    scheduler_key: Path | None,
+    guided: bool | None,
+    options: str | None,
+    target: Path | None,
+    iterations: int,
+    runs: tuple[Path, ...],
+    out: Path | None,
 ) -> None:
     """Fit the regional model and the drivers' own split ratios of a SUMO city; writes a network.toml.
 
@@ -73,12 +96,24 @@ def identify(
         if out and both and guide:
             folder = out / "guided"
         loading = identify.Loading(
-            levels=levels, seeds=range(1000, 1000 + seeds), guided=guide,
-            options=options.split("+") if options else (), network=target, iterations=iterations, runs=runs)
+            levels=levels,
+            seeds=range(1000, 1000 + seeds),
+            guided=guide,
+            options=options.split("+") if options else (),
+            network=target,
+            iterations=iterations,
+            runs=runs,
+        )
         with resumable("identify", folder) as progress:
             text = identify.identify(
-                scenario, loading, out=folder, workers=at_a_time(workers), scheduler=cluster,
-                progress=progress, tell=tell)
+                scenario,
+                loading,
+                out=folder,
+                workers=at_a_time(workers),
+                scheduler=cluster,
+                progress=progress,
+                tell=tell,
+            )
         if both:
             click.echo("Drivers who are guided:" if guide else "Drivers who go their own ways:")
         click.echo(text)
@@ -88,27 +123,50 @@ def identify(
 
 @click.command(name="import")
 @click.argument("source", type=FILE, required=False, metavar="SUMOCFG|NET|OSM")
-@click.option("--bbox", metavar="W,S,E,N",
-              help="A box of OpenStreetMap, in degrees, fetched from a public server, instead of a file.")
+@click.option(
+    "--bbox",
+    metavar="W,S,E,N",
+    help="A box of OpenStreetMap, in degrees, fetched from a public server, instead of a file.",
+)
 @click.option("--left-hand", is_flag=True, help="Of OpenStreetMap: a city that drives on the left.")
 @declared("cosim.importing.settings:Import", "regions", instead="those of --edges, --taz or --polygons")
 @click.option("--out", type=FOLDER, required=True, metavar="DIR", help="The network's folder, such as networks/mycity.")
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="[default: scenarios/<name>, beside the networks]")
-@click.option("--method", type=click.Choice(["density", "geometric"]), default="density", show_default=True,
-              help="How: streets of similar density together, or k-means on the road graph.")
+@click.option(
+    "--method",
+    type=click.Choice(["density", "geometric"]),
+    default="density",
+    show_default=True,
+    help="How: streets of similar density together, or k-means on the road graph.",
+)
 @click.option("--edges", type=FILE, metavar="CSV", help="Or your own regions: a table with the columns edge,region,")
 @click.option("--taz", type=FILE, metavar="FILE", help="or a SUMO file with a TAZ per region,")
 @click.option("--polygons", type=FILE, metavar="FILE", help="or one with a polygon or more (id, id.1, ...) per region.")
-@click.option("--routes", type=FILE, multiple=True, metavar="FILE",
-              help="Vehicles, trips or flows, if not in the sumocfg. May be repeated.")
-@click.option("--od", type=FILE, multiple=True, metavar="FILE",
-              help="OD matrix between TAZ: tazRelation XML, or VISUM's O- or V-format. May be repeated.")
+@click.option(
+    "--routes",
+    type=FILE,
+    multiple=True,
+    metavar="FILE",
+    help="Vehicles, trips or flows, if not in the sumocfg. May be repeated.",
+)
+@click.option(
+    "--od",
+    type=FILE,
+    multiple=True,
+    metavar="FILE",
+    help="OD matrix between TAZ: tazRelation XML, or VISUM's O- or V-format. May be repeated.",
+)
 @click.option("--zones", type=FILE, multiple=True, metavar="FILE", help="The TAZ of --od, if not in the sumocfg.")
 @click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak, for a city without demand.")
 @declared("cosim.importing.settings:Import", "iterations", "gap")
-@click.option("--level", default="1", show_default=True, metavar="X|auto",
-              help="Times the city's vehicles, or the usual peak; auto: the lowest at which without control a region "
-              "comes to its critical accumulation.")
+@click.option(
+    "--level",
+    default="1",
+    show_default=True,
+    metavar="X|auto",
+    help="Times the city's vehicles, or the usual peak; auto: the lowest at which without control a region "
+    "comes to its critical accumulation.",
+)
 @declared("cosim.importing.settings:Import", "seeds")
 @declared("cosim.plant.settings:SumoTable", "mesoscopic", is_flag=True)
 @click.option("--begin", metavar="TIME", help="Instead of the sumocfg's, in seconds or as hours:minutes:seconds.")
@@ -117,10 +175,29 @@ def identify(
 @click.option("--no-run", is_flag=True, help="Do not simulate the city first: no densities and no flows.")
 @click.option("--force", is_flag=True, help="Replace a network and scenario that are there.")
 def import_(
-    source: Path | None, bbox: str | None, left_hand: bool, regions: int | None, out: Path, scenario: Path | None,
-    method: Literal["density", "geometric"], edges: Path | None, taz: Path | None, polygons: Path | None,
-    routes: tuple[Path, ...], od: tuple[Path, ...], zones: tuple[Path, ...], demand: str | None, iterations: int,
-    gap: float, level: str, seeds: int, mesoscopic: bool, begin: str | None, end: str | None, seed: int, no_run: bool,
+    source: Path | None,
+    bbox: str | None,
+    left_hand: bool,
+    regions: int | None,
+    out: Path,
+    scenario: Path | None,
+    method: Literal["density", "geometric"],
+    edges: Path | None,
+    taz: Path | None,
+    polygons: Path | None,
+    routes: tuple[Path, ...],
+    od: tuple[Path, ...],
+    zones: tuple[Path, ...],
+    demand: str | None,
+    iterations: int,
+    gap: float,
+    level: str,
+    seeds: int,
+    mesoscopic: bool,
+    begin: str | None,
+    end: str | None,
+    seed: int,
+    no_run: bool,
     force: bool,
 ) -> None:
     """Turn any SUMO city into a network and a scenario: regions, gateways, demand by pair of regions, map.
@@ -154,11 +231,25 @@ def import_(
     if no_run and cuts[0].method == "density":
         raise InputError("--no-run: the densities come from that run; add --method geometric")
     order = ImportOptions(
-        source=given, left_hand=left_hand, out=out, cut=cuts[0], seed=seed, run=not no_run, force=force,
-        peak=demand is not None, level=parsed_level(level, no_run), mesoscopic=mesoscopic,
+        source=given,
+        left_hand=left_hand,
+        out=out,
+        cut=cuts[0],
+        seed=seed,
+        run=not no_run,
+        force=force,
+        peak=demand is not None,
+        level=parsed_level(level, no_run),
+        mesoscopic=mesoscopic,
         scenario=scenario or out.parent.parent / "scenarios" / out.name,
-        begin=parse_time(begin, "--begin"), end=parse_time(end, "--end"), routes=routes, od=od,
-        zones=zones, effort=Effort(iterations=iterations, gap=gap), seeds=seeds)
+        begin=parse_time(begin, "--begin"),
+        end=parse_time(end, "--end"),
+        routes=routes,
+        od=od,
+        zones=zones,
+        effort=Effort(iterations=iterations, gap=gap),
+        seeds=seeds,
+    )
     with progress_line("import") as progress:
         report = import_city(order, lambda stage, share=0.0: progress(round(100 * share), 100, stage))
     click.echo(report)

@@ -24,19 +24,40 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("controllers", metavar="[NAME...]", nargs=-1)
-@click.option("--tasks", default="v1", show_default=True, metavar="SET",
-              help="A task set that comes with the package, or a TOML file of your own.")
+@click.option(
+    "--tasks",
+    default="v1",
+    show_default=True,
+    metavar="SET",
+    help="A task set that comes with the package, or a TOML file of your own.",
+)
 @click.option("--only", metavar="A,B,...", help="Of its tasks these alone, for now; in quotes also patterns: 'grid7*'.")
 @declared("cosim.evaluation.settings:Evaluation", "workers", instead="one per core")
 @scheduler_options
-@click.option("--table", "tables", multiple=True, metavar="DIR|SET",
-              help="Instead of running: the leaderboard of the entries in this folder, and, where a task set is named, "
-                   "of those that come with the package. May be repeated.")
-@click.option("--out", type=FOLDER, metavar="DIR",
-              help="Where entries and runs go, or the leaderboard. [default: runs/compete-SET; of a table its DIR]")
+@click.option(
+    "--table",
+    "tables",
+    multiple=True,
+    metavar="DIR|SET",
+    help="Instead of running: the leaderboard of the entries in this folder, and, where a task set is named, "
+    "of those that come with the package. May be repeated.",
+)
+@click.option(
+    "--out",
+    type=FOLDER,
+    metavar="DIR",
+    help="Where entries and runs go, or the leaderboard. [default: runs/compete-SET; of a table its DIR]",
+)
 def compete(
-    controllers: tuple[str, ...], tasks: str, only: str | None, workers: int | None, scheduler: str | None,
-    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, tables: tuple[str, ...],
+    controllers: tuple[str, ...],
+    tasks: str,
+    only: str | None,
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_ca: Path | None,
+    scheduler_cert: Path | None,
+    scheduler_key: Path | None,
+    tables: tuple[str, ...],
     out: Path | None,
 ) -> None:
     """Enter controllers in a released task set, or make the leaderboard of entries.
@@ -64,7 +85,11 @@ def compete(
 
 
 def _run(
-    controllers: tuple[str, ...], tasks: str, only: str | None, workers: int, cluster: "Scheduler | None",
+    controllers: tuple[str, ...],
+    tasks: str,
+    only: str | None,
+    workers: int,
+    cluster: "Scheduler | None",
     out: Path | None,
 ) -> None:
     from cosim.compete import run, task_set  # heavy
@@ -73,9 +98,11 @@ def _run(
 
     loaded = task_set.read(tasks)
     order = run.Order(
-        task_set=loaded, controllers=tuple(names.chosen(controllers, parse, registry.choice, "compete")),
+        task_set=loaded,
+        controllers=tuple(names.chosen(controllers, parse, registry.choice, "compete")),
         only=tuple(word.strip() for word in only.split(",") if word.strip()) if only else (),
-        out=Path("runs") / f"compete-{file_name(loaded.tasks.name)}" if out is None else out)
+        out=Path("runs") / f"compete-{file_name(loaded.tasks.name)}" if out is None else out,
+    )
     with resumable("compete", order.out) as progress:
         entries = run.compete(order, workers=workers, scheduler=cluster, progress=progress, tell=tell)
     for made in entries:
@@ -98,8 +125,24 @@ def _table(tables: tuple[str, ...], out: Path | None) -> None:
         raise InputError(f"--out: {folder or 'missing'}; give a folder that is there, for the leaderboard")
     page.write(folder / "leaderboard.html", board)
     table.write_csv(folder / "leaderboard.csv", board)
-    click.echo(text_table([{
-        "controller": row.name, "rank": row.rank or "-", "worth": page.number(row.worth, ".3f") or "-",
-        **{task: page.in_task(one) for task, rows in board.by_task.items() for one in rows if one.name == row.name},
-        "failed": row.failed} for row in board.overall], table.RULE))
+    click.echo(
+        text_table(
+            [
+                {
+                    "controller": row.name,
+                    "rank": row.rank or "-",
+                    "worth": page.number(row.worth, ".3f") or "-",
+                    **{
+                        task: page.in_task(one)
+                        for task, rows in board.by_task.items()
+                        for one in rows
+                        if one.name == row.name
+                    },
+                    "failed": row.failed,
+                }
+                for row in board.overall
+            ],
+            table.RULE,
+        )
+    )
     click.echo(f"Written to {folder}: see leaderboard.html and leaderboard.csv")

@@ -16,8 +16,12 @@ NAMES = ("no-control", "pi-gating")
 @click.command()
 @click.option("--seed", type=SEED, default=1000, show_default=True, help="Of the trips and the drivers.")
 @click.option("--out", type=FOLDER, default=Path("runs/demo"), show_default=True, metavar="DIR", help="The run folder.")
-@click.option("--open/--no-open", "browse", default=None,
-              help="Open the page in this machine's browser. [default: where there is a screen and a terminal]")
+@click.option(
+    "--open/--no-open",
+    "browse",
+    default=None,
+    help="Open the page in this machine's browser. [default: where there is a screen and a terminal]",
+)
 def demo(seed: int, out: Path, browse: bool | None) -> None:
     """See what gates do: a small city that locks, and the same with signals that hold vehicles back around its centre.
 
@@ -40,8 +44,10 @@ def demo(seed: int, out: Path, browse: bool | None) -> None:
         rows = experiment.experiment(tasks, out=out, workers=2, progress=progress, tell=tell)
     for name in NAMES:
         [row] = rows[(rows["controller"] == name) & (rows["seed"] == seed)].to_dict("records")
-        click.echo(f"{name + ':':12} {row['completed_veh']:,.0f} of {row['trips']:,.0f} trips served, "
-                   f"{card.minutes_per_trip(row):.1f} minutes per trip")
+        click.echo(
+            f"{name + ':':12} {row['completed_veh']:,.0f} of {row['trips']:,.0f} trips served, "
+            f"{card.minutes_per_trip(row):.1f} minutes per trip"
+        )
     page = html.write_page(out / "report.html", [results.read(out, scenario)], seed=seed)
     click.echo(f"Both side by side: {page.resolve()}")
     if has_screen() if browse is None else browse:

@@ -30,6 +30,5 @@ def get(name: str | None, out: Path | None) -> None:
         click.echo(download.listed())
         return
     with progress_line("get") as progress:
-        text = download.get(
-            name, Path("cities") / name if out is None else out, lambda stage: progress(0, 1, stage))
+        text = download.get(name, Path("cities") / name if out is None else out, lambda stage: progress(0, 1, stage))
     click.echo(text)

@@ -61,10 +61,22 @@ def main() -> None:
 @TIME_LIMIT
 @out_option("evaluate", "The folder.")
 def evaluate(
-    scenario: Path, controllers: str, seeds: int, first_seed: int, demand: tuple[float, ...], reference: str | None,
-    earlier: tuple[Path, ...], policies: tuple[str, ...], workers: int | None, scheduler: str | None,
-    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None,
-    own_time_limit: float | None, out: Path | None,
+    scenario: Path,
+    controllers: str,
+    seeds: int,
+    first_seed: int,
+    demand: tuple[float, ...],
+    reference: str | None,
+    earlier: tuple[Path, ...],
+    policies: tuple[str, ...],
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_ca: Path | None,
+    scheduler_cert: Path | None,
+    scheduler_key: Path | None,
+    steps: int | None,
+    own_time_limit: float | None,
+    out: Path | None,
 ) -> None:
     """Compare controllers in the microsimulation over seeds and demand levels; print and write tables, draw figures.
 
@@ -89,16 +101,22 @@ def evaluate(
 
     loaded = load_scenario(scenario)
     chosen = evaluate.Evaluation(
-        scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
-        levels=demand, steps=steps, policies=files, reference=reference, time_limit=own_time_limit,
-        earlier=earlier, out=Path("runs") / f"{file_name(loaded.name)}-evaluate" if out is None else out)
+        scenario=scenario,
+        controllers=tuple(names),
+        seeds=range(first_seed, first_seed + seeds),
+        levels=demand,
+        steps=steps,
+        policies=files,
+        reference=reference,
+        time_limit=own_time_limit,
+        earlier=earlier,
+        out=Path("runs") / f"{file_name(loaded.name)}-evaluate" if out is None else out,
+    )
     workers = at_a_time(workers)
     with resumable("evaluate", chosen.out) as progress:
-        table, failures = evaluate.evaluate(
-            chosen, workers=workers, scheduler=cluster, progress=progress, tell=tell)
+        table, failures = evaluate.evaluate(chosen, workers=workers, scheduler=cluster, progress=progress, tell=tell)
         if len(table):
-            pictures.draw_all(
-                chosen.out, evaluate.level_folders(chosen.out), loaded, evaluate.kept_runs(chosen))
+            pictures.draw_all(chosen.out, evaluate.level_folders(chosen.out), loaded, evaluate.kept_runs(chosen))
     if len(table):
         click.echo(statistics.text(table, reference))
         click.echo(f"Written to {chosen.out}: see evaluate.md, pairs.csv and the pictures")
@@ -118,10 +136,21 @@ def evaluate(
 @TIME_LIMIT
 @out_option("sweep", "The folder.")
 def sweep(
-    scenario: Path, controllers: str, seeds: int, first_seed: int, demand: tuple[float, ...],
-    compliance: tuple[int, ...] | None, policies: tuple[str, ...], workers: int | None, scheduler: str | None,
-    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None,
-    own_time_limit: float | None, out: Path | None,
+    scenario: Path,
+    controllers: str,
+    seeds: int,
+    first_seed: int,
+    demand: tuple[float, ...],
+    compliance: tuple[int, ...] | None,
+    policies: tuple[str, ...],
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_ca: Path | None,
+    scheduler_cert: Path | None,
+    scheduler_key: Path | None,
+    steps: int | None,
+    own_time_limit: float | None,
+    out: Path | None,
 ) -> None:
     """Run controllers x seeds x demand levels x compliance; write one table, sweep.parquet.
 
@@ -144,10 +173,16 @@ def sweep(
     from nmfd.api import load_scenario
 
     order = sweeps.Sweep(
-        scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
-        levels=demand, compliance=tuple(share / 100 for share in compliance or ()), steps=steps,
-        policies=files, time_limit=own_time_limit,
-        out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-sweep" if out is None else out)
+        scenario=scenario,
+        controllers=tuple(names),
+        seeds=range(first_seed, first_seed + seeds),
+        levels=demand,
+        compliance=tuple(share / 100 for share in compliance or ()),
+        steps=steps,
+        policies=files,
+        time_limit=own_time_limit,
+        out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-sweep" if out is None else out,
+    )
     workers = at_a_time(workers)
     with resumable("sweep", order.out) as progress:
         rows = sweeps.sweep(order, workers=workers, scheduler=cluster, progress=progress, tell=tell)
@@ -158,6 +193,22 @@ def sweep(
 
 
 for command in (
-        demo, listing("cosim.plant.strategy:options"), run, compare, report, video, watch, identify, import_, get,
-        reference, tune, improve, bound, frontier, compete, verify):
+    demo,
+    listing("cosim.plant.strategy:options"),
+    run,
+    compare,
+    report,
+    video,
+    watch,
+    identify,
+    import_,
+    get,
+    reference,
+    tune,
+    improve,
+    bound,
+    frontier,
+    compete,
+    verify,
+):
     main.add_command(command)

@@ -19,45 +19,65 @@ CONTROLLER_HELP = (
     "actuated, max-pressure or max-pressure-cyclic signals, rerouting-N (percent of the drivers), guided (drivers "
     "follow travel times), hold-back or redistribute, compliance-N, guidance-period-N (guided drivers are asked again "
     "every N seconds), queue-override-N, metering or metering-N (trips wait outside), short-first, estimate. A "
-    "controller of your own: file.py:Class (see nmfd new-controller).")
+    "controller of your own: file.py:Class (see nmfd new-controller)."
+)
 CONTROLLER = click.option("--controller", required=True, metavar="NAME[+...]", help=CONTROLLER_HELP)
 POLICY = click.option(
-    "--policy", type=FILE, metavar="FILE", help="Policy of a DPC controller, if not SCENARIO/NAME.pt.")
+    "--policy", type=FILE, metavar="FILE", help="Policy of a DPC controller, if not SCENARIO/NAME.pt."
+)
 RUNS = click.option(
-    "--runs", type=FOLDER, multiple=True, metavar="DIR",
+    "--runs",
+    type=FOLDER,
+    multiple=True,
+    metavar="DIR",
     help="Finished runs of the same city that the model is fitted to besides, a folder of cosim run or evaluate: at a "
-         "demand at which the loading runs lock, those under a gate say more. May be repeated.")
+    "demand at which the loading runs lock, those under a gate say more. May be repeated.",
+)
 EARLIER = click.option(
-    "--earlier", type=FILE, multiple=True, metavar="FILE",
+    "--earlier",
+    type=FILE,
+    multiple=True,
+    metavar="FILE",
     help="The runs.csv of an earlier evaluation or frontier of the same city whose runs are not kept any more: its "
-         "rows are in the tables too. May be repeated: of a run in several, the first one counts.")
+    "rows are in the tables too. May be repeated: of a run in several, the first one counts.",
+)
 REFERENCE = click.option(
-    "--reference", metavar="NAME",
-    help="Pair all controllers with this one too, besides no-control, or the first one if that is not there.")
+    "--reference",
+    metavar="NAME",
+    help="Pair all controllers with this one too, besides no-control, or the first one if that is not there.",
+)
 
 
 def scheduler_options(command: Callable) -> Callable:
     """--scheduler, and the certificates of its connection; the command makes `chosen_scheduler` of them."""
-    for option in reversed((
+    for option in reversed(
+        (
             click.option(
-                "--scheduler", metavar="ADDRESS",
+                "--scheduler",
+                metavar="ADDRESS",
                 help="Of a Dask cluster that does the runs, such as tls://host:8786 (extra dask). Its workers need "
-                     "this package, and the same files under the same paths. Whoever reaches a tcp:// scheduler runs "
-                     "code on the cluster and here."),
+                "this package, and the same files under the same paths. Whoever reaches a tcp:// scheduler runs "
+                "code on the cluster and here.",
+            ),
             click.option(
-                "--scheduler-ca", type=FILE, metavar="PEM", help="Authority that a tls:// scheduler is trusted by."),
+                "--scheduler-ca", type=FILE, metavar="PEM", help="Authority that a tls:// scheduler is trusted by."
+            ),
+            click.option("--scheduler-cert", type=FILE, metavar="PEM", help="Certificate that this side shows to it."),
             click.option(
-                "--scheduler-cert", type=FILE, metavar="PEM", help="Certificate that this side shows to it."),
-            click.option(
-                "--scheduler-key", type=FILE, metavar="PEM",
+                "--scheduler-key",
+                type=FILE,
+                metavar="PEM",
                 help="The key of that certificate. [default, of all three: Dask's own configuration, "
-                     "distributed.comm.tls]"))):
+                "distributed.comm.tls]",
+            ),
+        )
+    ):
         command = option(command)
     return command
 
 
 def chosen_scheduler(
-    workers: int | None, address: str | None, ca: Path | None, cert: Path | None, key: Path | None,
+    workers: int | None, address: str | None, ca: Path | None, cert: Path | None, key: Path | None
 ) -> "Scheduler | None":
     """What the runs are done by instead of `workers` processes here, None for these. InputError for both at once, and
     for certificates of nothing."""

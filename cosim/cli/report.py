@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="The runs' scenario, if it is no longer where it was.")
 @click.option("--seed", type=SEED, help="Of the runs on the map. [default: the first that both have]")
 def report(
-    folders: tuple[Path, ...], out: Path | None, reference: str | None, scenario: Path | None, seed: int | None,
+    folders: tuple[Path, ...], out: Path | None, reference: str | None, scenario: Path | None, seed: int | None
 ) -> None:
     """Write one self-contained HTML page about finished runs: what came of them, in four figures, on a map, in pictures
     and tables.
@@ -47,8 +47,10 @@ def report(
     found = [results.read(folder, scenario) for folder in folders]
     known = {name for run in found for name in run.rows["controller"]}
     if reference is not None and reference not in known:
-        raise InputError(f"--reference: {reference!r} is not in these runs{did_you_mean(reference, known)}; choose "
-                         f"from {', '.join(sorted(known))}")
+        raise InputError(
+            f"--reference: {reference!r} is not in these runs{did_you_mean(reference, known)}; choose "
+            f"from {', '.join(sorted(known))}"
+        )
     with progress_line("report") as progress:
         path = html.write_page(out or folders[0] / "report.html", found, reference, progress, seed=seed)
     click.echo(f"Written to {path}: open it in a browser")
@@ -62,11 +64,21 @@ def report(
 @click.option("--demand", type=float, metavar="X", help="Level of an evaluation. [default: the one nearest to 1]")
 @declared("cosim.evaluation.settings:Window", "rate")
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="The run's scenario, if it is no longer where it was.")
-@click.option("--out", type=FILE, metavar="FILE",
-              help="A name that ends in .gif, or .mp4 where ffmpeg is installed. [default: a gif in RUN]")
+@click.option(
+    "--out",
+    type=FILE,
+    metavar="FILE",
+    help="A name that ends in .gif, or .mp4 where ffmpeg is installed. [default: a gif in RUN]",
+)
 def video(
-    folder: Path, controller: str | None, against: str | None, seed: int | None, demand: float | None, rate: int,
-    scenario: Path | None, out: Path | None,
+    folder: Path,
+    controller: str | None,
+    against: str | None,
+    seed: int | None,
+    demand: float | None,
+    rate: int,
+    scenario: Path | None,
+    out: Path | None,
 ) -> None:
     """Make a film of the link densities of a finished run, from its record; nothing is simulated.
 
@@ -99,16 +111,32 @@ def video(
 @declared("cosim.evaluation.settings:Window", "delay", instead="0; {} with --gui")
 @POLICY
 @click.option("--port", type=click.IntRange(0, 65535), help="Of the page. [default: any that is free]")
-@click.option("--host", metavar="ADDRESS",
-              help="Of this machine, where others can reach the page: who has its address, with its token, can watch "
-                   "and command. [default: 127.0.0.1, this machine alone]")
-@click.option("--open/--no-open", "browse", default=None,
-              help="Open the page in this machine's browser. [default: where there is a screen and a terminal]")
+@click.option(
+    "--host",
+    metavar="ADDRESS",
+    help="Of this machine, where others can reach the page: who has its address, with its token, can watch "
+    "and command. [default: 127.0.0.1, this machine alone]",
+)
+@click.option(
+    "--open/--no-open",
+    "browse",
+    default=None,
+    help="Open the page in this machine's browser. [default: where there is a screen and a terminal]",
+)
 @click.option("--gui", is_flag=True, help="SUMO's own window instead of a page; one run, and nothing to switch.")
 def watch(
-    scenario: Path, controller: str, against: str | None, seed: int, steps: int | None, demand: float,
-    delay: float | None, policy: Path | None, port: int | None, host: str | None,
-    browse: bool | None, gui: bool,
+    scenario: Path,
+    controller: str,
+    against: str | None,
+    seed: int,
+    steps: int | None,
+    demand: float,
+    delay: float | None,
+    policy: Path | None,
+    port: int | None,
+    host: str | None,
+    browse: bool | None,
+    gui: bool,
 ) -> None:
     """Watch controllers steer the city on a live page in the browser; nothing is written.
 
@@ -131,9 +159,16 @@ def watch(
 
     names = [controller] + ([against] if against and against != controller else [])
     tasks = [
-        Task(scenario=scenario, controller=name, seed=seed, policy=policy if name == controller else None, steps=steps,
-             demand_factor=demand)
-        for name in names]
+        Task(
+            scenario=scenario,
+            controller=name,
+            seed=seed,
+            policy=policy if name == controller else None,
+            steps=steps,
+            demand_factor=demand,
+        )
+        for name in names
+    ]
     if gui:
         if len(tasks) > 1 or port is not None or host is not None or browse is not None:
             raise InputError("--gui: shows one run, without a page; omit --against, --port, --host and --open")
@@ -144,14 +179,23 @@ def watch(
     scenario_of(tasks[0])  # what is wrong with it is said before anything starts
     with progress_line("watch") as progress:
         runs = watch(
-            tasks, host=host or LOOPBACK, port=port or 0, delay=(delay or 0.0) / 1000.0,
-            browse=has_screen() if browse is None else browse, tell=lambda line: click.echo(line), progress=progress)
+            tasks,
+            host=host or LOOPBACK,
+            port=port or 0,
+            delay=(delay or 0.0) / 1000.0,
+            browse=has_screen() if browse is None else browse,
+            tell=lambda line: click.echo(line),
+            progress=progress,
+        )
     for seen in runs:
         if isinstance(seen.outcome, Result):
             _tell(seen.name, seed, seen.outcome.trajectory)
         if seen.faults:
-            click.echo("Gates were switched by hand; the same run: --controller " + seen.name + "".join(
-                f" --fault {text}" for text in seen.faults))
+            click.echo(
+                "Gates were switched by hand; the same run: --controller "
+                + seen.name
+                + "".join(f" --fault {text}" for text in seen.faults)
+            )
 
 
 def _window(task: "Task", delay: float | None) -> None:
@@ -172,7 +216,8 @@ def _tell(controller: str, seed: int, trajectory: "Trajectory") -> None:
     from nmfd.metrics import summary
 
     row = summary(trajectory)
-    click.echo(f"{controller}, seed {seed}: total time spent {row['total_time_spent_veh_s']:.4g} veh s, "
-               f"{row['completed_veh']:,.0f} trips completed"
-               + (f", {removed:,.0f} vehicles removed" if (removed := trajectory.removed[-1].sum()) else ""))
-
+    click.echo(
+        f"{controller}, seed {seed}: total time spent {row['total_time_spent_veh_s']:.4g} veh s, "
+        f"{row['completed_veh']:,.0f} trips completed"
+        + (f", {removed:,.0f} vehicles removed" if (removed := trajectory.removed[-1].sum()) else "")
+    )

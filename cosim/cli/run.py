@@ -18,22 +18,36 @@ from nmfd.errors import InputError
 @click.command()
 @SCENARIO
 @CONTROLLER
-@click.option("--against", metavar="NAME",
-              help="Run this controller too, on the same trips, in a second process, and compare with it.")
-@click.option("--seed", type=SEED, default=0, show_default=True,
-              help="Of the trips, the drivers and the guidance.")
+@click.option(
+    "--against",
+    metavar="NAME",
+    help="Run this controller too, on the same trips, in a second process, and compare with it.",
+)
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Of the trips, the drivers and the guidance.")
 @STEPS
 @POLICY
-@click.option("--sumo-output", metavar="A,B,...",
-              help="SUMO's own outputs in the run folder too: tripinfo, summary, edgedata (per control interval), "
-                   "emission (of every vehicle in every step, large).")
+@click.option(
+    "--sumo-output",
+    metavar="A,B,...",
+    help="SUMO's own outputs in the run folder too: tripinfo, summary, edgedata (per control interval), "
+    "emission (of every vehicle in every step, large).",
+)
 @PARQUET
 @fault_option("closed:EDGE, signal:NAME, gate:I-H=SHARE, sumo-exits")
 @TIME_LIMIT
 @out_option()
 def run(
-    scenario: Path, controller: str, against: str | None, seed: int, steps: int | None, policy: Path | None,
-    sumo_output: str | None, parquet: bool, faults: tuple[str, ...], own_time_limit: float | None, out: Path | None,
+    scenario: Path,
+    controller: str,
+    against: str | None,
+    seed: int,
+    steps: int | None,
+    policy: Path | None,
+    sumo_output: str | None,
+    parquet: bool,
+    faults: tuple[str, ...],
+    own_time_limit: float | None,
+    out: Path | None,
 ) -> None:
     """Run a controller in the microsimulation; print a table and write a run folder.
 
@@ -64,9 +78,17 @@ def run(
     from cosim.evaluation.simulate import Task
 
     tasks = [
-        Task(scenario=scenario, controller=name, seed=seed, policy=policy if name == controller else None, steps=steps,
-             faults=faults, time_limit=own_time_limit)
-        for name in names]
+        Task(
+            scenario=scenario,
+            controller=name,
+            seed=seed,
+            policy=policy if name == controller else None,
+            steps=steps,
+            faults=faults,
+            time_limit=own_time_limit,
+        )
+        for name in names
+    ]
     out, rows = _experiment(tasks, out, kinds)
     click.echo(experiment.overview_table(rows))
     if parquet:
@@ -82,16 +104,20 @@ def run(
 
 @click.command()
 @click.argument("target", type=FOLDER, metavar="SCENARIO|RUN")
-@click.option("--controller", metavar="NAME[+...]",
-              help=CONTROLLER_HELP + " [default: no-control; all runs of a RUN folder]")
+@click.option(
+    "--controller", metavar="NAME[+...]", help=CONTROLLER_HELP + " [default: no-control; all runs of a RUN folder]"
+)
 @click.option("--seed", type=SEED, help="[default: 0]")
-@click.option("--model", type=FOLDER, metavar="DIR",
-              help="A network of the same city, whose regional model predicts. [default: that with which the "
-                   "controller plans]")
+@click.option(
+    "--model",
+    type=FOLDER,
+    metavar="DIR",
+    help="A network of the same city, whose regional model predicts. [default: that with which the controller plans]",
+)
 @STEPS
 @out_option(text="Run folder of a SCENARIO.")
 def compare(
-    target: Path, controller: str | None, seed: int | None, model: Path | None, steps: int | None, out: Path | None,
+    target: Path, controller: str | None, seed: int | None, model: Path | None, steps: int | None, out: Path | None
 ) -> None:
     """Compare microsimulated accumulations with what the regional model predicts.
 
@@ -119,23 +145,30 @@ def compare(
         if seed is not None or steps is not None:
             raise InputError(
                 f"--{'seed' if steps is None else 'steps'}: without --controller all runs of {target} are compared, "
-                "whole; name a controller, or omit it")
+                "whole; name a controller, or omit it"
+            )
         _foresight(target, model)
         return
     controller, seed = controller or "no-control", seed or 0
     if manifest is not None:
         try:
             task = Task(
-                scenario=Path(manifest["sessions"][-1]["scenario_folder"]), controller=controller, seed=seed,
-                steps=manifest["configuration"]["steps"], demand_factor=manifest["configuration"]["demand_factor"])
+                scenario=Path(manifest["sessions"][-1]["scenario_folder"]),
+                controller=controller,
+                seed=seed,
+                steps=manifest["configuration"]["steps"],
+                demand_factor=manifest["configuration"]["demand_factor"],
+            )
         except (LookupError, TypeError):
             raise InputError(
-                f"{target / 'manifest.json'}: is not that of a run in SUMO; choose another folder") from None
+                f"{target / 'manifest.json'}: is not that of a run in SUMO; choose another folder"
+            ) from None
         out = target
     elif results:
         raise InputError(
             f"{target}: holds runs of several demand levels; give one of its folders {target}/demand-..., or leave "
-            "--controller away")
+            "--controller away"
+        )
     else:
         task = Task(scenario=target, controller=controller, seed=seed, steps=steps)
         out, _ = _experiment([task], out)

@@ -18,15 +18,7 @@ from cosim.cli.options import (
     tell,
 )
 from nmfd.cli.declared import declared
-from nmfd.cli.options import (
-    POLICIES,
-    SCENARIO,
-    STEPS,
-    controller_names,
-    controllers_option,
-    out_option,
-    policy_files,
-)
+from nmfd.cli.options import POLICIES, SCENARIO, STEPS, controller_names, controllers_option, out_option, policy_files
 from nmfd.cli.progress import resumable
 from nmfd.errors import RunFailed
 from nmfd.runs.files import file_name
@@ -36,10 +28,16 @@ from nmfd.runs.workers import at_a_time
 @click.command()
 @SCENARIO
 @CONTROLLER
-@click.option("--option", "knobs", required=True, multiple=True, metavar="KEY=LOW:HIGH",
-              help="An option of the controller and the range that is searched; KEY[0], KEY[1], ... for numbers of "
-                   "a list. May be repeated, up to 20 numbers. One with which a policy is trained trains one for "
-                   "every candidate.")
+@click.option(
+    "--option",
+    "knobs",
+    required=True,
+    multiple=True,
+    metavar="KEY=LOW:HIGH",
+    help="An option of the controller and the range that is searched; KEY[0], KEY[1], ... for numbers of "
+    "a list. May be repeated, up to 20 numbers. One with which a policy is trained trains one for "
+    "every candidate.",
+)
 @declared("cosim.evaluation.settings:Search", "candidates", "seeds", "first_seed", "demand", "search_seed")
 @declared("cosim.evaluation.settings:Search", "population", instead="the rule of CMA-ES")
 @declared("cosim.evaluation.settings:Search", "workers", instead="one per core")
@@ -47,9 +45,21 @@ from nmfd.runs.workers import at_a_time
 @STEPS
 @out_option("tune", "The folder.")
 def tune(
-    scenario: Path, controller: str, knobs: tuple[str, ...], candidates: int, seeds: int, first_seed: int,
-    demand: tuple[float, ...], search_seed: int, population: int | None, workers: int | None, scheduler: str | None,
-    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None,
+    scenario: Path,
+    controller: str,
+    knobs: tuple[str, ...],
+    candidates: int,
+    seeds: int,
+    first_seed: int,
+    demand: tuple[float, ...],
+    search_seed: int,
+    population: int | None,
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_ca: Path | None,
+    scheduler_cert: Path | None,
+    scheduler_key: Path | None,
+    steps: int | None,
     out: Path | None,
 ) -> None:
     """Search for the options of a controller that do best in the microsimulation, by CMA-ES.
@@ -71,13 +81,19 @@ def tune(
     from cosim.evaluation import tuning  # heavy
 
     order = tuning.Tuning(
-        scenario=scenario, controller=controller, knobs=tuple(tuning.knob(text) for text in knobs),
-        candidates=candidates, seeds=range(first_seed, first_seed + seeds),
-        levels=demand, search_seed=search_seed, population=population, steps=steps,
-        out=Path("runs") / f"{file_name(scenario.name)}-tune" if out is None else out)
+        scenario=scenario,
+        controller=controller,
+        knobs=tuple(tuning.knob(text) for text in knobs),
+        candidates=candidates,
+        seeds=range(first_seed, first_seed + seeds),
+        levels=demand,
+        search_seed=search_seed,
+        population=population,
+        steps=steps,
+        out=Path("runs") / f"{file_name(scenario.name)}-tune" if out is None else out,
+    )
     with resumable("tune", order.out, "tune.csv") as progress:
-        table = tuning.tune(
-            order, workers=at_a_time(workers), scheduler=cluster, progress=progress, tell=tell)
+        table = tuning.tune(order, workers=at_a_time(workers), scheduler=cluster, progress=progress, tell=tell)
     click.echo(tuning.text(order, table))
     click.echo(f"Written to {order.out}: see tune.toml and tune.csv")
 
@@ -95,10 +111,24 @@ def tune(
 @STEPS
 @out_option("improve", "The folder.")
 def improve(
-    scenario: Path, controller: str, rounds: int, seeds: int, first_seed: int, demand: tuple[float, ...], descent: int,
-    learning_rate: float | None, iterations: int, policy: Path | None, runs: tuple[Path, ...], workers: int | None,
-    scheduler: str | None, scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None,
-    steps: int | None, out: Path | None,
+    scenario: Path,
+    controller: str,
+    rounds: int,
+    seeds: int,
+    first_seed: int,
+    demand: tuple[float, ...],
+    descent: int,
+    learning_rate: float | None,
+    iterations: int,
+    policy: Path | None,
+    runs: tuple[Path, ...],
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_ca: Path | None,
+    scheduler_cert: Path | None,
+    scheduler_key: Path | None,
+    steps: int | None,
+    out: Path | None,
 ) -> None:
     """Let a DPC policy learn from its own runs in the microsimulation.
 
@@ -117,12 +147,21 @@ def improve(
     from cosim.report import improve as picture
 
     order = method.Improvement(
-        scenario=scenario, controller=controller, rounds=rounds, seeds=range(first_seed, first_seed + seeds),
-        levels=demand, descent=descent, learning_rate=learning_rate, iterations=iterations, policy=policy, runs=runs,
-        steps=steps, out=Path("runs") / f"{file_name(scenario.name)}-improve" if out is None else out)
+        scenario=scenario,
+        controller=controller,
+        rounds=rounds,
+        seeds=range(first_seed, first_seed + seeds),
+        levels=demand,
+        descent=descent,
+        learning_rate=learning_rate,
+        iterations=iterations,
+        policy=policy,
+        runs=runs,
+        steps=steps,
+        out=Path("runs") / f"{file_name(scenario.name)}-improve" if out is None else out,
+    )
     with resumable("improve", order.out, "improve.csv") as progress:
-        table = method.improve(
-            order, workers=at_a_time(workers), scheduler=cluster, progress=progress, tell=tell)
+        table = method.improve(order, workers=at_a_time(workers), scheduler=cluster, progress=progress, tell=tell)
         picture.draw(order.out / "improve.png", table, runs=len(order.seeds) * len(order.levels))
     click.echo(method.text(order, table))
     click.echo(f"Written to {order.out}: see policy.pt, model, improve.csv and improve.png")
@@ -131,18 +170,33 @@ def improve(
 @click.command()
 @SCENARIO
 @CONTROLLER
-@click.option("--against", metavar="NAME[+...]",
-              help="A rival, which is run with the same seeds: how much of what the bound saves against it the "
-                   "controller saves as well.")
+@click.option(
+    "--against",
+    metavar="NAME[+...]",
+    help="A rival, which is run with the same seeds: how much of what the bound saves against it the "
+    "controller saves as well.",
+)
 @declared("cosim.evaluation.settings:Bound", "candidates", "knots", "seeds", "first_seed", "demand", "search_seed")
 @declared("cosim.evaluation.settings:Bound", "workers", instead="one per core")
 @scheduler_options
 @STEPS
 @out_option("bound", "The folder.")
 def bound(
-    scenario: Path, controller: str, against: str | None, candidates: int, knots: int, seeds: int, first_seed: int,
-    demand: tuple[float, ...], search_seed: int, workers: int | None, scheduler: str | None,
-    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None,
+    scenario: Path,
+    controller: str,
+    against: str | None,
+    candidates: int,
+    knots: int,
+    seeds: int,
+    first_seed: int,
+    demand: tuple[float, ...],
+    search_seed: int,
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_ca: Path | None,
+    scheduler_cert: Path | None,
+    scheduler_key: Path | None,
+    steps: int | None,
     out: Path | None,
 ) -> None:
     """See how much there is to win: the best that a controller could have done, had it known the day.
@@ -161,9 +215,17 @@ def bound(
     from cosim.evaluation import bound as method  # heavy
 
     order = method.Bound(
-        scenario=scenario, controller=controller, against=against, candidates=candidates, knots=knots,
-        seeds=range(first_seed, first_seed + seeds), levels=demand, search_seed=search_seed, steps=steps,
-        out=Path("runs") / f"{file_name(scenario.name)}-bound" if out is None else out)
+        scenario=scenario,
+        controller=controller,
+        against=against,
+        candidates=candidates,
+        knots=knots,
+        seeds=range(first_seed, first_seed + seeds),
+        levels=demand,
+        search_seed=search_seed,
+        steps=steps,
+        out=Path("runs") / f"{file_name(scenario.name)}-bound" if out is None else out,
+    )
     with resumable("bound", order.out, "bound.csv") as progress:
         table = method.bound(order, workers=at_a_time(workers), scheduler=cluster, progress=progress, tell=tell)
     click.echo(method.text(order, table))
@@ -174,8 +236,11 @@ def bound(
 @SCENARIO
 @controllers_option("Separated by commas. " + CONTROLLER_HELP)
 @declared("cosim.evaluation.settings:Range", "demand", "seeds", "first_seed")
-@click.option("--everything", is_flag=True,
-              help="Run every controller at every level, also beyond one at which it served all trips with no seed.")
+@click.option(
+    "--everything",
+    is_flag=True,
+    help="Run every controller at every level, also beyond one at which it served all trips with no seed.",
+)
 @POLICIES
 @EARLIER
 @declared("cosim.evaluation.settings:Range", "workers", instead="one per core")
@@ -183,9 +248,20 @@ def bound(
 @STEPS
 @out_option("frontier", "The folder.")
 def frontier(
-    scenario: Path, controllers: str, demand: tuple[float, ...], seeds: int, first_seed: int, everything: bool,
-    policies: tuple[str, ...], earlier: tuple[Path, ...], workers: int | None, scheduler: str | None,
-    scheduler_ca: Path | None, scheduler_cert: Path | None, scheduler_key: Path | None, steps: int | None,
+    scenario: Path,
+    controllers: str,
+    demand: tuple[float, ...],
+    seeds: int,
+    first_seed: int,
+    everything: bool,
+    policies: tuple[str, ...],
+    earlier: tuple[Path, ...],
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_ca: Path | None,
+    scheduler_cert: Path | None,
+    scheduler_key: Path | None,
+    steps: int | None,
     out: Path | None,
 ) -> None:
     """Find up to which demand every controller serves all trips: a picture, frontier.png, and a table.
@@ -209,13 +285,19 @@ def frontier(
     from nmfd.api import load_scenario
 
     order = evaluate.Evaluation(
-        scenario=scenario, controllers=tuple(names), seeds=range(first_seed, first_seed + seeds),
-        levels=demand, steps=steps, policies=files, earlier=earlier,
-        out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-frontier" if out is None else out)
+        scenario=scenario,
+        controllers=tuple(names),
+        seeds=range(first_seed, first_seed + seeds),
+        levels=demand,
+        steps=steps,
+        policies=files,
+        earlier=earlier,
+        out=Path("runs") / f"{file_name(load_scenario(scenario).name)}-frontier" if out is None else out,
+    )
     with resumable("frontier", order.out) as progress:
         table, failures = method.frontier(
-            order, everything=everything, workers=at_a_time(workers), scheduler=cluster,
-            progress=progress, tell=tell)
+            order, everything=everything, workers=at_a_time(workers), scheduler=cluster, progress=progress, tell=tell
+        )
         picture.draw(order.out / "frontier.png", table)
     click.echo(method.text(table))
     click.echo(f"Written to {order.out}: see frontier.png and frontier.md")

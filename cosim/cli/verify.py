@@ -19,24 +19,45 @@ if TYPE_CHECKING:  # heavy
 
 @click.command()
 @click.argument("folder", type=FOLDER)
-@click.option("--row", metavar="LABEL", help="Which one, in quotes also a pattern; a random one of those that fit. "
-                                             "[default: any]")
+@click.option(
+    "--row", metavar="LABEL", help="Which one, in quotes also a pattern; a random one of those that fit. [default: any]"
+)
 @click.option("--seed", type=SEED, help="Of the choice. [default: another one every time]")
-@click.option("--all", "every", is_flag=True,
-              help="All that fit, one after the other, instead of one of them. What comes of them is in verified.csv "
-                   "in the folder --out; the same command goes on where it was interrupted.")
-@click.option("--missing", is_flag=True,
-              help="With --all: only those that verified.csv does not have, of this or another commit.")
-@click.option("--out", type=FOLDER, metavar="DIR",
-              help="With --all: the folder of verified.csv, which may have rows of other folders. [default: runs]")
-@click.option("--within", type=click.FloatRange(0.0, 1.0), metavar="SHARE",
-              help="By which figures may differ, as a share of them. [default: 0 for the same version and commit, else "
-                   "1e-9, for sums in another order]")
+@click.option(
+    "--all",
+    "every",
+    is_flag=True,
+    help="All that fit, one after the other, instead of one of them. What comes of them is in verified.csv "
+    "in the folder --out; the same command goes on where it was interrupted.",
+)
+@click.option(
+    "--missing", is_flag=True, help="With --all: only those that verified.csv does not have, of this or another commit."
+)
+@click.option(
+    "--out",
+    type=FOLDER,
+    metavar="DIR",
+    help="With --all: the folder of verified.csv, which may have rows of other folders. [default: runs]",
+)
+@click.option(
+    "--within",
+    type=click.FloatRange(0.0, 1.0),
+    metavar="SHARE",
+    help="By which figures may differ, as a share of them. [default: 0 for the same version and commit, else "
+    "1e-9, for sums in another order]",
+)
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="The rows' scenario, if it is no longer where it was.")
 @click.option("--list", "listed", is_flag=True, help="Only show the labels of the rows.")
 def verify(
-    folder: Path, row: str | None, seed: int | None, every: bool, missing: bool, out: Path | None,
-    within: float | None, scenario: Path | None, listed: bool,
+    folder: Path,
+    row: str | None,
+    seed: int | None,
+    every: bool,
+    missing: bool,
+    out: Path | None,
+    within: float | None,
+    scenario: Path | None,
+    listed: bool,
 ) -> None:
     """Make a row of a published table, or of a run folder, again from what is written beside it, and compare.
 
@@ -75,8 +96,7 @@ def _all(folder: Path, rows: "list[Row]", out: Path, within: float | None, missi
     from cosim.compete import verified  # heavy
 
     with resumable("verify", out, verified.TABLE) as progress:
-        lines = verified.verify_all(
-            folder, rows, out=out, within=within, missing=missing, progress=progress, tell=tell)
+        lines = verified.verify_all(folder, rows, out=out, within=within, missing=missing, progress=progress, tell=tell)
     count = Counter(str(line["verdict"]) for line in lines)
     words = ", ".join(f"{number} {word}" for word, number in count.items())
     click.echo(f"{folder}: {len(lines)} rows: {words}; see {out / verified.TABLE}")
@@ -99,8 +119,13 @@ def _one(one: "Row", within: float | None) -> None:
     if verdict.same_bytes is False:
         click.echo("  the kept run differs" + (", as it may in another version" if verdict.good else ""))
     if not verdict.good:
-        raise RunFailed(f"{one.label}: {len(verdict.differ)} of {verdict.compared} figures differ"
-                        + ("" if verdict.same_bytes is not False else ", and so does the kept run"))
-    click.echo(f"The same: {verdict.compared} figures "
-               + ("" if verdict.exact else f"within {verdict.within:g}, {verdict.equal} ") + "to the last digit"
-               + (", the kept run to the byte" if verdict.same_bytes else ""))
+        raise RunFailed(
+            f"{one.label}: {len(verdict.differ)} of {verdict.compared} figures differ"
+            + ("" if verdict.same_bytes is not False else ", and so does the kept run")
+        )
+    click.echo(
+        f"The same: {verdict.compared} figures "
+        + ("" if verdict.exact else f"within {verdict.within:g}, {verdict.equal} ")
+        + "to the last digit"
+        + (", the kept run to the byte" if verdict.same_bytes else "")
+    )

@@ -32,12 +32,13 @@ class Asked:
     def by(cls, command: str, session: Mapping, file: Path, scenario: Path | None = None) -> Self | None:
         """None for another command. scenario: where it is now, if not where the command says. InputError for one that
         is not there."""
-        words = [part for word in shlex.split(command) for part in (
-            word.split("=", 1) if word.startswith("--") else [word])]
+        words = [
+            part for word in shlex.split(command) for part in (word.split("=", 1) if word.startswith("--") else [word])
+        ]
         if words[:2] != ["cosim", "evaluate"]:
             return None
         at = next((n for n in range(2, len(words), 2) if not words[n].startswith("--")), 2)  # options may come first
-        rest = [*words[2:at], *words[at + 1:]]
+        rest = [*words[2:at], *words[at + 1 :]]
         given = list(zip(rest[::2], rest[1::2], strict=False))
         options, usual, where = dict(given), Evaluation(), f"{file.name}: {command}"
         if scenario is None:
@@ -45,24 +46,40 @@ class Asked:
         try:
             first = int(options.get("--first-seed", usual.first_seed))
             return cls(
-                scenario=scenario, controllers=tuple(options["--controllers"].split(",")),
+                scenario=scenario,
+                controllers=tuple(options["--controllers"].split(",")),
                 seeds=range(first, first + int(options.get("--seeds", usual.seeds))),
                 levels=tuple(map(float, options["--demand"].split(","))) if "--demand" in options else usual.demand,
                 steps=int(options["--steps"]) if "--steps" in options else None,
                 time_limit=float(options["--time-limit"]) if "--time-limit" in options else None,
-                policies={value.partition("=")[0]: Path(value.partition("=")[2])
-                          for option, value in given if option == "--policy"},
-                session=session)
+                policies={
+                    value.partition("=")[0]: Path(value.partition("=")[2])
+                    for option, value in given
+                    if option == "--policy"
+                },
+                session=session,
+            )
         except (ValueError, LookupError):
-            raise InputError(f"{file}: {command}: is no command of version {__version__}; verify it with the version "
-                             "that made it") from None
+            raise InputError(
+                f"{file}: {command}: is no command of version {__version__}; verify it with the version that made it"
+            ) from None
 
     def covers(self, row: Mapping) -> bool:
         """Whether it asked for a row of runs.csv."""
-        return row["seed"] in self.seeds and row["demand"] in self.levels and any(
-            fnmatchcase(row["controller"], pattern) for pattern in self.controllers)
+        return (
+            row["seed"] in self.seeds
+            and row["demand"] in self.levels
+            and any(fnmatchcase(row["controller"], pattern) for pattern in self.controllers)
+        )
 
     def task(self, controller: str, seed: int, demand: float) -> Task:
         """To be run again."""
-        return Task(scenario=self.scenario, controller=controller, seed=seed, policy=self.policies.get(controller),
-                    steps=self.steps, demand_factor=demand, time_limit=self.time_limit)
+        return Task(
+            scenario=self.scenario,
+            controller=controller,
+            seed=seed,
+            policy=self.policies.get(controller),
+            steps=self.steps,
+            demand_factor=demand,
+            time_limit=self.time_limit,
+        )

@@ -73,7 +73,8 @@ class Entry(Settings):
     task_set: TaskSetName = setting("which tasks")
     command: Text = setting("that makes it again, with the same files and versions")
     sessions: tuple[dict[str, Any], ...] = setting(
-        "date, versions and commit of every one that made runs", strict=False)
+        "date, versions and commit of every one that made runs", strict=False
+    )
     tasks: Rows[Outcome] = setting("every task of the set")
     missing: tuple[str, ...] = setting("tasks that are not complete", strict=False)
     metrics: dict[str, dict[str, str]] = setting("what the metrics are, and what RESCO and LibSignal call them")
@@ -85,8 +86,10 @@ class Entry(Settings):
 
 def about_metrics() -> dict[str, dict[str, str]]:
     """`Entry.metrics`."""
-    return {name: {"what": metric.text, "RESCO": metric.resco, "LibSignal": metric.libsignal}
-            for name, metric in METRICS.items()}
+    return {
+        name: {"what": metric.text, "RESCO": metric.resco, "LibSignal": metric.libsignal}
+        for name, metric in METRICS.items()
+    }
 
 
 def path(folder: Path, controller: str) -> Path:
@@ -116,6 +119,8 @@ def read(file: Path) -> Entry:
     for outcome in found.tasks:
         for run in outcome.runs:
             if unknown := set(run.metrics) - set(METRICS):
-                raise InputError(f"{file}: {outcome.task}: {min(unknown)!r} is no metric of version {__version__}; "
-                                 "read it with the version that wrote it")
+                raise InputError(
+                    f"{file}: {outcome.task}: {min(unknown)!r} is no metric of version {__version__}; "
+                    "read it with the version that wrote it"
+                )
     return found

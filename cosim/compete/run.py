@@ -69,8 +69,12 @@ def strategy(controller: str, task: TaskTable) -> str:
 
 
 def compete(
-    order: Order, *, workers: int = 1, scheduler: dask_cluster.Scheduler | None = None,
-    progress: Progress | None = None, tell: Tell | None = None,
+    order: Order,
+    *,
+    workers: int = 1,
+    scheduler: dask_cluster.Scheduler | None = None,
+    progress: Progress | None = None,
+    tell: Tell | None = None,
 ) -> list[Entry]:
     """Run what is not there yet of the chosen tasks; returns the entries, which are in the folder.
 
@@ -90,8 +94,14 @@ def compete(
         for task in tasks:
             if task.plant != SUMO:
                 _regional(books, task, workers=workers, progress=progress, tell=tell, source=source)
-        _in_sumo(books, [task for task in tasks if task.plant == SUMO], workers=workers, progress=progress,
-                 tell=tell, source=source)
+        _in_sumo(
+            books,
+            [task for task in tasks if task.plant == SUMO],
+            workers=workers,
+            progress=progress,
+            tell=tell,
+            source=source,
+        )
         return books.write()
 
 
@@ -129,7 +139,8 @@ class _Books:
         if (found.task_set.name, found.task_set.hash) != (now.tasks.name, now.hash):
             raise InputError(
                 f"{file}: is an entry in {found.task_set.name} ({found.task_set.hash}), not in {now.tasks.name} "
-                f"({now.hash}); choose another folder with --out")
+                f"({now.hash}); choose another folder with --out"
+            )
         return found
 
     def fail(self, name: str, task: TaskTable, reason: str, seeds: Sequence[int]) -> None:
@@ -191,15 +202,25 @@ class _Books:
         now = sessions.index(self._session)
         tasks = tuple(self._outcome(name, task, rows[task.id], now) for task in loaded.tasks.tasks)
         used = sorted({run.session for outcome in tasks for run in outcome.runs if run.session is not None})
-        tasks = tuple(outcome.changed(runs=tuple(
-            run if run.session is None else run.changed(session=used.index(run.session)) for run in outcome.runs))
-            for outcome in tasks)
+        tasks = tuple(
+            outcome.changed(
+                runs=tuple(
+                    run if run.session is None else run.changed(session=used.index(run.session)) for run in outcome.runs
+                )
+            )
+            for outcome in tasks
+        )
         return Entry(
-            controller=name, command=shlex.join(["cosim", "compete", name, "--tasks", loaded.named]),
-            task_set=TaskSetName(name=loaded.tasks.name, named=loaded.named, hash=loaded.hash,
-                                 released=loaded.worlds is not None),
-            sessions=tuple(sessions[number] for number in used), tasks=tasks, metrics=entry.about_metrics(),
-            missing=tuple(outcome.task for outcome in tasks if not outcome.complete))
+            controller=name,
+            command=shlex.join(["cosim", "compete", name, "--tasks", loaded.named]),
+            task_set=TaskSetName(
+                name=loaded.tasks.name, named=loaded.named, hash=loaded.hash, released=loaded.worlds is not None
+            ),
+            sessions=tuple(sessions[number] for number in used),
+            tasks=tasks,
+            metrics=entry.about_metrics(),
+            missing=tuple(outcome.task for outcome in tasks if not outcome.complete),
+        )
 
     def _outcome(self, name: str, task: TaskTable, rows: Mapping[tuple[str, int], dict], session: int) -> Outcome:
         """Of one task, by the rows of its run folder."""
@@ -221,27 +242,46 @@ class _Books:
                 if (reason := self.failed.get((name, task.id, seed))) is not None:
                     failed.append(Failure(seed=seed, reason=reason))
             elif (longest := row["control_step_ms_max"] / 1e3) > task.time_limit:
-                failed.append(Failure(seed=seed, reason=(
-                    f"a decision took {longest:.3g} s, longer than the {task.time_limit:g} s of the task")))
+                failed.append(
+                    Failure(
+                        seed=seed,
+                        reason=(f"a decision took {longest:.3g} s, longer than the {task.time_limit:g} s of the task"),
+                    )
+                )
             elif kept is not None and kept.metrics[metrics.TTS] == row[metrics.TTS]:
                 runs.append(kept)
             else:
                 here = self._there[task.id].get((called, seed), {}).get("evaluation_time_s")
-                runs.append(Run(
-                    seed=seed, session=None if here == row["evaluation_time_s"] else session,
-                    metrics=_metrics(task, scenario, row, folder)))
+                runs.append(
+                    Run(
+                        seed=seed,
+                        session=None if here == row["evaluation_time_s"] else session,
+                        metrics=_metrics(task, scenario, row, folder),
+                    )
+                )
         ended = {*(one.seed for one in runs), *(one.seed for one in failed)}
         return Outcome(
-            task=task.id, text=task.text, strategy=called, plant=task.plant, scenario=scenario.name,
-            scenario_hash=scenario.hash, network=scenario.network.name, network_hash=scenario.network.hash,
-            world=self.worlds[task.id], demand=task.demand, time_limit=task.time_limit, depends_on=depends,
-            seeds=task.seeds, runs=tuple(runs), failed=tuple(failed),
-            missing=tuple(seed for seed in task.seeds if seed not in ended))
+            task=task.id,
+            text=task.text,
+            strategy=called,
+            plant=task.plant,
+            scenario=scenario.name,
+            scenario_hash=scenario.hash,
+            network=scenario.network.name,
+            network_hash=scenario.network.hash,
+            world=self.worlds[task.id],
+            demand=task.demand,
+            time_limit=task.time_limit,
+            depends_on=depends,
+            seeds=task.seeds,
+            runs=tuple(runs),
+            failed=tuple(failed),
+            missing=tuple(seed for seed in task.seeds if seed not in ended),
+        )
 
 
 def _regional(
-    books: _Books, task: TaskTable, *, workers: int, progress: Progress | None, tell: Tell | None,
-    source: Source | None,
+    books: _Books, task: TaskTable, *, workers: int, progress: Progress | None, tell: Tell | None, source: Source | None
 ) -> None:
     """The runs of all controllers on a regional model."""
     entrants: dict[str, list[str]] = {}
@@ -252,9 +292,18 @@ def _regional(
         return
     try:
         _, failures = benchmark.perform(
-            books.scenarios[task.id], list(entrants), task.seeds, task.plant, out=books.order.out / task.id,
-            noise=noise_of(task), workers=workers, progress=progress, renew=tell or _silent, source=source,
-            omit={(called, seed) for called, names in entrants.items() for seed in books.held(names[0], task)})
+            books.scenarios[task.id],
+            list(entrants),
+            task.seeds,
+            task.plant,
+            out=books.order.out / task.id,
+            noise=noise_of(task),
+            workers=workers,
+            progress=progress,
+            renew=tell or _silent,
+            source=source,
+            omit={(called, seed) for called, names in entrants.items() for seed in books.held(names[0], task)},
+        )
         for (called, seed), failure in failures:
             for name in entrants[called]:
                 books.fail(name, task, failure.reason, [seed])
@@ -266,7 +315,12 @@ def _regional(
 
 
 def _in_sumo(
-    books: _Books, tasks: Sequence[TaskTable], *, workers: int, progress: Progress | None, tell: Tell | None,
+    books: _Books,
+    tasks: Sequence[TaskTable],
+    *,
+    workers: int,
+    progress: Progress | None,
+    tell: Tell | None,
     source: Source | None,
 ) -> None:
     """The runs in SUMO of all controllers, seed by seed."""
@@ -289,8 +343,15 @@ def _in_sumo(
         books.write()
 
     experiment.perform(
-        plan, workers=workers, fresh=True, progress=progress, tell=tell or _silent, kept=books.write, failed=failed,
-        source=source)
+        plan,
+        workers=workers,
+        fresh=True,
+        progress=progress,
+        tell=tell or _silent,
+        kept=books.write,
+        failed=failed,
+        source=source,
+    )
 
 
 def _able(books: _Books, task: TaskTable) -> list[str]:
@@ -308,8 +369,13 @@ def _able(books: _Books, task: TaskTable) -> list[str]:
 
 def _task(books: _Books, task: TaskTable, name: str, seed: int) -> Task:
     return Task(
-        scenario=books.order.task_set.folder(task), controller=strategy(name, task), seed=seed, steps=task.steps,
-        demand_factor=task.demand, time_limit=task.time_limit)
+        scenario=books.order.task_set.folder(task),
+        controller=strategy(name, task),
+        seed=seed,
+        steps=task.steps,
+        demand_factor=task.demand,
+        time_limit=task.time_limit,
+    )
 
 
 def _rows(folder: Path, task: TaskTable) -> dict[tuple[str, int], dict]:

@@ -1,8 +1,8 @@
 """Task sets: what controllers are compared on, in TOML; and which of them were released, and as what.
 
-    <set>.toml       a `TaskSet`; those that come with the package lie beside this file
-    released.toml    of every released set a fingerprint of what stands in its file, and one of the world of every task;
-                     .ci/release.py writes it. A released set is refused if either is not the same any more
+<set>.toml       a `TaskSet`; those that come with the package lie beside this file
+released.toml    of every released set a fingerprint of what stands in its file, and one of the world of every task;
+                 .ci/release.py writes it. A released set is refused if either is not the same any more
 """
 
 import hashlib
@@ -50,15 +50,26 @@ class TaskTable(Settings):
     demand: Level = setting("multiple of the scenario's demand", 1.0)
     noise: float = setting(
         "standard deviation of Gaussian noise on the demand, drawn from the seed, of which controllers know nothing; "
-        "on regional models", 0.0, unit="veh/s", ge=0.0, le=1e6)
+        "on regional models",
+        0.0,
+        unit="veh/s",
+        ge=0.0,
+        le=1e6,
+    )
     noise_where: Literal["planned", "pairs", "all"] = setting("what the noise is on, as of nmfd robustness", "pairs")
     signals: Signals = setting(
         "control of the signals that is part of the plant: it takes the place of what a controller brings along; "
-        "with fixed ones controllers may bring their own", FIXED)
+        "with fixed ones controllers may bring their own",
+        FIXED,
+    )
     seeds: Annotated[tuple[Seed, ...], Field(min_length=1), *DISTINCT] = setting("of the runs")
     time_limit: float = setting(
         "of every decision; a run with a later one does not count, and of a controller of one's own it is ended, in "
-        "its import, making and reset, too", unit="s", gt=0.0, le=3600.0)
+        "its import, making and reset, too",
+        unit="s",
+        gt=0.0,
+        le=3600.0,
+    )
     steps: int | None = whole("control intervals; without it, the scenario's", None, low=1)
 
     @model_validator(mode="after")
@@ -109,7 +120,8 @@ class Loaded:
         if not (folder / "scenario.toml").is_file():
             raise InputError(
                 f"{self.file}: {task.id}: scenario: there is no {folder / 'scenario.toml'}, and no scenario "
-                f"{task.scenario!r} comes with the package; `cosim list scenarios` shows those that do")
+                f"{task.scenario!r} comes with the package; `cosim list scenarios` shows those that do"
+            )
         return folder
 
     def check_world(self, task: TaskTable, now: str) -> None:
@@ -117,7 +129,8 @@ class Loaded:
         if self.worlds is not None and self.worlds.get(task.id) != now:
             raise InputError(
                 f"{self.file}: {task.id}: its scenario or network has changed since {self.tasks.name} was released "
-                f"({now} instead of {self.worlds.get(task.id)}); take the version of the release, or make a new set")
+                f"({now} instead of {self.worlds.get(task.id)}); take the version of the release, or make a new set"
+            )
 
 
 def names() -> list[str]:
@@ -132,14 +145,16 @@ def read(name: str) -> Loaded:
     if not ours and not file.is_file():
         raise InputError(
             f"{name}: no such file, and no task set of that name comes with the package{did_you_mean(name, names())}; "
-            f"choose from {', '.join(names())}")
+            f"choose from {', '.join(names())}"
+        )
     content = config.read(file)
     found, now = config.checked(TaskSet, content, file), fingerprint(content)
     release = config.read(RELEASED).get(name) if ours else None
     if release is not None and release["hash"] != now:
         raise InputError(
             f"{file}: is not the task set {name} that was released ({now} instead of {release['hash']}); restore it, "
-            "and give what is to be different a new number")
+            "and give what is to be different a new number"
+        )
     return Loaded(tasks=found, named=name, file=file, hash=now, worlds=None if release is None else release["worlds"])
 
 
@@ -158,10 +173,21 @@ def world(task: TaskTable, scenario: Scenario) -> str:
     network = scenario.network
     chosen = settings(scenario).model_dump(mode="json", exclude_defaults=True)
     files = [scenario.folder / name for key in FILES for name in chosen.pop(key, ())] if scenario.folder else []
-    return fingerprint([
-        scenario.name, scenario.step, scenario.steps, scenario.measurement_std, scenario.faults, network.u_min,
-        network.u_max, network.adjacency.tolist(), chosen, [_content(file) for file in (*files, *sources(network))],
-        hashlib.sha256(scenario.demand.round(9).tobytes()).hexdigest()])
+    return fingerprint(
+        [
+            scenario.name,
+            scenario.step,
+            scenario.steps,
+            scenario.measurement_std,
+            scenario.faults,
+            network.u_min,
+            network.u_max,
+            network.adjacency.tolist(),
+            chosen,
+            [_content(file) for file in (*files, *sources(network))],
+            hashlib.sha256(scenario.demand.round(9).tobytes()).hexdigest(),
+        ]
+    )
 
 
 def noise_of(task: TaskTable) -> Noise | None:

@@ -28,8 +28,14 @@ Line = dict[str, object]
 
 
 def verify_all(
-    folder: Path, rows: Sequence[Row], *, out: Path, within: float | None = None, missing: bool = False,
-    progress: Show, tell: Callable[[str], None],
+    folder: Path,
+    rows: Sequence[Row],
+    *,
+    out: Path,
+    within: float | None = None,
+    missing: bool = False,
+    progress: Show,
+    tell: Callable[[str], None],
 ) -> list[Line]:
     """The lines of the table of `rows`, which are in `folder`, after those that are not there yet were made again.
 
@@ -46,8 +52,13 @@ def verify_all(
             others = [one for one in _read(out / TABLE) if (one["folder"], one["row"]) != (place, line["row"])]
             write_table(out / TABLE, pd.DataFrame([*others, line], columns=list(COLUMNS)))
 
-    enough = {line["row"] for line in _read(out / TABLE) if line["folder"] == place and line["verdict"] != FAILED
-              and (missing or line["commit"] == commit and not here["dirty"])}
+    enough = {
+        line["row"]
+        for line in _read(out / TABLE)
+        if line["folder"] == place
+        and line["verdict"] != FAILED
+        and (missing or line["commit"] == commit and not here["dirty"])
+    }
     for done, row in enumerate(rows):
         progress(done, len(rows), row.label)
         if row.label not in enough:
@@ -85,5 +96,6 @@ def _read(file: Path) -> list[Line]:
         raise InputError(f"{file}: is no table of cosim verify ({error}); choose another folder with --out") from None
     if not {*COLUMNS} <= {*table.columns}:
         raise InputError(
-            f"{file}: is no table of cosim verify (expected {', '.join(COLUMNS)}); choose another folder with --out")
+            f"{file}: is no table of cosim verify (expected {', '.join(COLUMNS)}); choose another folder with --out"
+        )
     return table[list(COLUMNS)].to_dict("records")

@@ -38,8 +38,18 @@ from nmfd.studies import benchmark, robustness
 Figures = Mapping[str, object]
 ROUNDING = 1e-9  # as a share: what sums in another order may come to
 CLOCK = (  # columns and metrics that are wall times, or depend on them
-    "evaluation_time_s", "control_step_ms_median", "control_step_ms_max", "late_decisions", "wall_time_s",
-    "sumo_time_s", "overhead_share", "setup_time_s", "decision_ms_median", "decision_ms_max", "notes")
+    "evaluation_time_s",
+    "control_step_ms_median",
+    "control_step_ms_max",
+    "late_decisions",
+    "wall_time_s",
+    "sumo_time_s",
+    "overhead_share",
+    "setup_time_s",
+    "decision_ms_median",
+    "decision_ms_max",
+    "notes",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +99,9 @@ def rows(folder: Path, scenario: Path | None = None) -> list[Row]:
     does not say how, and for a scenario that is none."""
     given = None if scenario is None else load_scenario(scenario)
     if levels := evaluate.level_folders(folder):
-        return [replace(row, label=f"{level:g},{row.label}")
-                for level, at in levels.items() for row in rows(at, scenario)]
+        return [
+            replace(row, label=f"{level:g},{row.label}") for level, at in levels.items() for row in rows(at, scenario)
+        ]
     if (folder / "manifest.json").is_file():
         manifest = run_folder.read_manifest(folder / "manifest.json")
         at = scenario or results.scenario_folder(folder, manifest)
@@ -98,23 +109,29 @@ def rows(folder: Path, scenario: Path | None = None) -> list[Row]:
         if (folder / "robustness.csv").is_file():
             return _of_robustness(folder, manifest, loaded)
         if (folder / "summary.csv").is_file():
-            return _in_sumo(folder, manifest, loaded, at) if manifest["configuration"].get("plant") == "sumo" else (
-                _regional(folder, manifest, loaded))
+            return (
+                _in_sumo(folder, manifest, loaded, at)
+                if manifest["configuration"].get("plant") == "sumo"
+                else (_regional(folder, manifest, loaded))
+            )
     if files := sorted(file for file in folder.glob("*.json") if file.name != "manifest.json"):
         return [row for file in files for row in _of_entry(entry.read(file))]
     if (folder / "runs.csv").is_file():
         return _of_table(folder / "runs.csv", scenario)
     raise InputError(
         f"{folder}: does not say how its rows were made; give a folder with manifest.json and summary.csv or "
-        "robustness.csv, one of an evaluation, or one of entries")
+        "robustness.csv, one of an evaluation, or one of entries"
+    )
 
 
 def fitting(found: Sequence[Row], pattern: str | None) -> list[Row]:
     """Those whose label matches. InputError for none."""
     matching = [row for row in found if pattern is None or fnmatchcase(row.label, pattern)]
     if not matching:
-        raise InputError(f"--row: no row matches {pattern!r}; there are {', '.join(row.label for row in found[:20])}"
-                         + (" ..." if len(found) > 20 else ""))
+        raise InputError(
+            f"--row: no row matches {pattern!r}; there are {', '.join(row.label for row in found[:20])}"
+            + (" ..." if len(found) > 20 else "")
+        )
     return matching
 
 
@@ -126,13 +143,26 @@ def verify(row: Row, within: float | None = None) -> Verdict:
         same = None if row.file is None or file is None else row.file.read_bytes() == file.read_bytes()
     keys = [key for key, value in row.figures.items() if key not in CLOCK and key in figures and not _empty(value)]
     verdict = Verdict(
-        label=row.label, compared=len(keys), same_bytes=same, differ={}, within=0.0,
+        label=row.label,
+        compared=len(keys),
+        same_bytes=same,
+        differ={},
+        within=0.0,
         equal=sum(_same(row.figures[key], figures[key], 0.0) for key in keys),
-        depends={key: (row.depends.get(key), depends.get(key)) for key in {**row.depends, **depends}
-                 if row.depends.get(key) != depends.get(key)})
+        depends={
+            key: (row.depends.get(key), depends.get(key))
+            for key in {**row.depends, **depends}
+            if row.depends.get(key) != depends.get(key)
+        },
+    )
     share = (ROUNDING if verdict.another else 0.0) if within is None else within
-    return replace(verdict, within=share, differ={
-        key: (row.figures[key], figures[key]) for key in keys if not _same(row.figures[key], figures[key], share)})
+    return replace(
+        verdict,
+        within=share,
+        differ={
+            key: (row.figures[key], figures[key]) for key in keys if not _same(row.figures[key], figures[key], share)
+        },
+    )
 
 
 def _empty(value: object) -> bool:
@@ -154,8 +184,13 @@ def _of_run(folder: Path, manifest: Mapping, published: Mapping, make: Callable[
         made = make(out)
         return made, _depends(run_folder.read_manifest(out / "manifest.json"), name), _kept(out, name, seed)
 
-    return Row(label=f"{name},{seed}", figures=published, depends=_depends(manifest, name, seed),
-               file=_kept(folder, name, seed), again=again)
+    return Row(
+        label=f"{name},{seed}",
+        figures=published,
+        depends=_depends(manifest, name, seed),
+        file=_kept(folder, name, seed),
+        again=again,
+    )
 
 
 def _regional(folder: Path, manifest: Mapping, scenario: Scenario) -> list[Row]:
@@ -166,14 +201,22 @@ def _regional(folder: Path, manifest: Mapping, scenario: Scenario) -> list[Row]:
     def make(name: str, seed: int, out: Path) -> Figures:
         policy = _policy(scenario, manifest, name)
         made, failures = benchmark.perform(
-            scenario, [name], [seed], plant, out=out, noise=benchmark.Noise(**noise) if noise else None,
-            policies={name: policy} if policy else None)
+            scenario,
+            [name],
+            [seed],
+            plant,
+            out=out,
+            noise=benchmark.Noise(**noise) if noise else None,
+            policies={name: policy} if policy else None,
+        )
         if failures:
             raise InputError(f"{name}, seed {seed}: {failures[0][1].reason}")
         return made[0]
 
-    return [_of_run(folder, manifest, published, partial(make, published["controller"], published["seed"]))
-            for published in _read(folder / "summary.csv", run_folder.COLUMNS, str)]
+    return [
+        _of_run(folder, manifest, published, partial(make, published["controller"], published["seed"]))
+        for published in _read(folder / "summary.csv", run_folder.COLUMNS, str)
+    ]
 
 
 def _value(text: str) -> object:
@@ -189,8 +232,10 @@ def _read(file: Path, columns: Mapping[str, Callable], others: Callable) -> list
     check_file(file)
     try:
         with file.open(newline="", encoding="utf-8") as stream:
-            return [{name: columns.get(name, others)(value) for name, value in row.items()
-                     if name != trail.COLUMN} for row in csv.DictReader(stream)]
+            return [
+                {name: columns.get(name, others)(value) for name, value in row.items() if name != trail.COLUMN}
+                for row in csv.DictReader(stream)
+            ]
     except (OSError, ValueError, TypeError, csv.Error) as error:
         raise InputError(f"{file}: is no table of runs ({error}); give a folder that holds one") from None
 
@@ -201,12 +246,23 @@ def _in_sumo(folder: Path, manifest: Mapping, scenario: Scenario, at: Path) -> l
     faults = tuple(fault for fault in about.get("faults", ()) if fault not in scenario.faults)
 
     def make(name: str, seed: int, out: Path) -> Figures:
-        return _simulated(Task(
-            scenario=at, controller=name, seed=seed, steps=about["steps"], demand_factor=about["demand_factor"],
-            faults=faults, policy=_policy(scenario, manifest, name)), out)
+        return _simulated(
+            Task(
+                scenario=at,
+                controller=name,
+                seed=seed,
+                steps=about["steps"],
+                demand_factor=about["demand_factor"],
+                faults=faults,
+                policy=_policy(scenario, manifest, name),
+            ),
+            out,
+        )
 
-    return [_of_run(folder, manifest, published, partial(make, published["controller"], published["seed"]))
-            for published in experiment.overview(folder).to_dict("records")]
+    return [
+        _of_run(folder, manifest, published, partial(make, published["controller"], published["seed"]))
+        for published in experiment.overview(folder).to_dict("records")
+    ]
 
 
 def _policy(scenario: Scenario, manifest: Mapping, name: str) -> Path | None:
@@ -215,8 +271,12 @@ def _policy(scenario: Scenario, manifest: Mapping, name: str) -> Path | None:
     wanted, at = manifest["controllers"].get(name, {}).get("policy_hash"), scenario.folder
     if wanted is None or at is None:
         return None
-    files = (file for folder in (at, at.parent) for kind in (registry.POLICY, registry.PLAN)
-             for file in sorted(folder.glob(f"*.{kind.suffix}")))
+    files = (
+        file
+        for folder in (at, at.parent)
+        for kind in (registry.POLICY, registry.PLAN)
+        for file in sorted(folder.glob(f"*.{kind.suffix}"))
+    )
     return next((file for file in files if file_hash(file) == wanted), None)
 
 
@@ -243,21 +303,29 @@ def _of_table(file: Path, scenario: Path | None) -> list[Row]:
             now = {**_of_session(now), **_hashes(now, ".", task.controller)}
             return made, {key: now.get(key) for key in depends}, None
 
-        return Row(label=f"{published['demand']:g},{task.controller},{task.seed}", figures=published, file=None,
-                   depends=depends, again=again)
+        return Row(
+            label=f"{published['demand']:g},{task.controller},{task.seed}",
+            figures=published,
+            file=None,
+            depends=depends,
+            again=again,
+        )
 
     records = _read(file, KEYS, _value)
     if not all(KEYS.keys() <= one.keys() for one in records):
         raise InputError(f"{file}: is no table of runs (expected {', '.join(KEYS)}); give a folder that holds one")
     asked = [(one, next((each for each in there if each.covers(one)), None)) for one in records]
     why = [reason for one, _ in asked for name, reason in refused.items() if fnmatchcase(one["controller"], name)]
-    if rows := [row(one, by) for one, by in asked if by and not any(
-            fnmatchcase(one["controller"], name) for name in refused)]:
+    if rows := [
+        row(one, by) for one, by in asked if by and not any(fnmatchcase(one["controller"], name) for name in refused)
+    ]:
         return rows
     if why:
         raise InputError(f"{file}: cannot be made again: {why[0]}")
-    raise InputError(f"{file}: names no command (cosim evaluate) that asked for its rows; give a folder with the "
-                     "run folders of the evaluation, demand-*")
+    raise InputError(
+        f"{file}: names no command (cosim evaluate) that asked for its rows; give a folder with the "
+        "run folders of the evaluation, demand-*"
+    )
 
 
 def _hashes(found: Mapping, place: str, controller: str) -> dict:
@@ -279,8 +347,13 @@ def _of_robustness(folder: Path, manifest: Mapping, scenario: Scenario) -> list[
             now = {"configuration": {**common, "where": where}, "controllers": settings, "sessions": [provenance()]}
             return made, _depends(now, one.controller), None
 
-        return Row(label=f"{one.sigma:g},{one.scenario},{one.controller}", figures=published, file=None,
-                   depends=_depends(manifest, one.controller), again=again)
+        return Row(
+            label=f"{one.sigma:g},{one.scenario},{one.controller}",
+            figures=published,
+            file=None,
+            depends=_depends(manifest, one.controller),
+            again=again,
+        )
 
     return [row(published) for published in robustness.read(folder / "robustness.csv")]
 
@@ -289,15 +362,19 @@ def _of_entry(one: Entry) -> list[Row]:
     """Of cosim compete."""
     loaded = task_set.read(one.task_set.named)
     if loaded.hash != one.task_set.hash:
-        raise InputError(f"{one.controller}: is an entry in {one.task_set.name} {one.task_set.hash}, but that is "
-                         f"{loaded.hash} here; verify it with the version of that release")
+        raise InputError(
+            f"{one.controller}: is an entry in {one.task_set.name} {one.task_set.hash}, but that is "
+            f"{loaded.hash} here; verify it with the version of that release"
+        )
     tasks = {task.id: task for task in loaded.tasks.tasks}
 
     def row(outcome: entry.Outcome, kept: entry.Run) -> Row:
         alone = tasks[outcome.task].changed(seeds=(kept.seed,))
         order = run.Order(
             task_set=replace(loaded, worlds=None, tasks=loaded.tasks.changed(tasks=(alone,))),
-            controllers=(one.controller,), out=Path())
+            controllers=(one.controller,),
+            out=Path(),
+        )
 
         def again(out: Path) -> tuple[Figures, Figures, Path | None]:
             made = run.compete(replace(order, out=out))[0]
@@ -307,8 +384,13 @@ def _of_entry(one: Entry) -> list[Row]:
             return found.runs[0].metrics, _of_outcome(found, made.sessions[0]), None
 
         session = {} if kept.session is None else one.sessions[kept.session]
-        return Row(label=f"{one.controller},{outcome.task},{kept.seed}", figures=kept.metrics, file=None,
-                   depends=_of_outcome(outcome, session), again=again)
+        return Row(
+            label=f"{one.controller},{outcome.task},{kept.seed}",
+            figures=kept.metrics,
+            file=None,
+            depends=_of_outcome(outcome, session),
+            again=again,
+        )
 
     return [row(outcome, kept) for outcome in one.tasks for kept in outcome.runs]
 
@@ -321,8 +403,11 @@ def _of_outcome(outcome: entry.Outcome, session: Mapping) -> Figures:
 def _depends(manifest: Mapping, name: str, seed: int | None = None) -> Figures:
     """What a row depended on; seed: of the last session that asked for it."""
     sessions = [one for one in manifest["sessions"] if seed is None or seed in one.get("seeds", ())]
-    return {**manifest["configuration"], **manifest["controllers"].get(name, {}),
-            **_of_session((sessions or manifest["sessions"])[-1])}
+    return {
+        **manifest["configuration"],
+        **manifest["controllers"].get(name, {}),
+        **_of_session((sessions or manifest["sessions"])[-1]),
+    }
 
 
 def _of_session(session: Mapping) -> Figures:

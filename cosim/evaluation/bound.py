@@ -65,26 +65,41 @@ class Bound:
         if registry.is_own(registry.split(variant)[0]):
             raise InputError(
                 f"--controller: {self.controller!r} is a controller of your own, and a schedule can be added to those "
-                "that are built in only; choose one of these")
+                "that are built in only; choose one of these"
+            )
         return channels(registry.make(variant, scenario), planning_model(scenario, variant))
 
     def search(self, level: float, seed: int, used: Sequence[str]) -> "Search":
         """The search of one seed and demand level, over the channels `used`."""
         return Search(
-            scenario=self.scenario, controller=self.controller, candidates=self.candidates, seeds=(seed,),
-            levels=(level,), search_seed=self.search_seed, steps=self.steps, first_step=FIRST_STEP,
+            scenario=self.scenario,
+            controller=self.controller,
+            candidates=self.candidates,
+            seeds=(seed,),
+            levels=(level,),
+            search_seed=self.search_seed,
+            steps=self.steps,
+            first_step=FIRST_STEP,
             out=self.out / f"demand-{level:g}-seed-{seed}",
-            knobs=tuple(tuning.Knob(option=f"{channel}[{knot}]", low=-RANGES[channel], high=RANGES[channel])
-                        for channel in used for knot in range(self.knots)))
+            knobs=tuple(
+                tuning.Knob(option=f"{channel}[{knot}]", low=-RANGES[channel], high=RANGES[channel])
+                for channel in used
+                for knot in range(self.knots)
+            ),
+        )
 
     def rivals(self) -> list[tuple[Path, Task]]:
         """The runs of the rival, each with its run folder."""
         if self.against is None:
             return []
         return [
-            (experiment.level_folder(self.out / "against", level), Task(
-                scenario=self.scenario, controller=self.against, seed=seed, steps=self.steps, demand_factor=level))
-            for level in self.levels for seed in self.seeds]
+            (
+                experiment.level_folder(self.out / "against", level),
+                Task(scenario=self.scenario, controller=self.against, seed=seed, steps=self.steps, demand_factor=level),
+            )
+            for level in self.levels
+            for seed in self.seeds
+        ]
 
 
 class Search(tuning.Tuning):
@@ -101,8 +116,10 @@ class Search(tuning.Tuning):
 
     def plan(self, candidate: int, options: tuple[tuple[str, object], ...]) -> list[tuple[Path, Task]]:
         """The run of one candidate, whose first one is the controller itself."""
-        return [(folder, replace(task, options=(), schedule=task.options if candidate else ()))  # type: ignore[arg-type]
-                for folder, task in super().plan(candidate, options)]
+        return [
+            (folder, replace(task, options=(), schedule=task.options if candidate else ()))  # type: ignore[arg-type]
+            for folder, task in super().plan(candidate, options)
+        ]
 
 
 def check(order: Bound) -> tuple[str, ...]:
@@ -111,11 +128,13 @@ def check(order: Bound) -> tuple[str, ...]:
     if not used:
         raise InputError(
             f"--controller: {order.controller!r} commands no gates, prices or rates that a schedule could be added to; "
-            "choose one that does, in a scenario with protected regions")
+            "choose one that does, in a scenario with protected regions"
+        )
     if len(used) * order.knots > tuning.MOST:
         raise InputError(
             f"--knots: expected at most {tuning.MOST // len(used)}, for {order.controller} has {len(used)} channels "
-            f"({', '.join(used)}) and a search {tuning.MOST} numbers at most, got {order.knots} instead")
+            f"({', '.join(used)}) and a search {tuning.MOST} numbers at most, got {order.knots} instead"
+        )
     if order.against is not None:
         scenario = load_scenario(order.scenario)
         registry.verify(configured(order.against, scenario.controller_options), scenario)
@@ -123,8 +142,12 @@ def check(order: Bound) -> tuple[str, ...]:
 
 
 def bound(
-    order: Bound, *, workers: int = 1, scheduler: dask_cluster.Scheduler | str | None = None,
-    progress: experiment.Progress | None = None, tell: Callable[[str], None] | None = None,
+    order: Bound,
+    *,
+    workers: int = 1,
+    scheduler: dask_cluster.Scheduler | str | None = None,
+    progress: experiment.Progress | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Search for every seed and demand level; returns the table of bound.csv.
 
@@ -135,20 +158,30 @@ def bound(
     pairs = [(level, seed) for level in order.levels for seed in order.seeds]
     file, rows = order.out / "bound.csv", list[dict[str, float]]()
     with run_folder.manifest(
-            order.out, configuration=_configuration(order, used), results=file,
-            session={"scenario_folder": str(order.scenario), "workers": workers}):
+        order.out,
+        configuration=_configuration(order, used),
+        results=file,
+        session={"scenario_folder": str(order.scenario), "workers": workers},
+    ):
         for number, (level, seed) in enumerate(pairs):
+
             def kept(table: pd.DataFrame, level: float = level, seed: int = seed) -> None:
                 files.write_table(file, pd.DataFrame([*rows, _row(order, level, seed, table)]))
 
             table = tuning.search(
-                order.search(level, seed, used), workers=workers, source=source, tell=tell, kept=kept,
-                progress=_of_search(progress, number, len(pairs)))
+                order.search(level, seed, used),
+                workers=workers,
+                source=source,
+                tell=tell,
+                kept=kept,
+                progress=_of_search(progress, number, len(pairs)),
+            )
             rows.append(_row(order, level, seed, table))
         if order.against is None:
             return pd.DataFrame(rows)
         failures = experiment.perform(
-            order.rivals(), workers=workers, fresh=True, progress=progress, tell=tell, source=source)
+            order.rivals(), workers=workers, fresh=True, progress=progress, tell=tell, source=source
+        )
         if failures:
             raise ended([(experiment.label(task), failure) for task, failure in failures])
         found = pd.DataFrame([_beside(order, row) for row in rows])
@@ -159,29 +192,51 @@ def bound(
 def text(order: Bound, table: pd.DataFrame) -> str:
     """For the terminal: one line per search."""
     used = "used: share of what the bound saves against the rival that the controller saves as well"
-    return text_table([{
-        "demand": f"{row['demand']:g}", "seed": row["seed"], f"{order.controller} [veh s]": f"{row[FIRST]:.4g}",
-        "bound [veh s]": f"{row[FOUND]:.4g}", "room": f"{row[ROOM]:+.1f} %",
-        **({} if order.against is None else {
-            f"{order.against} [veh s]": f"{row[RIVAL]:.4g}",
-            "used": "" if math.isnan(row[USED]) else f"{row[USED]:.0f} %"})} for row in table.to_dict("records")],
+    return text_table(
+        [
+            {
+                "demand": f"{row['demand']:g}",
+                "seed": row["seed"],
+                f"{order.controller} [veh s]": f"{row[FIRST]:.4g}",
+                "bound [veh s]": f"{row[FOUND]:.4g}",
+                "room": f"{row[ROOM]:+.1f} %",
+                **(
+                    {}
+                    if order.against is None
+                    else {
+                        f"{order.against} [veh s]": f"{row[RIVAL]:.4g}",
+                        "used": "" if math.isnan(row[USED]) else f"{row[USED]:.0f} %",
+                    }
+                ),
+            }
+            for row in table.to_dict("records")
+        ],
         f"bound: the best of {order.candidates} schedules, found knowing the seed; room: against the controller"
-        + (f"; {used}" if order.against else ""))
+        + (f"; {used}" if order.against else ""),
+    )
 
 
 def _of_search(progress: experiment.Progress | None, number: int, searches: int) -> experiment.Progress | None:
     """`progress` of one search, among all."""
-    return progress and (lambda done, total, note: progress(
-        number * total + done, searches * total, f"search {number + 1} of {searches}; {note}"))
+    return progress and (
+        lambda done, total, note: progress(
+            number * total + done, searches * total, f"search {number + 1} of {searches}; {note}"
+        )
+    )
 
 
 def _row(order: Bound, level: float, seed: int, table: pd.DataFrame) -> dict[str, float]:
     """Of bound.csv, by the table of a search."""
     first, best = float(table[SCORE].iloc[0]), tuning.best(table)
     return {
-        "demand": level, "seed": seed, "candidates": len(table), FIRST: first, FOUND: float(best[SCORE]),
+        "demand": level,
+        "seed": seed,
+        "candidates": len(table),
+        FIRST: first,
+        FOUND: float(best[SCORE]),
         ROOM: percent_change(float(best[SCORE]), first),
-        **{name: float(best[name]) for name in table.columns if "[" in name}}
+        **{name: float(best[name]) for name in table.columns if "[" in name},
+    }
 
 
 def _beside(order: Bound, row: dict[str, float]) -> dict[str, float]:
@@ -195,7 +250,13 @@ def _beside(order: Bound, row: dict[str, float]) -> dict[str, float]:
 def _configuration(order: Bound, used: Sequence[str]) -> dict[str, object]:
     """What the folder is for."""
     return {
-        "bound": order.controller, "against": order.against,
+        "bound": order.controller,
+        "against": order.against,
         "scenario": load_scenario(order.scenario).name,
-        "seeds": list(order.seeds), "levels": list(order.levels), "channels": list(used), "knots": order.knots,
-        "search_seed": order.search_seed, "steps": order.steps}
+        "seeds": list(order.seeds),
+        "levels": list(order.levels),
+        "channels": list(used),
+        "knots": order.knots,
+        "search_seed": order.search_seed,
+        "steps": order.steps,
+    }

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from distributed.security import Security
 
 PATIENCE = 10.0  # s, for the scheduler to answer
-RETURN = 300.0   # s, for one that was lost to come back
-LOSSES = 5       # of the scheduler, without a run that ended between them: then it may be the runs that it dies of
+RETURN = 300.0  # s, for one that was lost to come back
+LOSSES = 5  # of the scheduler, without a run that ended between them: then it may be the runs that it dies of
 Tell = Callable[[str], None]
 
 
@@ -54,8 +54,10 @@ class Scheduler:
         """What is to be said of whom it trusts, "" if nothing."""
         if self.encrypted or self.address.startswith("inproc://") or _here(self.address):
             return ""
-        return (f"--scheduler {self.address}: is not encrypted; whoever reaches it can run code there and here. Use "
-                "tls:// (cosim sweep --help) outside a network of your own")
+        return (
+            f"--scheduler {self.address}: is not encrypted; whoever reaches it can run code there and here. Use "
+            "tls:// (cosim sweep --help) outside a network of your own"
+        )
 
 
 def _here(address: str) -> bool:
@@ -84,7 +86,7 @@ def source(scheduler: Scheduler | str | None, tell: Tell | None = None) -> Sourc
 
 
 def outcomes(
-    scheduler: Scheduler | str, function: Callable, tasks: Sequence, *, tell: Tell | None = None,
+    scheduler: Scheduler | str, function: Callable, tasks: Sequence, *, tell: Tell | None = None
 ) -> Iterator[tuple]:
     """(task, `function(task)` or Failure) of every task, once each, as they finish, from the workers of the scheduler.
 
@@ -107,8 +109,10 @@ def outcomes(
             yield task, outcome
         losses += 1
         if todo and tell:
-            tell(f"the scheduler at {at.address} was lost; its {len(todo)} runs begin again when it is "
-                 f"back, within {RETURN:g} s")
+            tell(
+                f"the scheduler at {at.address} was lost; its {len(todo)} runs begin again when it is "
+                f"back, within {RETURN:g} s"
+            )
 
 
 def _until_lost(client: "Client", function: Callable, tasks: Sequence) -> Iterator[tuple]:
@@ -124,8 +128,11 @@ def _until_lost(client: "Client", function: Callable, tasks: Sequence) -> Iterat
                 return
             try:
                 error = future.exception()
-                outcome = future.result() if error is None else Failure(
-                    f"{type(error).__name__}: {' '.join(str(error).split())}")
+                outcome = (
+                    future.result()
+                    if error is None
+                    else Failure(f"{type(error).__name__}: {' '.join(str(error).split())}")
+                )
             except (CancelledError, OSError, TimeoutError):  # lost between its end and here
                 return
             future.release()
@@ -169,7 +176,8 @@ def connect(scheduler: Scheduler | str) -> "Client":
         certificates = " with certificates that it trusts" if scheduler.encrypted else ""
         raise InputError(
             f"--scheduler: no Dask scheduler answers at {scheduler.address!r} ({reason}); start "
-            f"one with 'dask scheduler' and give its address, such as tcp://host:8786{certificates}") from None
+            f"one with 'dask scheduler' and give its address, such as tcp://host:8786{certificates}"
+        ) from None
 
 
 def _security(scheduler: Scheduler) -> "Security | None":
@@ -181,7 +189,8 @@ def _security(scheduler: Scheduler) -> "Security | None":
     if given and not scheduler.encrypted:
         raise InputError(
             f"{next(iter(given))}: is for an encrypted scheduler, at tls://..., not {scheduler.address!r}: omit it, or "
-            "start the scheduler with --protocol tls")
+            "start the scheduler with --protocol tls"
+        )
     for option, path in given.items():
         check_file(path, "give a PEM file")
         if not path.is_file():
@@ -190,12 +199,19 @@ def _security(scheduler: Scheduler) -> "Security | None":
         return None
     own = Security()  # with what dask's configuration says (distributed.comm.tls)
     security = Security(
-        require_encryption=True, tls_ca_file=str(scheduler.ca or own.tls_ca_file or "") or None,
+        require_encryption=True,
+        tls_ca_file=str(scheduler.ca or own.tls_ca_file or "") or None,
         tls_client_cert=str(scheduler.cert or own.tls_client_cert or "") or None,
-        tls_client_key=str(scheduler.key or own.tls_client_key or "") or None)
-    missing = [option for option, value in zip(
-        options, (security.tls_ca_file, security.tls_client_cert), strict=False) if value is None]
+        tls_client_key=str(scheduler.key or own.tls_client_key or "") or None,
+    )
+    missing = [
+        option
+        for option, value in zip(options, (security.tls_ca_file, security.tls_client_cert), strict=False)
+        if value is None
+    ]
     if missing:
-        raise InputError(f"{missing[0]}: missing for {scheduler.address!r}; give a PEM file, or name it in Dask's "
-                         "configuration (distributed.comm.tls)")
+        raise InputError(
+            f"{missing[0]}: missing for {scheduler.address!r}; give a PEM file, or name it in Dask's "
+            "configuration (distributed.comm.tls)"
+        )
     return security

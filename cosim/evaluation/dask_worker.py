@@ -25,8 +25,12 @@ def run(function: Callable, task: Any, folder: str) -> Any:
     simulate.Task, or a tuple (controller, ...); function: of a module, so that it can be pickled."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     process = subprocess.Popen(
-        [sys.executable, "-m", "cosim.evaluation.dask_worker"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        cwd=folder, env=environment)
+        [sys.executable, "-m", "cosim.evaluation.dask_worker"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        cwd=folder,
+        env=environment,
+    )
     with process:
         assert process.stdin is not None and process.stdout is not None  # they are pipes
         message = pickle.dumps((function, task))

@@ -24,8 +24,7 @@ def add(out: Path, tables: Sequence[Path], rows: pd.DataFrame) -> None:
         known, name = trail.earlier(out), f"{files.file_hash(table)}.csv"
         if not any(copy.name.endswith(name) for copy in known):
             (out / trail.EARLIER).mkdir(parents=True, exist_ok=True)
-            files.write_text(
-                out / trail.EARLIER / f"{len(known):03d}-{name}", table.read_text(encoding="utf-8"))
+            files.write_text(out / trail.EARLIER / f"{len(known):03d}-{name}", table.read_text(encoding="utf-8"))
 
 
 def joined(out: Path, rows: pd.DataFrame) -> pd.DataFrame:
@@ -48,7 +47,8 @@ def _left(out: Path, table: Path, rows: pd.DataFrame) -> pd.DataFrame:
         if here.get(key, value) != value and (len(key) == 2 or key[:2] in used):
             raise InputError(
                 f"{table}: its runs are of another {' '.join(key)} ({value}) than those in {out} ({here[key]}); choose "
-                "another folder with --out")
+                "another folder with --out"
+            )
     return left
 
 
@@ -57,6 +57,9 @@ def _hashes(found: Mapping) -> dict[tuple[str, ...], str]:
     values: dict[tuple[str, ...], str] = {}
     for place, about in found.get("hashes", {}).items():
         for key, value in about.items():
-            values.update({(place, key, name): each for name, each in value.items()} if isinstance(value, Mapping)
-                          else {(place, key): value})
+            values.update(
+                {(place, key, name): each for name, each in value.items()}
+                if isinstance(value, Mapping)
+                else {(place, key): value}
+            )
     return values

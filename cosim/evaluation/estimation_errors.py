@@ -14,11 +14,21 @@ from nmfd.studies.traffic_states import OutflowOf, remembered
 from nmfd.types import Trajectory
 
 COLUMNS = (
-    "controller", "seed", "region", "name", "critical_veh", "mean_veh", "rmse_veh", "rmse_share", "bias_veh",
-    "cell_rmse_veh")
+    "controller",
+    "seed",
+    "region",
+    "name",
+    "critical_veh",
+    "mean_veh",
+    "rmse_veh",
+    "rmse_share",
+    "bias_veh",
+    "cell_rmse_veh",
+)
 CAPTION = (
     "estimate against exact accumulation of a region: RMSE, also as a share of the critical accumulation; bias > 0: "
-    "too many; x_ij RMSE: of the single cells (region, destination) in which there were vehicles; mean over runs")
+    "too many; x_ij RMSE: of the single cells (region, destination) in which there were vehicles; mean over runs"
+)
 
 
 def errors(network: RegionalModel, trajectory: Trajectory) -> list[dict]:
@@ -29,21 +39,42 @@ def errors(network: RegionalModel, trajectory: Trajectory) -> list[dict]:
     rows = []
     for i, mfd in enumerate(network.mfds):
         total, cells = off[:, i].sum(axis=1), off[:, i][:, used[i]]
-        rows.append(dict(zip(COLUMNS, (
-            trajectory.controller, trajectory.seed, i, network.region_names[i], mfd.critical,
-            float(exact[:, i].sum(axis=1).mean()), _rms(total), _rms(total) / mfd.critical, float(total.mean()),
-            _rms(cells)), strict=True)))
+        rows.append(
+            dict(
+                zip(
+                    COLUMNS,
+                    (
+                        trajectory.controller,
+                        trajectory.seed,
+                        i,
+                        network.region_names[i],
+                        mfd.critical,
+                        float(exact[:, i].sum(axis=1).mean()),
+                        _rms(total),
+                        _rms(total) / mfd.critical,
+                        float(total.mean()),
+                        _rms(cells),
+                    ),
+                    strict=True,
+                )
+            )
+        )
     numbers = pd.DataFrame(rows)
     together = {name: float(numbers[name].mean()) for name in ("critical_veh", "mean_veh", "bias_veh")}
     together |= {name: _rms(numbers[name]) for name in ("rmse_veh", "rmse_share")}
     whole = {
-        "controller": trajectory.controller, "seed": trajectory.seed, "region": "all", "name": "mean of the regions",
-        **together, "cell_rmse_veh": _rms(off[:, used])}
+        "controller": trajectory.controller,
+        "seed": trajectory.seed,
+        "region": "all",
+        "name": "mean of the regions",
+        **together,
+        "cell_rmse_veh": _rms(off[:, used]),
+    }
     return [*rows, {name: whole[name] for name in COLUMNS}]
 
 
 def write_errors(
-    folder: Path, network: RegionalModel, trajectories: Sequence[Trajectory], outflow: OutflowOf | None = None,
+    folder: Path, network: RegionalModel, trajectories: Sequence[Trajectory], outflow: OutflowOf | None = None
 ) -> pd.DataFrame:
     """estimation.csv, and one picture per run that was controlled on estimates; nothing without such a run.
 
@@ -73,7 +104,8 @@ def error_table(rows: pd.DataFrame) -> str:
     shown = rows.astype({"region": str}).groupby(keys, sort=False)[numbers].mean().reset_index()
     for column in numbers:
         shown[column] = [
-            f"{100 * value:.1f} %" if column == "rmse_share" else f"{value:.1f}" for value in shown[column]]
+            f"{100 * value:.1f} %" if column == "rmse_share" else f"{value:.1f}" for value in shown[column]
+        ]
     headings = ["controller", "region", "name", "critical", "mean", "RMSE", "of critical", "bias", "x_ij RMSE"]
     return text_columns(headings, shown.to_numpy().tolist(), CAPTION)
 

@@ -1,10 +1,10 @@
 """The evaluation: controllers x seeds x demand levels in SUMO, paired by seed, with tables.
 
-    <folder>/demand-<level>/    the run folder of a demand level (cosim.evaluation.experiment)
-    <folder>/earlier/           tables whose rows are in these (cosim.evaluation.earlier)
-    <folder>/evaluate.md, evaluate.csv, pairs.csv, runs.csv    the tables (statistics), new after every run; in the
-        first,  at the end, why (explain)
-    what is drawn of a level lies in its folder, what is drawn across levels here (cosim.report.pictures)
+<folder>/demand-<level>/    the run folder of a demand level (cosim.evaluation.experiment)
+<folder>/earlier/           tables whose rows are in these (cosim.evaluation.earlier)
+<folder>/evaluate.md, evaluate.csv, pairs.csv, runs.csv    the tables (statistics), new after every run; in the
+    first,  at the end, why (explain)
+what is drawn of a level lies in its folder, what is drawn across levels here (cosim.report.pictures)
 """
 
 import re
@@ -43,15 +43,31 @@ class Evaluation:
     def plan(self) -> list[tuple[Path, Task]]:
         """Every run with its run folder, seed by seed, so that whatever is finished compares like with like."""
         return [
-            (experiment.level_folder(self.out, level), Task(
-                scenario=self.scenario, controller=name, seed=seed, policy=self.policies.get(name), steps=self.steps,
-                demand_factor=level, time_limit=self.time_limit))
-            for seed in self.seeds for level in self.levels for name in self.controllers]
+            (
+                experiment.level_folder(self.out, level),
+                Task(
+                    scenario=self.scenario,
+                    controller=name,
+                    seed=seed,
+                    policy=self.policies.get(name),
+                    steps=self.steps,
+                    demand_factor=level,
+                    time_limit=self.time_limit,
+                ),
+            )
+            for seed in self.seeds
+            for level in self.levels
+            for name in self.controllers
+        ]
 
 
 def evaluate(
-    evaluation: Evaluation, *, workers: int = 1, scheduler: dask_cluster.Scheduler | str | None = None,
-    progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
+    evaluation: Evaluation,
+    *,
+    workers: int = 1,
+    scheduler: dask_cluster.Scheduler | str | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Run what is not there yet and write tables; returns `tables.statistics` and a line per failed run.
 
@@ -65,11 +81,17 @@ def evaluate(
     if evaluation.reference is not None and evaluation.reference not in known:
         raise InputError(
             f"--reference: {evaluation.reference!r} is neither among --controllers nor in {out}"
-            f"{did_you_mean(evaluation.reference, known)}; add it to them")
+            f"{did_you_mean(evaluation.reference, known)}; add it to them"
+        )
     failures = experiment.perform(
-        evaluation.plan(), workers=workers, fresh=True, progress=progress, tell=tell,
+        evaluation.plan(),
+        workers=workers,
+        fresh=True,
+        progress=progress,
+        tell=tell,
         source=dask_cluster.source(scheduler, tell),
-        kept=lambda: statistics.write_tables(out, all_runs(evaluation), None))
+        kept=lambda: statistics.write_tables(out, all_runs(evaluation), None),
+    )
     rows, table = all_runs(evaluation), pd.DataFrame()
     if len(rows):
         table = statistics.write_tables(out, rows, evaluation.reference)
@@ -77,8 +99,10 @@ def evaluate(
         why = explain.text(level_folders(out), scenario.network, kept_runs(evaluation))
         remarks = "".join(f"- {line}\n" for line in experiment.remarks(rows))
         files.write_text(
-            out / "evaluate.md", "\n".join(filter(None, (
-                statistics.markdown(table, evaluation.reference), remarks, why))) + trail.comment(out / "evaluate.md"))
+            out / "evaluate.md",
+            "\n".join(filter(None, (statistics.markdown(table, evaluation.reference), remarks, why)))
+            + trail.comment(out / "evaluate.md"),
+        )
     if failures and table.empty and all(failure.mistake for _, failure in failures):
         raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])
     return table, [f"{experiment.label(task)}: {failure.reason}" for task, failure in failures]
@@ -117,5 +141,7 @@ def all_runs(evaluation: Evaluation) -> pd.DataFrame:
 def _ordered(evaluation: Evaluation, rows: pd.DataFrame) -> pd.DataFrame:
     names = list(dict.fromkeys([*evaluation.controllers, *rows["controller"]]))
     return rows.sort_values(
-        ["demand", "controller", "seed"], ignore_index=True,
-        key=lambda column: column.map(names.index) if column.name == "controller" else column)
+        ["demand", "controller", "seed"],
+        ignore_index=True,
+        key=lambda column: column.map(names.index) if column.name == "controller" else column,
+    )

@@ -46,11 +46,16 @@ CAPTION = (
     "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; change: of the mean "
     "TTS against {against}; removed: taken out before the last edge of their route, in TTS as if they were there to "
     "the end; backlog: not inserted at the end; step: median / longest decision; outside SUMO: share of the wall time "
-    "not in its own step")
+    "not in its own step"
+)
 
 
 def experiment(
-    tasks: Sequence[Task], *, out: Path, workers: int = 1, progress: Progress | None = None,
+    tasks: Sequence[Task],
+    *,
+    out: Path,
+    workers: int = 1,
+    progress: Progress | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Run the tasks that are not yet in the run folder `out`; returns `overview` of all that is there.
@@ -70,9 +75,14 @@ def experiment(
 
 
 def perform(
-    plan: Sequence[tuple[Path, Task]], *, workers: int = 1, fresh: bool = False,
-    progress: Progress | None = None, tell: Callable[[str], None] | None = None,
-    kept: Callable[[], object] | None = None, failed: Callable[[Task, str], None] | None = None,
+    plan: Sequence[tuple[Path, Task]],
+    *,
+    workers: int = 1,
+    fresh: bool = False,
+    progress: Progress | None = None,
+    tell: Callable[[str], None] | None = None,
+    kept: Callable[[], object] | None = None,
+    failed: Callable[[Task, str], None] | None = None,
     source: Source | None = None,
 ) -> list[tuple[Task, Failure]]:
     """Run every task, in this order, that is not yet in its run folder; returns those that failed, and why.
@@ -96,19 +106,30 @@ def perform(
     """
     where = {task: path for path, task in plan}
     settings_of = {
-        path: shared_configuration([t for t in where if where[t] == path]) for path in dict.fromkeys(where.values())}
+        path: shared_configuration([t for t in where if where[t] == path]) for path in dict.fromkeys(where.values())
+    }
     failures = []
     with ExitStack() as stack:
         folders = {}
         for path, (configuration, controllers) in settings_of.items():
             tasks = [task for task in where if where[task] == path]
-            folders[path] = stack.enter_context(run_folder.open_folder(
-                path, configuration=configuration, controllers=controllers,
-                order=[(task.controller, task.seed) for task in tasks], renew=tell,
-                session={"scenario_folder": str(tasks[0].scenario), "workers": workers}))
+            folders[path] = stack.enter_context(
+                run_folder.open_folder(
+                    path,
+                    configuration=configuration,
+                    controllers=controllers,
+                    order=[(task.controller, task.seed) for task in tasks],
+                    renew=tell,
+                    session={"scenario_folder": str(tasks[0].scenario), "workers": workers},
+                )
+            )
         there = {path: folder.finished for path, folder in folders.items()}
-        todo = [task for task in where if (task.controller, task.seed) not in there[where[task]] or not all(
-            file.is_file() for _, file in task.sumo_output)]
+        todo = [
+            task
+            for task in where
+            if (task.controller, task.seed) not in there[where[task]]
+            or not all(file.is_file() for _, file in task.sumo_output)
+        ]
         tally = _tally(todo, progress)
         found = _outcomes(todo, workers, fresh, tally) if source is None else source(simulate, todo)
         for task, outcome in found:
@@ -162,8 +183,11 @@ def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> d
     model = json.dumps([network.hash, scenario.integrator, scenario.substeps, scenario.protected])
     return {
         "options": options,
-        "policy_hash": None, **registry.fingerprint(controller, path),
-        "model_hash": hashlib.sha256(model.encode()).hexdigest()[:16], "torch": metadata.version("torch")}
+        "policy_hash": None,
+        **registry.fingerprint(controller, path),
+        "model_hash": hashlib.sha256(model.encode()).hexdigest()[:16],
+        "torch": metadata.version("torch"),
+    }
 
 
 def shared_configuration(tasks: Sequence[Task]) -> tuple[dict, dict]:
@@ -172,9 +196,10 @@ def shared_configuration(tasks: Sequence[Task]) -> tuple[dict, dict]:
     first = tasks[0]
     scenario = scenario_of(first)
     controllers = {
-        task.controller: dependencies(task.controller, scenario_of(task), task.policy) | (
-            {"schedule": [list(channel) for channel in task.schedule]} if task.schedule else {})
-        for task in {task.controller: task for task in tasks}.values()}
+        task.controller: dependencies(task.controller, scenario_of(task), task.policy)
+        | ({"schedule": [list(channel) for channel in task.schedule]} if task.schedule else {})
+        for task in {task.controller: task for task in tasks}.values()
+    }
     chosen = settings(scenario)
     files = ensure_built(scenario.network)
     city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
@@ -189,12 +214,20 @@ def shared_configuration(tasks: Sequence[Task]) -> tuple[dict, dict]:
     for name in controllers:
         check_strategy(name, scenario, city)
     configuration = {
-        "scenario": scenario.name, "network": scenario.network.name, "plant": "sumo", "step_s": scenario.step,
-        "steps": scenario.steps, "demand_factor": first.demand_factor,
+        "scenario": scenario.name,
+        "network": scenario.network.name,
+        "plant": "sumo",
+        "step_s": scenario.step,
+        "steps": scenario.steps,
+        "demand_factor": first.demand_factor,
         "demand_hash": hashlib.sha256(np.ascontiguousarray(scenario.demand).tobytes()).hexdigest()[:16],
-        "net_file_hash": file_hash(files.net_file), "regions_hash": file_hash(files.regions_csv),
-        "measurement_std_veh": scenario.measurement_std, "sumo": _plain(chosen, scenario),
-        "libsumo": metadata.version("libsumo"), **({"faults": list(scenario.faults)} if scenario.faults else {})}
+        "net_file_hash": file_hash(files.net_file),
+        "regions_hash": file_hash(files.regions_csv),
+        "measurement_std_veh": scenario.measurement_std,
+        "sumo": _plain(chosen, scenario),
+        "libsumo": metadata.version("libsumo"),
+        **({"faults": list(scenario.faults)} if scenario.faults else {}),
+    }
     return configuration, controllers
 
 
@@ -211,8 +244,10 @@ def _plain(chosen: Settings, scenario: Scenario) -> dict:
 def _tally(todo: Sequence[Task], progress: Progress | None) -> Tally:
     """What tells of the tasks, in control intervals."""
     runs = todo if progress else ()
-    scenarios = {key: scenario_of(Task(scenario=key[0], controller=REFERENCE, seed=0, steps=key[1]))
-                 for key in {(task.scenario, task.steps) for task in runs}}
+    scenarios = {
+        key: scenario_of(Task(scenario=key[0], controller=REFERENCE, seed=0, steps=key[1]))
+        for key in {(task.scenario, task.steps) for task in runs}
+    }
 
     def of(task: Task) -> Scenario:
         return scenarios[task.scenario, task.steps]
@@ -221,8 +256,13 @@ def _tally(todo: Sequence[Task], progress: Progress | None) -> Tally:
         length = of(task).steps * of(task).step / MINUTE
         return f": {share * length:.0f} of {length:.0f} min"
 
-    return Tally(progress, runs, steps=lambda task: of(task).steps, at=at,
-                 label=lambda task: label(task).removeprefix("controller "))
+    return Tally(
+        progress,
+        runs,
+        steps=lambda task: of(task).steps,
+        at=at,
+        label=lambda task: label(task).removeprefix("controller "),
+    )
 
 
 def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, tally: Tally) -> Outcomes:
@@ -244,19 +284,23 @@ def read_run(folder: Path, controller: str, seed: int) -> Result:
     """A finished run of the run folder. Raises InputError."""
     with run_folder.opened(run_folder.run_path(folder, controller, seed)) as file:
         return Result(
-            trajectory=run_folder.trajectory_in(file), record={name: file[name][...] for name in quantities(Record)},
-            facts={})
+            trajectory=run_folder.trajectory_in(file),
+            record={name: file[name][...] for name in quantities(Record)},
+            facts={},
+        )
 
 
 def measured_outflow(folder: Path) -> OutflowOf:
     """What left every region in a run of the folder, as SUMO counted it (T, R) [veh/s]; None of a run that an older
     version recorded without it."""
+
     def outflow(trajectory: Trajectory) -> RegionalOutflow | None:
         with run_folder.opened(run_folder.run_path(folder, trajectory.controller, trajectory.seed)) as file:
             if not {"arrivals", "crossings"} <= set(file.variables):
                 return None
             return run_metrics.regional_outflow(
-                {name: file[name][...] for name in ("arrivals", "crossings")}, trajectory.step)
+                {name: file[name][...] for name in ("arrivals", "crossings")}, trajectory.step
+            )
 
     return outflow
 
@@ -265,8 +309,10 @@ def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
     path = folder.path / "sumo.csv"
     rows = read_facts(path) if path.is_file() else pd.DataFrame(columns=[*FACTS])
     same = (rows["controller"] == result.facts["controller"]) & (rows["seed"] == result.facts["seed"])
-    found = sorted([*rows[~same].to_dict("records"), result.facts],  # not as they ended, which is chance
-                   key=lambda row: folder.position(row["controller"], row["seed"]))
+    found = sorted(
+        [*rows[~same].to_dict("records"), result.facts],  # not as they ended, which is chance
+        key=lambda row: folder.position(row["controller"], row["seed"]),
+    )
     rows = pd.DataFrame(found, columns=[*FACTS])
     write_table(path, rows)
 
@@ -274,7 +320,8 @@ def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
 def overview(folder: Path) -> pd.DataFrame:
     """summary.csv and sumo.csv joined, one row per finished run. Raises InputError."""
     return pd.DataFrame(run_folder.read_summary(folder / "summary.csv")).merge(
-        read_facts(folder / "sumo.csv"), on=["controller", "seed"])
+        read_facts(folder / "sumo.csv"), on=["controller", "seed"]
+    )
 
 
 def read_facts(path: Path) -> pd.DataFrame:
@@ -292,16 +339,23 @@ def overview_table(rows: pd.DataFrame) -> str:
         spread = f" ± {interval(list(tts)):.1e}" if len(tts) > 1 else ""
         percent = percent_change(tts.mean(), reference.mean())
         change = "" if name == against else "-" if math.isnan(percent) else f"{percent:+.1f} %"
-        lines.append({
-            "controller": name, "seeds": len(group), "TTS [veh s]": f"{tts.mean():.4g}{spread}", "change": change,
-            "completed": f"{group['completed_veh'].mean():,.0f} of {group['trips'].mean():,.0f}",
-            "removed": f"{group['removed_veh'].mean():,.0f}",
-            "left inside": f"{group['final_accumulation_veh'].mean():,.0f}",
-            "backlog": f"{group['final_backlog_veh'].mean():,.0f}", "teleports": int(group["teleports"].sum()),
-            "step [ms]": f"{group['control_step_ms_median'].mean():.3g} / {group['control_step_ms_max'].max():.3g}",
-            **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
-            "wall [s]": f"{group['wall_time_s'].mean():.0f}",
-            "outside SUMO": f"{100 * group['overhead_share'].mean():.1f} %"})
+        lines.append(
+            {
+                "controller": name,
+                "seeds": len(group),
+                "TTS [veh s]": f"{tts.mean():.4g}{spread}",
+                "change": change,
+                "completed": f"{group['completed_veh'].mean():,.0f} of {group['trips'].mean():,.0f}",
+                "removed": f"{group['removed_veh'].mean():,.0f}",
+                "left inside": f"{group['final_accumulation_veh'].mean():,.0f}",
+                "backlog": f"{group['final_backlog_veh'].mean():,.0f}",
+                "teleports": int(group["teleports"].sum()),
+                "step [ms]": f"{group['control_step_ms_median'].mean():.3g} / {group['control_step_ms_max'].max():.3g}",
+                **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
+                "wall [s]": f"{group['wall_time_s'].mean():.0f}",
+                "outside SUMO": f"{100 * group['overhead_share'].mean():.1f} %",
+            }
+        )
     return "\n".join([text_table(lines, CAPTION.format(against=against)), *signal_reasons.losses(rows), *remarks(rows)])
 
 
@@ -310,5 +364,7 @@ def remarks(rows: pd.DataFrame) -> list[str]:
     if "outside_training" not in rows:  # of an older version
         return []
     said = rows[rows["outside_training"].astype(object).fillna("") != ""]
-    return [f"{name}: {text}" for name, text in dict.fromkeys(
-        zip(said["controller"], said["outside_training"], strict=True))]
+    return [
+        f"{name}: {text}"
+        for name, text in dict.fromkeys(zip(said["controller"], said["outside_training"], strict=True))
+    ]

@@ -21,12 +21,12 @@ from nmfd.runs import run_folder
 from nmfd.studies.benchmark import REFERENCE
 from nmfd.types import Trajectory
 
-NO_AUTHORITY = 0.5   # of the flow over the boundaries passes without a signal under control
-HARDLY = 0.01        # of the commands, or of the time
-NEARLY_OPEN = 0.1    # of the range of u, below its upper bound: a learned policy never quite reaches that
+NO_AUTHORITY = 0.5  # of the flow over the boundaries passes without a signal under control
+HARDLY = 0.01  # of the commands, or of the time
+NEARLY_OPEN = 0.1  # of the range of u, below its upper bound: a learned policy never quite reaches that
 MOSTLY_INSIDE = 0.5  # of what came into a region started there
-MORE_FULL = 0.02     # of the edges before gateways and intervals
-A_WAIT = 1.0         # s, before a trip begins
+MORE_FULL = 0.02  # of the edges before gateways and intervals
+A_WAIT = 1.0  # s, before a trip begins
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,9 @@ def load(network: RegionalModel, trajectories: Sequence[Trajectory], records: It
         inside = started / (started + came)
     return Loading(
         most=np.mean([state.max(axis=0) for state in states], axis=0),
-        beyond=np.mean([(state > 1.0).mean(axis=0) for state in states], axis=0), inside=inside)
+        beyond=np.mean([(state > 1.0).mean(axis=0) for state in states], axis=0),
+        inside=inside,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +83,7 @@ class ControlActivity:
 
 
 def deeds(
-    network: RegionalModel, trajectories: Sequence[Trajectory], records: Iterable[Mapping], *, metered: bool = False,
+    network: RegionalModel, trajectories: Sequence[Trajectory], records: Iterable[Mapping], *, metered: bool = False
 ) -> ControlActivity:
     """What a controller did in some runs; metered: whether it could make trips wait."""
     limit = network.u_max - NEARLY_OPEN * (network.u_max - network.u_min)
@@ -91,7 +93,8 @@ def deeds(
         guided, trips = guided + record["guided"].sum(), trips + record["departures"].sum()
     waited = sum(t.backlog[1:].sum() * t.step for t in trajectories) if metered else 0.0
     return ControlActivity(
-        held=float(np.mean(held)), guided=float(guided / max(trips, 1.0)), waited=float(waited / max(trips, 1.0)))
+        held=float(np.mean(held)), guided=float(guided / max(trips, 1.0)), waited=float(waited / max(trips, 1.0))
+    )
 
 
 def text(folders: Mapping[float, Path], network: RegionalModel, rows: pd.DataFrame) -> str:
@@ -134,37 +137,52 @@ def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.Dat
     shown = statistics.compared_with(rows)
     if name == shown:
         return ""
-    before, after = (_runs(folder, one, [int(seed) for seed in rows.loc[rows["controller"] == one, "seed"]])
-                     for one in (shown, name))
+    before, after = (
+        _runs(folder, one, [int(seed) for seed in rows.loc[rows["controller"] == one, "seed"]]) for one in (shown, name)
+    )
     found, then = load(network, *before), load(network, after[0], ())
     done = deeds(network, *after, metered=_metered(folder, name))
-    gained = statistics.paired(
-        statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, shown)).percent < 0
+    gained = (
+        statistics.paired(statistics.by_seed(rows, level, name), statistics.by_seed(rows, level, shown)).percent < 0
+    )
     region = int(np.argmax(found.beyond))
     if not gained or not len(found.critical) or then.beyond[region] >= found.beyond[region]:
         leaking = float(rows.loc[rows["controller"] == shown, "leaking_share"].mean())
         return f"{name} {verdict(rows, level, name, found, leaking, done, network)}."
-    acts = [text for text, there in (
-        ("signals at the boundaries held vehicles back", done.held >= HARDLY),
-        ("drivers were guided to other routes", done.guided > 0),
-        ("trips waited outside for room", done.waited >= A_WAIT)) if there and not model_free(name)]
+    acts = [
+        text
+        for text, there in (
+            ("signals at the boundaries held vehicles back", done.held >= HARDLY),
+            ("drivers were guided to other routes", done.guided > 0),
+            ("trips waited outside for room", done.waited >= A_WAIT),
+        )
+        if there and not model_free(name)
+    ]
     means = f", because {' and '.join(acts)}" if acts else ""
     first = statistics.than(shown)
     return (
         f"{first[0].upper()}{first[1:]}, the region {network.region_names[region]} held more vehicles than it serves "
         f"best with for {_share(found.beyond[region])} of the time, up to {found.most[region]:.1f} times as many, and "
         f"served fewer of them; with {name} for {_share(then.beyond[region])}, up to {then.most[region]:.1f} times as "
-        f"many{means}.")
+        f"many{means}."
+    )
 
 
 def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Trajectory], Iterable[Mapping]]:
     """Trajectories and records of one controller."""
-    return ([run_folder.read_trajectory(run_folder.run_path(folder, name, seed)) for seed in seeds],
-            (experiment.read_run(folder, name, seed).record for seed in seeds))
+    return (
+        [run_folder.read_trajectory(run_folder.run_path(folder, name, seed)) for seed in seeds],
+        (experiment.read_run(folder, name, seed).record for seed in seeds),
+    )
 
 
 def verdict(
-    rows: pd.DataFrame, level: float, name: str, found: Loading, leaking: float, done: ControlActivity,
+    rows: pd.DataFrame,
+    level: float,
+    name: str,
+    found: Loading,
+    leaking: float,
+    done: ControlActivity,
     network: RegionalModel,
 ) -> str:
     """What a controller came to against no control or the first one, and why, in one line that begins behind its name.
@@ -193,35 +211,52 @@ def verdict(
 
 
 def _reasons(
-    rows: pd.DataFrame, name: str, against: str, found: Loading, leaking: float, done: ControlActivity,
+    rows: pd.DataFrame,
+    name: str,
+    against: str,
+    found: Loading,
+    leaking: float,
+    done: ControlActivity,
     network: RegionalModel,
 ) -> list[str]:
     """Why perimeter control, or guidance, gains nothing."""
     reasons = []
     if leaking > NO_AUTHORITY:
-        reasons.append(f"no control authority at the boundaries, {_share(leaking)} of the flow over them passes no "
-                       "signal under control")
+        reasons.append(
+            f"no control authority at the boundaries, {_share(leaking)} of the flow over them passes no "
+            "signal under control"
+        )
     if not len(found.critical):
         reasons.append("no region is ever critical, so that there is nothing to protect")
     elif done.held >= HARDLY and all(found.inside[r] > MOSTLY_INSIDE for r in found.critical):
-        reasons.append(f"most of what fills {_list(network, found.critical)} starts there, where no gateway holds it "
-                       "back")
+        reasons.append(
+            f"most of what fills {_list(network, found.critical)} starts there, where no gateway holds it back"
+        )
     full = rows.groupby("controller")["gateway_full_share"].mean()
     if done.held >= HARDLY and full.get(name, 0.0) - full.get(against, 0.0) > MORE_FULL:
-        reasons.append(f"its queues fill the streets before the gateways ({_share(full[name])} of the time, "
-                       f"{_share(full[against])} {statistics.than(against)}) and block others")
+        reasons.append(
+            f"its queues fill the streets before the gateways ({_share(full[name])} of the time, "
+            f"{_share(full[against])} {statistics.than(against)}) and block others"
+        )
     return [*reasons, str(done)]
 
 
 def _city(network: RegionalModel, found: Loading, leaking: float, shown: str) -> str:
     """The city without control, in two sentences."""
     when = "Without control" if shown == REFERENCE else f"Under {shown}"
-    hot = [f"{_list(network, [r])} ({_share(found.beyond[r])} of the time, most {found.most[r]:.1f} times it)"
-           for r in found.critical]
+    hot = [
+        f"{_list(network, [r])} ({_share(found.beyond[r])} of the time, most {found.most[r]:.1f} times it)"
+        for r in found.critical
+    ]
     highest = int(np.argmax(found.most))
-    state = f"beyond their critical accumulation were {', '.join(hot)}" if hot else (
-        f"no region went beyond its critical accumulation; {_list(network, [highest])} came nearest, with "
-        f"{found.most[highest]:.1f} times it")
+    state = (
+        f"beyond their critical accumulation were {', '.join(hot)}"
+        if hot
+        else (
+            f"no region went beyond its critical accumulation; {_list(network, [highest])} came nearest, with "
+            f"{found.most[highest]:.1f} times it"
+        )
+    )
     return f"Signals under control see {_share(1.0 - leaking)} of the flow over the boundaries. {when} {state}."
 
 

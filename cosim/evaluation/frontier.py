@@ -28,12 +28,17 @@ SERVED = 0.9  # share of the seeds
 CAPTION = (
     "served: runs in which every trip was completed within the horizon, of all runs; TTS: total time spent, running "
     f"and waiting to be inserted, mean over seeds ± 95 % interval; highest demand served: in {SERVED:.0%} of the seeds "
-    "or more, at this level and at every lower one that was run")
+    "or more, at this level and at every lower one that was run"
+)
 
 
 def frontier(
-    order: Evaluation, *, everything: bool = False, workers: int = 1,
-    scheduler: dask_cluster.Scheduler | str | None = None, progress: experiment.Progress | None = None,
+    order: Evaluation,
+    *,
+    everything: bool = False,
+    workers: int = 1,
+    scheduler: dask_cluster.Scheduler | str | None = None,
+    progress: experiment.Progress | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Run what is not there yet, from the lowest level up; returns the table of frontier.csv and a line per failed run.
@@ -50,7 +55,8 @@ def frontier(
     for level in sorted(order.levels):
         here = replace(order, levels=(level,), controllers=tuple(left))
         failures = experiment.perform(
-            here.plan(), workers=workers, fresh=True, source=source, progress=progress, tell=tell)
+            here.plan(), workers=workers, fresh=True, source=source, progress=progress, tell=tell
+        )
         rows = all_runs(order)
         if failures and rows.empty:
             raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])
@@ -70,12 +76,21 @@ def shares(rows: pd.DataFrame) -> pd.DataFrame:
     for (level, name), part in rows.groupby(["demand", "controller"], sort=False):
         served = int((part["completed_veh"] >= part["trips"]).sum())
         between = binomtest(served, len(part)).proportion_ci(method="wilson")
-        out.append({
-            "demand": level, "controller": name, "seeds": len(part), "served_runs": served,
-            "served_share": served / len(part), "served_share_low": between.low, "served_share_high": between.high,
-            "completed_share": float((part["completed_veh"] / part["trips"].clip(lower=1)).mean()),
-            "mean_trips": float(part["trips"].mean()),
-            f"mean_{TTS}": float(part[TTS].mean()), f"half_interval_{TTS}": interval(list(part[TTS]))})
+        out.append(
+            {
+                "demand": level,
+                "controller": name,
+                "seeds": len(part),
+                "served_runs": served,
+                "served_share": served / len(part),
+                "served_share_low": between.low,
+                "served_share_high": between.high,
+                "completed_share": float((part["completed_veh"] / part["trips"].clip(lower=1)).mean()),
+                "mean_trips": float(part["trips"].mean()),
+                f"mean_{TTS}": float(part[TTS].mean()),
+                f"half_interval_{TTS}": interval(list(part[TTS])),
+            }
+        )
     return pd.DataFrame(out)
 
 

@@ -42,7 +42,7 @@ from nmfd.studies.fit_quality import (
     write_fits,
 )
 
-WINDOW = 5   # control intervals
+WINDOW = 5  # control intervals
 PRIOR = 5.0  # vehicles
 PATHS = ("recipe", "net", "regions")  # keys of [sumo] in network.toml
 
@@ -82,13 +82,19 @@ class Loading:
 
 def without_model(scenario: Scenario) -> bool:
     """Whether controllers that guide routes are told of no model of their own: they need that of guided drivers."""
-    return not any(name.startswith(GUIDING) and "model" in options
-                   for name, options in scenario.controller_options.items())
+    return not any(
+        name.startswith(GUIDING) and "model" in options for name, options in scenario.controller_options.items()
+    )
 
 
 def identify(
-    scenario: Path, loading: Loading, *, out: Path, workers: int = 1,
-    scheduler: dask_cluster.Scheduler | str | None = None, progress: experiment.Progress | None = None,
+    scenario: Path,
+    loading: Loading,
+    *,
+    out: Path,
+    workers: int = 1,
+    scheduler: dask_cluster.Scheduler | str | None = None,
+    progress: experiment.Progress | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> str:
     """Load the city of `scenario`, fit its regional model, and write the network.toml of `loading`.
@@ -104,7 +110,8 @@ def identify(
     if (loading.guided or loading.options) and target.resolve() == own.resolve():
         raise InputError(
             f"{'--guided' if loading.guided else '--with'}: {loaded.name} runs on {target}, whose model must stay that "
-            "of its own drivers and signals; name another folder with --network")
+            "of its own drivers and signals; name another folder with --network"
+        )
     if shipped.installed(target):
         shipped.beside(own, "network.toml", "another folder with --network")
     there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
@@ -128,13 +135,13 @@ def identify(
 
         runs = [observed(result) for result in results]
         model = fitted_to(
-            network, runs, samples, loaded, iterations=loading.iterations, progress=fitting if progress else None)
+            network, runs, samples, loaded, iterations=loading.iterations, progress=fitting if progress else None
+        )
         return identification.fit_disturbance(model, runs, iterations=loading.iterations // 4, **scheme)
 
     samples = samples_of(network, found)
     model = fitted(found, samples, "fitting")
-    fits = region_fits(
-        model, samples, [result.trajectory.accumulation for result in found], seeds=len(loading.seeds))
+    fits = region_fits(model, samples, [result.trajectory.accumulation for result in found], seeds=len(loading.seeds))
     text, foreseen = fit_table(model, samples, fits), None
     if held_out:
         kept = [result for result in found if not any(result is other for other in held_out)]
@@ -154,10 +161,16 @@ def identify(
     mfd_bands.draw_production(out / "production.png", model, [result.record for result in found])
     levels, seeds = ", ".join(f"{level:g}" for level in loading.levels), f"{min(loading.seeds)} to {max(loading.seeds)}"
     target.mkdir(parents=True, exist_ok=True)
-    files.write_text(target / "network.toml", schema_line(target) + network_toml(
-        model, _sumo_table(own, target),
-        f"Regional model: written by cosim identify from {len(found) - len(more)} loading runs of {loaded.name} under "
-        f"{first} and\n# {second}, demand times {levels}, seeds {seeds}{_and_runs(more)}."))
+    files.write_text(
+        target / "network.toml",
+        schema_line(target)
+        + network_toml(
+            model,
+            _sumo_table(own, target),
+            f"Regional model: written by cosim identify from {len(found) - len(more)} loading runs of {loaded.name} under "
+            f"{first} and\n# {second}, demand times {levels}, seeds {seeds}{_and_runs(more)}.",
+        ),
+    )
     verdict.write_verdict(target, judged)
     return text
 
@@ -168,14 +181,27 @@ def _named(progress: experiment.Progress | None, what: str) -> experiment.Progre
 
 
 def _load(
-    scenario: Path, loading: Loading, controller: str, options: dict, *, out: Path, workers: int,
-    source: Source | None, progress: experiment.Progress | None,
+    scenario: Path,
+    loading: Loading,
+    controller: str,
+    options: dict,
+    *,
+    out: Path,
+    workers: int,
+    source: Source | None,
+    progress: experiment.Progress | None,
 ) -> list[Result]:
     """The loading runs of one controller at all levels, those that are kept or new ones."""
     plan = [
-        (out / f"level-{level:g}", Task(
-            scenario=scenario, controller=controller, seed=seed, demand_factor=level, options=tuple(options.items())))
-        for level in loading.levels for seed in loading.seeds]
+        (
+            out / f"level-{level:g}",
+            Task(
+                scenario=scenario, controller=controller, seed=seed, demand_factor=level, options=tuple(options.items())
+            ),
+        )
+        for level in loading.levels
+        for seed in loading.seeds
+    ]
     failures = experiment.perform(plan, workers=workers, source=source, progress=progress, tell=lambda line: None)
     if failures:
         raise ended([(experiment.label(task), failure) for task, failure in failures])
@@ -187,8 +213,11 @@ def finished(folder: Path, scenario: Path) -> list[Result]:
     finished = results.read(folder, scenario)
     if finished.changed:
         raise InputError(f"--runs: {folder}: {finished.changed}; run them again, or omit them")
-    return [experiment.read_run(level.folder, row.controller, row.seed)
-            for level in finished.levels for row in level.rows.itertuples()]
+    return [
+        experiment.read_run(level.folder, row.controller, row.seed)
+        for level in finished.levels
+        for row in level.rows.itertuples()
+    ]
 
 
 def _and_runs(runs: Sequence[Result]) -> str:
@@ -209,11 +238,17 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
     if len(empty) == network.regions:
         raise InputError(
             "--levels: every region was nearly empty in all loading runs; give higher levels, or a scenario with more "
-            "vehicles")
-    network = replace(network, mfds=tuple(
-        network.mfds[region] if region in empty else
-        mfd.fit(*own_points(cloud).T, max_rate=scenario.substeps / scenario.step)
-        for region, cloud in enumerate(samples)))
+            "vehicles"
+        )
+    network = replace(
+        network,
+        mfds=tuple(
+            network.mfds[region]
+            if region in empty
+            else mfd.fit(*own_points(cloud).T, max_rate=scenario.substeps / scenario.step)
+            for region, cloud in enumerate(samples)
+        ),
+    )
     if guided:  # what theta is compared with stays what it is for the plant (cosim.plant.guidance)
         return network
     crossings = sum(result.record["crossings"].sum(axis=0) for result in results)
@@ -224,16 +259,22 @@ def samples_of(network: RegionalModel, results: Sequence[Result]) -> list[dict[s
     """Outflow samples of every region (cosim.evaluation.model_validation.outflow_samples)."""
     return [
         outflow_samples(
-            [r.trajectory for r in results], [r.record for r in results], network.u_max, region, network.adjacency)
-        for region in range(network.regions)]
+            [r.trajectory for r in results], [r.record for r in results], network.u_max, region, network.adjacency
+        )
+        for region in range(network.regions)
+    ]
 
 
 def observed(result: Result) -> Observed:
     """A run as identification sees it; the demand is what entered the streets."""
     trajectory, record = result.trajectory, result.record
     return Observed(
-        accumulation=trajectory.accumulation, demand=record["departures"] / trajectory.step,
-        perimeter=trajectory.perimeter, splits=trajectory.splits, crossings=record["crossings"].sum(axis=3))
+        accumulation=trajectory.accumulation,
+        demand=record["departures"] / trajectory.step,
+        perimeter=trajectory.perimeter,
+        splits=trajectory.splits,
+        crossings=record["crossings"].sum(axis=3),
+    )
 
 
 def followed(network: RegionalModel, result: Result) -> Observed:
@@ -249,13 +290,28 @@ def followed(network: RegionalModel, result: Result) -> Observed:
 
 
 def fitted_to(
-    network: RegionalModel, runs: Sequence[Observed], samples: Sequence[dict], scheme: Scenario | PlanningModel, *,
-    iterations: int, progress: Callable[[int, int, str], None] | None = None,
+    network: RegionalModel,
+    runs: Sequence[Observed],
+    samples: Sequence[dict],
+    scheme: Scenario | PlanningModel,
+    *,
+    iterations: int,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> RegionalModel:
     """`network` with the parameters that predict `runs` best, and as it was where hardly anybody drove."""
-    return as_it_was(network, identification.fit(
-        network, runs, iterations=iterations, progress=progress, step=scheme.step, substeps=scheme.substeps,
-        integrator=scheme.integrator), nearly_empty(samples))
+    return as_it_was(
+        network,
+        identification.fit(
+            network,
+            runs,
+            iterations=iterations,
+            progress=progress,
+            step=scheme.step,
+            substeps=scheme.substeps,
+            integrator=scheme.integrator,
+        ),
+        nearly_empty(samples),
+    )
 
 
 def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[int]) -> RegionalModel:
@@ -264,8 +320,11 @@ def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[in
     alone = np.isin(np.arange(model.regions), regions)
     mfds = tuple((network if alone[n] else model).mfds[n] for n in range(model.regions))
     return replace(
-        model, mfds=mfds, exit_rates=np.where(alone[:, None], 1.0, model.exit_rates),
-        storage=np.where(alone, np.maximum(model.storage, [mfd.jam for mfd in mfds]), model.storage))
+        model,
+        mfds=mfds,
+        exit_rates=np.where(alone[:, None], 1.0, model.exit_rates),
+        storage=np.where(alone, np.maximum(model.storage, [mfd.jam for mfd in mfds]), model.storage),
+    )
 
 
 def _sumo_table(folder: Path, target: Path) -> dict[str, str]:
@@ -273,7 +332,8 @@ def _sumo_table(folder: Path, target: Path) -> dict[str, str]:
     table = config.read(folder / "network.toml").get("sumo", {})
     return {
         key: files.relative(folder / value, target) if key in PATHS and isinstance(value, str) else value
-        for key, value in table.items()}
+        for key, value in table.items()
+    }
 
 
 def _write_samples(path: Path, samples: Sequence[dict]) -> None:

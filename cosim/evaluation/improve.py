@@ -75,14 +75,22 @@ class Improvement:
         """One run of a round."""
         model = self.model(number)
         return Task(
-            scenario=self.scenario, controller=self.controller, seed=seed, steps=self.steps, demand_factor=level,
+            scenario=self.scenario,
+            controller=self.controller,
+            seed=seed,
+            steps=self.steps,
+            demand_factor=level,
             policy=self.folder(number) / "policy.pt" if number else self.policy,
-            options=() if model is None else (("model", str(model.absolute())),))
+            options=() if model is None else (("model", str(model.absolute())),),
+        )
 
     def plan(self, number: int) -> list[tuple[Path, Task]]:
         """The runs of a round, each with its run folder."""
-        return [(experiment.level_folder(self.folder(number), level), self.task(number, level, seed))
-                for seed in self.seeds for level in self.levels]
+        return [
+            (experiment.level_folder(self.folder(number), level), self.task(number, level, seed))
+            for seed in self.seeds
+            for level in self.levels
+        ]
 
     @property
     def variant(self) -> str:
@@ -110,15 +118,20 @@ def check(order: Improvement) -> None:
     if parse(order.controller).controller not in training.NAMES:
         raise InputError(
             f"--controller: {order.controller!r} has no policy that learns; choose one of "
-            f"{', '.join(training.NAMES)}, with what else the city does")
+            f"{', '.join(training.NAMES)}, with what else the city does"
+        )
     scenario = scenario_of(order.task(0))
     training.settings(scenario, order.variant)
     registry.verify(order.variant, scenario, policy=order.policy)
 
 
 def improve(
-    order: Improvement, *, workers: int = 1, scheduler: dask_cluster.Scheduler | str | None = None,
-    progress: experiment.Progress | None = None, tell: Callable[[str], None] | None = None,
+    order: Improvement,
+    *,
+    workers: int = 1,
+    scheduler: dask_cluster.Scheduler | str | None = None,
+    progress: experiment.Progress | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Run the rounds; returns the table of improve.csv.
 
@@ -131,13 +144,21 @@ def improve(
     source, rows = dask_cluster.source(scheduler, tell), list[dict[str, object]]()
     file = order.out / "improve.csv"
     with run_folder.manifest(
-            order.out, configuration=_configuration(order), results=file,
-            session={"scenario_folder": str(order.scenario), "workers": workers}):
+        order.out,
+        configuration=_configuration(order),
+        results=file,
+        session={"scenario_folder": str(order.scenario), "workers": workers},
+    ):
         for number in range(order.rounds + 1):
             about = _prepared(order, rows, more, progress) if number else {}
             failures = experiment.perform(
-                order.plan(number), workers=workers, fresh=True, source=source, tell=tell,
-                progress=_of_round(order, number, progress))
+                order.plan(number),
+                workers=workers,
+                fresh=True,
+                source=source,
+                tell=tell,
+                progress=_of_round(order, number, progress),
+            )
             if failures:
                 raise ended([(experiment.label(task), failure) for task, failure in failures])
             rows.append(_row(order, rows, about))
@@ -155,24 +176,39 @@ def best(rows: Sequence[dict]) -> int:
 def text(order: Improvement, table: pd.DataFrame) -> str:
     """For the terminal: one line per round."""
     first = float(table[SCORE].iloc[0])
-    return text_table([{
-        "round": row["round"], "kept": "yes" if row["kept"] else "no", "mean TTS [veh s]": f"{row[SCORE]:.4g}",
-        "change": f"{100.0 * (row[SCORE] / first - 1.0):+.1f} %",
-        "foreseen": "" if math.isnan(row[FORESEEN]) else f"{100.0 * (row[FORESEEN] / row[REPLAYED] - 1.0):+.1f} %",
-        **{f"at {level:g}": f"{np.mean([row[scores.column(level, seed)] for seed in order.seeds]):.4g}"
-           for level in order.levels}} for row in table.to_dict("records")],
+    return text_table(
+        [
+            {
+                "round": row["round"],
+                "kept": "yes" if row["kept"] else "no",
+                "mean TTS [veh s]": f"{row[SCORE]:.4g}",
+                "change": f"{100.0 * (row[SCORE] / first - 1.0):+.1f} %",
+                "foreseen": ""
+                if math.isnan(row[FORESEEN])
+                else f"{100.0 * (row[FORESEEN] / row[REPLAYED] - 1.0):+.1f} %",
+                **{
+                    f"at {level:g}": f"{np.mean([row[scores.column(level, seed)] for seed in order.seeds]):.4g}"
+                    for level in order.levels
+                },
+            }
+            for row in table.to_dict("records")
+        ],
         "mean TTS: geometric mean over all runs; change: against round 0; foreseen: by the model, against the policy "
-        "that the round began with; at: arithmetic mean at that demand level")
+        "that the round began with; at: arithmetic mean at that demand level",
+    )
 
 
 def _of_round(order: Improvement, number: int, progress: experiment.Progress | None) -> experiment.Progress | None:
     """`progress` of the runs of a round, among all rounds."""
-    return progress and (lambda done, total, note: progress(
-        number * total + done, (order.rounds + 1) * total, f"round {number} of {order.rounds}; {note}"))
+    return progress and (
+        lambda done, total, note: progress(
+            number * total + done, (order.rounds + 1) * total, f"round {number} of {order.rounds}; {note}"
+        )
+    )
 
 
 def _prepared(
-    order: Improvement, rows: Sequence[dict], more: Sequence[Result], progress: experiment.Progress | None,
+    order: Improvement, rows: Sequence[dict], more: Sequence[Result], progress: experiment.Progress | None
 ) -> dict[str, float]:
     """Make model and policy of the next round, unless they are there; returns what the model made of the policy."""
     number, folder = len(rows), order.folder(len(rows))
@@ -198,12 +234,22 @@ def _fit(order: Improvement, folder: Path, runs: Sequence[Result], progress: exp
             progress(done, total, f"fitting the model to {len(runs)} runs; {note}")
 
     model = fitted_to(
-        network, [followed(network, run) for run in runs], samples_of(network, runs), planning,
-        iterations=order.iterations, progress=told if progress else None)
+        network,
+        [followed(network, run) for run in runs],
+        samples_of(network, runs),
+        planning,
+        iterations=order.iterations,
+        progress=told if progress else None,
+    )
     folder.mkdir(exist_ok=True)
-    files.write_text(folder / "network.toml", network_toml(
-        model, {}, f"Regional model: fitted by cosim improve to {len(runs)} runs of {planning.name} under "
-        f"{order.controller}."))
+    files.write_text(
+        folder / "network.toml",
+        network_toml(
+            model,
+            {},
+            f"Regional model: fitted by cosim improve to {len(runs)} runs of {planning.name} under {order.controller}.",
+        ),
+    )
 
 
 def _descend(order: Improvement, number: int, begin: int, steps: int) -> list[float]:
@@ -217,16 +263,21 @@ def _descend(order: Improvement, number: int, begin: int, steps: int) -> list[fl
     results = order.results(begin)
     with one_thread():
         replays = Replays(rollout, policy, [_run(result, waits=began.architecture.metering) for result in results])
-        path = descend(
-            policy, replays, steps=steps, learning_rate=order.learning_rate or chosen.learning_rate)
+        path = descend(policy, replays, steps=steps, learning_rate=order.learning_rate or chosen.learning_rate)
     states = np.concatenate([result.trajectory.accumulation for result in results]) / policy.scale.numpy()
     low, high = (content["configuration"].get(key, 1.0) for key in ("demand_low", "demand_high"))
     configuration = {
-        **content["configuration"], "improved": number, "demand_low": min(low, *order.levels),
-        "demand_high": max(high, *order.levels)}
-    training.write(policy_file.checkpoint(
-        policy, planning.network, configuration, fallback.statistics(states.reshape(len(states), -1))),
-        order.folder(number) / "policy.pt")
+        **content["configuration"],
+        "improved": number,
+        "demand_low": min(low, *order.levels),
+        "demand_high": max(high, *order.levels),
+    }
+    training.write(
+        policy_file.checkpoint(
+            policy, planning.network, configuration, fallback.statistics(states.reshape(len(states), -1))
+        ),
+        order.folder(number) / "policy.pt",
+    )
     return path
 
 
@@ -252,15 +303,24 @@ def _publish(order: Improvement, number: int) -> None:
         shutil.copyfile(order.file(number), temporary)
     planning = order.planning(number)
     (order.out / "model").mkdir(exist_ok=True)
-    files.write_text(order.out / "model" / "network.toml", network_toml(
-        planning.network, {}, f"Regional model of {order.controller}, round {number} of cosim improve."))
+    files.write_text(
+        order.out / "model" / "network.toml",
+        network_toml(planning.network, {}, f"Regional model of {order.controller}, round {number} of cosim improve."),
+    )
 
 
 def _configuration(order: Improvement) -> dict[str, object]:
     """What the folder is for."""
     return {
-        "improve": order.controller, "scenario": scenario_of(order.task(0)).name, "seeds": list(order.seeds),
-        "levels": list(order.levels), "descent": order.descent, "learning_rate": order.learning_rate,
-        "iterations": order.iterations, "policy_hash": files.file_hash(order.file(0)),
+        "improve": order.controller,
+        "scenario": scenario_of(order.task(0)).name,
+        "seeds": list(order.seeds),
+        "levels": list(order.levels),
+        "descent": order.descent,
+        "learning_rate": order.learning_rate,
+        "iterations": order.iterations,
+        "policy_hash": files.file_hash(order.file(0)),
         "model_hash": order.planning(0).network.hash,
-        "runs": [str(folder) for folder in order.runs], "steps": order.steps}
+        "runs": [str(folder) for folder in order.runs],
+        "steps": order.steps,
+    }

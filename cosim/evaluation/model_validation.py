@@ -25,14 +25,25 @@ from nmfd.studies.traffic_states import model_outflow, remembered
 from nmfd.types import Controls, Observation, Trajectory
 
 COLUMNS = (
-    "region", "name", "critical_veh", "mean_veh", "rmse_veh", "rmse_share", "persistence_rmse_veh", "bias_veh",
-    "next_interval_rmse_veh", "next_interval_rmse_share", "next_interval_persistence_rmse_veh")
+    "region",
+    "name",
+    "critical_veh",
+    "mean_veh",
+    "rmse_veh",
+    "rmse_share",
+    "persistence_rmse_veh",
+    "bias_veh",
+    "next_interval_rmse_veh",
+    "next_interval_rmse_share",
+    "next_interval_persistence_rmse_veh",
+)
 COLLAPSED = 0.7  # of the largest outflow so far
 CAPTION = (
     "RMSE, bias: of the accumulation that the regional model predicts for the whole run from its start [veh]; next "
     "interval: predicted one control interval ahead from every recorded state; if nothing changed: RMSE of the "
     "prediction that the region keeps what it holds, from the start or for one interval [veh]; bias > 0: the model "
-    "holds too many")
+    "holds too many"
+)
 
 
 class Replay:
@@ -57,8 +68,12 @@ def predict(scenario: Scenario, result: Result) -> Trajectory:
     Demand is what entered the streets, not what wished to: the backlog is none of the model's business here.
     """
     same = replace(
-        scenario, steps=len(result.trajectory.perimeter), demand=result.record["departures"] / scenario.step,
-        measurement_std=0.0, faults=())
+        scenario,
+        steps=len(result.trajectory.perimeter),
+        demand=result.record["departures"] / scenario.step,
+        measurement_std=0.0,
+        faults=(),
+    )
     trajectory = closed_loop.run(NmfdPlant(same), Replay(result.trajectory), same, seed=result.trajectory.seed)
     return replace(trajectory, plant="nmfd")
 
@@ -73,8 +88,15 @@ def predict_next(scenario: Scenario, result: Result, intervals: int = 1) -> Floa
     for n in range(intervals):
         part = slice(n, n + len(x))
         x = advance(
-            p, x, demand[part], perimeter[part], splits[part], scenario.step, integrator=scenario.integrator,
-            substeps=scenario.substeps)
+            p,
+            x,
+            demand[part],
+            perimeter[part],
+            splits[part],
+            scenario.step,
+            integrator=scenario.integrator,
+            substeps=scenario.substeps,
+        )
     return x.sum(-1).numpy()
 
 
@@ -90,23 +112,45 @@ def errors(scenario: Scenario, result: Result, predicted: Trajectory) -> list[di
     critical = scenario.network.critical
     rows = [
         _row(i, scenario.network.region_names[i], critical[i], simulated[:, i], whole[:, i], ahead[:, i])
-        for i in range(scenario.network.regions)]
+        for i in range(scenario.network.regions)
+    ]
     return [*rows, _row("all", "all regions", critical.sum(), simulated.sum(1), whole.sum(1), ahead.sum(1))]
 
 
 def _row(
-    region: int | str, name: str, critical: float, simulated: Float[np.ndarray, " S"],
-    whole: Float[np.ndarray, " S"], ahead: Series,
+    region: int | str,
+    name: str,
+    critical: float,
+    simulated: Float[np.ndarray, " S"],
+    whole: Float[np.ndarray, " S"],
+    ahead: Series,
 ) -> dict:
     rmse, next_rmse, still, next_still = (
-        float(np.sqrt((part**2).mean())) for part in (whole, ahead, simulated[0] - simulated, np.diff(simulated)))
-    return dict(zip(COLUMNS, (
-        region, name, float(critical), float(simulated.mean()), rmse, rmse / critical, still, float(whole.mean()),
-        next_rmse, next_rmse / critical, next_still), strict=True))
+        float(np.sqrt((part**2).mean())) for part in (whole, ahead, simulated[0] - simulated, np.diff(simulated))
+    )
+    return dict(
+        zip(
+            COLUMNS,
+            (
+                region,
+                name,
+                float(critical),
+                float(simulated.mean()),
+                rmse,
+                rmse / critical,
+                still,
+                float(whole.mean()),
+                next_rmse,
+                next_rmse / critical,
+                next_still,
+            ),
+            strict=True,
+        )
+    )
 
 
 def outflow_samples(
-    trajectories: Sequence[Trajectory], records: Sequence[dict], u_max: float, region: int, adjacency: Adjacency,
+    trajectories: Sequence[Trajectory], records: Sequence[dict], u_max: float, region: int, adjacency: Adjacency
 ) -> dict[str, Points]:
     """MFD samples of one region: label -> (n, 2) of accumulation [veh] and outflow [veh/s].
 
@@ -124,8 +168,7 @@ def outflow_samples(
         outflow = run_metrics.regional_outflow(record, trajectory.step)
         share = np.minimum(trajectory.perimeter[:, region].max(axis=1), u_max)
         weight = own[:, region] + share * (total - own)[:, region]
-        points = np.stack(
-            [total[:, region], outflow[:, region] * total[:, region] / np.maximum(weight, 1e-9)], axis=1)
+        points = np.stack([total[:, region], outflow[:, region] * total[:, region] / np.maximum(weight, 1e-9)], axis=1)
         rising = np.diff(trajectory.accumulation[:, region].sum(1)) >= 0
         seen, blocked = total[:, region] >= 5.0, held_up(total, outflow, adjacency)[:, region]
         samples["loading"].append(points[seen & ~blocked & rising])
@@ -134,9 +177,7 @@ def outflow_samples(
     return {label: np.concatenate(clouds) for label, clouds in samples.items()}
 
 
-def held_up(
-    accumulation: RegionCounts, outflow: RegionCounts, adjacency: Adjacency,
-) -> Bool[np.ndarray, "T R"]:
+def held_up(accumulation: RegionCounts, outflow: RegionCounts, adjacency: Adjacency) -> Bool[np.ndarray, "T R"]:
     """(T, R) bool: a neighbour that collapsed before the region did is collapsed in this interval.
 
     Collapsed: holding more vehicles (T, R) than when its outflow (T, R) was largest so far, and letting out less than
@@ -151,7 +192,8 @@ def held_up(
             if outflow[k, i] >= outflow[best, i]:
                 best = k
             collapsed[k, i] = (
-                accumulation[k, i] > accumulation[best, i] and outflow[k, i] < COLLAPSED * outflow[best, i])
+                accumulation[k, i] > accumulation[best, i] and outflow[k, i] < COLLAPSED * outflow[best, i]
+            )
     onset = np.where(collapsed.any(axis=0), collapsed.argmax(axis=0), steps)
     earlier = adjacency & (onset[None, :] < onset[:, None])
     return (collapsed[:, None, :] & earlier[None]).any(axis=2)
@@ -165,8 +207,18 @@ def error_table(rows: pd.DataFrame) -> str:
     for column in ("rmse_share", "next_interval_rmse_share"):
         shown[column] = [f"{100 * value:.1f} %" for value in rows[column]]
     headings = [
-        "region", "name", "critical", "mean", "RMSE", "of critical", "if nothing changed", "bias", "next interval RMSE",
-        "of critical", "if nothing changed"]
+        "region",
+        "name",
+        "critical",
+        "mean",
+        "RMSE",
+        "of critical",
+        "if nothing changed",
+        "bias",
+        "next interval RMSE",
+        "of critical",
+        "if nothing changed",
+    ]
     return text_columns(headings, shown.to_numpy().tolist(), CAPTION)
 
 
@@ -182,14 +234,17 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
     outflow = remembered(lambda t: measured if t.plant == "sumo" else predicted_outflow(t))
     for region, ax in enumerate(axes[:-1]):
         plots.region_accumulation(ax, scenario.network, region, [result.trajectory, predicted], outflow=outflow)
-    plots.total_accumulation(axes[-1], [replace(
-        result.trajectory, backlog=np.zeros_like(result.trajectory.backlog)), predicted])
+    plots.total_accumulation(
+        axes[-1], [replace(result.trajectory, backlog=np.zeros_like(result.trajectory.backlog)), predicted]
+    )
     axes[-1].set_title("all regions", fontsize="medium")
     plots.legend_below(drawing, axes, columns=4)
     plots.save(drawing, folder / f"compare-{name}-accumulation.png")
     samples = [
         outflow_samples(
-            [result.trajectory], [result.record], scenario.network.u_max, region, scenario.network.adjacency)
-        for region in range(scenario.network.regions)]
+            [result.trajectory], [result.record], scenario.network.u_max, region, scenario.network.adjacency
+        )
+        for region in range(scenario.network.regions)
+    ]
     mfd_bands.draw_mfds(folder / f"compare-{name}-mfd.png", scenario.network, samples)
     return rows

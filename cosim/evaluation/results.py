@@ -84,12 +84,18 @@ def read(path: Path, scenario: Path | None = None) -> Finished:
     loaded = load_scenario(scenario or scenario_folder(levels[0].folder, levels[0].manifest))
     if configuration.get("scenario") != loaded.name:
         raise InputError(
-            f"--scenario: the runs are of {configuration.get('scenario')}, not of {loaded.name}; give its folder")
+            f"--scenario: the runs are of {configuration.get('scenario')}, not of {loaded.name}; give its folder"
+        )
     files = ensure_built(loaded.network)
     changed = _changed(configuration, files)
     return Finished(
-        path=path, levels=levels, evaluation=evaluation, scenario=loaded, changed=changed,
-        city=None if changed else load_city(files.net_file, files.regions_csv, loaded.network.regions))
+        path=path,
+        levels=levels,
+        evaluation=evaluation,
+        scenario=loaded,
+        changed=changed,
+        city=None if changed else load_city(files.net_file, files.regions_csv, loaded.network.regions),
+    )
 
 
 def _order(path: Path) -> list[str]:
@@ -110,8 +116,10 @@ def _level(demand: float, folder: Path, order: Sequence[str]) -> Level:
     rows.insert(0, "demand", float(demand))
     names = list(dict.fromkeys([*order, *rows["controller"]]))
     rows = rows.sort_values(
-        ["controller", "seed"], ignore_index=True,
-        key=lambda column: column.map(names.index) if column.name == "controller" else column)
+        ["controller", "seed"],
+        ignore_index=True,
+        key=lambda column: column.map(names.index) if column.name == "controller" else column,
+    )
     return Level(demand=float(demand), folder=folder, rows=rows, manifest=_manifest(folder))
 
 

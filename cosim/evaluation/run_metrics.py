@@ -13,15 +13,19 @@ from nmfd.arrays import PerRegion
 from nmfd.metrics import gini
 from nmfd.types import Trajectory
 
-FULL = 0.8         # share of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards
+FULL = 0.8  # share of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards
 
 
 def trip_facts(facts: TripFacts) -> dict:
     """Means over all trips that were due, finished or not [s], and emissions of the whole run [kg]."""
     trips = max(facts.trips, 1)
     return {
-        "mean_trip_time_s": facts.travel_time / trips, "mean_departure_delay_s": facts.departure_delay / trips,
-        "mean_time_loss_s": facts.time_loss / trips, "co2_kg": facts.co2, "fuel_kg": facts.fuel}
+        "mean_trip_time_s": facts.travel_time / trips,
+        "mean_departure_delay_s": facts.departure_delay / trips,
+        "mean_time_loss_s": facts.time_loss / trips,
+        "co2_kg": facts.co2,
+        "fuel_kg": facts.fuel,
+    }
 
 
 def delay_gini(trajectory: Trajectory, record: Record, time_loss: PerRegion) -> float:
@@ -48,8 +52,10 @@ def queue_facts(record: Record, city: City) -> dict:
     queue, longest = record.gateway_queue[:, upstream], record.gateway_queue_max[:, upstream]
     full = gateway_full(record.edge_vehicles, city)[:, upstream]
     return {
-        "gateway_queue_mean_veh": float(queue.mean()), "gateway_queue_max_veh": float(longest.max()),
-        "gateway_full_share": float(full.mean())}
+        "gateway_queue_mean_veh": float(queue.mean()),
+        "gateway_queue_max_veh": float(longest.max()),
+        "gateway_full_share": float(full.mean()),
+    }
 
 
 def upstream_gateways(city: City) -> list[int]:

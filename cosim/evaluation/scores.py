@@ -20,8 +20,13 @@ def column(level: float, seed: int) -> str:
     return f"tts_{level:g}_{seed}_veh_s"
 
 
-def totals(folder: Path, levels: Iterable[float], seeds: Sequence[int], fact: str = TTS,
-           named: Callable[[float, int], str] = column) -> dict[str, float]:
+def totals(
+    folder: Path,
+    levels: Iterable[float],
+    seeds: Sequence[int],
+    fact: str = TTS,
+    named: Callable[[float, int], str] = column,
+) -> dict[str, float]:
     """Column -> `fact` of the run at that level with that seed; NaN where there is none."""
     found: dict[str, float] = {}
     for level in levels:

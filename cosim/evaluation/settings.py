@@ -6,9 +6,9 @@ from pydantic import Field
 
 from nmfd.runs.config import DISTINCT, Settings, setting, whole
 
-MOST = 10**6           # runs
+MOST = 10**6  # runs
 MOST_SEED = 2**31 - 1  # SUMO's are 32 bits long
-FIRST_SEED = 2000      # these seeds are kept for evaluations: nothing was chosen, trained or identified on them
+FIRST_SEED = 2000  # these seeds are kept for evaluations: nothing was chosen, trained or identified on them
 FIRST_DEVELOPMENT = 1000
 Level = Annotated[float, Field(gt=0.0, le=10.0)]
 Levels = Annotated[tuple[Level, ...], *DISTINCT]
@@ -18,9 +18,11 @@ class Evaluation(Settings):
     """Of controllers x seeds x demand levels."""
 
     seeds: int = whole(
-        "runs per controller and demand level, on the same trips for all controllers", 10, low=1, high=MOST)
+        "runs per controller and demand level, on the same trips for all controllers", 10, low=1, high=MOST
+    )
     first_seed: int = whole(
-        "the seeds are S to S + N - 1; from 2000 on they were never used in development", FIRST_SEED, high=MOST_SEED)
+        "the seeds are S to S + N - 1; from 2000 on they were never used in development", FIRST_SEED, high=MOST_SEED
+    )
     demand: Levels = setting("demand levels: multiples of the scenario's demand", (1.0,))
     workers: int | None = whole("runs at a time, each in a process of its own", None, low=1, high=MOST)
 
@@ -31,8 +33,10 @@ class Sweep(Evaluation):
     seeds: int = whole("runs per controller, demand level and compliance", 1, low=1, high=MOST)
     first_seed: int = whole("the seeds are S to S + N - 1", 0, high=MOST_SEED)
     compliance: Annotated[tuple[Annotated[int, Field(ge=0, le=100)], ...], *DISTINCT] = setting(
-        "drivers who follow route guidance; of controllers that guide nobody there is one run all the same", (),
-        unit="%")
+        "drivers who follow route guidance; of controllers that guide nobody there is one run all the same",
+        (),
+        unit="%",
+    )
 
 
 class Search(Evaluation):
@@ -40,10 +44,14 @@ class Search(Evaluation):
 
     seeds: int = whole("runs per candidate and demand level", 2, low=1, high=MOST)
     first_seed: int = whole(
-        "the seeds are S to S + N - 1; those from 2000 on are for evaluations", FIRST_DEVELOPMENT, high=MOST_SEED)
+        "the seeds are S to S + N - 1; those from 2000 on are for evaluations", FIRST_DEVELOPMENT, high=MOST_SEED
+    )
     candidates: int = whole(
-        "how many are tried, the scenario's own options first; each takes one run per seed and demand level", 40, low=1,
-        high=MOST)
+        "how many are tried, the scenario's own options first; each takes one run per seed and demand level",
+        40,
+        low=1,
+        high=MOST,
+    )
     search_seed: int = whole("of CMA-ES, and of training", 0, high=MOST_SEED)
     population: int | None = whole("candidates per generation", None, low=2, high=1000)
 
@@ -53,9 +61,11 @@ class Bound(Evaluation):
 
     seeds: int = whole("each has a search of its own", 2, low=1, high=MOST)
     first_seed: int = whole(
-        "the seeds are S to S + N - 1; those from 2000 on are for evaluations", FIRST_DEVELOPMENT, high=MOST_SEED)
+        "the seeds are S to S + N - 1; those from 2000 on are for evaluations", FIRST_DEVELOPMENT, high=MOST_SEED
+    )
     candidates: int = whole(
-        "schedules per seed and demand level, the first without any; each takes one run", 60, low=2, high=MOST)
+        "schedules per seed and demand level, the first without any; each takes one run", 60, low=2, high=MOST
+    )
     knots: int = whole("numbers of every channel of a schedule, evenly over the horizon", 6, low=1, high=10)
     search_seed: int = whole("of CMA-ES", 0, high=MOST_SEED)
 
@@ -65,10 +75,12 @@ class Improvement(Evaluation):
 
     seeds: int = whole("runs per round and demand level", 2, low=1, high=MOST)
     first_seed: int = whole(
-        "the seeds are S to S + N - 1; those from 2000 on are for evaluations", FIRST_DEVELOPMENT, high=MOST_SEED)
+        "the seeds are S to S + N - 1; those from 2000 on are for evaluations", FIRST_DEVELOPMENT, high=MOST_SEED
+    )
     rounds: int = whole("after round 0, which runs the policy as it is", 4, low=1, high=1000)
-    descent: int = whole("Adam steps of a round, half of them after every round that was not kept", 40, low=1,
-                         high=MOST)
+    descent: int = whole(
+        "Adam steps of a round, half of them after every round that was not kept", 40, low=1, high=MOST
+    )
     learning_rate: float | None = setting("of Adam", None, gt=0.0, le=1.0)
     iterations: int = whole("of the fit of the regional model; 0 leaves it as it is", 600, high=MOST)
 
@@ -77,9 +89,9 @@ class Range(Evaluation):
     """Of the demand that controllers serve."""
 
     first_seed: int = whole(
-        "the seeds are S to S + N - 1; those from 2000 on are for evaluations", FIRST_DEVELOPMENT, high=MOST_SEED)
-    demand: Levels = setting(
-        "demand levels: multiples of the scenario's demand", (0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0))
+        "the seeds are S to S + N - 1; those from 2000 on are for evaluations", FIRST_DEVELOPMENT, high=MOST_SEED
+    )
+    demand: Levels = setting("demand levels: multiples of the scenario's demand", (0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0))
 
 
 class Identification(Settings):
@@ -96,5 +108,6 @@ class Window(Settings):
 
     demand: Level = setting("multiple of the scenario's demand", 1.0)
     delay: float = setting(
-        "wall time per simulated second at least; the window has a slider for it, too", 20.0, unit="ms", ge=0.0, le=1e6)
+        "wall time per simulated second at least; the window has a slider for it, too", 20.0, unit="ms", ge=0.0, le=1e6
+    )
     rate: int = whole("control intervals per second of the film", 8, low=1, high=60)

@@ -19,22 +19,27 @@ def reasons(rows: pd.DataFrame) -> list[str]:
     lanes, split, never = (round(mean[key]) for key in ("signal_lanes", "split_lanes", "never_whole_lanes"))
     found = []
     if split:
-        found.append(f"{split} of {lanes} lanes before its signals are shared by movements that a stage serves one "
-                     "without the other: who is first there holds up all behind")
+        found.append(
+            f"{split} of {lanes} lanes before its signals are shared by movements that a stage serves one "
+            "without the other: who is first there holds up all behind"
+        )
     if never:
         found.append(f"{never} of them are shared by movements that no stage serves together")
     if mean["intergreen_share"] > mean["programmed_intergreen_share"] + MORE:
-        found.append(f"its signals were between two stages {100 * mean['intergreen_share']:.0f} % of the time, those "
-                     f"of the original programmes are {100 * mean['programmed_intergreen_share']:.0f} %")
+        found.append(
+            f"its signals were between two stages {100 * mean['intergreen_share']:.0f} % of the time, those "
+            f"of the original programmes are {100 * mean['programmed_intergreen_share']:.0f} %"
+        )
     if mean["signals_left_alone"]:
         found.append(f"{mean['signals_left_alone']:.0f} signals keep their own programmes")
-    return found or ["neither shared lanes nor the time between stages tells why: the original programmes suit this "
-                     "demand better, by their coordination or their longer greens"]
+    return found or [
+        "neither shared lanes nor the time between stages tells why: the original programmes suit this "
+        "demand better, by their coordination or their longer greens"
+    ]
 
 
 def losses(rows: pd.DataFrame) -> list[str]:
-    """A sentence for every strategy over max-pressure that took more time than no control; rows: an overview of runs.
-    """
+    """A sentence for every strategy over max-pressure that took more time than no control; rows: an overview of runs."""
     mean = rows.groupby("controller", sort=False)["total_time_spent_veh_s"].mean()
     if not mean.get(REFERENCE, 0.0) > 0:
         return []

@@ -35,18 +35,31 @@ if TYPE_CHECKING:
     import xarray
 
 SHOWN = (  # of FACTS, in notebooks
-    "trips", "departed_veh", "final_backlog_veh", "removed_veh", "teleports", "mean_trip_time_s", "co2_kg",
-    "gateway_queue_mean_veh", "wall_time_s")
+    "trips",
+    "departed_veh",
+    "final_backlog_veh",
+    "removed_veh",
+    "teleports",
+    "mean_trip_time_s",
+    "co2_kg",
+    "gateway_queue_mean_veh",
+    "wall_time_s",
+)
 # Columns of sumo.csv, beside those of summary.csv, and what they say.
 FACTS = {
-    "controller": "the strategy", "seed": "of trips, drivers and guidance", "trips": "that were due",
-    "departed_veh": "trips that could enter", "final_backlog_veh": "waiting to enter at the end",
-    "total_backlog_veh_s": "time integral of those who wait to enter", "teleports": "out of jams, by SUMO",
+    "controller": "the strategy",
+    "seed": "of trips, drivers and guidance",
+    "trips": "that were due",
+    "departed_veh": "trips that could enter",
+    "final_backlog_veh": "waiting to enter at the end",
+    "total_backlog_veh_s": "time integral of those who wait to enter",
+    "teleports": "out of jams, by SUMO",
     "mean_trip_time_s": "on the road, of all trips, unfinished ones with what they had spent at the end",
     "mean_departure_delay_s": "between the wanted and the real departure, of all trips",
     "mean_time_loss_s": "lost on the road against driving freely, of all trips (SUMO's timeLoss)",
     "delay_gini": "Gini coefficient of the mean delays of regions of origin (run_metrics.delay_gini)",
-    "co2_kg": "of all vehicles, by SUMO's HBEFA4 petrol car", "fuel_kg": "of all vehicles, by the same model",
+    "co2_kg": "of all vehicles, by SUMO's HBEFA4 petrol car",
+    "fuel_kg": "of all vehicles, by the same model",
     "gateway_queue_mean_veh": "halting on the edges before gateways, mean over edges and time",
     "gateway_queue_max_veh": "the longest of these queues",
     "gateway_full_share": "share of these edges and intervals that were full",
@@ -55,15 +68,19 @@ FACTS = {
     "leaking_share": "share of the flow over the boundaries that passes no signal under control",
     "estimate_rmse_share": "error of estimated accumulations, as a share of the critical ones",
     "estimate_cell_rmse_veh": "error of estimated accumulations by destination",
-    "wall_time_s": "of the run", "sumo_time_s": "of it, SUMO's own steps",
-    "overhead_share": "of it, the share outside SUMO", "setup_time_s": "before the first interval",
+    "wall_time_s": "of the run",
+    "sumo_time_s": "of it, SUMO's own steps",
+    "overhead_share": "of it, the share outside SUMO",
+    "setup_time_s": "before the first interval",
     "signals_left_alone": "signals that keep their own programmes",
     "booked_intervals": "of a standstill that was not simulated any more",
     "removed_veh": "taken out before the end of their trips",
     "removed_waiting_veh": "of these, before they could enter",
     "freed_veh": "vehicles that waited for each other on a junction with free streets behind it, and were set down",
     "led_on_veh": "guided drivers who could not change lanes and went on where theirs led",
-    "jumps": "vehicles that came into another region where no gateway leads there", **PRESSURE_FACTS}
+    "jumps": "vehicles that came into another region where no gateway leads there",
+    **PRESSURE_FACTS,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,20 +127,25 @@ class Result:
 
         return xarray.Dataset(
             {**self.trajectory.variables, **variables(Record, self.record)},
-            attrs={**self.facts, **self.trajectory.labels})
+            attrs={**self.facts, **self.trajectory.labels},
+        )
 
     def _repr_html_(self) -> str:
         """Regions and figures, for notebooks."""
         return self.trajectory._repr_html_() + html_table(
-            ["sumo.csv", "value"], ([name, f"{value:.4g}" if isinstance(value, float) else value]
-                                    for name, value in self.facts.items() if name in SHOWN))
+            ["sumo.csv", "value"],
+            (
+                [name, f"{value:.4g}" if isinstance(value, float) else value]
+                for name, value in self.facts.items()
+                if name in SHOWN
+            ),
+        )
 
 
 def scenario_of(task: Task) -> Scenario:
     """The scenario with the horizon and demand of `task`. Raises InputError."""
     scenario = with_faults(load_scenario(task.scenario), task.faults)
-    scenario = with_time_limit(
-        with_demand(scenario, steps=task.steps, factor=task.demand_factor), task.time_limit)
+    scenario = with_time_limit(with_demand(scenario, steps=task.steps, factor=task.demand_factor), task.time_limit)
     if not task.options:
         return scenario
     tables = scenario.controller_options
@@ -132,7 +154,7 @@ def scenario_of(task: Task) -> Scenario:
 
 
 def simulate(
-    task: Task, progress: Callable[[int, int], None] | None = None, observer: Observer | None = None,
+    task: Task, progress: Callable[[int, int], None] | None = None, observer: Observer | None = None
 ) -> Result:
     """Run `task` in this process, which must hold no other SUMO session. Raises InputError.
 
@@ -145,16 +167,31 @@ def simulate(
     if task.schedule:
         controller = Scheduled(controller, dict(task.schedule), planning_model(scenario, variant))
     result = drive(
-        scenario, strategy, controller, seed=task.seed, progress=progress, begin=begin, outputs=dict(task.sumo_output),
-        planning=planning_of(scenario, task.controller), observer=observer)
+        scenario,
+        strategy,
+        controller,
+        seed=task.seed,
+        progress=progress,
+        begin=begin,
+        outputs=dict(task.sumo_output),
+        planning=planning_of(scenario, task.controller),
+        observer=observer,
+    )
     outside = registry.outside_training(variant, scenario, task.demand_factor, file=task.policy)
     return replace(result, facts={**result.facts, "outside_training": outside})
 
 
 def drive(
-    scenario: Scenario, strategy: Strategy, controller: Controller, *, seed: int,
-    progress: Callable[[int, int], None] | None = None, begin: float | None = None,
-    outputs: Mapping[str, Path] | None = None, planning: PlanningModel | None = None, observer: Observer | None = None,
+    scenario: Scenario,
+    strategy: Strategy,
+    controller: Controller,
+    *,
+    seed: int,
+    progress: Callable[[int, int], None] | None = None,
+    begin: float | None = None,
+    outputs: Mapping[str, Path] | None = None,
+    planning: PlanningModel | None = None,
+    observer: Observer | None = None,
 ) -> Result:
     """The closed loop of `controller` in SUMO, filed under `strategy.name`, whose options the city takes.
 
@@ -167,33 +204,49 @@ def drive(
     with ExitStack() as stack:
         files = {kind: stack.enter_context(atomic(path)) for kind, path in (outputs or {}).items()}
         plant = SumoPlant(
-            scenario, overrides=settings(scenario).changed(**strategy.overrides), outputs=files,
-            planning=planning, observer=observer)
+            scenario,
+            overrides=settings(scenario).changed(**strategy.overrides),
+            outputs=files,
+            planning=planning,
+            observer=observer,
+        )
         stack.callback(plant.close)
         trajectory = run_folder.labelled(
             closed_loop.run(plant, controller, scenario, seed=seed, progress=progress),
-            controller=strategy.name, plant="sumo")
+            controller=strategy.name,
+            plant="sumo",
+        )
         trips, sumo_time, leaks, facts = plant.trips, plant.sumo_time, set(plant.leaks()), plant.trip_facts()
         record = plant.record()
         trajectory = settled(trajectory, record)
         backlog = trajectory.backlog.sum(axis=(1, 2))
         row = {
-            "controller": strategy.name, "seed": seed, "trips": trips,
+            "controller": strategy.name,
+            "seed": seed,
+            "trips": trips,
             "departed_veh": int(record.departures.sum()),
-            "final_backlog_veh": int(backlog[-1]), "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
-            "teleports": int(record.teleports.sum()), **run_metrics.trip_facts(facts),
+            "final_backlog_veh": int(backlog[-1]),
+            "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
+            "teleports": int(record.teleports.sum()),
+            **run_metrics.trip_facts(facts),
             "delay_gini": run_metrics.delay_gini(trajectory, record, plant.time_loss()),
-            **run_metrics.queue_facts(record, plant.city), "notes": metrics.notes(trajectory),
+            **run_metrics.queue_facts(record, plant.city),
+            "notes": metrics.notes(trajectory),
             "outside_training": "",
             "leaking_share": run_metrics.leaking_share(record, plant.city, leaks),
-            **_estimation(scenario, trajectory), "wall_time_s": trajectory.wall_time, "sumo_time_s": sumo_time,
+            **_estimation(scenario, trajectory),
+            "wall_time_s": trajectory.wall_time,
+            "sumo_time_s": sumo_time,
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
-            "signals_left_alone": len(plant.other_signals), "booked_intervals": plant.booked,
+            "signals_left_alone": len(plant.other_signals),
+            "booked_intervals": plant.booked,
             "removed_veh": int(record.removals.sum() + record.given_up.sum()),
-            "removed_waiting_veh": int(record.given_up.sum()), "jumps": int(record.jumps.sum()),
+            "removed_waiting_veh": int(record.given_up.sum()),
+            "jumps": int(record.jumps.sum()),
             **plant.helped(),
-            **plant.pressure_facts()}
+            **plant.pressure_facts(),
+        }
         check_whole(files)
     return Result(trajectory=trajectory, record=asdict(record), facts=row)
 

@@ -20,30 +20,51 @@ from nmfd.studies.benchmark import REFERENCE, interval
 
 TTS = "total_time_spent_veh_s"
 MEANS = (  # columns of summary.csv and sumo.csv of which an evaluation shows the mean over seeds
-    "completed_veh", "removed_veh", "trips", "final_backlog_veh", "total_backlog_veh_s", "mean_trip_time_s",
-    "mean_departure_delay_s", "co2_kg", "fuel_kg", "gateway_queue_mean_veh", "gateway_full_share",
-    "control_step_ms_median", "overhead_share", "wall_time_s")
+    "completed_veh",
+    "removed_veh",
+    "trips",
+    "final_backlog_veh",
+    "total_backlog_veh_s",
+    "mean_trip_time_s",
+    "mean_departure_delay_s",
+    "co2_kg",
+    "fuel_kg",
+    "gateway_queue_mean_veh",
+    "gateway_full_share",
+    "control_step_ms_median",
+    "overhead_share",
+    "wall_time_s",
+)
 COLUMNS = {  # heading of a table, without its unit -> what it says
-    "controller": "the strategy for signals and routes", "seeds": "how many runs, each with other trips",
+    "controller": "the strategy for signals and routes",
+    "seeds": "how many runs, each with other trips",
     "TTS": "total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval",
     "change": "of TTS against no-control, or against the controller that the heading names, paired by seed, mean of "
-              "the percentages ± 95 % interval, * if that excludes zero",
+    "the percentages ± 95 % interval, * if that excludes zero",
     "completed": "trips that ended on the last edge of their route",
     "removed": "by whatever else takes vehicles out of SUMO, in TTS as if they were there to the end",
-    "backlog": "not inserted at the end, and its time integral", "teleports": "all seeds",
+    "backlog": "not inserted at the end, and its time integral",
+    "teleports": "all seeds",
     "trip": "mean time on the road of all trips, unfinished ones with what they had spent at the end",
     "delay": "mean time between the wanted and the real departure, of the same trips",
     "CO2": "of all vehicles, by SUMO's HBEFA4 petrol car",
     "queue": "halting on the edges before gateways, mean / longest",
-    "full": "share of these edges and intervals that were full", "decision": "median / longest",
-    **dict(COUNTED.values()), "outside SUMO": "share of the wall time that was not SUMO's"}
+    "full": "share of these edges and intervals that were full",
+    "decision": "median / longest",
+    **dict(COUNTED.values()),
+    "outside SUMO": "share of the wall time that was not SUMO's",
+}
 PAIRS = {  # columns of pairs.csv
-    "demand": "multiple of the scenario's", "controller": "the strategy", "against": "what it is paired with",
-    "seeds": "that both have", "change_percent": "of total time spent, mean over these seeds",
+    "demand": "multiple of the scenario's",
+    "controller": "the strategy",
+    "against": "what it is paired with",
+    "seeds": "that both have",
+    "change_percent": "of total time spent, mean over these seeds",
     "half_interval_percent": "half of the 95 % interval of that change",
     "difference_veh_s": "of total time spent, mean over these seeds",
     "half_interval_veh_s": "half of the 95 % interval of that difference",
-    "excludes_zero": "whether the interval of the change does: more than the chance of the seeds"}
+    "excludes_zero": "whether the interval of the change does: more than the chance of the seeds",
+}
 CAPTION = "; ".join(f"{heading}: {text}" for heading, text in COLUMNS.items() if heading not in ("controller", "seeds"))
 
 
@@ -74,8 +95,12 @@ def paired(a: Mapping[int, float], b: Mapping[int, float]) -> Paired:
     percent = [percent_change(a[seed], b[seed]) for seed in seeds]
     difference = [a[seed] - b[seed] for seed in seeds]
     return Paired(
-        seeds=len(seeds), percent=_mean(percent), percent_half=interval(percent), difference=_mean(difference),
-        difference_half=interval(difference))
+        seeds=len(seeds),
+        percent=_mean(percent),
+        percent_half=interval(percent),
+        difference=_mean(difference),
+        difference_half=interval(difference),
+    )
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -115,8 +140,13 @@ def statistics(rows: pd.DataFrame, reference: str | None = None) -> pd.DataFrame
         for name in names:
             part = rows[(rows["demand"] == level) & (rows["controller"] == name)]
             row = {
-                "demand": level, "controller": name, "against": against, "seeds": len(part),
-                f"mean_{TTS}": part[TTS].mean(), f"half_interval_{TTS}": interval(list(part[TTS]))}
+                "demand": level,
+                "controller": name,
+                "against": against,
+                "seeds": len(part),
+                f"mean_{TTS}": part[TTS].mean(),
+                f"half_interval_{TTS}": interval(list(part[TTS])),
+            }
             for label, other in (("change", against), ("change_to_reference", reference)):
                 pair = paired(by_seed(rows, level, name), by_seed(rows, level, other) if other else {})
                 shown = pair.seeds > 0 and name != other
@@ -124,13 +154,15 @@ def statistics(rows: pd.DataFrame, reference: str | None = None) -> pd.DataFrame
                     f"{label}_percent": pair.percent if shown else math.nan,
                     f"{label}_half_interval_percent": pair.percent_half if shown else math.nan,
                     f"{label}_excludes_zero": pair.excludes_zero if shown else None,
-                    f"{label}_seeds": pair.seeds if shown else 0}
+                    f"{label}_seeds": pair.seeds if shown else 0,
+                }
             row |= {column: part[column].mean() for column in MEANS}
             row |= {
                 "teleports": int(part["teleports"].sum()),
                 "gateway_queue_max_veh": part["gateway_queue_max_veh"].max(),
                 "control_step_ms_max": part["control_step_ms_max"].max(),
-                **{column: int(part[column].sum()) for column in COUNTED}}
+                **{column: int(part[column].sum()) for column in COUNTED},
+            }
             out.append(row)
     return pd.DataFrame(out)
 
@@ -144,11 +176,19 @@ def pairs(rows: pd.DataFrame) -> pd.DataFrame:
                 if other == name:
                     continue
                 pair = paired(by_seed(rows, level, name), by_seed(rows, level, other))
-                out.append({
-                    "demand": level, "controller": name, "against": other, "seeds": pair.seeds,
-                    "change_percent": pair.percent, "half_interval_percent": pair.percent_half,
-                    "difference_veh_s": pair.difference, "half_interval_veh_s": pair.difference_half,
-                    "excludes_zero": pair.excludes_zero})
+                out.append(
+                    {
+                        "demand": level,
+                        "controller": name,
+                        "against": other,
+                        "seeds": pair.seeds,
+                        "change_percent": pair.percent,
+                        "half_interval_percent": pair.percent_half,
+                        "difference_veh_s": pair.difference,
+                        "half_interval_veh_s": pair.difference_half,
+                        "excludes_zero": pair.excludes_zero,
+                    }
+                )
     return pd.DataFrame(out, columns=[*PAIRS])
 
 
@@ -161,20 +201,34 @@ def shown(table: pd.DataFrame, reference: str | None = None) -> tuple[pd.DataFra
     for row in table.to_dict("records"):
         teleports = f"{row['teleports']:.0f}"
         against = {f"against {reference}": _change(row, "change_to_reference")} if reference else {}
-        first.append({
-            "controller": row["controller"], "seeds": row["seeds"], "TTS [veh s]": _spread(row),
-            change: _change(row, "change"), **against,
-            "completed": f"{row['completed_veh']:,.0f} of {row['trips']:,.0f}",
-            "removed [veh]": f"{row['removed_veh']:,.0f}", "backlog [veh]": f"{row['final_backlog_veh']:,.0f}",
-            "backlog [veh s]": f"{row['total_backlog_veh_s']:.2e}", "teleports": teleports})
-        second.append({
-            "controller": row["controller"], "trip [s]": f"{row['mean_trip_time_s']:,.0f}",
-            "delay [s]": f"{row['mean_departure_delay_s']:,.0f}", "CO2 [kg]": f"{row['co2_kg']:,.0f}",
-            "queue [veh]": f"{row['gateway_queue_mean_veh']:.1f} / {row['gateway_queue_max_veh']:.0f}",
-            "full": f"{100 * row['gateway_full_share']:.1f} %",
-            "decision [ms]": f"{row['control_step_ms_median']:.3g} / {row['control_step_ms_max']:.3g}",
-            **{heading: row[column] for column, (heading, _) in COUNTED.items()},
-            "outside SUMO": f"{100 * row['overhead_share']:.1f} %", "teleports": teleports})
+        first.append(
+            {
+                "controller": row["controller"],
+                "seeds": row["seeds"],
+                "TTS [veh s]": _spread(row),
+                change: _change(row, "change"),
+                **against,
+                "completed": f"{row['completed_veh']:,.0f} of {row['trips']:,.0f}",
+                "removed [veh]": f"{row['removed_veh']:,.0f}",
+                "backlog [veh]": f"{row['final_backlog_veh']:,.0f}",
+                "backlog [veh s]": f"{row['total_backlog_veh_s']:.2e}",
+                "teleports": teleports,
+            }
+        )
+        second.append(
+            {
+                "controller": row["controller"],
+                "trip [s]": f"{row['mean_trip_time_s']:,.0f}",
+                "delay [s]": f"{row['mean_departure_delay_s']:,.0f}",
+                "CO2 [kg]": f"{row['co2_kg']:,.0f}",
+                "queue [veh]": f"{row['gateway_queue_mean_veh']:.1f} / {row['gateway_queue_max_veh']:.0f}",
+                "full": f"{100 * row['gateway_full_share']:.1f} %",
+                "decision [ms]": f"{row['control_step_ms_median']:.3g} / {row['control_step_ms_max']:.3g}",
+                **{heading: row[column] for column, (heading, _) in COUNTED.items()},
+                "outside SUMO": f"{100 * row['overhead_share']:.1f} %",
+                "teleports": teleports,
+            }
+        )
     return pd.DataFrame(first), pd.DataFrame(second)
 
 
@@ -194,8 +248,10 @@ def text(table: pd.DataFrame, reference: str | None = None) -> str:
     """`statistics` for the terminal."""
     parts = []
     for level, part in table.groupby("demand", sort=True):
-        parts += [f"Demand times {level:g}", *(
-            text_table(rows.to_dict("records")) + "\n" for rows in shown(part, reference))]
+        parts += [
+            f"Demand times {level:g}",
+            *(text_table(rows.to_dict("records")) + "\n" for rows in shown(part, reference)),
+        ]
     return "\n".join([*parts, *wrapped(CAPTION)])
 
 
@@ -203,8 +259,10 @@ def markdown(table: pd.DataFrame, reference: str | None = None) -> str:
     """`statistics` as markdown."""
     parts = []
     for level, part in table.groupby("demand", sort=True):
-        parts += [f"## Demand times {level:g}", *(
-            markdown_table(list(rows), rows.to_numpy().tolist()) for rows in shown(part, reference))]
+        parts += [
+            f"## Demand times {level:g}",
+            *(markdown_table(list(rows), rows.to_numpy().tolist()) for rows in shown(part, reference)),
+        ]
     return "\n\n".join([*parts, CAPTION]) + "\n"
 
 

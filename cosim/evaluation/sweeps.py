@@ -1,7 +1,7 @@
 """The sweep: controllers x seeds x demand levels x compliance rates in SUMO, on processes or a cluster, as one table.
 
-    <folder>/sweep.parquet      one row per run, new after every run: what was asked for, how it ended, all its figures
-    <folder>/demand-<level>/    the run folder of a demand level (cosim.evaluation.experiment), as of an evaluation
+<folder>/sweep.parquet      one row per run, new after every run: what was asked for, how it ended, all its figures
+<folder>/demand-<level>/    the run folder of a demand level (cosim.evaluation.experiment), as of an evaluation
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -64,15 +64,31 @@ class Sweep:
     def plan(self) -> list[tuple[Path, Task]]:
         """Every run with its run folder, seed by seed, so that whatever is finished compares like with like."""
         return [
-            (experiment.level_folder(self.out, level), Task(
-                scenario=self.scenario, controller=strategy, seed=seed, policy=self.policies.get(name),
-                steps=self.steps, demand_factor=level, time_limit=self.time_limit))
-            for seed in self.seeds for level in self.levels for strategy, name in self.strategies().items()]
+            (
+                experiment.level_folder(self.out, level),
+                Task(
+                    scenario=self.scenario,
+                    controller=strategy,
+                    seed=seed,
+                    policy=self.policies.get(name),
+                    steps=self.steps,
+                    demand_factor=level,
+                    time_limit=self.time_limit,
+                ),
+            )
+            for seed in self.seeds
+            for level in self.levels
+            for strategy, name in self.strategies().items()
+        ]
 
 
 def sweep(
-    order: Sweep, *, workers: int = 1, scheduler: dask_cluster.Scheduler | str | None = None,
-    progress: Callable[[int, int, str], None] | None = None, tell: Callable[[str], None] | None = None,
+    order: Sweep,
+    *,
+    workers: int = 1,
+    scheduler: dask_cluster.Scheduler | str | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Run what is not there yet; returns the table, which is in sweep.parquet, of all runs in the folder.
 
@@ -91,8 +107,10 @@ def sweep(
         done = _finished(order.out)
         for key in done[KEYS].itertuples(index=False, name=None):
             failures.pop(key, None)
-        failed = [{**dict(zip(KEYS, key, strict=True)), "status": FAILED, "reason": reason}
-                  for key, reason in failures.items()]
+        failed = [
+            {**dict(zip(KEYS, key, strict=True)), "status": FAILED, "reason": reason}
+            for key, reason in failures.items()
+        ]
         rows = _named(pd.concat([done, pd.DataFrame(failed)], ignore_index=True) if failed else done, own)
         order.out.mkdir(parents=True, exist_ok=True)
         write_parquet(file, rows)
@@ -104,8 +122,8 @@ def sweep(
 
     source = dask_cluster.source(scheduler, tell)
     failed_now = experiment.perform(
-        plan, workers=workers, fresh=True, progress=progress, tell=tell, kept=write, failed=failed,
-        source=source)
+        plan, workers=workers, fresh=True, progress=progress, tell=tell, kept=write, failed=failed, source=source
+    )
     rows = write()
     if failed_now and (rows["status"] == FAILED).all():
         raise ended([(experiment.label(task), failure) for task, failure in failed_now[:1]])
@@ -132,19 +150,26 @@ def _failures(file: Path) -> dict[tuple[str, int, float], str]:
     except (OSError, ValueError, KeyError) as error:  # pyarrow's own errors are among them
         raise InputError(
             f"{file}: is no table of a sweep ({' '.join(str(error).split())[:200]}); delete it, the runs are kept in "
-            "the folders beside it") from None
+            "the folders beside it"
+        ) from None
 
 
 def _named(rows: pd.DataFrame, own: float) -> pd.DataFrame:
     """`rows` with what was asked for as the first columns, sorted by it; `own`: the compliance of the scenario."""
     strategies = {name: parse(name) for name in dict.fromkeys(rows["strategy"])}
-    controllers = {name: "+".join(part for part in (registry.split(name)[0], *registry.split(name)[1])
-                                  if not part.startswith("compliance-")) for name in strategies}
+    controllers = {
+        name: "+".join(
+            part for part in (registry.split(name)[0], *registry.split(name)[1]) if not part.startswith("compliance-")
+        )
+        for name in strategies
+    }
     compliance = {name: float(strategy.overrides.get("compliance", own)) for name, strategy in strategies.items()}
     named = rows.assign(
-        controller=rows["strategy"].map(controllers), compliance=rows["strategy"].map(compliance).astype(float))
+        controller=rows["strategy"].map(controllers), compliance=rows["strategy"].map(compliance).astype(float)
+    )
     return named[[*FIRST, *(column for column in named if column not in FIRST)]].sort_values(
-        ["demand", "controller", "compliance", "seed"], ignore_index=True)
+        ["demand", "controller", "compliance", "seed"], ignore_index=True
+    )
 
 
 def text(rows: pd.DataFrame) -> str:

@@ -34,9 +34,9 @@ from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, Source, ended, outcomes
 
 NAME = re.compile(r"[a-z_]\w*(\[[0-9]\])?")  # of an option, or of one number of a list
-MOST = 20           # numbers to tune: with more, the runs that CMA-ES needs are beyond what a city allows
-DECADES = 1.0       # a range that spans more is searched in the logarithm
-FIRST_STEP = 0.25   # standard deviation of the first generation, as a share of every range
+MOST = 20  # numbers to tune: with more, the runs that CMA-ES needs are beyond what a city allows
+DECADES = 1.0  # a range that spans more is searched in the logarithm
+FIRST_STEP = 0.25  # standard deviation of the first generation, as a share of every range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,9 +100,15 @@ class Tuning:
     def configuration(self) -> dict[str, object]:
         """What the folder is for."""
         return {
-            "tune": self.controller, "scenario": load_scenario(self.scenario).name, "seeds": list(self.seeds),
-            "options": {knob.option: [knob.low, knob.high] for knob in self.knobs}, "levels": list(self.levels),
-            "search_seed": self.search_seed, "population": self.population, "steps": self.steps}
+            "tune": self.controller,
+            "scenario": load_scenario(self.scenario).name,
+            "seeds": list(self.seeds),
+            "options": {knob.option: [knob.low, knob.high] for knob in self.knobs},
+            "levels": list(self.levels),
+            "search_seed": self.search_seed,
+            "population": self.population,
+            "steps": self.steps,
+        }
 
     def folder(self, candidate: int) -> Path:
         """Of one candidate."""
@@ -136,10 +142,21 @@ class Tuning:
     def plan(self, candidate: int, options: tuple[tuple[str, object], ...]) -> list[tuple[Path, Task]]:
         """The runs of one candidate, each with its run folder."""
         return [
-            (experiment.level_folder(self.folder(candidate), level), Task(
-                scenario=self.scenario, controller=self.controller, seed=seed, policy=self.policy(candidate),
-                steps=self.steps, demand_factor=level, options=options))
-            for seed in self.seeds for level in self.levels]
+            (
+                experiment.level_folder(self.folder(candidate), level),
+                Task(
+                    scenario=self.scenario,
+                    controller=self.controller,
+                    seed=seed,
+                    policy=self.policy(candidate),
+                    steps=self.steps,
+                    demand_factor=level,
+                    options=options,
+                ),
+            )
+            for seed in self.seeds
+            for level in self.levels
+        ]
 
 
 def knob(text: str) -> Knob:
@@ -153,7 +170,8 @@ def knob(text: str) -> Knob:
     if not (NAME.fullmatch(found.option) and -math.inf < found.low < found.high < math.inf):
         raise InputError(
             "--option: expected KEY=LOW:HIGH with LOW below HIGH, such as kp=0.1:10 or set_point[0]=200:600, "
-            f"got {text!r} instead")
+            f"got {text!r} instead"
+        )
     return found
 
 
@@ -170,7 +188,8 @@ def check(order: Tuning) -> None:
         if known != set(range(len(known))):
             raise InputError(
                 f"--option: {key} needs a range for each number that the scenario's list does not have: {key}[0], "
-                f"{key}[1], ...; its list has {len(order.numbers(key))}")
+                f"{key}[1], ...; its list has {len(order.numbers(key))}"
+            )
     for point in ([0.0] * len(names), [1.0] * len(names)):
         scenario = scenario_of(order.plan(0, order.options(point))[0][1])
         variant = configured(order.controller, scenario.controller_options)
@@ -181,8 +200,12 @@ def check(order: Tuning) -> None:
 
 
 def tune(
-    order: Tuning, *, workers: int = 1, scheduler: dask_cluster.Scheduler | str | None = None,
-    progress: experiment.Progress | None = None, tell: Callable[[str], None] | None = None,
+    order: Tuning,
+    *,
+    workers: int = 1,
+    scheduler: dask_cluster.Scheduler | str | None = None,
+    progress: experiment.Progress | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Try candidates; returns the table of tune.csv.
 
@@ -193,20 +216,33 @@ def tune(
     """
     check(order)
     return search(
-        order, workers=workers, source=dask_cluster.source(scheduler, tell), progress=progress, tell=tell,
-        kept=lambda table: files.write_text(order.out / "tune.toml", toml(order, table)))
+        order,
+        workers=workers,
+        source=dask_cluster.source(scheduler, tell),
+        progress=progress,
+        tell=tell,
+        kept=lambda table: files.write_text(order.out / "tune.toml", toml(order, table)),
+    )
 
 
 def search(
-    order: Tuning, *, workers: int, source: Source | None = None, progress: experiment.Progress | None = None,
-    tell: Callable[[str], None] | None = None, kept: Callable[[pd.DataFrame], object] | None = None,
+    order: Tuning,
+    *,
+    workers: int,
+    source: Source | None = None,
+    progress: experiment.Progress | None = None,
+    tell: Callable[[str], None] | None = None,
+    kept: Callable[[pd.DataFrame], object] | None = None,
 ) -> pd.DataFrame:
     """What `tune` does once the order was checked. kept: takes the table after every generation."""
     algorithm, rows = _search(order), list[dict[str, object]]()
     file = order.out / "tune.csv"
     with run_folder.manifest(
-            order.out, configuration=order.configuration, results=file,
-            session={"scenario_folder": str(order.scenario), "workers": workers}):
+        order.out,
+        configuration=order.configuration,
+        results=file,
+        session={"scenario_folder": str(order.scenario), "workers": workers},
+    ):
         points = [_start(order)]
         while points:
             found = _scored(order, points, len(rows), workers, source, progress, tell)
@@ -232,27 +268,46 @@ def toml(order: Tuning, table: pd.DataFrame) -> str:
     options = dict(order.options([knob.share(row[knob.option]) for knob in order.knobs]))
     lines = [f"{key} = {list(value) if isinstance(value, tuple) else value}" for key, value in options.items()]
     runs = f"seeds {min(order.seeds)} to {max(order.seeds)}, demand times {', '.join(f'{x:g}' for x in order.levels)}"
-    return "\n".join([
-        f"# The best of {len(table)} candidates of cosim tune: {row[SCORE]:.4g} veh s ({runs}); the first: "
-        f"{table[SCORE].iloc[0]:.4g} veh s", f'[controllers."{order.controller}"]', *lines, ""])
+    return "\n".join(
+        [
+            f"# The best of {len(table)} candidates of cosim tune: {row[SCORE]:.4g} veh s ({runs}); the first: "
+            f"{table[SCORE].iloc[0]:.4g} veh s",
+            f'[controllers."{order.controller}"]',
+            *lines,
+            "",
+        ]
+    )
 
 
 def text(order: Tuning, table: pd.DataFrame) -> str:
     """The first and the best candidate side by side."""
     shown = {"first": table.iloc[0], f"best: {best(table)['candidate']:.0f}": best(table)}
-    lines = [{
-        "candidate": name, **{knob.option: f"{row[knob.option]:.4g}" for knob in order.knobs},
-        "mean TTS [veh s]": f"{row[SCORE]:.4g}",
-        **{f"at {level:g}": f"{np.mean([row[scores.column(level, seed)] for seed in order.seeds]):.4g}"
-           for level in order.levels}} for name, row in shown.items()]
+    lines = [
+        {
+            "candidate": name,
+            **{knob.option: f"{row[knob.option]:.4g}" for knob in order.knobs},
+            "mean TTS [veh s]": f"{row[SCORE]:.4g}",
+            **{
+                f"at {level:g}": f"{np.mean([row[scores.column(level, seed)] for seed in order.seeds]):.4g}"
+                for level in order.levels
+            },
+        }
+        for name, row in shown.items()
+    ]
     return text_table(lines, "mean TTS: geometric mean over all runs; at: arithmetic mean at that demand level")
 
 
 def _search(order: Tuning) -> cma.CMAEvolutionStrategy:
     """Its random numbers are its own: what else draws between two generations changes nothing."""
     random = np.random.default_rng([order.search_seed, len(order.knobs)])
-    chosen = {"bounds": [0.0, 1.0], "randn": lambda *shape: random.standard_normal(shape), "seed": math.nan,
-              "verbose": -9, "maxfevals": math.inf, "CMA_diagonal": False}
+    chosen = {
+        "bounds": [0.0, 1.0],
+        "randn": lambda *shape: random.standard_normal(shape),
+        "seed": math.nan,
+        "verbose": -9,
+        "maxfevals": math.inf,
+        "CMA_diagonal": False,
+    }
     if order.population is not None:
         chosen["popsize"] = order.population
     return cma.CMAEvolutionStrategy(_start(order), order.first_step, chosen)
@@ -273,8 +328,10 @@ def _start(order: Tuning) -> list[float]:
 def _own(order: Tuning) -> dict[str, Any]:
     """The options that the scenario gives the controller."""
     tables = load_scenario(order.scenario).controller_options
-    return {**tables.get(parse(order.controller).controller, {}),
-            **tables.get(configured(order.controller, tables), {})}
+    return {
+        **tables.get(parse(order.controller).controller, {}),
+        **tables.get(configured(order.controller, tables), {}),
+    }
 
 
 def _default(controller: str, key: str) -> object:
@@ -291,8 +348,13 @@ def _whole_options(controller: str) -> set[str]:
 
 
 def _scored(
-    order: Tuning, points: Sequence[Sequence[float]], begin: int, workers: int,
-    source: Source | None, progress: experiment.Progress | None, tell: Callable[[str], None] | None,
+    order: Tuning,
+    points: Sequence[Sequence[float]],
+    begin: int,
+    workers: int,
+    source: Source | None,
+    progress: experiment.Progress | None,
+    tell: Callable[[str], None] | None,
 ) -> list[dict[str, object]]:
     """Run the candidates `begin`, `begin` + 1, ... at `points`; their rows of tune.csv."""
     options = {begin + n: order.options(point) for n, point in enumerate(points)}
@@ -301,14 +363,15 @@ def _scored(
 
     def report(done: int, total: int, note: str) -> None:
         if progress:  # of what is kept nothing is to do: total counts the rest
-            progress((begin + len(points)) * each - total + done, order.candidates * each,
-                     f"candidates {begin} to {max(options)} of {order.candidates}; {note}")
+            progress(
+                (begin + len(points)) * each - total + done,
+                order.candidates * each,
+                f"candidates {begin} to {max(options)} of {order.candidates}; {note}",
+            )
 
     if order.trains:
         _train(order, options, workers, lambda note: report(0, len(points) * each, note))
-    failures = experiment.perform(
-        plan, workers=workers, fresh=True, progress=report, tell=tell,
-        source=source)
+    failures = experiment.perform(plan, workers=workers, fresh=True, progress=report, tell=tell, source=source)
     rows = [_row(order, candidate, points[candidate - begin]) for candidate in options]
     if all(math.isnan(row[SCORE]) for row in rows):
         raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])
@@ -338,11 +401,14 @@ def _costs(rows: Sequence[Mapping[str, Any]]) -> list[float]:
 
 
 def _train(
-    order: Tuning, options: Mapping[int, tuple[tuple[str, object], ...]], workers: int, tell: Callable[[str], object],
+    order: Tuning, options: Mapping[int, tuple[tuple[str, object], ...]], workers: int, tell: Callable[[str], object]
 ) -> None:
     """The policies that are not there yet, several at a time. RunFailed if one cannot be trained."""
-    todo = [(order, candidate, chosen) for candidate, chosen in options.items()
-            if not (order.folder(candidate) / "trained").is_file()]
+    todo = [
+        (order, candidate, chosen)
+        for candidate, chosen in options.items()
+        if not (order.folder(candidate) / "trained").is_file()
+    ]
 
     def look(running: Sequence[tuple[tuple, float]]) -> None:
         tell("training " + ", ".join(f"{task[1]}: {share:.0%}" for task, share in running))

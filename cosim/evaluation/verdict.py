@@ -43,5 +43,6 @@ def boundaries(city: City, results: Sequence[Result]) -> Boundaries:
 def write_verdict(folder: Path, found: Verdict) -> None:
     """verdict.txt and boundaries.csv."""
     files.write_text(folder / authority.FILE, found.text())
-    files.write_text(folder / "boundaries.csv", pd.DataFrame(
-        found.boundaries.rows(), columns=authority.COLUMNS).to_csv(index=False))
+    files.write_text(
+        folder / "boundaries.csv", pd.DataFrame(found.boundaries.rows(), columns=authority.COLUMNS).to_csv(index=False)
+    )

@@ -30,9 +30,9 @@ from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.errors import InputError
 from nmfd.runs.scratch import Scratch
 
-PERIOD = 300        # s, over which the times of the streets are averaged
-ASKED = 2000        # drivers from whom the gap is estimated, at most
-NAME = "peak"       # of the files that duaIterate.py makes
+PERIOD = 300  # s, over which the times of the streets are averaged
+ASKED = 2000  # drivers from whom the gap is estimated, at most
+NAME = "peak"  # of the files that duaIterate.py makes
 CAR_FOLLOWING = 0.5  # times the iterations that are allowed in the mesoscopic model
 
 
@@ -83,8 +83,16 @@ class Assigned:
 
 
 def assign(
-    net: Path, elements: Sequence[ElementTree.Element], *, begin: float, end: float, seed: int, effort: Effort,
-    mesoscopic: bool = True, options: Sequence[str] = (), additional: Sequence[Path] = (),
+    net: Path,
+    elements: Sequence[ElementTree.Element],
+    *,
+    begin: float,
+    end: float,
+    seed: int,
+    effort: Effort,
+    mesoscopic: bool = True,
+    options: Sequence[str] = (),
+    additional: Sequence[Path] = (),
     tell: Tell = lambda stage, share=0.0: None,
 ) -> Assigned:
     """Find routes for vehicles that have some already.
@@ -105,13 +113,31 @@ def assign(
         for model, most in [(True, effort.iterations), *([] if mesoscopic else [(False, effort.car_following)])]:
             gaps: list[float] = []
             for n in range(len(found), len(found) + most):
-                tell(f"assignment{'' if model else ', car-following'}, at most {most} iterations"
-                     + (f", gap {100 * found[-1].gap:.0f} %" if found else ""), len(gaps) / most)
-                _iterate(folder, n, [
-                    "--net-file", file_list([net]), "--begin", f"{begin:g}", "--end", f"{end:g}", *options,
-                    *(["--mesosim", "--meso-junctioncontrol"] if model else []),
-                    *(["--additional", file_list(additional)] if additional else []),
-                    "duarouter--seed", str(seed), "sumo--seed", str(seed)], where=str(net))
+                tell(
+                    f"assignment{'' if model else ', car-following'}, at most {most} iterations"
+                    + (f", gap {100 * found[-1].gap:.0f} %" if found else ""),
+                    len(gaps) / most,
+                )
+                _iterate(
+                    folder,
+                    n,
+                    [
+                        "--net-file",
+                        file_list([net]),
+                        "--begin",
+                        f"{begin:g}",
+                        "--end",
+                        f"{end:g}",
+                        *options,
+                        *(["--mesosim", "--meso-junctioncontrol"] if model else []),
+                        *(["--additional", file_list(additional)] if additional else []),
+                        "duarouter--seed",
+                        str(seed),
+                        "sumo--seed",
+                        str(seed),
+                    ],
+                    where=str(net),
+                )
                 found.append(_judged(folder, net, n, begin=begin, seed=seed, mesoscopic=model))
                 gaps.append(found[-1].gap)
                 if gaps[-1] <= min(gaps):
@@ -124,23 +150,47 @@ def assign(
 def _iterate(folder: Path, n: int, options: Sequence[str], *, where: str) -> None:
     """Let duaIterate.py do its step n: routes (but in step 0) and a simulation."""
     start = ["--skip-first-routing", "--routes", str(_routes(folder, 0))] if n == 0 else ["--trips", f"{NAME}.xml"]
-    failed = _run(folder, [
-        *start, "--first-step", str(n), "--last-step", str(n + 1), "--aggregation", str(PERIOD),
-        "--routing-algorithm", "CH", "--disable-warnings", "--disable-summary", "--continue-on-unbuild", *options])
+    failed = _run(
+        folder,
+        [
+            *start,
+            "--first-step",
+            str(n),
+            "--last-step",
+            str(n + 1),
+            "--aggregation",
+            str(PERIOD),
+            "--routing-algorithm",
+            "CH",
+            "--disable-warnings",
+            "--disable-summary",
+            "--continue-on-unbuild",
+            *options,
+        ],
+    )
     if failed or not _tripinfo(folder, n).exists():
         log = folder / "dua.log"
         said = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.exists() else []
         reason = " ".join(next((line for line in said if "rror" in line), "no reason given").split())
-        raise InputError(f"{where}: duaIterate.py cannot assign routes: {reason}; correct the input, or add "
-                         "--iterations 0")
+        raise InputError(
+            f"{where}: duaIterate.py cannot assign routes: {reason}; correct the input, or add --iterations 0"
+        )
 
 
 def _run(folder: Path, arguments: Sequence[str]) -> int:
     """Run duaIterate.py; the programs that it started end with it, however this ends."""
     program = Path(sumo.SUMO_HOME) / "tools" / "assign" / "duaIterate.py"
-    with (folder / "console.log").open("ab") as log, subprocess.Popen(
-            [sys.executable, str(program), *arguments], cwd=folder, stdout=log, stderr=log, stdin=subprocess.DEVNULL,
-            env=os.environ | {"SUMO_HOME": sumo.SUMO_HOME, "PYTHONHASHSEED": "0"}) as process:
+    with (
+        (folder / "console.log").open("ab") as log,
+        subprocess.Popen(
+            [sys.executable, str(program), *arguments],
+            cwd=folder,
+            stdout=log,
+            stderr=log,
+            stdin=subprocess.DEVNULL,
+            env=os.environ | {"SUMO_HOME": sumo.SUMO_HOME, "PYTHONHASHSEED": "0"},
+        ) as process,
+    ):
         try:
             return process.wait()
         except BaseException:
@@ -163,7 +213,7 @@ def _end(pid: int) -> None:
 
 
 def relative_gap(
-    net: Path, elements: Sequence[ElementTree.Element], weights: Path, *, begin: float, seed: int,
+    net: Path, elements: Sequence[ElementTree.Element], weights: Path, *, begin: float, seed: int
 ) -> float:
     """[-], of at most ASKED of the drivers among `elements`, at the times of the edges in `weights`, an edgeData file.
 
@@ -178,11 +228,35 @@ def relative_gap(
         ElementTree.ElementTree(root).write(folder / "asked.rou.xml")
         # Every driver comes with one way, their own; duarouter adds the fastest, and writes the costs of both.
         run_sumo(
-            "duarouter", "--net-file", file_list([net]), "--route-files", str(folder / "asked.rou.xml"),
-            "--weight-files", str(weights), "--weights.expand", "true", "--gawron.beta", "1", "--keep-all-routes",
-            "true", "--routing-algorithm", "astar", "--begin", f"{begin:g}",
-            "--output-file", str(folder / "fastest.rou.xml"), "--alternatives-output", str(folder / "ways.xml"),
-            "--no-warnings", "true", "--no-step-log", "true", "--ignore-errors", "true", where=str(net))
+            "duarouter",
+            "--net-file",
+            file_list([net]),
+            "--route-files",
+            str(folder / "asked.rou.xml"),
+            "--weight-files",
+            str(weights),
+            "--weights.expand",
+            "true",
+            "--gawron.beta",
+            "1",
+            "--keep-all-routes",
+            "true",
+            "--routing-algorithm",
+            "astar",
+            "--begin",
+            f"{begin:g}",
+            "--output-file",
+            str(folder / "fastest.rou.xml"),
+            "--alternatives-output",
+            str(folder / "ways.xml"),
+            "--no-warnings",
+            "true",
+            "--no-step-log",
+            "true",
+            "--ignore-errors",
+            "true",
+            where=str(net),
+        )
         spent = least = 0.0
         for vehicle in read_xml(folder / "ways.xml").iter("vehicle"):
             costs = [float(attribute(route, "cost")) for route in vehicle.iter("route")]
@@ -197,12 +271,16 @@ def _judged(folder: Path, net: Path, n: int, *, begin: float, seed: int, mesosco
     return Iteration(
         mesoscopic=mesoscopic,
         gap=relative_gap(net, list(read_xml(_routes(folder, n))), weights, begin=begin, seed=seed),
-        trip_time=float(np.mean(durations)) if durations else np.nan, arrived=len(durations))
+        trip_time=float(np.mean(durations)) if durations else np.nan,
+        arrived=len(durations),
+    )
 
 
 def _read_routes(path: Path) -> dict[str, list[str]]:
-    return {attribute(vehicle, "id"): attribute(child(vehicle, "route"), "edges").split()
-            for vehicle in read_xml(path).iter("vehicle")}
+    return {
+        attribute(vehicle, "id"): attribute(child(vehicle, "route"), "edges").split()
+        for vehicle in read_xml(path).iter("vehicle")
+    }
 
 
 def _step(folder: Path, n: int) -> Path:

@@ -18,7 +18,12 @@ from nmfd.studies import plots
 
 
 def draw_map(
-    path: Path, streets: Streets, regions: EdgeNumbers, names: Sequence[str], places: Positions, tables: Tables,
+    path: Path,
+    streets: Streets,
+    regions: EdgeNumbers,
+    names: Sequence[str],
+    places: Positions,
+    tables: Tables,
     density: PerEdge | None,
 ) -> None:
     """density: (E,) [veh per lane-km], or None."""
@@ -35,21 +40,28 @@ def draw_map(
     drawing.savefig(path, dpi=130, metadata={"Software": None, **trail.metadata(path)})
 
 
-def region_map(
-    ax: Axes, streets: Streets, regions: EdgeNumbers, names: Sequence[str], places: Positions,
-) -> Axes:
+def region_map(ax: Axes, streets: Streets, regions: EdgeNumbers, names: Sequence[str], places: Positions) -> Axes:
     """Every street in the colour of its region, with a scale bar."""
     _streets(ax, streets, colors=[colour(region) for region in regions[streets.drivable]])
     for region, (x, y) in enumerate(places):
-        ax.text(x, y, f"{region} {names[region]}", ha="center", va="center", fontsize="small", zorder=5,
-                bbox={"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": colour(region), "alpha": 0.85})
+        ax.text(
+            x,
+            y,
+            f"{region} {names[region]}",
+            ha="center",
+            va="center",
+            fontsize="small",
+            zorder=5,
+            bbox={"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": colour(region), "alpha": 0.85},
+        )
     left, right = ax.get_xlim()
     length = 10.0 ** np.floor(np.log10(0.4 * (right - left)))
     bottom = ax.get_ylim()[0]
     ax.plot([left, left + length], [bottom, bottom], color="black", linewidth=2)
     text = f"{length:g} m" if length < 1000 else f"{length / 1000:g} km"
-    ax.annotate(text, (left + length / 2, bottom), xytext=(0, 3), textcoords="offset points", ha="center",
-                fontsize="small")
+    ax.annotate(
+        text, (left + length / 2, bottom), xytext=(0, 3), textcoords="offset points", ha="center", fontsize="small"
+    )
     return ax
 
 
@@ -59,8 +71,16 @@ def gateway_marks(ax: Axes, streets: Streets, tables: Tables) -> Axes:
         edges = sorted({g["from_edge"] for g in tables.gateways if (g["control"] == "controlled") == controlled})
         points = np.array([streets.shapes[streets.number[edge]][-1] for edge in edges]).reshape(-1, 2)
         if len(points):
-            ax.scatter(points[:, 0], points[:, 1], s=14, facecolor=face, edgecolor="black", linewidths=0.8, zorder=4,
-                       label=label)
+            ax.scatter(
+                points[:, 0],
+                points[:, 1],
+                s=14,
+                facecolor=face,
+                edgecolor="black",
+                linewidths=0.8,
+                zorder=4,
+                label=label,
+            )
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=2, frameon=False, fontsize="small")
     return ax
@@ -69,8 +89,11 @@ def gateway_marks(ax: Axes, streets: Streets, tables: Tables) -> Axes:
 def _streets(ax: Axes, streets: Streets, array: np.ndarray | None = None, **style: Any) -> LineCollection:
     members = np.flatnonzero(streets.drivable)
     lines = LineCollection(
-        [streets.shapes[n] for n in members], linewidths=0.6 + 0.5 * np.minimum(streets.lanes[members], 4),
-        capstyle="round", **style)
+        [streets.shapes[n] for n in members],
+        linewidths=0.6 + 0.5 * np.minimum(streets.lanes[members], 4),
+        capstyle="round",
+        **style,
+    )
     if array is not None:
         lines.set_array(array[members])
     ax.add_collection(lines)

@@ -22,7 +22,7 @@ from nmfd.runs.scratch import Scratch
 
 INTERVAL = 300.0  # s, of the densities
 STEP = re.compile(r"Step #([\d.]+)")
-PEAK = 3          # such intervals, one after the other: those with the most vehicles count for the partition
+PEAK = 3  # such intervals, one after the other: those with the most vehicles count for the partition
 
 
 class Tell(Protocol):
@@ -80,7 +80,7 @@ class Baseline:
 
     def _crowded(self, edges: EdgeMask) -> np.ndarray:
         held = np.where(edges, self.presence[busiest(self.presence[:, edges])].sum(axis=0), 0.0)
-        return np.argsort(-held, kind="stable")[:holding_half(held)]
+        return np.argsort(-held, kind="stable")[: holding_half(held)]
 
     def moves(self) -> Counter[tuple[int, int]]:
         """(edge, next edge) -> vehicles that went from one to the other."""
@@ -125,9 +125,17 @@ def holding_half(held: Float[np.ndarray, " E"]) -> int:
 
 
 def run_baseline(
-    streets: Streets, *, routes: Sequence[Path], additional: Sequence[Path], begin: float, end: float,
-    vehicles: Collection[str] = (), options: Sequence[str] = (), seed: int = 0,
-    look: Callable[[Path], None] = lambda edges: None, reached: Callable[[float], None] = lambda time: None,
+    streets: Streets,
+    *,
+    routes: Sequence[Path],
+    additional: Sequence[Path],
+    begin: float,
+    end: float,
+    vehicles: Collection[str] = (),
+    options: Sequence[str] = (),
+    seed: int = 0,
+    look: Callable[[Path], None] = lambda edges: None,
+    reached: Callable[[float], None] = lambda time: None,
 ) -> Baseline:
     """Simulate without control; vehicles: ids of the demand; look: is called with SUMO's edgeData, which goes then;
     reached: now and then with SUMO's time [s]. Raises InputError with SUMO's own words if it refuses."""
@@ -137,16 +145,44 @@ def run_baseline(
         edges = folder / "edges.xml"
         (folder / "measure.add.xml").write_text(
             f'<additional><edgeData id="all" freq="{INTERVAL:g}" file="{edges}" excludeEmpty="true"/></additional>',
-            encoding="utf-8")
+            encoding="utf-8",
+        )
         run_sumo(
-            "sumo", "--net-file", file_list([streets.path]), "--route-files", file_list(routes),
-            "--additional-files", file_list([*additional, folder / "measure.add.xml"]), "--begin", str(begin),
-            "--end", str(end), "--seed", str(seed), "--step-log.period", "10", "--no-warnings", "true",
-            "--ignore-route-errors", "true", "--vehroute-output", str(folder / "ways.xml"),
-            "--vehroute-output.exit-times", str(not rerouted).lower(), "--vehroute-output.last-route", "true",
-            "--vehroute-output.write-unfinished", "true", "--statistic-output", str(folder / "statistic.xml"),
-            "--duration-log.statistics", "true",
-            *options, where=str(streets.path), reached=reached)
+            "sumo",
+            "--net-file",
+            file_list([streets.path]),
+            "--route-files",
+            file_list(routes),
+            "--additional-files",
+            file_list([*additional, folder / "measure.add.xml"]),
+            "--begin",
+            str(begin),
+            "--end",
+            str(end),
+            "--seed",
+            str(seed),
+            "--step-log.period",
+            "10",
+            "--no-warnings",
+            "true",
+            "--ignore-route-errors",
+            "true",
+            "--vehroute-output",
+            str(folder / "ways.xml"),
+            "--vehroute-output.exit-times",
+            str(not rerouted).lower(),
+            "--vehroute-output.last-route",
+            "true",
+            "--vehroute-output.write-unfinished",
+            "true",
+            "--statistic-output",
+            str(folder / "statistic.xml"),
+            "--duration-log.statistics",
+            "true",
+            *options,
+            where=str(streets.path),
+            reached=reached,
+        )
         statistic = ElementTree.parse(folder / "statistic.xml").getroot()
         counts, trips = child(statistic, "vehicles"), child(statistic, "vehicleTripStatistics")
         waiting = int(attribute(counts, "waiting"))
@@ -154,22 +190,28 @@ def run_baseline(
         look(edges)
         presence, production = _measured(edges, streets, begin, end)
         return Baseline(
-            presence=presence, production=production, ways=ways,
-            teleports=int(attribute(child(statistic, "teleports"), "total")), waiting=waiting,
-            running=int(attribute(counts, "running")), dropped=max(len(set(vehicles) - driven) - waiting, 0),
+            presence=presence,
+            production=production,
+            ways=ways,
+            teleports=int(attribute(child(statistic, "teleports"), "total")),
+            waiting=waiting,
+            running=int(attribute(counts, "running")),
+            dropped=max(len(set(vehicles) - driven) - waiting, 0),
             delay=float(attribute(trips, "totalDepartDelay"))
-            + waiting * max(float(attribute(trips, "departDelayWaiting")), 0.0))
+            + waiting * max(float(attribute(trips, "departDelayWaiting")), 0.0),
+        )
 
 
-def run_sumo(
-    program: str, *arguments: str, where: str, reached: Callable[[float], None] = lambda time: None,
-) -> None:
+def run_sumo(program: str, *arguments: str, where: str, reached: Callable[[float], None] = lambda time: None) -> None:
     """Run one of SUMO's programs. reached: is called with the times of its step log [s], if it writes one. Raises
     InputError with the first line of its complaint."""
     said = []
     with subprocess.Popen(
-            [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments], stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, text=True) as process:
+        [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as process:
         assert process.stdout is not None  # it is a pipe
         try:
             for line in process.stdout:  # universal newlines: the step log ends its lines with \r
@@ -188,8 +230,10 @@ def run_sumo(
 def averaged(runs: Sequence[Baseline]) -> Baseline:
     """The first run, with the presence and the production of all on average."""
     return replace(
-        runs[0], presence=np.mean([run.presence for run in runs], axis=0),
-        production=np.mean([run.production for run in runs], axis=0))
+        runs[0],
+        presence=np.mean([run.presence for run in runs], axis=0),
+        production=np.mean([run.production for run in runs], axis=0),
+    )
 
 
 def _measured(path: Path, streets: Streets, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
@@ -219,7 +263,8 @@ def _ways(path: Path, streets: Streets) -> tuple[Counter[tuple[tuple[int, ...], 
             if route is not None and (names := route.get("edges")):
                 edges = [streets.number.get(edge, -1) for edge in names.split()]
                 left = [float(time) >= 0 for time in route.get("exitTimes", "").split()] or (
-                    [element.get("arrival") is not None] * len(edges))
+                    [element.get("arrival") is not None] * len(edges)
+                )
                 driven = tuple(n for n, gone in zip(edges, left, strict=False) if gone and n >= 0)
                 if edges[-1] >= 0:
                     ways[driven, edges[-1]] += 1

@@ -15,9 +15,9 @@ from cosim.importing.layers import sampled
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import PerEdge
 
-ASIDE = 30.0      # m between the carriageways of one street, at most
-OPPOSED = -0.9    # cosine of the angle between their directions, at most
-LARGEST = 0.02    # of the network: no block grows beyond by joining carriageways
+ASIDE = 30.0  # m between the carriageways of one street, at most
+OPPOSED = -0.9  # cosine of the angle between their directions, at most
+LARGEST = 0.02  # of the network: no block grows beyond by joining carriageways
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,8 +48,10 @@ class Blocks:
 def make_blocks(streets: Streets) -> Blocks:
     """The blocks of the largest part of the network that cars can drive."""
     size, inside = len(streets.edges), streets.main_part
-    pairs = [_opposite(streets), *(
-        np.array([(ring[0], n) for n in ring[1:]]).reshape(-1, 2) for ring in streets.roundabouts)]
+    pairs = [
+        _opposite(streets),
+        *(np.array([(ring[0], n) for n in ring[1:]]).reshape(-1, 2) for ring in streets.roundabouts),
+    ]
     pairs = np.concatenate([p.reshape(-1, 2) for p in pairs]).astype(int)
     pairs = pairs[inside[pairs].all(axis=1)]
     same = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
@@ -60,9 +62,13 @@ def make_blocks(streets: Streets) -> Blocks:
     of[inside] = number
     count = number.max() + 1
     weight = np.bincount(number, streets.lane_metres[inside], count)
-    position = np.stack([
-        np.bincount(number, (streets.centre[:, axis] * streets.lane_metres)[inside], count) / weight
-        for axis in (0, 1)], axis=1)
+    position = np.stack(
+        [
+            np.bincount(number, (streets.centre[:, axis] * streets.lane_metres)[inside], count) / weight
+            for axis in (0, 1)
+        ],
+        axis=1,
+    )
     ends = of[streets.links[inside[streets.links].all(axis=1)]]
     ends = ends[ends[:, 0] != ends[:, 1]]
     both = np.concatenate([ends, ends[:, ::-1]])

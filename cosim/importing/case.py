@@ -13,15 +13,20 @@ from nmfd.errors import InputError
 
 # Names that SUMO gives the same option.
 FILES = {
-    "net-file": ("net-file", "net", "n"), "route-files": ("route-files", "routes", "r"),
-    "additional-files": ("additional-files", "additional", "a"), "begin": ("begin", "b"), "end": ("end", "e")}
+    "net-file": ("net-file", "net", "n"),
+    "route-files": ("route-files", "routes", "r"),
+    "additional-files": ("additional-files", "additional", "a"),
+    "begin": ("begin", "b"),
+    "end": ("end", "e"),
+}
 FOREVER = 1e9  # s; a later end is none
 TAKEN = ("step-length", "time-to-teleport", "scale", "mesosim")
 # Options that change what is written or shown, or how fast, but not what drives: all others are worth a word.
 IDLE = re.compile(
     r".*output.*|.*log.*|.*threads|(verbose|no-warnings|quit|start|delay|seed|random|precision|version|remote|xml|gui|"
     r"window|tracker|breakpoints|print|human|save|summary|tripinfo|vehroute|fcd|netstate|statistic|queue|emission|"
-    r"device\.emissions|link|save-|load|osg|demo|game|language|registry|meso-).*")
+    r"device\.emissions|link|save-|load|osg|demo|game|language|registry|meso-).*"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,8 +79,11 @@ class SumoInput:
     @property
     def left_out(self) -> list[str]:
         """Options that are not taken over although they may change what drives, as NAME = VALUE."""
-        return [f"{name} = {value}" for name, value in sorted(self.options.items())
-                if name not in TAKEN and not IDLE.fullmatch(name)]
+        return [
+            f"{name} = {value}"
+            for name, value in sorted(self.options.items())
+            if name not in TAKEN and not IDLE.fullmatch(name)
+        ]
 
 
 def read_sumo_input(path: Path) -> SumoInput:
@@ -85,8 +93,9 @@ def read_sumo_input(path: Path) -> SumoInput:
     if root.tag == "net":
         return SumoInput(source=path, net=path)
     if root.tag not in ("configuration", "sumoConfiguration"):
-        raise InputError(f"{path}: expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of "
-                         f"<{root.tag}> instead")
+        raise InputError(
+            f"{path}: expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of <{root.tag}> instead"
+        )
     given = {}
     for element in read_xml(path).iter():
         value = element.get("value", element.get("v"))
@@ -96,14 +105,17 @@ def read_sumo_input(path: Path) -> SumoInput:
     for name, alike in FILES.items():
         options[name] = next((given.pop(other) for other in alike if other in given), "")
     if not options["net-file"]:
-        raise InputError(f"{path}: net-file: missing; add <net-file value=\"city.net.xml\"/> to its <input>")
+        raise InputError(f'{path}: net-file: missing; add <net-file value="city.net.xml"/> to its <input>')
     end = seconds(options["end"] or "-1", f"{path}: end")
     return SumoInput(
-        source=path, net=_files(path, "net-file", options["net-file"])[0],
+        source=path,
+        net=_files(path, "net-file", options["net-file"])[0],
         routes=_files(path, "route-files", options["route-files"]),
         additional=_files(path, "additional-files", options["additional-files"]),
-        begin=seconds(options["begin"] or "0", f"{path}: begin"), end=end if 0 < end < FOREVER else None,
-        options=given)
+        begin=seconds(options["begin"] or "0", f"{path}: begin"),
+        end=end if 0 < end < FOREVER else None,
+        options=given,
+    )
 
 
 def _files(config: Path, key: str, value: str) -> tuple[Path, ...]:

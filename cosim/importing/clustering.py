@@ -12,10 +12,10 @@ from jaxtyping import Float, Int
 
 from cosim.importing.blocks import Blocks
 
-SMOOTHING = 2       # rounds of averaging with the neighbours
-PLACE = 1.0         # weight of the place against the density, both with variance 1 over the city
-HIGHEST = 0.15      # veh/m; denser is as dense
-SMALLEST = 0.4      # of the mean size, of Blocks.core: a cluster below is none of the regions that were asked for
+SMOOTHING = 2  # rounds of averaging with the neighbours
+PLACE = 1.0  # weight of the place against the density, both with variance 1 over the city
+HIGHEST = 0.15  # veh/m; denser is as dense
+SMALLEST = 0.4  # of the mean size, of Blocks.core: a cluster below is none of the regions that were asked for
 
 
 def features(blocks: Blocks, density: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 3"]:
@@ -57,8 +57,8 @@ def _merges(blocks: Blocks, feature: np.ndarray) -> list[tuple[int, int, int]]:
     count = len(blocks.weight)
     weight, mean = list(blocks.weight), [row for row in feature]
     near: dict[int, set[int]] = {  # of every cluster that is not part of a larger one yet
-        n: set(blocks.joins.indices[blocks.joins.indptr[n] : blocks.joins.indptr[n + 1]].tolist())
-        for n in range(count)}
+        n: set(blocks.joins.indices[blocks.joins.indptr[n] : blocks.joins.indptr[n + 1]].tolist()) for n in range(count)
+    }
 
     def cost(a: int, b: int) -> float:
         gap = mean[a] - mean[b]

@@ -50,7 +50,7 @@ class Traffic:
 
 
 def read_traffic(
-    case: SumoInput, streets: Streets, seed: int, od: Sequence[Path] = (), zones: Sequence[Path] = (),
+    case: SumoInput, streets: Streets, seed: int, od: Sequence[Path] = (), zones: Sequence[Path] = ()
 ) -> Traffic:
     """All route and additional files of the case, and the OD matrices `od` between TAZ of these or of `zones`. Flows
     and matrices become single vehicles, and TAZ and junctions the edges drawn for them (by `seed`); all else stays as
@@ -105,8 +105,8 @@ class _Reader:
         """Trips of the matrices, those of the case's own files only where it has no vehicles."""
         if vehicles and od:
             raise InputError(
-                f"--od: {self._case.source} has {vehicles:,} vehicles of its own; omit --od, or give the network "
-                "alone")
+                f"--od: {self._case.source} has {vehicles:,} vehicles of its own; omit --od, or give the network alone"
+            )
         if vehicles and cells:
             self._notes["relations between zones, left out: there are vehicles"] = len(cells)
             return []
@@ -150,7 +150,8 @@ class _Reader:
             inside = [(edge, 1.0) for edge in zone.get("edges", "").split()]
             self._zones[attribute(zone, "id")] = {
                 key: inside + [(attribute(e, "id"), float(e.get("weight", 1.0))) for e in zone.iter(tag)]
-                for key, tag in (("from", "tazSource"), ("to", "tazSink"))}
+                for key, tag in (("from", "tazSource"), ("to", "tazSink"))
+            }
 
     def _likeliest(self, distribution: Element) -> list[str]:
         """The edges of the route in a distribution that is driven most."""
@@ -158,8 +159,10 @@ class _Reader:
 
     def _distribution(self, distribution: Element) -> list[tuple[float, list[str]]]:
         """(probability, edges) of every route in a distribution."""
-        routes = [(float(r.get("probability", 1.0)), r.get("edges", "").split() or self._routes.get(
-            r.get("refId", ""), [])) for r in distribution.iter("route")]
+        routes = [
+            (float(r.get("probability", 1.0)), r.get("edges", "").split() or self._routes.get(r.get("refId", ""), []))
+            for r in distribution.iter("route")
+        ]
         names = distribution.get("routes", "").split()
         shares = [float(p) for p in distribution.get("probabilities", "").split()] or [1.0] * len(names)
         return routes + [(p, self._routes.get(name, [])) for p, name in zip(shares, names, strict=False)]
@@ -195,7 +198,8 @@ class _Reader:
                 times = begin + gap * np.arange(int(np.ceil((stop - begin) / gap - 1e-9)))
         except (ValueError, ZeroDivisionError):
             raise InputError(
-                f"{where}: expected a number, period, vehsPerHour or probability above 0; correct it") from None
+                f"{where}: expected a number, period, vehsPerHour or probability above 0; correct it"
+            ) from None
         times = times[times < stop][:number]
         routed = flow.get("route") or any(flow.find(tag) is not None for tag in ("route", "routeDistribution"))
         tag = "vehicle" if routed else "trip"
@@ -209,7 +213,10 @@ class _Reader:
         return singles
 
     def _checked(
-        self, vehicles: Iterable[tuple[Element, Path]], background: list[Element], shared: Sequence[Element],
+        self,
+        vehicles: Iterable[tuple[Element, Path]],
+        background: list[Element],
+        shared: Sequence[Element],
         switched: Iterable[str],
     ) -> Traffic:
         """Only what can be driven from its first to its last edge within the simulation."""
@@ -244,7 +251,9 @@ class _Reader:
                 if not name or name in files:
                     raise InputError(
                         f"{path}: {element.tag}: id: expected one that no other vehicle has, got {name!r}"
-                        + (f", which {files[name]} has too" if name else "") + "; give it another one")
+                        + (f", which {files[name]} has too" if name else "")
+                        + "; give it another one"
+                    )
                 files[name] = path
                 element.set("depart", f"{depart:.2f}")
                 kept.append((depart, number[edges[0]], number[edges[-1]], driven, element))
@@ -256,16 +265,23 @@ class _Reader:
         columns = (np.array([row[n] for row in kept], dtype=kind) for n, kind in ((0, float), (1, int), (2, int)))
         depart, origin, destination = columns
         return Traffic(
-            vehicles=tuple(row[4] for row in kept), depart=depart, origin=origin, destination=destination,
-            background=tuple(background), shared=tuple(shared), switched=tuple(sorted(switched)),
-            notes=dict(self._notes))
+            vehicles=tuple(row[4] for row in kept),
+            depart=depart,
+            origin=origin,
+            destination=destination,
+            background=tuple(background),
+            shared=tuple(shared),
+            switched=tuple(sorted(switched)),
+            notes=dict(self._notes),
+        )
 
     def _is_car(self, element: Element) -> bool:
         return self._classes.get(element.get("type", ""), "passenger") == "passenger"
 
     def _open_to_cars(self, edges: Sequence[int], driven: bool) -> bool:
         return bool(self._streets.drivable[list(edges)].all()) and (
-            not driven or self._car_moves.issuperset(pairwise(edges)))
+            not driven or self._car_moves.issuperset(pairwise(edges))
+        )
 
     def _edges(self, element: Element) -> tuple[list[str], bool]:
         """(the edges of a vehicle's route, True), or (those that a trip must pass, False)."""
@@ -314,12 +330,13 @@ class _Reader:
     def _usable(self, options: list[tuple[str, float]], key: str) -> list[tuple[str, float]]:
         """Of the edges of a zone those of cars; of these, if there are any, those that are joined to the rest."""
         number, joined = self._streets.number, self._streets.onward if key == "from" else self._streets.reached
-        options = [(edge, weight) for edge, weight in options
-                   if edge in number and self._streets.drivable[number[edge]]]
+        options = [
+            (edge, weight) for edge, weight in options if edge in number and self._streets.drivable[number[edge]]
+        ]
         return [option for option in options if joined[number[option[0]]]] or options
 
     def _reachable(
-        self, kept: list[tuple[float, int, int, bool, Element]],
+        self, kept: list[tuple[float, int, int, bool, Element]]
     ) -> list[tuple[float, int, int, bool, Element]]:
         """Without trips whose end cannot be reached from their beginning by any vehicle, or that of cars by cars."""
         lost = set()
@@ -334,7 +351,8 @@ class _Reader:
 
 def _no_number(element: Element, path: Path, error: ValueError) -> InputError:
     return InputError(
-        f"{path}: {element.tag} {element.get('id')}: weight or probability: expected a number ({error}); correct it")
+        f"{path}: {element.tag} {element.get('id')}: weight or probability: expected a number ({error}); correct it"
+    )
 
 
 def _begin(element: Element) -> float:

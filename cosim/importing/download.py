@@ -18,8 +18,8 @@ from nmfd.runs import files
 from nmfd.runs.scratch import Scratch
 
 RECORD = "SHA256SUMS"  # beside the cities: a line per address, as sha256sum writes them
-PATIENCE = 60.0        # s without a byte
-BLOCK = 1 << 20        # bytes
+PATIENCE = 60.0  # s without a byte
+BLOCK = 1 << 20  # bytes
 
 
 def get(name: str, out: Path, tell: Callable[[str], None] = lambda stage: None) -> str:
@@ -27,8 +27,9 @@ def get(name: str, out: Path, tell: Callable[[str], None] = lambda stage: None) 
     nothing: for an unknown name, a folder that is there, no network, and content that has another hash than it should
     or had when its address was first fetched."""
     if name not in CITIES:
-        raise InputError(f"cosim get: expected one of {', '.join(CITIES)}, got {name!r} instead"
-                         + did_you_mean(name, CITIES))
+        raise InputError(
+            f"cosim get: expected one of {', '.join(CITIES)}, got {name!r} instead" + did_you_mean(name, CITIES)
+        )
     city = CITIES[name]
     if out.exists():
         raise InputError(f"--out: {out} exists; choose another folder, or remove it")
@@ -39,13 +40,21 @@ def get(name: str, out: Path, tell: Callable[[str], None] = lambda stage: None) 
         found = _fetch(name, city, archive, tell)
         if expected not in (None, found):
             who = "its publisher says" if city.sha256 else f"{record} says"
-            raise InputError(f"{name}: {city.address} has sha256 {found}, and {who} {expected}: it is not what it was; "
-                             f"nothing was kept, ask {city.owner}")
-        how = ("checked against its publisher's" if city.sha256 else
-               f"the same as when it was first fetched, by {record}" if expected else
-               f"published nowhere: recorded in {record}, and later downloads are checked against it")
-        notice = (f"{name}: {city.about}\nLicence: {city.licence}\nOwner: {city.owner}\nFetched from {city.address}\n"
-                  f"sha256 {found}, {how}\n")
+            raise InputError(
+                f"{name}: {city.address} has sha256 {found}, and {who} {expected}: it is not what it was; "
+                f"nothing was kept, ask {city.owner}"
+            )
+        how = (
+            "checked against its publisher's"
+            if city.sha256
+            else f"the same as when it was first fetched, by {record}"
+            if expected
+            else f"published nowhere: recorded in {record}, and later downloads are checked against it"
+        )
+        notice = (
+            f"{name}: {city.about}\nLicence: {city.licence}\nOwner: {city.owner}\nFetched from {city.address}\n"
+            f"sha256 {found}, {how}\n"
+        )
         tell("unpacking")
         out.parent.mkdir(parents=True, exist_ok=True)
         with Scratch(f".{out.name}-", where=out.parent) as scratch:
@@ -84,8 +93,10 @@ def _fetch(name: str, city: Published, target: Path, tell: Callable[[str], None]
             if length is not None and size < int(length):
                 raise ConnectionError(f"{size} of {length} bytes came")
     except (OSError, http.client.HTTPException) as error:
-        raise InputError(f"{name}: {city.address} cannot be fetched ({error}); try again with a network, or unpack a "
-                         f"copy by hand: see {city.owner}") from None
+        raise InputError(
+            f"{name}: {city.address} cannot be fetched ({error}); try again with a network, or unpack a "
+            f"copy by hand: see {city.owner}"
+        ) from None
     return digest.hexdigest()
 
 
@@ -101,8 +112,9 @@ def _unpack(name: str, city: Published, archive: Path, target: Path) -> int:
                 file.write_bytes(stream.read())
                 count += 1
     except (zipfile.BadZipFile, tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError) as error:
-        raise InputError(f"{name}: {city.address} is no .zip or .tar.gz that can be read ({error}); ask {city.owner}"
-                         ) from None
+        raise InputError(
+            f"{name}: {city.address} is no .zip or .tar.gz that can be read ({error}); ask {city.owner}"
+        ) from None
     if not count:
         raise InputError(f"{name}: {city.address} has no folder {city.folder}; ask {city.owner}")
     return count

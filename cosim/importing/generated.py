@@ -16,12 +16,12 @@ from cosim.importing.streets import Streets
 from cosim.sumo.trips import CLASS_SPREAD, DRIVER_CLASSES, SHORT
 from nmfd.errors import InputError
 
-RAMP_UP, FLAT, RAMP_DOWN = 1800.0, 1800.0, 1800.0   # s
-INWARD, THROUGH = 0.5, 0.25                          # shares of the trips; the rest is the background
-BUSY = 3.0e-3           # veh/m of lane that the peak would keep on the streets at free flow, at level 1
-STARTS = 400            # streets where trips begin, at most: bounds the shortest paths to find
-JUNCTION, SIGNAL = 3.0, 10.0   # s that a driver reckons with
-PILOT = 1500            # trips from which the mean trip time is estimated
+RAMP_UP, FLAT, RAMP_DOWN = 1800.0, 1800.0, 1800.0  # s
+INWARD, THROUGH = 0.5, 0.25  # shares of the trips; the rest is the background
+BUSY = 3.0e-3  # veh/m of lane that the peak would keep on the streets at free flow, at level 1
+STARTS = 400  # streets where trips begin, at most: bounds the shortest paths to find
+JUNCTION, SIGNAL = 3.0, 10.0  # s that a driver reckons with
+PILOT = 1500  # trips from which the mean trip time is estimated
 
 
 def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> Traffic:
@@ -33,7 +33,8 @@ def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> 
     if streets.core.sum() < 4:
         raise InputError(
             f"{streets.path}: only {streets.core.sum()} streets can be reached from each other; give a demand of your "
-            "own with route-files in a sumocfg")
+            "own with route-files in a sumocfg"
+        )
     random = np.random.default_rng([seed, 0x7065616B])
     ends = _Ends(streets, random)
     ways = _Ways(streets, random)
@@ -47,11 +48,17 @@ def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> 
     kept = np.array([bool(route) for route in routes])
     vehicles = (
         _vehicle(n, time, [streets.edges[edge] for edge in route])
-        for n, (time, route) in enumerate(zip(depart, routes, strict=True)) if route)
+        for n, (time, route) in enumerate(zip(depart, routes, strict=True))
+        if route
+    )
     return Traffic(
-        vehicles=tuple(vehicles), depart=depart[kept], origin=first[kept], destination=last[kept],
+        vehicles=tuple(vehicles),
+        depart=depart[kept],
+        origin=first[kept],
+        destination=last[kept],
         shared=(Element("vType", {"id": "car", "sigma": "0.2"}),),
-        notes={"trips of a generated morning peak": int(kept.sum())})
+        notes={"trips of a generated morning peak": int(kept.sum())},
+    )
 
 
 class _Ends:
@@ -63,8 +70,11 @@ class _Ends:
         self._edges = np.flatnonzero(good if good.sum() >= 4 else streets.core)
         weight = streets.lane_metres[self._edges]
         signalled = [n for n, signal in enumerate(streets.link_signals) if signal is not None]
-        middle = (streets.centre[streets.links[signalled, 0]].mean(axis=0) if signalled
-                  else np.average(streets.centre[self._edges], axis=0, weights=weight))
+        middle = (
+            streets.centre[streets.links[signalled, 0]].mean(axis=0)
+            if signalled
+            else np.average(streets.centre[self._edges], axis=0, weights=weight)
+        )
         away = streets.centre[self._edges] - middle
         self._distance, self._angle = np.hypot(*away.T), np.arctan2(*away.T[::-1])
         radius = np.sqrt(np.average(self._distance**2, weights=weight))
@@ -143,8 +153,17 @@ def _times(uniform: np.ndarray) -> np.ndarray:
 
 
 def _vehicle(n: int, depart: float, edges: Iterable[str]) -> Element:
-    vehicle = Element("vehicle", {
-        "id": f"v{n}", "type": "car", "depart": f"{depart:.2f}", "departLane": "best", "departSpeed": "max",
-        "departPos": "random_free", "arrivalPos": "random"})
+    vehicle = Element(
+        "vehicle",
+        {
+            "id": f"v{n}",
+            "type": "car",
+            "depart": f"{depart:.2f}",
+            "departLane": "best",
+            "departSpeed": "max",
+            "departPos": "random_free",
+            "arrivalPos": "random",
+        },
+    )
     vehicle.append(Element("route", {"edges": " ".join(edges)}))
     return vehicle

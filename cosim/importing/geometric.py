@@ -61,7 +61,8 @@ def _nearest(blocks: Blocks, centres: list[int], handicap: np.ndarray) -> tuple[
     lengths = np.concatenate([near.data, handicap + 1e-3])
     graph = coo_array((lengths, (rows, columns)), shape=(size + regions,) * 2).tocsr()
     distance, _, source = dijkstra(
-        csr_array(graph), indices=size + np.arange(regions), min_only=True, return_predecessors=True)
+        csr_array(graph), indices=size + np.arange(regions), min_only=True, return_predecessors=True
+    )
     labels = source[:size] - size
     return labels, distance[:size] - handicap[labels]
 

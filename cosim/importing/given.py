@@ -25,7 +25,7 @@ def read_given(streets: Streets, path: Path, method: str) -> EdgeNumbers:
     used = np.unique(labels[streets.drivable & (labels >= 0)])
     if len(used) < 2:
         raise InputError(f"{path}: gives streets to {len(used)} region(s); expected two or more")
-    if (missing := set(range(int(labels.max()) + 1)) - set(used.tolist())):
+    if missing := set(range(int(labels.max()) + 1)) - set(used.tolist()):
         raise InputError(f"{path}: region {min(missing)} has no edge that cars may use; remove it or give it one")
     return labels
 
@@ -39,12 +39,14 @@ def _edges(streets: Streets, path: Path) -> np.ndarray:
         raise InputError(f"{path}: cannot be read ({error}); give a csv with the columns edge,region") from None
     if not rows or [cell.strip() for cell in rows[0][1]] != ["edge", "region"]:
         raise InputError(
-            f"{path}: line 1: expected edge,region, got {','.join(rows[0][1]) if rows else 'nothing'} instead")
+            f"{path}: line 1: expected edge,region, got {','.join(rows[0][1]) if rows else 'nothing'} instead"
+        )
     labels = np.full(len(streets.edges), -1)
     for number, row in rows[1:]:
         if len(row) != 2 or not row[1].strip().isdecimal() or len(row[1].strip()) > 6:
             raise InputError(
-                f"{path}: line {number}: expected an edge and a region from 0 up, got {','.join(row)} instead")
+                f"{path}: line {number}: expected an edge and a region from 0 up, got {','.join(row)} instead"
+            )
         _assign(labels, streets, row[0].strip(), int(row[1]), f"{path}: line {number}")
     return labels
 
@@ -53,7 +55,8 @@ def _taz(streets: Streets, path: Path) -> np.ndarray:
     labels, zones = np.full(len(streets.edges), -1), list(read_xml(path).iter("taz"))
     for region, zone in enumerate(zones):
         edges = zone.get("edges", "").split() + [
-            part.get("id", "") for part in zone if part.tag in ("tazSource", "tazSink")]
+            part.get("id", "") for part in zone if part.tag in ("tazSource", "tazSink")
+        ]
         for edge in dict.fromkeys(edges):
             _assign(labels, streets, edge, region, f"{path}: taz {zone.get('id')}")
     if not zones:

@@ -2,9 +2,9 @@
 
 from xml.etree.ElementTree import Element
 
-WRITERS = ("Detector", "Loop", "calibrator", "routeProbe")   # the names of elements that write end so
-WRITING = ("file", "has.ssm.device", "device.toc.file")      # parameters that only make SUMO write
-PATIENT = ("max", "random", "0", "0.0", "0.00")              # speeds at the departure that can wait for a green
+WRITERS = ("Detector", "Loop", "calibrator", "routeProbe")  # the names of elements that write end so
+WRITING = ("file", "has.ssm.device", "device.toc.file")  # parameters that only make SUMO write
+PATIENT = ("max", "random", "0", "0.0", "0.00")  # speeds at the departure that can wait for a green
 
 
 def silent(element: Element) -> Element:

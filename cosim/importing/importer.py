@@ -92,7 +92,8 @@ def _import(case: SumoInput, order: ImportOptions, tell: Tell) -> str:
     times, congests = order.level or 1.0, True
     if order.level is None:
         times, congests = level.congesting(
-            _probe(order, case, streets, traffic, peaks, scale, tell), mesoscopic=mesoscopic, tell=tell)
+            _probe(order, case, streets, traffic, peaks, scale, tell), mesoscopic=mesoscopic, tell=tell
+        )
     factor, assigned = scale * times, None
     if order.peak:
         factor, (traffic, assigned) = 1.0, peaks.at(times)
@@ -103,12 +104,14 @@ def _import(case: SumoInput, order: ImportOptions, tell: Tell) -> str:
             written.write_assignment(folder / "assignment.csv", assigned)
         baseline, gaps = None, []
         if order.run:
+
             def judge(edges: Path) -> None:
                 if assigned is not None:
                     gaps.append(relative_gap(streets.path, routed(traffic), edges, begin=clock.begin, seed=order.seed))
 
             baseline = Trials(streets, case, clock, folder, files).averaged(
-                factor, mesoscopic, order.seeds, tell, judge)
+                factor, mesoscopic, order.seeds, tell, judge
+            )
         left = left_alone(streets, traffic)
         tell("partition")
         regions, asked, moved = partition(streets, baseline, order.cut, seed=order.seed, left_alone=left)
@@ -118,8 +121,11 @@ def _import(case: SumoInput, order: ImportOptions, tell: Tell) -> str:
         written.write_table(net_folder / "regions.csv", ("edge", "region"), zip(streets.edges, regions, strict=True))
         city = load_city(net_folder / written.NET, net_folder / "regions.csv", network.regions)
         tell("other numbers of regions")
-        others = {} if baseline is None else alternatives(
-            streets, baseline, order.cut, regions, seed=order.seed, left_alone=left)
+        others = (
+            {}
+            if baseline is None
+            else alternatives(streets, baseline, order.cut, regions, seed=order.seed, left_alone=left)
+        )
         found = quality.tables(streets, regions, network.region_names, city, baseline, left, others)
         judged = verdict.of_import(network, found.gateways, regions, baseline)
         network = replace(network, controllable=judged.boundaries.shares)
@@ -130,27 +136,42 @@ def _import(case: SumoInput, order: ImportOptions, tell: Tell) -> str:
         written.write_network(net_folder, streets, regions, network, found, baseline, case.source.name)
         demand = model.region_demand(traffic, regions, clock)
         written.write_demand(folder / "demand.csv", demand)
-        (folder / "scenario.toml").write_text(model.scenario_text(
-            network, clock, case, name=order.scenario.name, files=files, leave=traffic.switched,
-            network_path=os.path.relpath(order.out, order.scenario).replace(os.sep, "/"),
-            protected=_protected(streets, regions, baseline, network), factor=factor,
-            mesoscopic=order.mesoscopic), encoding="utf-8")
+        (folder / "scenario.toml").write_text(
+            model.scenario_text(
+                network,
+                clock,
+                case,
+                name=order.scenario.name,
+                files=files,
+                leave=traffic.switched,
+                network_path=os.path.relpath(order.out, order.scenario).replace(os.sep, "/"),
+                protected=_protected(streets, regions, baseline, network),
+                factor=factor,
+                mesoscopic=order.mesoscopic,
+            ),
+            encoding="utf-8",
+        )
         report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
         report += _demand_lines(order, streets, assigned, baseline, gaps)
         report += "".join(f"\n{sentence}" for sentence in judged.sentences)
         report += _level_line(order, times if order.peak else factor, congests)
         if moved and isinstance(order.cut, Drawn):
-            report += (f"\n{moved:,} streets are in other regions than {order.cut.file.name} says: theirs was in "
-                       "several pieces, or could not be reached from the rest")
+            report += (
+                f"\n{moved:,} streets are in other regions than {order.cut.file.name} says: theirs was in "
+                "several pieces, or could not be reached from the rest"
+            )
         if scale != 1.0:
             report += f"\nvehicles times {scale:g}, the scale in {case.source.name}"
-        left_out = [*case.left_out, *(
-            [] if case.step_length == model.step_length(case, clock) else [f"step-length = {case.step_length:g}"])]
+        left_out = [
+            *case.left_out,
+            *([] if case.step_length == model.step_length(case, clock) else [f"step-length = {case.step_length:g}"]),
+        ]
         if left_out:
             report += f"\nnot taken over from {case.source.name}: {', '.join(left_out)}"
         if mesoscopic and order.run:
             report += "\nsimulated by SUMO's mesoscopic model" + (
-                "" if order.mesoscopic else f": the city has more than {LARGE:,} edges for cars")
+                "" if order.mesoscopic else f": the city has more than {LARGE:,} edges for cars"
+            )
         (net_folder / "import.txt").write_text(report + "\n", encoding="utf-8")
     return report
 
@@ -165,12 +186,14 @@ def _traffic(case: SumoInput, streets: Streets, order: ImportOptions) -> Traffic
         if not len(traffic.depart):
             raise InputError(
                 f"{case.source}: names no vehicles for the streets of cars{_notes(traffic)}; give a sumocfg with "
-                "route-files, or add --routes FILE, --od FILE or --demand peak")
+                "route-files, or add --routes FILE, --od FILE or --demand peak"
+            )
         return traffic
     if len(traffic.depart):
         raise InputError(
             f"--demand: {case.source} has {len(traffic.depart):,} vehicles of its own; omit --demand, or give "
-            "the network alone")
+            "the network alone"
+        )
     return traffic
 
 
@@ -182,8 +205,10 @@ def left_alone(streets: Streets, traffic: Traffic) -> dict[str, str]:
 def _check_free(order: ImportOptions) -> None:
     for folder, file, option in ((order.out, "network.toml", "--out"), (order.scenario, "scenario.toml", "--scenario")):
         if folder.name in ("", "..") or "," in str(folder):
-            raise InputError(f"{option}: expected a folder such as {option[2:]}/mycity, without a comma, which SUMO "
-                             f"cannot read, got {folder} instead")
+            raise InputError(
+                f"{option}: expected a folder such as {option[2:]}/mycity, without a comma, which SUMO "
+                f"cannot read, got {folder} instead"
+            )
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{option}: {folder}: is not a folder; choose another name")
         if (folder / file).exists() and not order.force:
@@ -228,8 +253,7 @@ def _folders(order: ImportOptions) -> Iterator[tuple[Path, Path]]:
 
 
 def _probe(
-    order: ImportOptions, case: SumoInput, streets: Streets, traffic: Traffic, peaks: Peaks, scale: float,
-    tell: Tell,
+    order: ImportOptions, case: SumoInput, streets: Streets, traffic: Traffic, peaks: Peaks, scale: float, tell: Tell
 ) -> level.Probe:
     """Runs of other levels, seen by provisional regions: the user's own, or as many of similar size."""
     if isinstance(order.cut, Drawn):
@@ -243,39 +267,49 @@ def _probe(
             files = written.write_traffic(folder, vehicles)
             trials = Trials(streets, case, model.clock(case, streets, vehicles), folder, files)
             run = trials.run(
-                factor, mesoscopic, reached=lambda share: tell(f"simulating demand times {times:g}", share))
+                factor, mesoscopic, reached=lambda share: tell(f"simulating demand times {times:g}", share)
+            )
             return level.loaded(run, streets, regions)
 
     return probe
 
 
 def _demand_lines(
-    order: ImportOptions, streets: Streets, assigned: Assigned | None, baseline: Baseline | None,
-    gaps: Sequence[float],
+    order: ImportOptions, streets: Streets, assigned: Assigned | None, baseline: Baseline | None, gaps: Sequence[float]
 ) -> str:
     """How far a generated demand is from an equilibrium, and whether a few streets hold it, for the report. gaps: of
     the run without control, in which SUMO's model may be another one than in the assignment."""
     text = ""
     if assigned is not None:
         last = assigned.iterations[assigned.best]
-        text = (f"\nroutes by duaIterate.py: relative gap {100 * assigned.iterations[0].gap:.1f} % at free flow, "
-                f"{100 * assigned.gap:.1f} % in iteration {assigned.best + 1} of {len(assigned.iterations)}, "
-                f"{'mesoscopic' if last.mesoscopic else 'car-following'} (assignment.csv)"
-                + "".join(f", {100 * gap:.1f} % in the run without control" for gap in gaps))
+        text = (
+            f"\nroutes by duaIterate.py: relative gap {100 * assigned.iterations[0].gap:.1f} % at free flow, "
+            f"{100 * assigned.gap:.1f} % in iteration {assigned.best + 1} of {len(assigned.iterations)}, "
+            f"{'mesoscopic' if last.mesoscopic else 'car-following'} (assignment.csv)"
+            + "".join(f", {100 * gap:.1f} % in the run without control" for gap in gaps)
+        )
         if not assigned.reached:
-            text += (f"\nWARNING: the relative gap of {100 * assigned.effort.gap:g} % was not reached: some of what "
-                     "rerouting gains here it would gain from drivers who know the city, too; more --iterations, or a "
-                     "lower --level")
+            text += (
+                f"\nWARNING: the relative gap of {100 * assigned.effort.gap:g} % was not reached: some of what "
+                "rerouting gains here it would gain from drivers who know the city, too; more --iterations, or a "
+                "lower --level"
+            )
     elif order.peak:
-        text = ("\nWARNING: everybody takes a way that is fastest at free flow: no routes were assigned; omit "
-                "--no-run and --iterations 0 for a demand on which controllers can be compared")
+        text = (
+            "\nWARNING: everybody takes a way that is fastest at free flow: no routes were assigned; omit "
+            "--no-run and --iterations 0 for a demand on which controllers can be compared"
+        )
     if baseline is not None:
         half, of = baseline.concentration(streets.drivable)
-        text += (f"\nhalf of all vehicles are on {half:,} of {of:,} edges ({100 * half / max(of, 1):.1f} %) in the "
-                 "busiest quarter of an hour")
+        text += (
+            f"\nhalf of all vehicles are on {half:,} of {of:,} edges ({100 * half / max(of, 1):.1f} %) in the "
+            "busiest quarter of an hour"
+        )
         if half < level.FEW * of and baseline.pace_of_crowded(streets, streets.drivable) > STANDING:
-            text += ("\nWARNING: these are queues on a few streets rather than a congested network: what relieves them "
-                     "gains much, for drivers who know the city as well")
+            text += (
+                "\nWARNING: these are queues on a few streets rather than a congested network: what relieves them "
+                "gains much, for drivers who know the city as well"
+            )
     return text
 
 
@@ -284,8 +318,10 @@ def _level_line(order: ImportOptions, times: float, congests: bool) -> str:
     if order.level is not None:
         return ""
     if congests:
-        return (f"\nlevel: demand times {times:g} is the lowest tried at which a region comes to its critical "
-                "accumulation without control")
+        return (
+            f"\nlevel: demand times {times:g} is the lowest tried at which a region comes to its critical "
+            "accumulation without control"
+        )
     return f"\nlevel: not even demand times {times:g} brings a region to its critical accumulation without control"
 
 
@@ -303,8 +339,16 @@ def _notes(traffic: Traffic) -> str:
 
 
 def _report(
-    order: ImportOptions, case: SumoInput, streets: Streets, traffic: Traffic, clock: model.Clock,
-    network: RegionalModel, asked: int, city: City, found: quality.Tables, left: Mapping[str, str],
+    order: ImportOptions,
+    case: SumoInput,
+    streets: Streets,
+    traffic: Traffic,
+    clock: model.Clock,
+    network: RegionalModel,
+    asked: int,
+    city: City,
+    found: quality.Tables,
+    left: Mapping[str, str],
     baseline: Baseline | None,
 ) -> str:
     """What was found, what was left alone and what cannot be done, in a few lines."""
@@ -317,27 +361,37 @@ def _report(
         + f"; {len(signals):,} signals that cars see; {len(traffic.vehicles):,} vehicles in {clock.steps} intervals of "
         f"{clock.step:g} s{_notes(traffic)}",
         f"{network.regions} regions by method {order.cut.method}, seed {order.seed}"
-        + (f"; {asked} were asked for: the others fell apart, or could not be reached from the rest"
-           if network.regions < asked else ""),
-        quality.text(found)]
+        + (
+            f"; {asked} were asked for: the others fell apart, or could not be reached from the rest"
+            if network.regions < asked
+            else ""
+        ),
+        quality.text(found),
+    ]
     at_gateways = {g["signal"] for g in found.gateways if g["signal"]}
     skipped = sorted(signal for signal in left if signal in at_gateways)
     if skipped:
-        lines.append(f"left alone at boundaries: {len(skipped)} of {len(at_gateways)} signals, such as {skipped[0]} "
-                     f"({left[skipped[0]]}); see gateways.csv")
+        lines.append(
+            f"left alone at boundaries: {len(skipped)} of {len(at_gateways)} signals, such as {skipped[0]} "
+            f"({left[skipped[0]]}); see gateways.csv"
+        )
     if several := sum(len(logics) > 1 for logics in streets.logics.values()):
         lines.append(f"{several} signals have several programmes: the last that is loaded runs, as in SUMO")
     if found.uncontrolled > LITTLE:
-        lines.append(f"perimeter control reaches only {100 * (1 - found.uncontrolled):.0f} % of the flow over the "
-                     "boundaries: other regions (--regions, --method, your own) may have more signals between them")
+        lines.append(
+            f"perimeter control reaches only {100 * (1 - found.uncontrolled):.0f} % of the flow over the "
+            "boundaries: other regions (--regions, --method, your own) may have more signals between them"
+        )
     if baseline is not None:
         lines.append(
             f"without control: driving takes {baseline.pace(streets):.1f} times as long as at the speed limits; "
             f"{baseline.teleports} teleports, {baseline.running} vehicles on the road and {baseline.waiting} waiting "
-            "to enter at the end")
+            "to enter at the end"
+        )
         if baseline.dropped:
             lines.append(
-                f"{baseline.dropped:,} vehicles never drove: SUMO found no way, or no lane to depart on, for them")
+                f"{baseline.dropped:,} vehicles never drove: SUMO found no way, or no lane to depart on, for them"
+            )
     return "\n".join(lines)
 
 

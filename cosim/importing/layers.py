@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers, Points
 
-CELLS = 160       # along the longer side of the map
-SPACING = 40.0    # m between the points that stand for an edge
+CELLS = 160  # along the longer side of the map
+SPACING = 40.0  # m between the points that stand for an edge
 COLOURS = ("#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#b07aa1", "#edc948", "#9c755f", "#ff9da7", "#8cd17d")
 
 
@@ -28,7 +28,8 @@ def taz_xml(streets: Streets, regions: EdgeNumbers, names: tuple[str, ...]) -> s
     for region, name in enumerate(names):
         edges = " ".join(streets.edges[n] for n in np.flatnonzero(regions == region))
         out.write(
-            f'  <taz id="region{region}" name={quoteattr(name)} color="{_rgb(region)}" edges={quoteattr(edges)}/>\n')
+            f'  <taz id="region{region}" name={quoteattr(name)} color="{_rgb(region)}" edges={quoteattr(edges)}/>\n'
+        )
     out.write("</additional>\n")
     return out.getvalue()
 
@@ -41,8 +42,10 @@ def polygons_xml(streets: Streets, regions: EdgeNumbers, names: tuple[str, ...])
         for n, ring in enumerate(rings):
             shape = " ".join(f"{x:.1f},{y:.1f}" for x, y in ring)
             mark = f"region{region}" + (f".{n}" if n else "")
-            out.write(f'  <poly id="{mark}" type={quoteattr(names[region])} color="{_rgb(region)},90" fill="1" '
-                      f'layer="-1" shape="{shape}"/>\n')
+            out.write(
+                f'  <poly id="{mark}" type={quoteattr(names[region])} color="{_rgb(region)},90" fill="1" '
+                f'layer="-1" shape="{shape}"/>\n'
+            )
     out.write("</additional>\n")
     return out.getvalue()
 
@@ -53,7 +56,7 @@ def outlines(streets: Streets, regions: EdgeNumbers) -> list[list[Points]]:
 
 
 def rings_round(
-    shapes: Sequence[Points], members: np.ndarray, regions: EdgeNumbers, blocks: float = 0.0,
+    shapes: Sequence[Points], members: np.ndarray, regions: EdgeNumbers, blocks: float = 0.0
 ) -> list[list[Points]]:
     """The same of `members`, (E,) bool, of some edges: E `shapes` (n, 2) [m], and their `regions`.
 

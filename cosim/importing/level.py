@@ -20,12 +20,12 @@ from cosim.importing.baseline import INTERVAL, PEAK, Baseline
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers
 
-NEAR = 0.9       # of the critical accumulation
-FALLEN = 0.9     # of the highest production: below, what is beyond counts as beyond critical
-FEW = 0.03       # of the streets of a region
-BINS = 12        # of the accumulation, in which the production is averaged
-RATIO = 1.2      # between two levels that are tried: ..., 0.83, 1, 1.2, 1.44, ...
-MOST = 6         # levels above and below 1
+NEAR = 0.9  # of the critical accumulation
+FALLEN = 0.9  # of the highest production: below, what is beyond counts as beyond critical
+FEW = 0.03  # of the streets of a region
+BINS = 12  # of the accumulation, in which the production is averaged
+RATIO = 1.2  # between two levels that are tried: ..., 0.83, 1, 1.2, 1.44, ...
+MOST = 6  # levels above and below 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,8 @@ def loaded(baseline: Baseline, streets: Streets, regions: EdgeNumbers) -> Loaded
     return Loaded(
         accumulation=np.stack([baseline.presence[:, edges].sum(axis=1) / INTERVAL for edges in members], axis=1),
         production=np.stack([baseline.production[:, edges].sum(axis=1) / INTERVAL for edges in members], axis=1),
-        spread=half / np.maximum(count, 1))
+        spread=half / np.maximum(count, 1),
+    )
 
 
 def critical(accumulation: Float[np.ndarray, " N"], production: Float[np.ndarray, " N"]) -> float:
@@ -74,8 +75,12 @@ def congested(run: Loaded, runs: Sequence[Loaded]) -> np.ndarray:
     """(R,) bool: the regions that are congested in `run`, one of `runs`, as the head of this file says."""
     found = []
     for region in range(len(run.spread)):
-        limit = NEAR * critical(*(np.concatenate([getattr(one, name)[:, region] for one in runs])
-                                  for name in ("accumulation", "production")))
+        limit = NEAR * critical(
+            *(
+                np.concatenate([getattr(one, name)[:, region] for one in runs])
+                for name in ("accumulation", "production")
+            )
+        )
         above = (run.accumulation[:, region] >= limit).astype(int)
         long = np.convolve(above, np.ones(min(PEAK, len(above))), mode="valid").max() >= min(PEAK, len(above))
         found.append(bool(long) and run.spread[region] > FEW)

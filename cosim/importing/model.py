@@ -22,12 +22,12 @@ from nmfd.runs.config import quoted
 
 # The shape of the published MFD, g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam, for want of anything measured.
 ALPHA, BETA = 0.98405, -1.97190
-JAM_SHARE = 0.6        # of the lanes that can fill up
-SIGNAL_DELAY = 0.5     # speed with signals over the speed limit
-DEFAULT_CYCLE = 90.0   # s
+JAM_SHARE = 0.6  # of the lanes that can fill up
+SIGNAL_DELAY = 0.5  # speed with signals over the speed limit
+DEFAULT_CYCLE = 90.0  # s
 CYCLES = (60.0, 180.0)  # s; shorter cycles are taken several times
-IDLE = 900.0           # s
-RECOVERY = 1800.0      # s after the last departure, for the network to empty
+IDLE = 900.0  # s
+RECOVERY = 1800.0  # s after the last departure, for the network to empty
 # A policy that trusts an identified model too much holds vehicles back, or sends them round, for gains that SUMO does
 # not pay (measured on grid7): it starts from no control and must gain in many models at many demand levels. What guides
 # is of the compact kind, whose prices add to guidance by travel times: policies that command shares of their own took
@@ -97,9 +97,15 @@ def region_demand(traffic: Traffic, regions: EdgeNumbers, clock: Clock) -> Pairs
 def network_of(streets: Streets, regions: EdgeNumbers, name: str, baseline: Baseline | None) -> RegionalModel:
     """The regional model: adjacency from the streets, own splits from the baseline, MFDs from lanes and speeds."""
     network = RegionalModel(
-        name=name, region_names=names(streets, regions), positions=positions(streets, regions).round(1),
-        adjacency=digraph(streets, regions) > 0, mfds=_placeholders(streets, regions, baseline), u_min=0.1, u_max=0.9,
-        placeholder=True)
+        name=name,
+        region_names=names(streets, regions),
+        positions=positions(streets, regions).round(1),
+        adjacency=digraph(streets, regions) > 0,
+        mfds=_placeholders(streets, regions, baseline),
+        u_min=0.1,
+        u_max=0.9,
+        placeholder=True,
+    )
     if baseline is None:
         return network
     return replace(network, observed_split_ratios=observed_split_ratios(network, baseline.crossings(regions)))
@@ -125,32 +131,51 @@ def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline | No
 def network_text(network: RegionalModel, sumo: Mapping[str, str], source: str) -> str:
     """The network.toml. sumo: its table [sumo]; source: what was imported."""
     return network_toml(
-        network, sumo,
+        network,
+        sumo,
         f"Imported from {source}. The MFDs are PLACEHOLDERS from lane length and speed limits:\n"
-        "# cosim identify replaces them by measured ones.")
+        "# cosim identify replaces them by measured ones.",
+    )
 
 
 def scenario_text(
-    network: RegionalModel, clock: Clock, case: SumoInput, *, name: str, network_path: str, protected: int,
-    files: Mapping, leave: Sequence[str], factor: float = 1.0, mesoscopic: bool = False,
+    network: RegionalModel,
+    clock: Clock,
+    case: SumoInput,
+    *,
+    name: str,
+    network_path: str,
+    protected: int,
+    files: Mapping,
+    leave: Sequence[str],
+    factor: float = 1.0,
+    mesoscopic: bool = False,
 ) -> str:
     """scenario.toml; files: routes, background, additional -> file names beside it."""
     fastest = max(mfd.c for mfd in network.mfds)
     substeps = int(np.ceil(clock.step / min(30.0, 0.5 / fastest)))
     lines = [
         f"# Imported from {case.source.name}: its own vehicles, with their routes, departures and types.",
-        f"name = {quoted(name)}", f"network = {quoted(network_path)}",
+        f"name = {quoted(name)}",
+        f"network = {quoted(network_path)}",
         f"step = {clock.step:.1f}                 # s, control interval = most common signal cycle",
-        f"steps = {clock.steps}", f"substeps = {substeps}",
+        f"steps = {clock.steps}",
+        f"substeps = {substeps}",
         f"protected = [{protected}]             # the densest region; {network.region_names[protected]}",
         'demand_file = "demand.csv"  # veh/s by interval and pair of regions, counted from the vehicles',
-        f"demand_factor = {factor:g}         # vehicles are left out, or drive twice", "",
-        "[forecast]", "error = 0.0                 # of what controllers are told of the demand, std of its logarithm",
-        "", "[sumo]", f"begin = {clock.begin:.1f}", f"step_length = {step_length(case, clock):g}",
+        f"demand_factor = {factor:g}         # vehicles are left out, or drive twice",
+        "",
+        "[forecast]",
+        "error = 0.0                 # of what controllers are told of the demand, std of its logarithm",
+        "",
+        "[sumo]",
+        f"begin = {clock.begin:.1f}",
+        f"step_length = {step_length(case, clock):g}",
         f"time_to_teleport = {case.time_to_teleport:g}      # s; every table counts the teleports",
         "departure_jitter = 10.0     # s, either way: what seeds differ in, beside SUMO's own randomness",
         "ways_return = true          # guided drivers may leave a region and come back, as main roads here do",
-        *(f"{key} = [{', '.join(quoted(value) for value in values)}]" for key, values in files.items() if values)]
+        *(f"{key} = [{', '.join(quoted(value) for value in values)}]" for key, values in files.items() if values),
+    ]
     if mesoscopic:
         lines.append("mesoscopic = true           # SUMO's queue model: fast, without lanes; for quick studies")
     if leave:

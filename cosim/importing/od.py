@@ -51,7 +51,8 @@ def read_od(path: Path) -> list[Cell]:
         if cells:
             return cells
     raise InputError(
-        f"{path}: is no OD matrix: expected tazRelation elements in intervals, or $O... or $V... in the first line")
+        f"{path}: is no OD matrix: expected tazRelation elements in intervals, or $O... or $V... in the first line"
+    )
 
 
 def relations(root: Element, path: Path) -> list[Cell]:
@@ -63,10 +64,18 @@ def relations(root: Element, path: Path) -> list[Cell]:
                 where = f"{path}: {element.tag} from {element.get('from')} to {element.get('to')}"
                 times = [seconds(interval.get(key, ""), f"{path}: interval: {key}") for key in ("begin", "end")]
                 text = next((element.get(key) for key in COUNTS if element.get(key) is not None), None)
-                found.append(Cell(
-                    begin=times[0], end=times[1], origin=element.get("from", ""), destination=element.get("to", ""),
-                    count=_number(text, f"{where}: count"), zones=element.tag == "tazRelation",
-                    type=element.get("type"), where=str(path)))
+                found.append(
+                    Cell(
+                        begin=times[0],
+                        end=times[1],
+                        origin=element.get("from", ""),
+                        destination=element.get("to", ""),
+                        count=_number(text, f"{where}: count"),
+                        zones=element.tag == "tazRelation",
+                        type=element.get("type"),
+                        where=str(path),
+                    )
+                )
     return _checked(found)
 
 
@@ -136,13 +145,15 @@ def _number(text: str | None, where: str) -> float:
 def _checked(cells: Sequence[Cell]) -> list[Cell]:
     for cell in cells:
         if cell.end <= cell.begin:
-            raise InputError(f"{cell.where}: an interval ends at {cell.end:g} s, but begins at {cell.begin:g} s; "
-                             "correct the times")
+            raise InputError(
+                f"{cell.where}: an interval ends at {cell.end:g} s, but begins at {cell.begin:g} s; correct the times"
+            )
     return [cell for cell in cells if cell.count > 0]
 
 
-def trips(cells: Sequence[Cell], random: np.random.Generator, types: Collection[str],
-          note: Callable[[str, int], None]) -> list[Element]:
+def trips(
+    cells: Sequence[Cell], random: np.random.Generator, types: Collection[str], note: Callable[[str, int], None]
+) -> list[Element]:
     """`trip` elements od0, od1, ...; a part of a vehicle drives with that probability. Types that nobody defines are
     left away. note(what, how often) is told what was done."""
     found: list[Element] = []
@@ -154,9 +165,19 @@ def trips(cells: Sequence[Cell], random: np.random.Generator, types: Collection[
             shared["type"] = cell.type
         for n in range(count):
             depart = cell.begin + (cell.end - cell.begin) * (n + random.random()) / count
-            found.append(Element("trip", {
-                "id": f"od{len(found)}", "depart": f"{depart:.2f}", "departLane": "best", "departSpeed": "max",
-                "departPos": "random_free", **shared}))
+            found.append(
+                Element(
+                    "trip",
+                    {
+                        "id": f"od{len(found)}",
+                        "depart": f"{depart:.2f}",
+                        "departLane": "best",
+                        "departSpeed": "max",
+                        "departPos": "random_free",
+                        **shared,
+                    },
+                )
+            )
     note("trips drawn from OD matrices", len(found))
     if unknown := {cell.type for cell in cells if cell.type and cell.type not in types}:
         note(f"types of OD matrices that no vType defines, driven as cars ({', '.join(sorted(unknown))})", len(unknown))

@@ -20,11 +20,21 @@ from cosim.importing.case import SumoInput, read_sumo_input, root_of
 from nmfd.errors import InputError
 from nmfd.runs.scratch import Scratch
 
-RECOMMENDED = ("--geometry.remove", "--ramps.guess", "--junctions.join", "--tls.guess-signals", "--tls.discard-simple",
-               "--tls.join", "--tls.default-type", "actuated")
+RECOMMENDED = (
+    "--geometry.remove",
+    "--ramps.guess",
+    "--junctions.join",
+    "--tls.guess-signals",
+    "--tls.discard-simple",
+    "--tls.join",
+    "--tls.default-type",
+    "actuated",
+)
 CARS = ("--keep-edges.by-vclass", "passenger", "--remove-edges.isolated", "--no-turnarounds.except-deadend")
-LICENCE = ("The streets are those of OpenStreetMap: (c) OpenStreetMap contributors, Open Database License 1.0\n"
-           "(SPDX ODbL-1.0, https://opendatacommons.org/licenses/odbl/1-0/), https://www.openstreetmap.org/copyright\n")
+LICENCE = (
+    "The streets are those of OpenStreetMap: (c) OpenStreetMap contributors, Open Database License 1.0\n"
+    "(SPDX ODbL-1.0, https://opendatacommons.org/licenses/odbl/1-0/), https://www.openstreetmap.org/copyright\n"
+)
 SERVERS = "hpi,oapi,pcoffee"  # osmGet.py's names of public ones
 BY_HAND = "https://www.openstreetmap.org/export"
 PATIENCE = 600.0  # s, for a server to answer
@@ -37,8 +47,10 @@ def sumo_input(source: Path | Box, tell: Callable[[str], None], *, left_hand: bo
     north) [degrees], which is fetched first. A network made here is there until the end of the block.
     Raises InputError."""
     if isinstance(source, Path) and source.suffix == ".pbf":
-        raise InputError(f"{source}: SUMO does not read OpenStreetMap's pbf; convert it first: "
-                         f"osmium cat {source.name} -o {source.stem.removesuffix('.osm')}.osm")
+        raise InputError(
+            f"{source}: SUMO does not read OpenStreetMap's pbf; convert it first: "
+            f"osmium cat {source.name} -o {source.stem.removesuffix('.osm')}.osm"
+        )
     if isinstance(source, Path) and root_of(source).tag != "osm":
         if left_hand:
             raise InputError(f"--left-hand: {source} says itself where it drives; omit it")
@@ -58,8 +70,20 @@ def converted(osm: Path, net: Path, *, left_hand: bool = False) -> Path:
     if "," in str(osm):
         raise InputError(f"{osm}: SUMO reads no file with a comma in its path; rename it")
     types = Path(sumo.SUMO_HOME) / "data" / "typemap" / "osmNetconvert.typ.xml"
-    run_sumo("netconvert", "--osm-files", str(osm.resolve()), "--type-files", str(types), "--output-file", str(net),
-             *RECOMMENDED, *CARS, *(["--lefthand"] if left_hand else []), "--no-warnings", where=str(osm))
+    run_sumo(
+        "netconvert",
+        "--osm-files",
+        str(osm.resolve()),
+        "--type-files",
+        str(types),
+        "--output-file",
+        str(net),
+        *RECOMMENDED,
+        *CARS,
+        *(["--lefthand"] if left_hand else []),
+        "--no-warnings",
+        where=str(osm),
+    )
     net.write_bytes(re.sub(rb"<!--.*?-->\s*", b"", net.read_bytes(), count=1, flags=re.DOTALL))  # the date, this folder
     return net
 
@@ -70,17 +94,39 @@ def fetched(box: Box, folder: Path) -> Path:
     where = ",".join(f"{value:g}" for value in box)
     try:
         done = subprocess.run(
-            [sys.executable, str(program), f"--bbox={where}", "--output-dir", str(folder), "--prefix", "osm", "--gzip",
-             "--road-types", '{"highway": ["."]}', "--url", SERVERS, "--retries", "2"],
-            capture_output=True, text=True, errors="replace", stdin=subprocess.DEVNULL, timeout=PATIENCE, check=False,
-            env=os.environ | {"SUMO_HOME": sumo.SUMO_HOME})
+            [
+                sys.executable,
+                str(program),
+                f"--bbox={where}",
+                "--output-dir",
+                str(folder),
+                "--prefix",
+                "osm",
+                "--gzip",
+                "--road-types",
+                '{"highway": ["."]}',
+                "--url",
+                SERVERS,
+                "--retries",
+                "2",
+            ],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            stdin=subprocess.DEVNULL,
+            timeout=PATIENCE,
+            check=False,
+            env=os.environ | {"SUMO_HOME": sumo.SUMO_HOME},
+        )
         reason = (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
     except subprocess.TimeoutExpired:
         reason = f"no answer in {PATIENCE:g} s"
     file = folder / "osm_bbox.osm.xml.gz"
     if reason or not file.exists():
-        raise InputError(f"--bbox: {where}: osmGet.py got nothing from OpenStreetMap ({reason}); without a network, "
-                         f"give a file of the area, such as {BY_HAND} makes on a machine that has one")
+        raise InputError(
+            f"--bbox: {where}: osmGet.py got nothing from OpenStreetMap ({reason}); without a network, "
+            f"give a file of the area, such as {BY_HAND} makes on a machine that has one"
+        )
     return file
 
 
@@ -91,6 +137,7 @@ def parse_box(text: str) -> Box:
     except ValueError:
         west = south = east = north = 0.0
     if not (-180.0 <= west < east <= 180.0 and -90.0 <= south < north <= 90.0):
-        raise InputError(f"--bbox: expected west,south,east,north in degrees, such as 11.32,44.48,11.36,44.50, got "
-                         f"{text!r} instead")
+        raise InputError(
+            f"--bbox: expected west,south,east,north in degrees, such as 11.32,44.48,11.36,44.50, got {text!r} instead"
+        )
     return west, south, east, north

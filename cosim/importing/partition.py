@@ -42,7 +42,7 @@ class Drawn:
 
 
 def partition(
-    streets: Streets, baseline: Baseline | None, cut: Clustered | Drawn, *, seed: int, left_alone: Collection[str] = (),
+    streets: Streets, baseline: Baseline | None, cut: Clustered | Drawn, *, seed: int, left_alone: Collection[str] = ()
 ) -> tuple[EdgeNumbers, int, int]:
     """(E,) region of every edge, numbered from 0, how many were asked for, and how many streets are in another one than
     a file of the user's says.
@@ -60,7 +60,8 @@ def partition(
         if regions > len(blocks.weight):
             raise InputError(
                 f"--regions: expected at most {len(blocks.weight)}, the streets of {streets.path}, got {regions} "
-                "instead")
+                "instead"
+            )
         density = np.zeros(len(streets.edges)) if baseline is None else baseline.density(streets)
         feature = features(blocks, blocks.mean(density, streets.lane_metres))
         if cut.method == "geometric":
@@ -69,19 +70,26 @@ def partition(
         else:
             starts = [agglomerate(blocks, feature, regions)]
         starts += [k_means(blocks, regions, seed + n) for n in range(STARTS)]
-        controlled = np.array([
-            signal is not None and signal not in left_alone for signal in streets.link_signals], dtype=bool)
+        controlled = np.array(
+            [signal is not None and signal not in left_alone for signal in streets.link_signals], dtype=bool
+        )
         labels = best(blocks, starts, feature, prices(streets, blocks, controlled, baseline))
         found = finish(streets, np.where(blocks.of >= 0, labels[blocks.of], -1))
     if found.max() < 1:
         raise InputError(
             f"{streets.path}: no two regions can be made that can be reached from each other; give a network with "
-            "more streets, or other regions")
+            "more streets, or other regions"
+        )
     return found, regions, moved
 
 
 def alternatives(
-    streets: Streets, baseline: Baseline, cut: Clustered | Drawn, regions: EdgeNumbers, *, seed: int,
+    streets: Streets,
+    baseline: Baseline,
+    cut: Clustered | Drawn,
+    regions: EdgeNumbers,
+    *,
+    seed: int,
     left_alone: Collection[str] = (),
 ) -> dict[int, EdgeNumbers]:
     """How many regions were asked for -> (E,) region of every edge, from 2 to twice as many as in `regions`, by the
@@ -92,7 +100,8 @@ def alternatives(
     for number in np.unique(np.linspace(2, most, min(most - 1, SIDE_BY_SIDE)).astype(int)):
         with suppress(InputError):
             found[int(number)], *_ = partition(
-                streets, baseline, Clustered(method=method, regions=int(number)), seed=seed, left_alone=left_alone)
+                streets, baseline, Clustered(method=method, regions=int(number)), seed=seed, left_alone=left_alone
+            )
     return found
 
 

@@ -18,12 +18,37 @@ from nmfd.arrays import PerRegion
 from nmfd.runs.tables import text_table
 
 QUALITY = (
-    "region", "name", "edges", "lane_km", "signals", "pieces", "mean_density_veh_km", "variance_before",
-    "variance_within", "ncut_silhouette", "tv_n", "half_on_edges", "gateways", "controlled_gateways",
-    "boundary_flow_veh", "uncontrolled_share")
+    "region",
+    "name",
+    "edges",
+    "lane_km",
+    "signals",
+    "pieces",
+    "mean_density_veh_km",
+    "variance_before",
+    "variance_within",
+    "ncut_silhouette",
+    "tv_n",
+    "half_on_edges",
+    "gateways",
+    "controlled_gateways",
+    "boundary_flow_veh",
+    "uncontrolled_share",
+)
 GATEWAYS = (
-    "source", "target", "from_edge", "to_edge", "lanes", "shared_lanes", "signal", "links", "signal_serves", "control",
-    "kind", "flow_veh")
+    "source",
+    "target",
+    "from_edge",
+    "to_edge",
+    "lanes",
+    "shared_lanes",
+    "signal",
+    "links",
+    "signal_serves",
+    "control",
+    "kind",
+    "flow_veh",
+)
 
 
 PARTITIONS = ("asked", "regions", "ncut_silhouette", "tv_n", "smallest_lane_share", "chosen")
@@ -49,8 +74,13 @@ class Tables:
 
 
 def tables(
-    streets: Streets, regions: EdgeNumbers, names: Sequence[str], city: City, baseline: Baseline | None,
-    left_alone: Mapping[str, str], others: Mapping[int, EdgeNumbers] | None = None,
+    streets: Streets,
+    regions: EdgeNumbers,
+    names: Sequence[str],
+    city: City,
+    baseline: Baseline | None,
+    left_alone: Mapping[str, str],
+    others: Mapping[int, EdgeNumbers] | None = None,
 ) -> Tables:
     """left_alone: signal -> why perimeter control does not touch it; others: partitions to compare with, by the number
     of regions that was asked for."""
@@ -59,20 +89,39 @@ def tables(
     for gateway in city.gateways:
         if gateway.signal is not None:
             pairs.setdefault(gateway.signal, set()).add((gateway.source, gateway.target))
-    gateways = [{
-        "source": g.source, "target": g.target, "from_edge": g.from_edge, "to_edge": g.to_edge,
-        "lanes": " ".join(map(str, g.lanes)), "shared_lanes": " ".join(map(str, g.shared)), "signal": g.signal or "",
-        "links": " ".join(map(str, g.links)),
-        "signal_serves": " ".join(f"{i}-{h}" for i, h in sorted(pairs.get(g.signal or "", ()))),
-        "control": "no signal" if g.signal is None else left_alone.get(g.signal, "controlled"),
-        "kind": kind(streets, g.signal),
-        "flow_veh": moves[streets.number[g.from_edge], streets.number[g.to_edge]]} for g in city.gateways]
+    gateways = [
+        {
+            "source": g.source,
+            "target": g.target,
+            "from_edge": g.from_edge,
+            "to_edge": g.to_edge,
+            "lanes": " ".join(map(str, g.lanes)),
+            "shared_lanes": " ".join(map(str, g.shared)),
+            "signal": g.signal or "",
+            "links": " ".join(map(str, g.links)),
+            "signal_serves": " ".join(f"{i}-{h}" for i, h in sorted(pairs.get(g.signal or "", ()))),
+            "control": "no signal" if g.signal is None else left_alone.get(g.signal, "controlled"),
+            "kind": kind(streets, g.signal),
+            "flow_veh": moves[streets.number[g.from_edge], streets.number[g.to_edge]],
+        }
+        for g in city.gateways
+    ]
     density = np.zeros(len(regions)) if baseline is None else 1000.0 * baseline.density(streets)
     everywhere = _variance(density, streets, streets.drivable)[1]
     signals = _signals(streets, regions, city)
     rows = [
-        _row(streets, regions == region, str(region), name, signals[region], density, everywhere,
-             [g for g in gateways if region in (g["source"], g["target"])]) for region, name in enumerate(names)]
+        _row(
+            streets,
+            regions == region,
+            str(region),
+            name,
+            signals[region],
+            density,
+            everywhere,
+            [g for g in gateways if region in (g["source"], g["target"])],
+        )
+        for region, name in enumerate(names)
+    ]
     total = _row(streets, regions >= 0, "all", "all regions", signals.sum(), density, everywhere, gateways)
     weight = np.array([row["lane_km"] for row in rows])
     total["variance_within"] = round(float(np.average([row["variance_within"] for row in rows], weights=weight)), 2)
@@ -82,13 +131,22 @@ def tables(
     for row, silhouette, share in zip(rows, *_homogeneity(streets, regions, density), strict=True):
         row |= {"ncut_silhouette": round(silhouette, 3), "tv_n": round(share, 4)}
     total |= _overall(streets, regions, density)
-    partitions = [] if baseline is None else [
-        _compared(streets, found, density, number, chosen=False) for number, found in (others or {}).items()
-        if found.max() != regions.max()]
+    partitions = (
+        []
+        if baseline is None
+        else [
+            _compared(streets, found, density, number, chosen=False)
+            for number, found in (others or {}).items()
+            if found.max() != regions.max()
+        ]
+    )
     if baseline is not None:
         partitions.append(_compared(streets, regions, density, len(rows), chosen=True))
-    return Tables(quality=[*rows, total], gateways=gateways, partitions=sorted(
-        partitions, key=lambda row: (row["regions"], row["asked"])))
+    return Tables(
+        quality=[*rows, total],
+        gateways=gateways,
+        partitions=sorted(partitions, key=lambda row: (row["regions"], row["asked"])),
+    )
 
 
 def _homogeneity(streets: Streets, regions: EdgeNumbers, density: PerEdge) -> tuple[PerRegion, PerRegion]:
@@ -103,15 +161,22 @@ def _overall(streets: Streets, regions: EdgeNumbers, density: PerEdge) -> dict[s
     """NcutSilhouette and TV_n of a partition; NaN where nothing tells."""
     silhouettes, parts = _homogeneity(streets, regions, density)
     told = silhouettes[~np.isnan(silhouettes)]
-    return {"ncut_silhouette": round(float(told.mean()), 3) if len(told) else np.nan,
-            "tv_n": round(float(parts.sum()), 4)}
+    return {
+        "ncut_silhouette": round(float(told.mean()), 3) if len(told) else np.nan,
+        "tv_n": round(float(parts.sum()), 4),
+    }
 
 
 def _compared(streets: Streets, regions: EdgeNumbers, density: PerEdge, asked: int, *, chosen: bool) -> dict:
     """A row of PARTITIONS."""
     lanes = np.bincount(regions, streets.lane_metres)
-    return {"asked": asked, "regions": len(lanes), **_overall(streets, regions, density),
-            "smallest_lane_share": round(float(lanes.min() / lanes.sum()), 3), "chosen": int(chosen)}
+    return {
+        "asked": asked,
+        "regions": len(lanes),
+        **_overall(streets, regions, density),
+        "smallest_lane_share": round(float(lanes.min() / lanes.sum()), 3),
+        "chosen": int(chosen),
+    }
 
 
 def _halves(streets: Streets, regions: EdgeNumbers, baseline: Baseline | None) -> list[int]:
@@ -125,7 +190,9 @@ def left_alone(streets: Streets) -> dict[str, str]:
     found = {signal: "no programme" for signal in streets.link_signals if signal and signal not in streets.logics}
     return found | {
         signal: "switched off" if logics[-1].programme == "off" else f"{logics[-1].kind} signal"
-        for signal, logics in streets.logics.items() if logics[-1].kind not in HELD or logics[-1].programme == "off"}
+        for signal, logics in streets.logics.items()
+        if logics[-1].kind not in HELD or logics[-1].programme == "off"
+    }
 
 
 def kind(streets: Streets, signal: str | None) -> str:
@@ -134,17 +201,44 @@ def kind(streets: Streets, signal: str | None) -> str:
     return "" if not logics else "fixed" if logics[-1].kind == FIXED else logics[-1].kind
 
 
-def _row(streets: Streets, members: np.ndarray, region: str, name: str, signals: int, density: np.ndarray,
-         everywhere: float, gateways: Sequence[Mapping]) -> dict:
+def _row(
+    streets: Streets,
+    members: np.ndarray,
+    region: str,
+    name: str,
+    signals: int,
+    density: np.ndarray,
+    everywhere: float,
+    gateways: Sequence[Mapping],
+) -> dict:
     usable = members & streets.drivable
     mean, variance = _variance(density, streets, usable)
     flow = sum(g["flow_veh"] for g in gateways)
     free = sum(g["flow_veh"] for g in gateways if g["control"] != "controlled")
-    return dict(zip(QUALITY, (
-        region, name, int(usable.sum()), round(float(streets.lane_metres[usable].sum()) / 1000.0, 2), int(signals),
-        pieces(streets, usable & streets.main_part), round(mean, 2), round(everywhere, 2), round(variance, 2),
-        np.nan, np.nan, 0, len(gateways), sum(g["control"] == "controlled" for g in gateways), flow,
-        round(free / flow, 3) if flow else float("nan")), strict=True))
+    return dict(
+        zip(
+            QUALITY,
+            (
+                region,
+                name,
+                int(usable.sum()),
+                round(float(streets.lane_metres[usable].sum()) / 1000.0, 2),
+                int(signals),
+                pieces(streets, usable & streets.main_part),
+                round(mean, 2),
+                round(everywhere, 2),
+                round(variance, 2),
+                np.nan,
+                np.nan,
+                0,
+                len(gateways),
+                sum(g["control"] == "controlled" for g in gateways),
+                flow,
+                round(free / flow, 3) if flow else float("nan"),
+            ),
+            strict=True,
+        )
+    )
 
 
 def _variance(density: np.ndarray, streets: Streets, members: np.ndarray) -> tuple[float, float]:
@@ -178,14 +272,25 @@ def text(tables: Tables) -> str:
     for row in tables.quality:
         share = "-" if np.isnan(row["uncontrolled_share"]) else f"{100 * row['uncontrolled_share']:.0f} %"
         title = row["name"] if row["region"] == "all" else f"{row['region']} {row['name']}"
-        lines.append({
-            "region": title, "lane-km": row["lane_km"], "signals": row["signals"],
-            "density": row["mean_density_veh_km"], "var. before": row["variance_before"],
-            "within": row["variance_within"], "NS": row["ncut_silhouette"], "TV_n": row["tv_n"],
-            "gateways": row["gateways"], "controlled": row["controlled_gateways"],
-            "uncontrolled": share})
+        lines.append(
+            {
+                "region": title,
+                "lane-km": row["lane_km"],
+                "signals": row["signals"],
+                "density": row["mean_density_veh_km"],
+                "var. before": row["variance_before"],
+                "within": row["variance_within"],
+                "NS": row["ncut_silhouette"],
+                "TV_n": row["tv_n"],
+                "gateways": row["gateways"],
+                "controlled": row["controlled_gateways"],
+                "uncontrolled": share,
+            }
+        )
     return text_table(
-        lines, "density: vehicles per lane-km in the busiest quarter of an hour without control; its variance over "
+        lines,
+        "density: vehicles per lane-km in the busiest quarter of an hour without control; its variance over "
         "lanes; NS: NcutSilhouette, below 1 where streets are more like each other than like those of the most similar "
         "neighbour; TV_n: share of the variance over streets that is left within; uncontrolled: share of the flow over "
-        "the region's boundary that no controlled signal sees")
+        "the region's boundary that no controlled signal sees",
+    )

@@ -25,7 +25,7 @@ PASSES = 12
 
 
 def prices(
-    streets: Streets, blocks: Blocks, controlled: Bool[np.ndarray, " L"], baseline: Baseline | None,
+    streets: Streets, blocks: Blocks, controlled: Bool[np.ndarray, " L"], baseline: Baseline | None
 ) -> csr_array:
     """(B, B) symmetric: the price of a boundary between two blocks. controlled: (L,) bool, of streets.links."""
     price = np.ones(len(streets.links))
@@ -42,7 +42,7 @@ def prices(
 
 
 def refine(
-    blocks: Blocks, labels: Int[np.ndarray, " B"], feature: Float[np.ndarray, "B F"], price: csr_array,
+    blocks: Blocks, labels: Int[np.ndarray, " B"], feature: Float[np.ndarray, "B F"], price: csr_array
 ) -> Int[np.ndarray, " B"]:
     """(B,) better labels; no region is lost or torn apart. feature: (B, F), each with variance 1 over the city."""
     state = _State(blocks, labels, feature, price)
@@ -62,7 +62,7 @@ def cut(labels: Int[np.ndarray, " B"], price: csr_array) -> float:
 
 
 def best(
-    blocks: Blocks, starts: Sequence[Int[np.ndarray, " B"]], feature: Float[np.ndarray, "B F"], price: csr_array,
+    blocks: Blocks, starts: Sequence[Int[np.ndarray, " B"]], feature: Float[np.ndarray, "B F"], price: csr_array
 ) -> Int[np.ndarray, " B"]:
     """(B,) the labels of least cost among the refined `starts`, of those that have the most regions. The price of
     boundaries is over that of the first start for all of them."""

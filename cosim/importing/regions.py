@@ -81,7 +81,8 @@ def _not_reachable(streets: Streets, regions: np.ndarray) -> int | None:
     compact[inside] = numbers
     links = streets.links[inside[streets.links].all(axis=1)]
     _, part = connected_components(
-        graph(np.unique(compact[links], axis=0), len(used)), directed=True, connection="strong")
+        graph(np.unique(compact[links], axis=0), len(used)), directed=True, connection="strong"
+    )
     size = np.bincount(numbers, streets.lane_metres[inside])
     total = np.bincount(part, size)
     outside = np.flatnonzero(part != np.argmax(total))
@@ -133,11 +134,13 @@ def _gravity(streets: Streets, members: np.ndarray) -> np.ndarray:
 def names(streets: Streets, regions: EdgeNumbers) -> tuple[str, ...]:
     """A name for each region by its place: centre, north, south-west 2, ..."""
     places, middle = positions(streets, regions), _gravity(streets, regions >= 0)
-    radius = np.sqrt((((streets.centre - middle) ** 2).sum(axis=1) * streets.lane_metres).sum() / (
-        streets.lane_metres.sum()))
+    radius = np.sqrt(
+        (((streets.centre - middle) ** 2).sum(axis=1) * streets.lane_metres).sum() / (streets.lane_metres.sum())
+    )
     found: list[str] = []
     for x, y in places - middle:
         central = np.hypot(x, y) < 0.35 * radius
         found.append("centre" if central else DIRECTIONS[round(np.arctan2(y, x) / (np.pi / 4)) % 8])
     return tuple(
-        name if found.count(name) == 1 else f"{name} {found[:n + 1].count(name)}" for n, name in enumerate(found))
+        name if found.count(name) == 1 else f"{name} {found[: n + 1].count(name)}" for n, name in enumerate(found)
+    )

@@ -95,8 +95,9 @@ class Streets:
 
     def _reached(self, links: Int[np.ndarray, "L 2"]) -> EdgeMask:
         found = np.zeros(len(self.edges), dtype=bool)
-        found[breadth_first_order(graph(links, len(self.edges)), int(np.argmax(self.core)),
-                                  return_predecessors=False)] = True
+        found[
+            breadth_first_order(graph(links, len(self.edges)), int(np.argmax(self.core)), return_predecessors=False)
+        ] = True
         return found
 
     def connected(self, pairs: Iterable[tuple[int, int]], *, cars: bool) -> dict[tuple[int, int], bool]:
@@ -168,9 +169,15 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
                 if element.tag == "edge" and element.get("function", "normal") in ("normal", "connector"):
                     rows[attribute(element, "id")] = _edge(element)
                 elif element.tag == "connection" and not attribute(element, "from").startswith(":"):
-                    links.append(_Link(
-                        attribute(element, "from"), attribute(element, "to"), int(attribute(element, "fromLane")),
-                        int(attribute(element, "toLane")), element.get("tl")))
+                    links.append(
+                        _Link(
+                            attribute(element, "from"),
+                            attribute(element, "to"),
+                            int(attribute(element, "fromLane")),
+                            int(attribute(element, "toLane")),
+                            element.get("tl"),
+                        )
+                    )
                 elif element.tag == "roundabout":
                     roundabouts.append(element.get("edges", "").split())
                 elif element.tag == "tlLogic":
@@ -196,8 +203,13 @@ def _edge(element: ElementTree.Element) -> _Edge:
     points = np.array([[float(x) for x in point.split(",")[:2]] for point in shape.split()])
     speed = max(size(lane, "speed") for lane in cars.values() or lanes)
     return _Edge(
-        cars=frozenset(cars), length=size(lane, "length"), speed=speed, shape=points,
-        start=attribute(element, "from"), end=attribute(element, "to"))
+        cars=frozenset(cars),
+        length=size(lane, "length"),
+        speed=speed,
+        shape=points,
+        start=attribute(element, "from"),
+        end=attribute(element, "to"),
+    )
 
 
 def _logic(element: ElementTree.Element, path: Path) -> Logic:
@@ -207,36 +219,55 @@ def _logic(element: ElementTree.Element, path: Path) -> Logic:
     if kind == "static" and any(phase.get("next") for phase in phases):
         kind = "branching"
     return Logic(
-        signal=attribute(element, "id"), programme=element.get("programID", "0"), kind=kind,
+        signal=attribute(element, "id"),
+        programme=element.get("programID", "0"),
+        kind=kind,
         cycle=sum(seconds(phase.get("duration", "0"), where) for phase in phases),
-        links=max((len(phase.get("state", "")) for phase in phases), default=0))
+        links=max((len(phase.get("state", "")) for phase in phases), default=0),
+    )
 
 
 def _streets(
-    net: Path, rows: Mapping[str, _Edge], links: Iterable[_Link], roundabouts: Iterable[Iterable[str]],
-    logics: Mapping[str, list[Logic]], left_hand: bool,
+    net: Path,
+    rows: Mapping[str, _Edge],
+    links: Iterable[_Link],
+    roundabouts: Iterable[Iterable[str]],
+    logics: Mapping[str, list[Logic]],
+    left_hand: bool,
 ) -> Streets:
     edges = tuple(sorted(rows))
     number = {edge: n for n, edge in enumerate(edges)}
     places: dict[str, int] = {}
-    ends = np.array([[places.setdefault(name, len(places)) for name in (rows[edge].start, rows[edge].end)]
-                     for edge in edges])
+    ends = np.array(
+        [[places.setdefault(name, len(places)) for name in (rows[edge].start, rows[edge].end)] for edge in edges]
+    )
     known = [link for link in links if link.source in number and link.target in number]
     every = sorted({(number[link.source], number[link.target]) for link in known})
     signal_of = {
-        (number[link.source], number[link.target]): link.signal for link in known
-        if link.lane in rows[link.source].cars and link.to_lane in rows[link.target].cars}
+        (number[link.source], number[link.target]): link.signal
+        for link in known
+        if link.lane in rows[link.source].cars and link.to_lane in rows[link.target].cars
+    }
     cars = sorted(signal_of)
     shapes = tuple(rows[edge].shape for edge in edges)
     return Streets(
-        path=net, edges=edges, drivable=np.array([bool(rows[edge].cars) for edge in edges]),
+        path=net,
+        edges=edges,
+        drivable=np.array([bool(rows[edge].cars) for edge in edges]),
         length=np.array([rows[edge].length for edge in edges]),
-        lanes=np.array([len(rows[edge].cars) for edge in edges]), speed=np.array([rows[edge].speed for edge in edges]),
-        shapes=shapes, centre=np.array([_middle(shape) for shape in shapes]), junctions=ends, places=places,
-        links=np.array(cars, dtype=int).reshape(-1, 2), all_links=np.array(every, dtype=int).reshape(-1, 2),
+        lanes=np.array([len(rows[edge].cars) for edge in edges]),
+        speed=np.array([rows[edge].speed for edge in edges]),
+        shapes=shapes,
+        centre=np.array([_middle(shape) for shape in shapes]),
+        junctions=ends,
+        places=places,
+        links=np.array(cars, dtype=int).reshape(-1, 2),
+        all_links=np.array(every, dtype=int).reshape(-1, 2),
         link_signals=tuple(signal_of[pair] for pair in cars),
         roundabouts=tuple(tuple(number[e] for e in ring if e in number) for ring in roundabouts),
-        logics={signal: tuple(found) for signal, found in sorted(logics.items())}, left_hand=left_hand)
+        logics={signal: tuple(found) for signal, found in sorted(logics.items())},
+        left_hand=left_hand,
+    )
 
 
 def _middle(shape: Points) -> Float[np.ndarray, " 2"]:

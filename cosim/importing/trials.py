@@ -32,13 +32,22 @@ class Trials:
         """folder, files: where the vehicles are (cosim.importing.written)."""
         self._streets, self._clock = streets, clock
         self._routes, self._background, self._additional = (
-            [folder / name for name in files[key]] for key in ("routes", "background", "additional"))
-        self._options = ["--step-length", f"{model.step_length(case, clock):g}",
-                         "--time-to-teleport", f"{case.time_to_teleport:g}"]
+            [folder / name for name in files[key]] for key in ("routes", "background", "additional")
+        )
+        self._options = [
+            "--step-length",
+            f"{model.step_length(case, clock):g}",
+            "--time-to-teleport",
+            f"{case.time_to_teleport:g}",
+        ]
         self._known: dict[tuple[float, bool, int], Baseline] = {}
 
     def run(
-        self, factor: float, mesoscopic: bool, seed: int = 0, look: Callable[[Path], None] = lambda edges: None,
+        self,
+        factor: float,
+        mesoscopic: bool,
+        seed: int = 0,
+        look: Callable[[Path], None] = lambda edges: None,
         reached: Callable[[float], None] = lambda share: None,
     ) -> Baseline:
         """With the demand times `factor`. Of seed 0 everybody departs when they wish to. look: as of run_baseline;
@@ -48,22 +57,32 @@ class Trials:
             with Scratch("cosim-") as folder:
                 routes, vehicles = self._vehicles(folder, factor, seed)
                 self._known[key] = run_baseline(
-                    self._streets, routes=[*routes, *self._background], additional=self._additional,
-                    begin=self._clock.begin, end=self._clock.end, vehicles=vehicles, seed=seed, look=look,
+                    self._streets,
+                    routes=[*routes, *self._background],
+                    additional=self._additional,
+                    begin=self._clock.begin,
+                    end=self._clock.end,
+                    vehicles=vehicles,
+                    seed=seed,
+                    look=look,
                     reached=lambda time: reached(min((time - begin) / length, 1.0)),
-                    options=[*self._options, *(MESOSCOPIC if mesoscopic else ())])
+                    options=[*self._options, *(MESOSCOPIC if mesoscopic else ())],
+                )
         return self._known[key]
 
     def averaged(
-        self, factor: float, mesoscopic: bool, seeds: int, tell: Tell, look: Callable[[Path], None],
+        self, factor: float, mesoscopic: bool, seeds: int, tell: Tell, look: Callable[[Path], None]
     ) -> Baseline:
         """Of seeds 0 to seeds - 1. look: as of run_baseline, for the first."""
         runs = []
         for seed in range(seeds):
+
             def reached(share: float, seed: int = seed) -> None:
                 length = (self._clock.end - self._clock.begin) / MINUTE
-                tell(f"simulating without control, {seed + 1} of {seeds}: {share * length:.0f} of {length:.0f} min",
-                     (seed + share) / seeds)
+                tell(
+                    f"simulating without control, {seed + 1} of {seeds}: {share * length:.0f} of {length:.0f} min",
+                    (seed + share) / seeds,
+                )
 
             reached(0.0)
             runs.append(self.run(factor, mesoscopic, seed, look if seed == 0 else lambda edges: None, reached))
@@ -83,11 +102,27 @@ class Trials:
 class Peaks:
     """Generated peaks at any level, their routes assigned; each level is made once."""
 
-    def __init__(self, streets: Streets, case: SumoInput, beside: Traffic, *, seed: int, effort: Effort,
-                 mesoscopic: bool, tell: Tell):
+    def __init__(
+        self,
+        streets: Streets,
+        case: SumoInput,
+        beside: Traffic,
+        *,
+        seed: int,
+        effort: Effort,
+        mesoscopic: bool,
+        tell: Tell,
+    ):
         """beside: what else the city's files hold; effort, mesoscopic: of the assignment."""
         self._streets, self._case, self._beside, self._seed, self._effort, self._mesoscopic, self._tell = (
-            streets, case, beside, seed, effort, mesoscopic, tell)
+            streets,
+            case,
+            beside,
+            seed,
+            effort,
+            mesoscopic,
+            tell,
+        )
         self._known: dict[float, tuple[Traffic, Assigned | None]] = {}
 
     def at(self, level: float) -> tuple[Traffic, Assigned | None]:
@@ -104,8 +139,13 @@ class Peaks:
         peak = morning_peak(self._streets, level=level, begin=self._case.begin, seed=self._seed)
         known = {part.get("id") for element in beside.shared for part in element.iter("vType")}
         own = tuple(e for e in peak.shared if e.get("id") not in known)  # a type car of the city will do
-        return replace(peak, background=beside.background, shared=beside.shared + own, switched=beside.switched,
-                       notes={**beside.notes, **peak.notes})
+        return replace(
+            peak,
+            background=beside.background,
+            shared=beside.shared + own,
+            switched=beside.switched,
+            notes={**beside.notes, **peak.notes},
+        )
 
     def _assigned(self, traffic: Traffic) -> tuple[Traffic, Assigned]:
         """Only cars drive in the assignment: what runs in the background is left out of it."""
@@ -117,9 +157,17 @@ class Peaks:
                 additional = [folder / "city.add.xml"]
                 ElementTree(wrapped(others, "additional")).write(additional[0])
             found = assign(
-                self._streets.path.absolute(), routed(traffic), begin=clock.begin, end=clock.end,
-                seed=self._seed, effort=self._effort, additional=additional, mesoscopic=self._mesoscopic,
-                options=[f"--time-to-teleport={self._case.time_to_teleport:g}"], tell=self._tell)
+                self._streets.path.absolute(),
+                routed(traffic),
+                begin=clock.begin,
+                end=clock.end,
+                seed=self._seed,
+                effort=self._effort,
+                additional=additional,
+                mesoscopic=self._mesoscopic,
+                options=[f"--time-to-teleport={self._case.time_to_teleport:g}"],
+                tell=self._tell,
+            )
         for vehicle in traffic.vehicles:
             if (route := vehicle.find("route")) is not None and (name := vehicle.get("id", "")) in found.routes:
                 route.set("edges", " ".join(found.routes[name]))

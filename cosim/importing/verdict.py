@@ -14,7 +14,7 @@ from nmfd.model.regional_model import RegionalModel
 
 
 def of_import(
-    network: RegionalModel, gateways: Sequence[Mapping], regions: EdgeNumbers, baseline: Baseline | None,
+    network: RegionalModel, gateways: Sequence[Mapping], regions: EdgeNumbers, baseline: Baseline | None
 ) -> Verdict:
     """gateways: rows of gateways.csv (cosim.importing.quality); regions: (E,)"""
     shape = (network.regions,) * 2
@@ -36,7 +36,8 @@ def of_import(
             started[regions[way[0]]] += vehicles
     critical = network.critical
     return authority.verdict(
-        network, boundaries, most=held.max(axis=0) / critical, started=started, where="in the run without control")
+        network, boundaries, most=held.max(axis=0) / critical, started=started, where="in the run without control"
+    )
 
 
 def write_verdict(folder: Path, found: Verdict) -> None:

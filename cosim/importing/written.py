@@ -24,8 +24,11 @@ FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz",
 
 def write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
     """The vehicles, what is left alone and what both refer to; returns the file names by key of [sumo]."""
-    contents = {"routes": (traffic.vehicles, "routes"), "background": (traffic.background, "routes"),
-                "additional": (traffic.shared, "additional")}
+    contents = {
+        "routes": (traffic.vehicles, "routes"),
+        "background": (traffic.background, "routes"),
+        "additional": (traffic.shared, "additional"),
+    }
     files: dict[str, list[str]] = {}
     for key, (elements, tag) in contents.items():
         files[key] = [FILES[key]] if len(elements) else []
@@ -58,28 +61,49 @@ def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence]) -> 
 
 def write_demand(path: Path, demand: PairsOverTime) -> None:
     """demand: (T, R, R) [veh/s]"""
-    write_table(path, ("interval", "from", "to", "veh_s"), (
-        (k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)))
+    write_table(
+        path,
+        ("interval", "from", "to", "veh_s"),
+        ((k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)),
+    )
 
 
 def write_assignment(path: Path, assigned: Assigned) -> None:
     """A row per iteration; the routes of the chosen one are those of the vehicles."""
-    write_table(path, ("iteration", "mesoscopic", "relative_gap", "mean_trip_s", "arrived_veh", "chosen"), (
-        (n + 1, int(one.mesoscopic), f"{one.gap:.5f}", f"{one.trip_time:.1f}", one.arrived, int(n == assigned.best))
-        for n, one in enumerate(assigned.iterations)))
+    write_table(
+        path,
+        ("iteration", "mesoscopic", "relative_gap", "mean_trip_s", "arrived_veh", "chosen"),
+        (
+            (n + 1, int(one.mesoscopic), f"{one.gap:.5f}", f"{one.trip_time:.1f}", one.arrived, int(n == assigned.best))
+            for n, one in enumerate(assigned.iterations)
+        ),
+    )
 
 
-def write_network(folder: Path, streets: Streets, regions: EdgeNumbers, network: RegionalModel, found: quality.Tables,
-                   baseline: Baseline | None, source: str) -> None:
+def write_network(
+    folder: Path,
+    streets: Streets,
+    regions: EdgeNumbers,
+    network: RegionalModel,
+    found: quality.Tables,
+    baseline: Baseline | None,
+    source: str,
+) -> None:
     """network.toml, its tables, layers and map; source: the name of what the user gave."""
-    (folder / "network.toml").write_text(model.network_text(
-        network, {"net": NET, "regions": "regions.csv"}, source), encoding="utf-8")
-    for name, columns, rows in (("quality.csv", quality.QUALITY, found.quality),
-                                ("gateways.csv", quality.GATEWAYS, found.gateways)):
+    (folder / "network.toml").write_text(
+        model.network_text(network, {"net": NET, "regions": "regions.csv"}, source), encoding="utf-8"
+    )
+    for name, columns, rows in (
+        ("quality.csv", quality.QUALITY, found.quality),
+        ("gateways.csv", quality.GATEWAYS, found.gateways),
+    ):
         write_table(folder / name, columns, ([row[column] for column in columns] for row in rows))
     if found.partitions:
-        write_table(folder / "partitions.csv", quality.PARTITIONS, (
-            [row[column] for column in quality.PARTITIONS] for row in found.partitions))
+        write_table(
+            folder / "partitions.csv",
+            quality.PARTITIONS,
+            ([row[column] for column in quality.PARTITIONS] for row in found.partitions),
+        )
     names = network.region_names
     (folder / "regions.taz.xml").write_text(layers.taz_xml(streets, regions, names), encoding="utf-8")
     (folder / "regions.poly.xml").write_text(layers.polygons_xml(streets, regions, names), encoding="utf-8")

@@ -48,8 +48,14 @@ class Actuation:
     """
 
     def __init__(
-        self, session: Session, city: City, scenario: Scenario, chosen: Settings, signals: CitySignals,
-        incidents: Incidents, flows: Mapping[tuple[str, str], float] | None,
+        self,
+        session: Session,
+        city: City,
+        scenario: Scenario,
+        chosen: Settings,
+        signals: CitySignals,
+        incidents: Incidents,
+        flows: Mapping[tuple[str, str], float] | None,
     ):
         """flows: (edge, next edge) -> any measure of flow, if max-pressure is to run the signals"""
         self._session, self._city, self._incidents = session, city, incidents
@@ -57,20 +63,54 @@ class Actuation:
         self._controls: list[SignalControl] = []
         phases: dict[str, Sequence[Phase]] = {}  # of the original programmes of the signals that are commanded
         movements = gateway_movements(city)
-        self._pressure = None if flows is None else MaxPressure(
-            session, city, signals.steered, flows, min_green=chosen.min_green, max_green=chosen.max_green,
-            show=incidents.show, cyclic=chosen.signals == CYCLIC)
+        self._pressure = (
+            None
+            if flows is None
+            else MaxPressure(
+                session,
+                city,
+                signals.steered,
+                flows,
+                min_green=chosen.min_green,
+                max_green=chosen.max_green,
+                show=incidents.show,
+                cyclic=chosen.signals == CYCLIC,
+            )
+        )
         if self._pressure is not None:
             self._controls.append(self._pressure)
             phases |= {signal.id: signal.phases for signal in signals.steered if signal.id in movements}
-        own = [session.programme(signal) for signal in sorted(movements)
-               if signal not in phases and signal not in chosen.leave_signals]
-        self._controls.append(GatewaySignals([
-            GatewaySignal(plan, movements[plan.signal], min_green=chosen.min_green, mode=chosen.actuation,
-                          start=session.time) for plan in own if plan.static], incidents.show))
-        self._controls.append(ResponsiveSignals(session, [
-            ResponsiveSignal(session, incidents, plan, movements[plan.signal], min_green=chosen.min_green)
-            for plan in own if plan.actuated]))
+        own = [
+            session.programme(signal)
+            for signal in sorted(movements)
+            if signal not in phases and signal not in chosen.leave_signals
+        ]
+        self._controls.append(
+            GatewaySignals(
+                [
+                    GatewaySignal(
+                        plan,
+                        movements[plan.signal],
+                        min_green=chosen.min_green,
+                        mode=chosen.actuation,
+                        start=session.time,
+                    )
+                    for plan in own
+                    if plan.static
+                ],
+                incidents.show,
+            )
+        )
+        self._controls.append(
+            ResponsiveSignals(
+                session,
+                [
+                    ResponsiveSignal(session, incidents, plan, movements[plan.signal], min_green=chosen.min_green)
+                    for plan in own
+                    if plan.actuated
+                ],
+            )
+        )
         phases |= {plan.signal: plan.phases for plan in own if plan.static or plan.actuated}
         self._commanded = phases.keys()
         self.original_green = _programmed_green(city, phases, scenario.step)
@@ -98,9 +138,12 @@ class Actuation:
         green: dict[str, dict[int, float]] = {}
         for control in self._controls:
             green |= control.green_time()
-        return np.array([
-            sum(green[g.signal][link] for link in g.links) / len(g.links) if g.signal in green else np.nan
-            for g in self._city.gateways])
+        return np.array(
+            [
+                sum(green[g.signal][link] for link in g.links) / len(g.links) if g.signal in green else np.nan
+                for g in self._city.gateways
+            ]
+        )
 
     def as_shown(self, green: PerGateway) -> PerGateway:
         """(G,) [s] per gateway in the last control interval, where `green` was meant to be shown: where a signal was

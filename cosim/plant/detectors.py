@@ -25,15 +25,15 @@ from cosim.sumo.session import Session
 from nmfd.arrays import PerPair
 from nmfd.model.estimation import Instruments, Readings
 
-LAYOUT = 0x6C6F6F70   # seed of the places of the loops: a property of the city, not of a run
-PROBES = 0x70726F62   # keeps the random numbers of the probes apart from others of the same seed
+LAYOUT = 0x6C6F6F70  # seed of the places of the loops: a property of the city, not of a run
+PROBES = 0x70726F62  # keeps the random numbers of the probes apart from others of the same seed
 VEHICLE_LENGTH = 5.0  # m, SUMO's passenger car
 STATIONS, SPACING = 3, 50.0  # loops of a lane at most; m, a shorter link has one, one of twice the length two
 # Standard deviation over mean [-] of the density over the links of a region, and of what the loops of one link make of
 # its density: a queue here and none there, and before or behind a loop. Measured in a run of grid7 that locked: over
 # the links 1.3 that lasts and 1.1 that passes; with loops on all links, regions at 76 to 144 % of the truth.
 SPREAD_OVER_LINKS, SPREAD_ALONG_LINK = 1.3, 1.0
-EVERY = 3.0           # s, between two readings of a loop
+EVERY = 3.0  # s, between two readings of a loop
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +61,10 @@ def lay_out(city: City, share: float) -> Layout:
     edges = sorted(int(n) for n in chosen)
     names = {city.edges[n] for n in edges}
     return Layout(
-        edges=tuple(edges), positions=tuple(_stations(city.length[city.edges[n]], place[n]) for n in edges),
-        counted=np.array([gateway.to_edge in names for gateway in city.gateways], dtype=bool))
+        edges=tuple(edges),
+        positions=tuple(_stations(city.length[city.edges[n]], place[n]) for n in edges),
+        counted=np.array([gateway.to_edge in names for gateway in city.gateways], dtype=bool),
+    )
 
 
 def _stations(length: float, place: float) -> tuple[float, ...]:
@@ -77,7 +79,8 @@ def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
     equipped = np.isin(np.arange(len(region)), layout.edges)
     whole, seen, squares = (
         np.bincount(region, weights, city.regions)
-        for weights in (lane_length, lane_length * equipped, lane_length**2 * equipped))
+        for weights in (lane_length, lane_length * equipped, lane_length**2 * equipped)
+    )
     share = seen / whole
     boundary, counted, number = np.zeros((3, city.regions, city.regions))
     for gateway, there in zip(city.gateways, layout.counted, strict=True):
@@ -89,18 +92,22 @@ def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
         detector_share=share,
         # Of samples of links, weighted by lane length; a sample of all links is none. Where the queues mostly are
         # lasts, how far they reach changes with every cycle.
-        detector_error=np.sqrt(
-            (SPREAD_OVER_LINKS**2 * (1.0 - share) + SPREAD_ALONG_LINK**2) * squares) / np.maximum(seen, 1e-9),
+        detector_error=np.sqrt((SPREAD_OVER_LINKS**2 * (1.0 - share) + SPREAD_ALONG_LINK**2) * squares)
+        / np.maximum(seen, 1e-9),
         detector_noise=SPREAD_ALONG_LINK * np.sqrt(squares) / np.maximum(seen, 1e-9),
-        counted_share=counted / np.maximum(boundary, 1.0), counted_gateways=number, probe_share=probe_share)
+        counted_share=counted / np.maximum(boundary, 1.0),
+        counted_gateways=number,
+        probe_share=probe_share,
+    )
 
 
 def write_loops(city: City, layout: Layout, period: float, path: Path) -> None:
     """The loops as an additional file for SUMO."""
     rows = [
         f'  <inductionLoop id="{loop}" lane="{lane}" pos="{position:.2f}" period="{period:g}" file="NUL"/>\n'
-        for loop, lane, position, _ in _loops(city, layout)]
-    path.write_text(f"<additional>\n{''.join(rows)}</additional>\n", encoding='utf-8')
+        for loop, lane, position, _ in _loops(city, layout)
+    ]
+    path.write_text(f"<additional>\n{''.join(rows)}</additional>\n", encoding="utf-8")
 
 
 def probes(vehicles: Sequence[str], share: float, seed: int) -> frozenset[str]:
@@ -142,8 +149,11 @@ class Detectors:
         density = self._occupancy / max(self._samples, 1) / 100.0 / VEHICLE_LENGTH
         length = self._length * self._working
         vehicles = np.bincount(self._region, density * length, regions)
-        share = share * np.bincount(self._region, length, regions) / np.maximum(
-            np.bincount(self._region, self._length, regions), 1e-9)
+        share = (
+            share
+            * np.bincount(self._region, length, regions)
+            / np.maximum(np.bincount(self._region, self._length, regions), 1e-9)
+        )
         counts = np.zeros((regions, regions))
         for gateway, there, flow in zip(self._city.gateways, self._layout.counted, gateway_flow, strict=True):
             counts[gateway.source, gateway.target] += flow if there else 0.0
@@ -156,7 +166,8 @@ class Detectors:
                 accumulation=np.where(share > 0, vehicles / share, np.nan),
                 crossings=np.where(self._known.counted_share > 0, counts / self._known.counted_share, np.nan),
                 probes=self._meter.probes() if self._known.probe_share > 0 else unknown,
-                probe_departures=departed.astype(float) if self._known.probe_share > 0 else unknown)
+                probe_departures=departed.astype(float) if self._known.probe_share > 0 else unknown,
+            )
 
     def backlog(self) -> PerPair:
         """(R, R) [veh]: the probes that wait to enter, expanded; zero without probes. Who is made to wait is known."""
@@ -166,5 +177,8 @@ class Detectors:
 def _loops(city: City, layout: Layout) -> list[tuple[str, str, float, int]]:
     """Name, lane, position [m] and link (its number) of every loop."""
     return [
-        (f"{lane}#{n}", lane, position, edge) for edge, positions in zip(layout.edges, layout.positions, strict=True)
-        for lane in city.lane_ids[city.edges[edge]] for n, position in enumerate(positions)]
+        (f"{lane}#{n}", lane, position, edge)
+        for edge, positions in zip(layout.edges, layout.positions, strict=True)
+        for lane in city.lane_ids[city.edges[edge]]
+        for n, position in enumerate(positions)
+    ]

@@ -22,8 +22,13 @@ if TYPE_CHECKING:
 
 
 def gymnasium_env(
-    scenario: Scenario | Path | str, *, guidance: bool = False, metering: bool = False, steps: int | None = None,
-    city: str = "", render_mode: str | None = None,
+    scenario: Scenario | Path | str,
+    *,
+    guidance: bool = False,
+    metering: bool = False,
+    steps: int | None = None,
+    city: str = "",
+    render_mode: str | None = None,
 ) -> "RegionalEnv":
     """One agent for all regions (nmfd.rl.RegionalEnv) in SUMO.
 
@@ -37,14 +42,20 @@ def gymnasium_env(
 
 
 def pettingzoo_env(
-    scenario: Scenario | Path | str, *, guidance: bool = False, cooperative: bool = True, steps: int | None = None,
-    city: str = "", render_mode: str | None = None,
+    scenario: Scenario | Path | str,
+    *,
+    guidance: bool = False,
+    cooperative: bool = True,
+    steps: int | None = None,
+    city: str = "",
+    render_mode: str | None = None,
 ) -> "RegionsEnv":
     """One agent per region (nmfd.rl.RegionsEnv) in SUMO; the other arguments as of `gymnasium_env`."""
     from nmfd.rl import RegionsEnv  # of an extra: not there for everybody
 
     return RegionsEnv(
-        *_city(scenario, steps, city), guidance=guidance, cooperative=cooperative, render_mode=render_mode)
+        *_city(scenario, steps, city), guidance=guidance, cooperative=cooperative, render_mode=render_mode
+    )
 
 
 def _city(scenario: Scenario | Path | str, steps: int | None, city: str) -> tuple[Scenario, SumoPlant]:

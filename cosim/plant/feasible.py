@@ -27,9 +27,12 @@ def signals_of(city: City, scenario: Scenario, chosen: Settings) -> CitySignals:
 
 def check_settings(scenario: Scenario, chosen: Settings) -> None:
     """InputError for what needs lanes where there are none."""
-    for key, values, what in (("signals", PRESSURES, "counts vehicles lane by lane"),
-                              ("measurement", (ESTIMATE,), "needs loop detectors on lanes")):
+    for key, values, what in (
+        ("signals", PRESSURES, "counts vehicles lane by lane"),
+        ("measurement", (ESTIMATE,), "needs loop detectors on lanes"),
+    ):
         if chosen.mesoscopic and (value := getattr(chosen, key)) in values:
             raise InputError(
                 f"{scenario_file(scenario)}: sumo.{key}: {value} {what}, but SUMO's mesoscopic model has no lanes; "
-                "omit it, or set mesoscopic = false (import the city without --mesoscopic)")
+                "omit it, or set mesoscopic = false (import the city without --mesoscopic)"
+            )

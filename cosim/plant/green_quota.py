@@ -22,7 +22,13 @@ class Ration:
     """
 
     def __init__(
-        self, pair: tuple[int, int], *, cycle: float, min_green: float, yellow: float, start: float,
+        self,
+        pair: tuple[int, int],
+        *,
+        cycle: float,
+        min_green: float,
+        yellow: float,
+        start: float,
         full: float | None = None,
     ):
         """pair: (i, h), whose command it follows"""

@@ -42,15 +42,15 @@ from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
 from nmfd.arrays import PerRegion, PerTurn
 
-DRIVER_CLASSES = 4          # groups of drivers who see different travel times: were all sent one way, it would jam
-SPREAD = 0.05               # standard deviation of the logarithm of their travel times
-MESO_SPREAD = 0.15          # the same in the mesoscopic model
-SHARE_PENALTY = 30.0        # s per vehicle that a region is behind its share
-SWITCHING_THRESHOLD = 0.6   # drivers keep their way if the best one saves less than this share of the delay on theirs,
-                            # times the share that the delay has in the time of their way
-MESO_THRESHOLD = 0.3        # in the mesoscopic model: if it saves less than this share of its own time
-SOON = 10.0                 # s after which they are asked again for whom it was too late to change lanes
-MEMORY = 0.9                # of the vehicles assigned before and of their wishes, per control interval
+DRIVER_CLASSES = 4  # groups of drivers who see different travel times: were all sent one way, it would jam
+SPREAD = 0.05  # standard deviation of the logarithm of their travel times
+MESO_SPREAD = 0.15  # the same in the mesoscopic model
+SHARE_PENALTY = 30.0  # s per vehicle that a region is behind its share
+SWITCHING_THRESHOLD = 0.6  # drivers keep their way if the best one saves less than this share of the delay on theirs,
+# times the share that the delay has in the time of their way
+MESO_THRESHOLD = 0.3  # in the mesoscopic model: if it saves less than this share of its own time
+SOON = 10.0  # s after which they are asked again for whom it was too late to change lanes
+MEMORY = 0.9  # of the vehicles assigned before and of their wishes, per control interval
 
 
 def shifted(wish: Sequence[float], own: Sequence[float], theta: Sequence[float]) -> list[float]:
@@ -99,8 +99,17 @@ class Guide:
     """
 
     def __init__(
-        self, session: Session, city: City, own: PerTurn, *, compliance: float, most_detour: float,
-        random: np.random.Generator, ways_return: bool = False, period: float = 0.0, lanes: bool = True,
+        self,
+        session: Session,
+        city: City,
+        own: PerTurn,
+        *,
+        compliance: float,
+        most_detour: float,
+        random: np.random.Generator,
+        ways_return: bool = False,
+        period: float = 0.0,
+        lanes: bool = True,
         turn_late: bool = False,
     ):
         """own: (R, R, R) [-], the drivers' own split ratios, which controllers mean as well
@@ -122,19 +131,30 @@ class Guide:
         here = [np.array(self._region) == region for region in range(city.regions)]
         self._within, within_back, self._without_back = (
             [Moves(times.first, times.second, allowed=allowed ^ outside, reverse=reverse) for allowed in here]
-            for outside, reverse in ((False, False), (False, True), (True, True)))
+            for outside, reverse in ((False, False), (False, True), (True, True))
+        )
         self._ways_return = ways_return
         self._homeward, self._anywhere = within_back, None  # by region, or one for all
         if ways_return:
             self._anywhere, back = (
                 Moves(times.first, times.second, allowed=np.full(len(city.edges), True), reverse=reverse)
-                for reverse in (False, True))
+                for reverse in (False, True)
+            )
             self._homeward = [back]
         ends = [(self._index[g.from_edge], self._index[g.to_edge], g) for g in city.gateways]
         self._gateways = [
-            np.array([(first, second, self._move[first, second], g.target) for first, second, g in ends
-                      if g.source == region], dtype=int).reshape(-1, 4).T
-            for region in range(city.regions)]
+            np.array(
+                [
+                    (first, second, self._move[first, second], g.target)
+                    for first, second, g in ends
+                    if g.source == region
+                ],
+                dtype=int,
+            )
+            .reshape(-1, 4)
+            .T
+            for region in range(city.regions)
+        ]
         spread = SPREAD if lanes else MESO_SPREAD
         self._taste = np.exp(spread * random.standard_normal((DRIVER_CLASSES, len(city.edges))))
         self._prices: PerRegion | None = None
@@ -220,15 +240,14 @@ class Guide:
 
     def _guide_on(self, visit: _Visit, here: int, target: int) -> None:
         """The next region, and the fastest way through it."""
-        event, ways = visit.event, self._ways_from(
-            visit.event.region, visit.taste, visit.event.destination)
+        event, ways = visit.event, self._ways_from(visit.event.region, visit.taste, visit.event.destination)
         present = self._present(event.vehicle, here, ways.time)
-        cost, reached = ways.cost(
-            here, target, self._most_detour + present.takes + 1.0 if present.bound else np.inf)
+        cost, reached = ways.cost(here, target, self._most_detour + present.takes + 1.0 if present.bound else np.inf)
         # Plain numbers from here on: there are a handful of next regions, too few for arrays to pay.
         least, open_ways = (
             best.reduceat(values, ways.begins).tolist()
-            for best, values in ((np.minimum, cost), (np.logical_or, reached)))
+            for best, values in ((np.minimum, cost), (np.logical_or, reached))
+        )
         fastest = min(least, default=np.inf)
         returning = None  # the next region of the fastest way of all, where that is one that comes back
         of_all, gateway = ways.returning(here, target, min(fastest, present.takes + 1.0 if present.bound else np.inf))
@@ -241,11 +260,13 @@ class Guide:
         self._wished[event.region, ways.neighbours[least.index(fastest)], event.destination] += 1.0
         wish, own, theta, assigned = (
             values[event.region, ways.neighbours, event.destination].tolist()
-            for values in (self._wished, self._own, self._splits, self._assigned))
+            for values in (self._wished, self._own, self._splits, self._assigned)
+        )
         wishes = sum(wish)
         shares = [
             share * is_open
-            for share, is_open in zip(shifted([w / wishes for w in wish], own, theta), open_ways, strict=True)]
+            for share, is_open in zip(shifted([w / wishes for w in wish], own, theta), open_ways, strict=True)
+        ]
         if (total := sum(shares)) <= 0:
             return
         shares, everybody = [share / total for share in shares], sum(assigned) + 1.0
@@ -254,7 +275,8 @@ class Guide:
             allowed = [c <= fastest for c in least]
         price = [
             c - SHARE_PENALTY * (share * everybody - sent) if good else np.inf
-            for c, share, sent, good in zip(least, shares, assigned, allowed, strict=True)]
+            for c, share, sent, good in zip(least, shares, assigned, allowed, strict=True)
+        ]
         n = price.index(min(price))
         following = int(ways.neighbours[n])
         if not self._keeps(present, least[n], following):
@@ -272,7 +294,7 @@ class Guide:
 
     def _present(self, vehicle: str, here: int, time: PerEdge) -> _Present:
         """The driver's, who is asked on edge `here`, at `time` (E,) [s]."""
-        route = self._session.route(vehicle)[self._session.route_index(vehicle):]
+        route = self._session.route(vehicle)[self._session.route_index(vehicle) :]
         way: list[int] = []
         try:
             way += map(self._index.__getitem__, route)
@@ -339,7 +361,8 @@ class Guide:
         key = 0 if self._ways_return else region, taste, free
         if key not in self._homes:
             self._homes[key] = Home(
-                self._homeward[key[0]], time * self._taste[taste], self._times.turns, self._searches)
+                self._homeward[key[0]], time * self._taste[taste], self._times.turns, self._searches
+            )
         return self._homes[key]
 
     def _ways_from(self, region: int, taste: int, destination: int) -> "Ways":
@@ -350,21 +373,34 @@ class Guide:
             first, second, move, following = self._gateways[region]
             if region not in self._leading:
                 self._leading[region] = (
-                    inside.leading_to(inside.number[first]), outside.leading_to(outside.number[second]))
+                    inside.leading_to(inside.number[first]),
+                    outside.leading_to(outside.number[second]),
+                )
             if (region, taste) not in self._ahead:
                 self._ahead[region, taste] = outside.ahead(
-                    outside.number[second], self._times.free * tastes, self._times.free_turns)
+                    outside.number[second], self._times.free * tastes, self._times.free_turns
+                )
             leading, reached = self._leading[region]
             turns = self._times.turns
             self._ways[key] = Ways(
-                first, second, following, inside=inside, outside=outside,
-                crossing=turns[move] if self._lanes else np.zeros(len(move)), leading=leading, reached=reached,
-                ahead=self._ahead[region, taste], time=time * tastes, turns=turns, searches=self._searches,
-                everywhere=self._by_all_moves(region, taste, free, time))
+                first,
+                second,
+                following,
+                inside=inside,
+                outside=outside,
+                crossing=turns[move] if self._lanes else np.zeros(len(move)),
+                leading=leading,
+                reached=reached,
+                ahead=self._ahead[region, taste],
+                time=time * tastes,
+                turns=turns,
+                searches=self._searches,
+                everywhere=self._by_all_moves(region, taste, free, time),
+            )
         return self._ways[key]
 
     def _by_all_moves(
-        self, region: int, taste: int, free: int | None, time: PerEdge,
+        self, region: int, taste: int, free: int | None, time: PerEdge
     ) -> tuple[Trees, PerGateway, PerGateway] | None:
         """What Ways calls `everywhere`."""
         if self._anywhere is None:
@@ -372,8 +408,10 @@ class Guide:
         first, second, move, _ = self._gateways[region]
         if (region, taste) not in self._back:
             self._back[region, taste] = self._homeward[0].ahead(
-                second, self._times.free * self._taste[taste], self._times.free_turns)[first]
+                second, self._times.free * self._taste[taste], self._times.free_turns
+            )[first]
         if (taste, free) not in self._everywhere:
             self._everywhere[taste, free] = Trees(
-                self._anywhere, time * self._taste[taste], self._times.turns, self._searches)
+                self._anywhere, time * self._taste[taste], self._times.turns, self._searches
+            )
         return self._everywhere[taste, free], self._times.turns[move], self._back[region, taste]

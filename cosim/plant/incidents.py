@@ -31,11 +31,13 @@ def check(faults: Sequence[Fault], city: City, where: str, others: Collection[st
             raise InputError(
                 f"{where}: gate: no street leads from region {fault.name.partition('=')[0].replace('-', ' to ')}; "
                 f"choose from {', '.join(f'{i}-{h}' for i, h in sorted(joined)[:8])}"
-                f"{' and others' if len(joined) > 8 else ''}")
+                f"{' and others' if len(joined) > 8 else ''}"
+            )
         if fault.kind == "signal" and fault.name not in signals:
             raise InputError(
                 f"{where}: signal: {fault.name!r} is no signal with a gateway movement; choose from "
-                f"{', '.join(signals[:8])}{' and others' if len(signals) > 8 else ''}")
+                f"{', '.join(signals[:8])}{' and others' if len(signals) > 8 else ''}"
+            )
 
 
 class Incidents:
@@ -52,11 +54,11 @@ class Incidents:
         self._by_hand: dict[tuple[int, int], float] = {}
         self._limits: dict[str, list[float]] = {}  # closed edge -> what its lanes allowed before
         self._own = {fault.name: session.programme_id(fault.name) for fault in faults if fault.kind == "signal"}
-        self._silent: set[str] = set()             # signals that take no programme
-        self._refused: set[str] = set()            # signals to which SUMO said no in this interval
-        self._wanted: dict[str, str] = {}          # the last state that a signal should have shown
-        self._yellow: dict[str, float] = {}        # signal on its way from one to the other -> the end of its yellow
-        self.silent_loops = 0.0                    # share of the loop detectors that tell nothing
+        self._silent: set[str] = set()  # signals that take no programme
+        self._refused: set[str] = set()  # signals to which SUMO said no in this interval
+        self._wanted: dict[str, str] = {}  # the last state that a signal should have shown
+        self._yellow: dict[str, float] = {}  # signal on its way from one to the other -> the end of its yellow
+        self.silent_loops = 0.0  # share of the loop detectors that tell nothing
 
     @property
     def closed(self) -> EdgeMask:
@@ -108,8 +110,11 @@ class Incidents:
     def show(self, signal: str, state: str) -> None:
         """Put a state on a signal, or note that it does not take it: its own programme runs on."""
         self._wanted[signal] = state
-        if signal not in self._silent and signal not in self._yellow and not (
-                self._session.set_signal_state(signal, state)):
+        if (
+            signal not in self._silent
+            and signal not in self._yellow
+            and not (self._session.set_signal_state(signal, state))
+        ):
             self._refused.add(signal)
 
     def release(self, signal: str, programme: str) -> None:

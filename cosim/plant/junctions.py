@@ -13,7 +13,7 @@ from cosim.sumo.net import City
 from cosim.sumo.session import Session
 
 STOOD = 120.0  # s: longer than any green, and than anybody waits on a junction for a gap
-GAP = 2.5      # m behind a vehicle that is set down, and before it
+GAP = 2.5  # m behind a vehicle that is set down, and before it
 
 
 class Junctions:
@@ -31,8 +31,11 @@ class Junctions:
         """Look at all junctions."""
         for edges in self._inside.values():
             standing = [
-                (self._session.standing_time(vehicle), vehicle) for edge in edges if self._session.halting(edge)
-                for vehicle in self._session.vehicles_on(edge)]
+                (self._session.standing_time(vehicle), vehicle)
+                for edge in edges
+                if self._session.halting(edge)
+                for vehicle in self._session.vehicles_on(edge)
+            ]
             if waiting := sorted((-time, vehicle) for time, vehicle in standing if time >= STOOD):
                 self._free([vehicle for _, vehicle in waiting])
 

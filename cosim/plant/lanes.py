@@ -14,8 +14,8 @@ from collections.abc import Sequence
 
 from cosim.sumo.session import Session
 
-NEAR = 50.0      # m before the end of a lane, where its queue stands: nobody changes lanes for a new way any more
-LEADER = 10.0    # m: who is there is the first
+NEAR = 50.0  # m before the end of a lane, where its queue stands: nobody changes lanes for a new way any more
+LEADER = 10.0  # m: who is there is the first
 PATIENCE = 60.0  # s that the first stands there before he gives up
 
 
@@ -40,7 +40,7 @@ class Lanes:
         if self._session.standing_time(vehicle) < PATIENCE:
             return []
         left, onward = self._left(vehicle)
-        here, *after = self._session.route(vehicle)[self._session.route_index(vehicle):]
+        here, *after = self._session.route(vehicle)[self._session.route_index(vehicle) :]
         if left > LEADER or not after or after[0] in onward:
             return []
         ways = [(time, way) for time, way in (self._session.fastest(edge, target) for edge in sorted(onward)) if way]

@@ -32,8 +32,17 @@ from nmfd.runs.scratch import Scratch
 # Equipped drivers take the fastest route by the mean speeds of the last 180 s (SUMO's default): when they depart, which
 # needs their route to be read no earlier, and every minute from then on, as drivers with navigation do.
 REROUTING = (
-    "--route-steps", "1", "--device.rerouting.pre-period", "60", "--device.rerouting.period", "60",
-    "--device.rerouting.adaptation-interval", "1", "--device.rerouting.adaptation-steps", "180")
+    "--route-steps",
+    "1",
+    "--device.rerouting.pre-period",
+    "60",
+    "--device.rerouting.period",
+    "60",
+    "--device.rerouting.adaptation-interval",
+    "1",
+    "--device.rerouting.adaptation-steps",
+    "180",
+)
 
 
 def own_vehicles(scenario: Scenario, chosen: Settings, city: City) -> RecordedTrips:
@@ -56,8 +65,15 @@ class Launch:
     """
 
     def __init__(
-        self, scenario: Scenario, chosen: Settings, city: City, signals: CitySignals, layout: Layout, *,
-        outputs: Mapping[str, Path], window: Window | None,
+        self,
+        scenario: Scenario,
+        chosen: Settings,
+        city: City,
+        signals: CitySignals,
+        layout: Layout,
+        *,
+        outputs: Mapping[str, Path],
+        window: Window | None,
     ):
         """outputs: kind (cosim.sumo.outputs) -> file; layout: of the loops, if states are estimated"""
         self._scenario, self._settings, self._city, self._signals = scenario, chosen, city, signals
@@ -74,9 +90,15 @@ class Launch:
         routes = self._scratch.path / "trips.rou.xml"
         self.vehicles = self._write_vehicles(routes, seed)
         return Session(
-            self._city.net_file, [routes, *own_files(scenario, chosen.background)], seed=seed,
-            step_length=chosen.step_length, time_to_teleport=chosen.time_to_teleport,
-            collision_action=chosen.collision_action, options=tuple(self._options()), window=self._window)
+            self._city.net_file,
+            [routes, *own_files(scenario, chosen.background)],
+            seed=seed,
+            step_length=chosen.step_length,
+            time_to_teleport=chosen.time_to_teleport,
+            collision_action=chosen.collision_action,
+            options=tuple(self._options()),
+            window=self._window,
+        )
 
     def turning_flows(self) -> Mapping[tuple[str, str], float]:
         """(edge, next edge) -> flow [veh/s] of the vehicles of a run; of those of the city itself after a `start`."""
@@ -91,8 +113,13 @@ class Launch:
         """SUMO's, besides those that every session has."""
         chosen = self._settings
         options = [
-            *trip_options(self.trip_file), *outputs.options(self._outputs), "--begin", str(chosen.begin),
-            "--ignore-route-errors", str(bool(chosen.routes)).lower()]
+            *trip_options(self.trip_file),
+            *outputs.options(self._outputs),
+            "--begin",
+            str(chosen.begin),
+            "--ignore-route-errors",
+            str(bool(chosen.routes)).lower(),
+        ]
         if chosen.rerouting > 0:
             options += [*REROUTING, "--device.rerouting.probability", str(chosen.rerouting)]
         if chosen.mesoscopic:
@@ -111,8 +138,7 @@ class Launch:
             write_loops(self._city, self._layout, scenario.step, files[-1])
         files += self._window.additional if self._window else ()
         if "edgedata" in self._outputs:
-            files.append(outputs.write_edge_data(
-                folder / "edgedata.add.xml", self._outputs["edgedata"], scenario.step))
+            files.append(outputs.write_edge_data(folder / "edgedata.add.xml", self._outputs["edgedata"], scenario.step))
         return files
 
     def _write_vehicles(self, path: Path, seed: int) -> list[str]:
@@ -125,15 +151,20 @@ class Launch:
         if self._originals is None:
             self._originals = own_vehicles(scenario, chosen, self._city)
         drawn = draw(
-            self._originals, seed=seed, factor=scenario.demand_factor, jitter=chosen.departure_jitter,
-            begin=chosen.begin)
+            self._originals,
+            seed=seed,
+            factor=scenario.demand_factor,
+            jitter=chosen.departure_jitter,
+            begin=chosen.begin,
+        )
         if chosen.metering:
             self.held = write_held_trips(self._originals, drawn, path, self._shared_routes, self._city.region_of)
             if not self.held.orders:
                 raise InputError(
                     f"{scenario_file(scenario)}: sumo.metering: none of the vehicles in sumo.routes can be made to "
                     "wait: those can that have neither stops nor edges to go by, and no attributes but "
-                    f"{', '.join(ORDERED)}; omit it")
+                    f"{', '.join(ORDERED)}; omit it"
+                )
         else:
             write_recorded_trips(self._originals, drawn, path)
         return [name for _, _, name in drawn]

@@ -35,17 +35,19 @@ from cosim.sumo.session import Phase, Session
 from cosim.sumo.signals import GREEN, Link, Signal, is_stage, lane_id
 from nmfd.arrays import PerPair
 
-LEVELS = "rgG"    # from nothing to the right of way
+LEVELS = "rgG"  # from nothing to the right of way
 FACTS = {  # columns of sumo.csv
-    "signal_lanes": "lanes before signals under max-pressure", "split_lanes": "those that a stage serves in part",
+    "signal_lanes": "lanes before signals under max-pressure",
+    "split_lanes": "those that a stage serves in part",
     "never_whole_lanes": "those that no stage serves whole",
     "intergreen_share": "share of the time between two stages under max-pressure",
-    "programmed_intergreen_share": "the same in the original programmes"}
-EVERY = 5.0       # s between two decisions: about two vehicles per lane
-SOON = 10.0       # s; about two minimum greens
-SHORT = 15.0      # m, two vehicles
-REACH = 100.0     # m before a signal within which vehicles count, wherever roads join and part there
-MAX_RED = 120.0   # s; about the longest cycle that is usual (Signal Timing Manual, 2nd edition, 2015)
+    "programmed_intergreen_share": "the same in the original programmes",
+}
+EVERY = 5.0  # s between two decisions: about two vehicles per lane
+SOON = 10.0  # s; about two minimum greens
+SHORT = 15.0  # m, two vehicles
+REACH = 100.0  # m before a signal within which vehicles count, wherever roads join and part there
+MAX_RED = 120.0  # s; about the longest cycle that is usual (Signal Timing Manual, 2nd edition, 2015)
 WHOLE = 1 - 1e-9  # of the vehicles of a lane: all of them
 PERMISSIVE = 0.3  # saturation flow of a movement that must give way (g), as a share of a protected one
 
@@ -54,8 +56,16 @@ class MaxPressure:
     """Max-pressure at `signals`; call `play` before every simulation step."""
 
     def __init__(
-        self, session: Session, city: City, signals: list[Signal], flows: Mapping[tuple[str, str], float], *,
-        min_green: float, max_green: float, show: Callable[[str, str], None], cyclic: bool = False,
+        self,
+        session: Session,
+        city: City,
+        signals: list[Signal],
+        flows: Mapping[tuple[str, str], float],
+        *,
+        min_green: float,
+        max_green: float,
+        show: Callable[[str, str], None],
+        cyclic: bool = False,
     ):
         """flows: (edge, next edge) -> any measure of flow, for the turning shares; min_green, max_green: [s];
         show(signal, state) puts a state on a signal; cyclic: whether stages keep their order."""
@@ -68,7 +78,8 @@ class MaxPressure:
         pairs = gateway_movements(city)
         self._programmed = float(np.mean([_intergreen(signal) for signal in signals])) if signals else 0.0
         self._junctions = [
-            Junction(signal, session.time, pairs.get(signal.id), min_green=min_green) for signal in signals]
+            Junction(signal, session.time, pairs.get(signal.id), min_green=min_green) for signal in signals
+        ]
         self._approaches = [Approaches(signal, roads.watched, session.time) for signal in signals]
         self._rationed = [junction for junction in self._junctions if junction.rationed]
         self._next = session.time
@@ -107,13 +118,12 @@ class MaxPressure:
             approaches.observe(junction.state, now)
             if junction.may_switch(now):
                 waiting = approaches.waiting(present, junction.exhausted_links())
-                stage = self._next_stage(
-                    junction, pressure[begin : begin + junction.stages], waiting, approaches, now)
+                stage = self._next_stage(junction, pressure[begin : begin + junction.stages], waiting, approaches, now)
                 if stage != junction.stage:
                     self._show(junction.signal, junction.switch(stage, now))
 
     def _next_stage(
-        self, junction: "Junction", pressure: np.ndarray, waiting: np.ndarray, approaches: "Approaches", now: float,
+        self, junction: "Junction", pressure: np.ndarray, waiting: np.ndarray, approaches: "Approaches", now: float
     ) -> int:
         """pressure: (n,) of the stages; waiting: (K,) bool, of the links; the present stage, if it may stay"""
         own, called = junction.stage, approaches.serves @ waiting > 0
@@ -126,8 +136,7 @@ class MaxPressure:
                 return int(np.argmax(overdue))
         worth = {n: pressure[n] * SOON / (SOON + junction.loss(n)) for n in in_turn}
         best = max(in_turn, key=worth.__getitem__)
-        if worth[best] > pressure[own] or (
-                now + EVERY > junction.stage_since + self._max_green + 1e-6):
+        if worth[best] > pressure[own] or (now + EVERY > junction.stage_since + self._max_green + 1e-6):
             return in_turn[0] if self._cyclic else best
         return own
 
@@ -143,7 +152,7 @@ class Junction:
     """What one signal shows, second by second: a stage, or the way from one stage to the next."""
 
     def __init__(
-        self, signal: Signal, now: float, gateways: Mapping[int, tuple[int, int]] | None = None, *, min_green: float,
+        self, signal: Signal, now: float, gateways: Mapping[int, tuple[int, int]] | None = None, *, min_green: float
     ):
         """gateways: link index -> (i, h), of the links whose green is rationed; min_green: [s]"""
         self.signal, self._phases, self._numbers = signal.id, signal.phases, stages_of(signal)
@@ -153,7 +162,8 @@ class Junction:
         cycle = sum(phase.duration for phase in signal.phases)
         self._rations = {
             link: Ration(pair, cycle=cycle, min_green=min_green, yellow=yellow_time(signal.phases, link), start=now)
-            for link, pair in (gateways or {}).items()}
+            for link, pair in (gateways or {}).items()
+        }
         self._movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
         self._coming: list[tuple[float, str]] = []
         self.lost = 0.0  # s between two stages so far
@@ -234,7 +244,9 @@ def stages_of(signal: Signal) -> tuple[int, ...]:
     def needless(n: int) -> bool:
         return any(
             all(a <= b for a, b in zip(level[n], level[m], strict=True)) and (level[n] != level[m] or m < n)
-            for m in level if m != n)
+            for m in level
+            if m != n
+        )
 
     return tuple(n for n in level if not needless(n))
 
@@ -255,13 +267,18 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
     if n == target:
         return between
     before, after = phases[source].state, phases[target].state
-    losing = {k for k, (a, b) in enumerate(zip(before, after, strict=True)) if a in GREEN and (
-        b not in GREEN or (a, b) == ("G", "g"))}
+    losing = {
+        k
+        for k, (a, b) in enumerate(zip(before, after, strict=True))
+        if a in GREEN and (b not in GREEN or (a, b) == ("G", "g"))
+    }
     yellow = max((yellow_time(phases, link) for link in losing), default=0.0)
     red = sum(phase.duration for phase in between if "y" not in phase.state) if losing else 0.0
     return [
         Phase(duration=seconds, state="".join(light if k in losing else a for k, a in enumerate(before)))
-        for seconds, light in ((yellow, "y"), (red, "r")) if seconds]
+        for seconds, light in ((yellow, "y"), (red, "r"))
+        if seconds
+    ]
 
 
 def _intergreen(signal: Signal) -> float:
@@ -415,9 +432,13 @@ class Roads:
         for signal in signals:
             for number in stages_of(signal):
                 state = signal.phases[number].state
-                rows.append({
-                    self.lane_number[lane_id(link)]: 1.0 if state[link.index] == "G" else PERMISSIVE
-                    for link in signal.others if state[link.index] in GREEN and lane_id(link) not in self._cars})
+                rows.append(
+                    {
+                        self.lane_number[lane_id(link)]: 1.0 if state[link.index] == "G" else PERMISSIVE
+                        for link in signal.others
+                        if state[link.index] in GREEN and lane_id(link) not in self._cars
+                    }
+                )
         return _sparse(rows, len(self.lanes))
 
     def watched(self, link: Link) -> set[int]:

@@ -85,7 +85,11 @@ class Meter:
     """
 
     def __init__(
-        self, session: Session, city: City, probes: frozenset[str] = frozenset(), trips: TripReader | None = None,
+        self,
+        session: Session,
+        city: City,
+        probes: frozenset[str] = frozenset(),
+        trips: TripReader | None = None,
         metering: Metering | None = None,
     ):
         """probes: vehicles that are counted apart, too; trips: what SUMO tells of those that have left, None to take
@@ -105,7 +109,8 @@ class Meter:
         self._seen: dict[str, tuple[str, ...]] = dict.fromkeys(entries, ())
         self.teleports, regions = 0, city.regions
         self._running, self.departures, self.probe_departures, self.removals, self.given_up = np.zeros(
-            (5, regions, regions), dtype=int)
+            (5, regions, regions), dtype=int
+        )
         self.arrivals, self.time_loss = np.zeros(regions, dtype=int), np.zeros(regions)
         self.crossings, self.jumps, self.redirected = np.zeros((3, regions, regions, regions), dtype=int)
         self.entry_flow: Counter[tuple[int, str]] = Counter()
@@ -116,13 +121,19 @@ class Meter:
         """What the city is in at `time` [s] since the start, when control step `step` begins. LedgerError."""
         accumulation, backlog = self.accumulation(step), self.backlog()
         return State(
-            step=step, time=time, accumulation=accumulation, backlog=backlog, completed=float(self.arrivals.sum()),
-            removed=(self.removals + self.given_up).astype(float))
+            step=step,
+            time=time,
+            accumulation=accumulation,
+            backlog=backlog,
+            completed=float(self.arrivals.sum()),
+            removed=(self.removals + self.given_up).astype(float),
+        )
 
     def gateway_flow(self) -> PerGateway:
         """(G,) [veh] over each gateway of the city since the beginning."""
-        return np.array([
-            self.entry_flow[g.source, g.to_edge] / self._alike[g.source, g.to_edge] for g in self._city.gateways])
+        return np.array(
+            [self.entry_flow[g.source, g.to_edge] / self._alike[g.source, g.to_edge] for g in self._city.gateways]
+        )
 
     def observe(self) -> list[Event]:
         """Account for the last simulation step; call after every one. Departures first, then entries."""
@@ -144,9 +155,16 @@ class Meter:
                 if vehicle in arrived:
                     arrived.remove(vehicle)
             known = self._depart(vehicle)
-            events.append(Event(
-                vehicle=vehicle, source=None, region=known.origin, destination=known.destination, edge=known.edge,
-                free=known.free))
+            events.append(
+                Event(
+                    vehicle=vehicle,
+                    source=None,
+                    region=known.origin,
+                    destination=known.destination,
+                    edge=known.edge,
+                    free=known.free,
+                )
+            )
         self._steps += 1
         for edge, region in self._entries.items() if self._steps % self._poll_every == 0 else ():
             present = session.vehicles_on(edge)
@@ -189,7 +207,8 @@ class Meter:
                 f"vehicle ledger broken at control step {step}, {self._session.time:g} s: {counted.sum()} vehicles are "
                 f"in the city, but {self.departures.sum()} departures minus {self.arrivals.sum()} arrivals"
                 f"{f' and {self.removals.sum()} removed' if self.removals.any() else ''} are {balance}; in region {i} "
-                f"bound for {j} there are {counted[i, j]}, and {self._running[i, j]} were followed there")
+                f"bound for {j} there are {counted[i, j]}, and {self._running[i, j]} were followed there"
+            )
         return counted.astype(float)
 
     def close_books(self) -> None:
@@ -205,7 +224,8 @@ class Meter:
         if self._gone or (facts.completed, facts.removed) != booked:
             raise LedgerError(
                 f"vehicle ledger broken at the end: {booked[0]} completed trips and {booked[1]} removed vehicles were "
-                f"booked, but SUMO's tripinfo has {facts.completed} and {facts.removed}{self._untold()}")
+                f"booked, but SUMO's tripinfo has {facts.completed} and {facts.removed}{self._untold()}"
+            )
 
     def _held(self, on_road: Collection[str]) -> set[str]:
         """The vehicles that the mesoscopic model has taken off a jammed road without a word, until there is room for
@@ -252,7 +272,8 @@ class Meter:
             return ""
         return (
             f": SUMO's tripinfo does not tell how the trips of {len(self._gone)} vehicles ended (such as "
-            f"{min(self._gone)}): is the disk full? Or does their type have has.tripinfo.device = false? Remove that")
+            f"{min(self._gone)}): is the disk full? Or does their type have has.tripinfo.device = false? Remove that"
+        )
 
     def _book(self, gone: _Gone, end: End, sign: int = 1) -> None:
         """In the books of a vehicle that is in no region any more; sign: -1 to take it back."""
@@ -310,8 +331,12 @@ class Meter:
             route, region_of = self._session.route(vehicle), self._city.region_of
             origin = region_of.get(route[0], 0)
             self._vehicles[vehicle] = _Vehicle(
-                origin=origin, destination=region_of.get(route[-1], 0), edge=route[-1], announced=origin,
-                free=self._session.is_free(vehicle))
+                origin=origin,
+                destination=region_of.get(route[-1], 0),
+                edge=route[-1],
+                announced=origin,
+                free=self._session.is_free(vehicle),
+            )
         return self._vehicles[vehicle]
 
     def _depart(self, vehicle: str) -> _Vehicle:
@@ -365,8 +390,13 @@ class Meter:
         known.announced = region
         self.entry_flow[source, edge] += 1
         return Event(
-            vehicle=vehicle, source=source, region=region, destination=known.destination, edge=known.edge,
-            free=known.free)
+            vehicle=vehicle,
+            source=source,
+            region=region,
+            destination=known.destination,
+            edge=known.edge,
+            free=known.free,
+        )
 
     def _cross(self, known: _Vehicle, region: int) -> None:
         if region != known.region:

@@ -21,11 +21,12 @@ from cosim.sumo.trips import HeldTrips, PerTrip
 from nmfd.arrays import PerPair, PerRegion
 
 KP, KI = 1.0, 0.3  # of the vehicles too many, those that are kept out in the next control interval [-]; not tuned
-FILLING = 60.0     # s, in which the largest rate fills a region to its critical accumulation
+FILLING = 60.0  # s, in which the largest rate fills a region to its critical accumulation
 
 
 def ways(session: Session, city: City, trips: HeldTrips) -> PerTrip:
     """(N,) [s] on empty streets; nothing for those of another vehicle class, which the city does not have."""
+
     def empty(route: tuple[str, ...]) -> float:
         if len(route) == 2 and route[1] not in city.successors.get(route[0], route):  # SUMO looks for the way
             return session.fastest(*route)[0]
@@ -41,8 +42,16 @@ class Metering:
     waited: by those who were let in so far [s]
     """
 
-    def __init__(self, session: Session, trips: HeldTrips, critical: PerRegion, *, level: float, step: float,
-                 way: PerTrip | None = None):
+    def __init__(
+        self,
+        session: Session,
+        trips: HeldTrips,
+        critical: PerRegion,
+        *,
+        level: float,
+        step: float,
+        way: PerTrip | None = None,
+    ):
         """critical: (R,) [veh]; level: accumulation that PI control holds, in these [-]; step: control interval [s];
         way: (N,) [s], if of those who wait in a region whoever has the shortest begins first; None: who is due first"""
         self._session, self._trips, self._set_point, self._interval = session, trips, level * critical, step
@@ -71,8 +80,7 @@ class Metering:
             heapq.heappush(self._queues[origin[self._due]], (self._way[self._due], self._due))
             self._due += 1
         # What is not used is not saved: after an hour without traffic nobody comes in a flood.
-        self._credit = np.minimum(
-            self._credit + self._rate * self._session.step_length, np.maximum(1.0, self._rate))
+        self._credit = np.minimum(self._credit + self._rate * self._session.step_length, np.maximum(1.0, self._rate))
         for region, queue in enumerate(self._queues):
             while queue and self._credit[region] >= 1.0 - 1e-9:
                 self._credit[region] -= 1.0

@@ -13,14 +13,15 @@ import numpy as np
 from cosim.sumo.net import City
 from cosim.sumo.signals import GREEN, Signal
 
-STEP = 2         # s between two offsets that are tried
-SWEEPS = 30      # through all signals, at most
-FULLEST = 0.95   # load, at most: above it a queue would never end, whatever the offset
-SLOWER = 1.15    # travel time over the free-flow time, of a platoon that accelerates
+STEP = 2  # s between two offsets that are tried
+SWEEPS = 30  # through all signals, at most
+FULLEST = 0.95  # load, at most: above it a queue would never end, whatever the offset
+SLOWER = 1.15  # travel time over the free-flow time, of a platoon that accelerates
 
 
-def offsets(city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, str], float], saturation: float,
-            ) -> list[Signal]:
+def offsets(
+    city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, str], float], saturation: float
+) -> list[Signal]:
     """`signals` with new offsets. flows: (edge, next edge) -> [veh/s]; saturation: [veh/s] and lane."""
     cycles = {round(sum(phase.duration for phase in signal.phases)) for signal in signals}
     if len(cycles) != 1:  # no common cycle, no wave
@@ -45,7 +46,7 @@ def offsets(city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, str
 
 
 def _costs(
-    city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, str], float], saturation: float, cycle: int,
+    city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, str], float], saturation: float, cycle: int
 ) -> dict[tuple[int, int], np.ndarray]:
     """(signal, next signal) -> (cycle,) queueing on the road between them [veh s per cycle], by the later offset minus
     the earlier one."""

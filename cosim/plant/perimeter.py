@@ -33,7 +33,12 @@ class GatewaySignal:
     """
 
     def __init__(
-        self, programme: Programme, movements: Mapping[int, tuple[int, int]], *, min_green: float, mode: str,
+        self,
+        programme: Programme,
+        movements: Mapping[int, tuple[int, int]],
+        *,
+        min_green: float,
+        mode: str,
         start: float,
     ):
         """mode: HOLD_BACK or REDISTRIBUTE of cosim.plant.strategy"""
@@ -86,8 +91,10 @@ class GatewaySignal:
             for phase in self._phases_of(link):
                 shares[phase] = max(shares.get(phase, 0.0), movement.share)
         takers = [
-            phase for phase, state in enumerate(self._states)
-            if phase not in shares and GREEN & set(state) and "y" not in state]
+            phase
+            for phase, state in enumerate(self._states)
+            if phase not in shares and GREEN & set(state) and "y" not in state
+        ]
         if not takers:  # nobody conflicts with the gateways: what they lose stays red
             return self._original
         durations = list(self._original)
@@ -125,7 +132,6 @@ class GatewaySignal:
                 return base, never
         red_at = movement.cut_at + self._yellow[link]
         return ("y", red_at) if now < red_at else ("r", never)
-
 
     def _green(self, movement: "_Movement", full: float) -> float:
         """Seconds to keep of a window of `full` seconds."""

@@ -41,8 +41,14 @@ class SumoPlant:
     """
 
     def __init__(
-        self, scenario: Scenario, *, overrides: Settings | None = None, outputs: Mapping[str, Path] | None = None,
-        window: Window | None = None, planning: PlanningModel | None = None, observer: Observer | None = None,
+        self,
+        scenario: Scenario,
+        *,
+        overrides: Settings | None = None,
+        outputs: Mapping[str, Path] | None = None,
+        window: Window | None = None,
+        planning: PlanningModel | None = None,
+        observer: Observer | None = None,
     ):
         """Builds the network if need be. Raises InputError for a city that does not fit the scenario's network.
 
@@ -62,7 +68,8 @@ class SumoPlant:
         self._signals = signals_of(self.city, scenario, chosen)
         self.simple_signals, self.other_signals = self._signals.simple, self._signals.others
         self._launch = Launch(
-            scenario, chosen, self.city, self._signals, self._layout, outputs=dict(outputs or {}), window=window)
+            scenario, chosen, self.city, self._signals, self._layout, outputs=dict(outputs or {}), window=window
+        )
         self._session: Session | None = None
 
     def reset(self, seed: int) -> State:
@@ -100,8 +107,7 @@ class SumoPlant:
             self._incidents.hold(source, target, share)
         self._incidents.begin(self._k)
         network = self._scenario.network
-        self._actuation.command(
-            self._incidents.gated(controls.perimeter, network.u_min, network.u_max), vehicles)
+        self._actuation.command(self._incidents.gated(controls.perimeter, network.u_min, network.u_max), vehicles)
         self._guide.command(self._splits(controls), streets, controls.prices)
         if self._metering:
             self._metering.command(controls.metering, self._state.accumulation.sum(axis=1))
@@ -211,16 +217,20 @@ class SumoPlant:
             return facts
         held, waiting = self._metering.waiting()
         return replace(
-            facts, trips=facts.trips + held, departure_delay=facts.departure_delay + self._metering.waited + waiting)
+            facts, trips=facts.trips + held, departure_delay=facts.departure_delay + self._metering.waited + waiting
+        )
 
     def _with_standstill(self, facts: TripFacts, co2: float, fuel: float) -> TripFacts:
         """And what was booked without being simulated. co2, fuel: of everybody on the road at the end [kg/s]"""
         time, state = self.booked * self._scenario.step, self._state
         return replace(
-            facts, travel_time=facts.travel_time + time * float(state.accumulation.sum()),
+            facts,
+            travel_time=facts.travel_time + time * float(state.accumulation.sum()),
             departure_delay=facts.departure_delay + time * float(state.backlog.sum()),
             time_loss=facts.time_loss + time * float(state.accumulation.sum()),
-            co2=facts.co2 + time * co2, fuel=facts.fuel + time * fuel)
+            co2=facts.co2 + time * co2,
+            fuel=facts.fuel + time * fuel,
+        )
 
     def _book(self) -> State:
         """One control interval in which nothing moves."""
@@ -241,8 +251,8 @@ class SumoPlant:
             return None
         way = ways(self.session, self.city, trips) if chosen.metering_first == SHORT else None
         return Metering(
-            self.session, trips, network.critical, level=chosen.metering_level,
-            step=self._scenario.step, way=way)
+            self.session, trips, network.critical, level=chosen.metering_level, step=self._scenario.step, way=way
+        )
 
     def _new_sensing(self, seed: int) -> Sensing:
         chosen = self._settings
@@ -252,21 +262,26 @@ class SumoPlant:
             known = probes(self._launch.vehicles, chosen.probe_share, seed)
             meter = Meter(self.session, self.city, known, self._trips, self._metering)
             estimation = Estimation(self.session, self.city, self._layout, meter, self._instruments, self._planning)
-        return Sensing(
-            self._scenario, self.session, self.city, self._incidents, meter, estimation, self._observer)
+        return Sensing(self._scenario, self.session, self.city, self._incidents, meter, estimation, self._observer)
 
     def _new_guide(self, seed: int) -> Guide:
         chosen = self._settings
         return Guide(
-            self.session, self.city, self._scenario.network.nominal_splits, compliance=chosen.compliance,
-            most_detour=chosen.most_detour, ways_return=chosen.ways_return, period=chosen.guidance_period,
-            lanes=not chosen.mesoscopic, turn_late=chosen.signals not in PRESSURES,
-            random=np.random.default_rng([seed, GUIDANCE]))
+            self.session,
+            self.city,
+            self._scenario.network.nominal_splits,
+            compliance=chosen.compliance,
+            most_detour=chosen.most_detour,
+            ways_return=chosen.ways_return,
+            period=chosen.guidance_period,
+            lanes=not chosen.mesoscopic,
+            turn_late=chosen.signals not in PRESSURES,
+            random=np.random.default_rng([seed, GUIDANCE]),
+        )
 
     def _new_actuation(self) -> Actuation:
         flows = self._launch.turning_flows() if self._settings.signals in PRESSURES else None
-        return Actuation(
-            self.session, self.city, self._scenario, self._settings, self._signals, self._incidents, flows)
+        return Actuation(self.session, self.city, self._scenario, self._settings, self._signals, self._incidents, flows)
 
     def _end_session(self) -> None:
         if self._session is not None:

@@ -35,7 +35,8 @@ def city_signals(city: City, chosen: Settings, additional: Sequence[Path]) -> Ci
     if chosen.signals != FIXED and not simple:
         raise InputError(
             f"{city.net_file}: sumo.signals: {chosen.signals} needs {'' if pressure else 'fixed-time '}signals "
-            f"with several green phases, but none of the {len(others)} signals here is one; choose fixed")
+            f"with several green phases, but none of the {len(others)} signals here is one; choose fixed"
+        )
     kept = set()
     if chosen.gateways_fixed and chosen.signals == ACTUATED:
         kept = {gateway.signal for gateway in city.gateways}
@@ -43,7 +44,11 @@ def city_signals(city: City, chosen: Settings, additional: Sequence[Path]) -> Ci
 
 
 def write_signal_programmes(
-    folder: Path, city: City, scenario: Scenario, chosen: Settings, signals: CitySignals,
+    folder: Path,
+    city: City,
+    scenario: Scenario,
+    chosen: Settings,
+    signals: CitySignals,
     own_flows: Mapping[tuple[str, str], float] | None,
 ) -> list[Path]:
     """Additional files with which SUMO runs other programmes than those of the network file; none for fixed ones.
@@ -51,9 +56,16 @@ def write_signal_programmes(
     folder: of this run; Webster's plan is kept with the network. own_flows: of the city's own vehicles
     """
     if chosen.signals == WEBSTER:
-        return [webster.plan(
-            city, signals.simple, scenario.demand, scenario.step,
-            folder=shipped.build_folder(network_folder(scenario.network)), flows=own_flows)]
+        return [
+            webster.plan(
+                city,
+                signals.simple,
+                scenario.demand,
+                scenario.step,
+                folder=shipped.build_folder(network_folder(scenario.network)),
+                flows=own_flows,
+            )
+        ]
     if chosen.signals == ACTUATED:
         path = folder / "actuated.add.xml"
         write_programmes(path, [actuated_row(signal) for signal in signals.steered])

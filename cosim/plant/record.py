@@ -24,42 +24,65 @@ class Record:
 
     departures: PairCounts = quantity("interval", "region", "destination", unit="veh", text="trips begun")
     arrivals: RegionCounts = quantity(
-        "interval", "destination", unit="veh", text="trips completed: on the last edge of their route")
+        "interval", "destination", unit="veh", text="trips completed: on the last edge of their route"
+    )
     removals: PairCounts = quantity(
-        "interval", "region", "destination", unit="veh", text="vehicles taken out on their way, whoever did it")
+        "interval", "region", "destination", unit="veh", text="vehicles taken out on their way, whoever did it"
+    )
     given_up: PairCounts = quantity(
-        "interval", "region", "destination", unit="veh", text="trips that SUMO dropped before they began")
+        "interval", "region", "destination", unit="veh", text="trips that SUMO dropped before they began"
+    )
     crossings: TurnCounts = quantity(
-        "interval", "region", "next_region", "destination", unit="veh", text="vehicles that crossed a boundary")
+        "interval", "region", "next_region", "destination", unit="veh", text="vehicles that crossed a boundary"
+    )
     jumps: TurnCounts = quantity(
-        "interval", "region", "next_region", "destination", unit="veh",
-        text="vehicles that came into another region where no gateway leads there")
+        "interval",
+        "region",
+        "next_region",
+        "destination",
+        unit="veh",
+        text="vehicles that came into another region where no gateway leads there",
+    )
     redirected: TurnCounts = quantity(
-        "interval", "region", "destination", "next_region", unit="veh",
-        text="vehicles there whose route was changed to end in another region, the next, instead of destination")
+        "interval",
+        "region",
+        "destination",
+        "next_region",
+        unit="veh",
+        text="vehicles there whose route was changed to end in another region, the next, instead of destination",
+    )
     production: RegionCounts = quantity("interval", "region", unit="veh m/s", text="travel production, mean of samples")
     mean_accumulation: RegionCounts = quantity(
-        "interval", "region", unit="veh", text="vehicles inside, mean of the same samples")
+        "interval", "region", unit="veh", text="vehicles inside, mean of the same samples"
+    )
     edge_vehicles: EdgesOverTime = quantity(
-        "interval", "edge", unit="veh", text="vehicles on the edge to 0.1 %, mean of the same samples")
+        "interval", "edge", unit="veh", text="vehicles on the edge to 0.1 %, mean of the same samples"
+    )
     gateway_green: GatewaysOverTime = quantity(
-        "interval", "gateway", unit="s", text="green shown, mean of the gateway's links; NaN without a signal")
+        "interval", "gateway", unit="s", text="green shown, mean of the gateway's links; NaN without a signal"
+    )
     gateway_original_green: GatewaysOverTime = quantity(
-        "interval", "gateway", unit="s", text="green in the original programme, mean of the gateway's links")
+        "interval", "gateway", unit="s", text="green in the original programme, mean of the gateway's links"
+    )
     gateway_flow: GatewaysOverTime = quantity(
-        "interval", "gateway", unit="veh", text="vehicles that crossed the boundary")
+        "interval", "gateway", unit="veh", text="vehicles that crossed the boundary"
+    )
     gateway_queue: GatewaysOverTime = quantity(
-        "interval", "gateway", unit="veh", text="vehicles halting on the edge before it, mean of samples")
+        "interval", "gateway", unit="veh", text="vehicles halting on the edge before it, mean of samples"
+    )
     gateway_queue_max: GatewaysOverTime = quantity(
-        "interval", "gateway", unit="veh", text="vehicles halting on the edge before it, largest of samples")
+        "interval", "gateway", unit="veh", text="vehicles halting on the edge before it, largest of samples"
+    )
     teleports: Series = quantity("interval", unit="1", text="vehicles that SUMO took out of a jam")
     guided: TurnCounts = quantity(
-        "interval", "region", "next_region", "destination", unit="veh", text="reroutes by route guidance")
+        "interval", "region", "next_region", "destination", unit="veh", text="reroutes by route guidance"
+    )
 
 
 def settled(trajectory: Trajectory, record: Record) -> Trajectory:
     """What became of vehicles as the closed books have it, for where SUMO told late (cosim.plant.meter). Who was taken
     out in the last step, too, is no longer there at the end."""
+
     def since_start(counts: np.ndarray) -> np.ndarray:
         return np.concatenate([np.zeros_like(counts[:1]), counts]).cumsum(axis=0).astype(float)
 
@@ -67,8 +90,11 @@ def settled(trajectory: Trajectory, record: Record) -> Trajectory:
     inside = (record.departures - record.removals).sum(axis=0) - np.diag(record.arrivals.sum(axis=0))
     inside = inside + moved.sum(axis=0) - moved.sum(axis=1) + redirected.sum(axis=1) - redirected.sum(axis=2)
     return replace(
-        trajectory, accumulation=np.concatenate([trajectory.accumulation[:-1], inside[None].astype(float)]),
-        completed=since_start(record.arrivals.sum(axis=1)), removed=since_start(record.removals + record.given_up))
+        trajectory,
+        accumulation=np.concatenate([trajectory.accumulation[:-1], inside[None].astype(float)]),
+        completed=since_start(record.arrivals.sum(axis=1)),
+        removed=since_start(record.removals + record.given_up),
+    )
 
 
 def _small(counts: np.ndarray) -> np.ndarray:
@@ -89,12 +115,18 @@ class Recorder:
         """streets: means of the interval that has just ended; all else is what was added since the last call"""
         totals = self._totals()
         added = {key: _small(total - self._before[key]) for key, total in totals.items()}
-        self._rows.append({
-            **added, "gateway_green": self._actuation.as_shown(added["gateway_green"]),
-            "gateway_original_green": self._actuation.original_green,
-            "production": streets.production, "mean_accumulation": streets.accumulation,
-            "edge_vehicles": streets.vehicles.astype(np.float16),  # to 0.1 % and as small as an integer
-            "gateway_queue": streets.queue, "gateway_queue_max": streets.queue_max})
+        self._rows.append(
+            {
+                **added,
+                "gateway_green": self._actuation.as_shown(added["gateway_green"]),
+                "gateway_original_green": self._actuation.original_green,
+                "production": streets.production,
+                "mean_accumulation": streets.accumulation,
+                "edge_vehicles": streets.vehicles.astype(np.float16),  # to 0.1 % and as small as an integer
+                "gateway_queue": streets.queue,
+                "gateway_queue_max": streets.queue_max,
+            }
+        )
         self._before = totals
 
     def repeat(self) -> None:
@@ -121,6 +153,9 @@ class Recorder:
     def _totals(self) -> dict[str, np.ndarray]:
         meter = self._meter
         return {
-            **{name: getattr(meter, name).copy() for name in BOOKS}, "teleports": np.array(meter.teleports),
-            "guided": self._guide.realised.copy(), "gateway_flow": meter.gateway_flow(),
-            "gateway_green": self._actuation.green_time()}
+            **{name: getattr(meter, name).copy() for name in BOOKS},
+            "teleports": np.array(meter.teleports),
+            "guided": self._guide.realised.copy(),
+            "gateway_flow": meter.gateway_flow(),
+            "gateway_green": self._actuation.green_time(),
+        }

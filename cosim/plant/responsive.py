@@ -24,8 +24,13 @@ class ResponsiveSignal:
     """One signal with gateway links; `play` before every simulation step."""
 
     def __init__(
-        self, session: Session, incidents: Incidents, programme: Programme, movements: Mapping[int, tuple[int, int]],
-        *, min_green: float,
+        self,
+        session: Session,
+        incidents: Incidents,
+        programme: Programme,
+        movements: Mapping[int, tuple[int, int]],
+        *,
+        min_green: float,
     ):
         """movements: link index -> (i, h); min_green: [s]"""
         self.signal, self._programme = programme.signal, programme.id
@@ -33,9 +38,15 @@ class ResponsiveSignal:
         phases, start = programme.phases, session.time
         self._rations = {
             link: Ration(
-                pair, cycle=programme.cycle, full=sum(p.duration for p in phases if p.state[link] in GREEN),
-                min_green=min_green, yellow=yellow_time(phases, link), start=start)
-            for link, pair in movements.items()}
+                pair,
+                cycle=programme.cycle,
+                full=sum(p.duration for p in phases if p.state[link] in GREEN),
+                min_green=min_green,
+                yellow=yellow_time(phases, link),
+                start=start,
+            )
+            for link, pair in movements.items()
+        }
         self._always = {link for link in movements if all(phase.state[link] in GREEN for phase in phases)}
         self._base, self._since, self._next, self._held, self._limited = "", start, start, False, False
 
@@ -65,7 +76,10 @@ class ResponsiveSignal:
             begun = not before or before[link] not in GREEN  # a window that begins lasts for SUMO's own minimum
             light, again = ration.show(
                 # of a yellow that is there in the beginning, as of that after a green
-                "G" if not before and base[link] == "y" else base[link], now, lasting=begun or link in self._always)
+                "G" if not before and base[link] == "y" else base[link],
+                now,
+                lasting=begun or link in self._always,
+            )
             self._next = min(self._next, again)
             if light == "y" or base[link] in "Ggy":
                 shown[link] = light

@@ -88,14 +88,23 @@ class StreetSampler:
             speed = self._routed / vehicles
         speed[closed] = 0.0  # nobody is sent through a street because it is empty
         production, accumulation = (
-            np.bincount(self._region, amount, self._city.regions) / samples for amount in (metres, vehicles))
+            np.bincount(self._region, amount, self._city.regions) / samples for amount in (metres, vehicles)
+        )
         mean, largest = (queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))
         crossing, crossed = self._crossing / samples, self._crossed / samples
         self._begin()
         begun, self._end = self._end, self._session.time
         return StreetMeans(
-            duration=self._end - begun, vehicles=vehicles / samples, speed=speed, accumulation=accumulation,
-            production=production, queue=mean, queue_max=largest, crossing=crossing, crossed=crossed)
+            duration=self._end - begun,
+            vehicles=vehicles / samples,
+            speed=speed,
+            accumulation=accumulation,
+            production=production,
+            queue=mean,
+            queue_max=largest,
+            crossing=crossing,
+            crossed=crossed,
+        )
 
     def present(self) -> tuple[PerEdge, PerEdge, PerEdge]:
         """Vehicles (E,) [veh], their mean speed (E,) [m/s], and that which routing goes by, by edge, now."""

@@ -25,7 +25,7 @@ class Estimation:
     """Loop detectors and probes of one run, and the filter that they feed."""
 
     def __init__(
-        self, session: Session, city: City, layout: Layout, meter: Meter, known: Instruments, planning: PlanningModel,
+        self, session: Session, city: City, layout: Layout, meter: Meter, known: Instruments, planning: PlanningModel
     ):
         """planning: what the filter predicts with"""
         self._meter, self._detectors = meter, Detectors(session, city, layout, meter, known)
@@ -48,7 +48,8 @@ class Estimation:
     def observation(self, step: int, time: float) -> Observation:
         """The estimate at `time` [s] since the start, when control step `step` begins."""
         return Observation(
-            step=step, time=time, accumulation=self._filter.accumulation, backlog=self._detectors.backlog())
+            step=step, time=time, accumulation=self._filter.accumulation, backlog=self._detectors.backlog()
+        )
 
 
 class Sensing:
@@ -58,8 +59,14 @@ class Sensing:
     """
 
     def __init__(
-        self, scenario: Scenario, session: Session, city: City, incidents: Incidents, meter: Meter,
-        estimation: Estimation | None, observer: Observer | None = None,
+        self,
+        scenario: Scenario,
+        session: Session,
+        city: City,
+        incidents: Incidents,
+        meter: Meter,
+        estimation: Estimation | None,
+        observer: Observer | None = None,
     ):
         """estimation: None where controllers see the exact state; observer: is shown every sample of the streets"""
         self._session, self._observer = session, observer
@@ -67,7 +74,8 @@ class Sensing:
         self._sampler = StreetSampler(session, city)
         steps = round(scenario.step / session.step_length)
         self._loops_apart, self._samples_apart = (
-            samples_apart(seconds, session, steps) for seconds in (detectors.EVERY, sampling.EVERY))
+            samples_apart(seconds, session, steps) for seconds in (detectors.EVERY, sampling.EVERY)
+        )
         self._measured = 0  # simulation steps of this interval
         self.meter = meter
         self.streets: StreetMeans | None = None

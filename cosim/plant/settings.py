@@ -29,65 +29,94 @@ class SumoTable(config.Settings):
 
     step_length: float = setting("time step of SUMO, a divisor of the control interval", 1.0, unit="s", gt=0.0, le=1.0)
     time_to_teleport: float = setting(
-        "standing time after which SUMO moves a vehicle on; -1 for never", -1.0, unit="s", ge=-1.0)
+        "standing time after which SUMO moves a vehicle on; -1 for never", -1.0, unit="s", ge=-1.0
+    )
     collision_action: Literal["none", "warn", "teleport", "remove"] = setting("of SUMO", "warn")
     actuation: Mode = setting(
-        "whether green that the perimeter control takes away is red for all, or goes to the other movements", HOLD_BACK)
+        "whether green that the perimeter control takes away is red for all, or goes to the other movements", HOLD_BACK
+    )
     min_green: float = setting(
-        "least green of a gateway movement, and of every stage under max-pressure", 5.0, unit="s", ge=1.0)
+        "least green of a gateway movement, and of every stage under max-pressure", 5.0, unit="s", ge=1.0
+    )
     max_green: float = setting(
         "under max-pressure, no stage is green for longer while others wait; 50 s is netconvert's for actuated signals",
-        50.0, unit="s", ge=1.0)
+        50.0,
+        unit="s",
+        ge=1.0,
+    )
     queue_override: Share = setting(
-        "a gateway whose edge held this share of its room in the last control interval is left open; 0 for never", 0.0)
+        "a gateway whose edge held this share of its room in the last control interval is left open; 0 for never", 0.0
+    )
     compliance: Share = setting("share of the decisions in which a driver follows the route guidance", 1.0)
     guidance_period: Seconds = setting(
         "guided drivers are asked again after this time in the same region; 0: when they depart and when they enter a "
-        "region only", 0.0)
+        "region only",
+        0.0,
+    )
     most_detour: Seconds = setting("drivers do not follow route guidance into a next region that costs them more", 60.0)
     ways_return: bool = setting(
         "guided drivers may leave a region and come back to it where that is the fastest way of all, as on a main road "
-        "along a ragged boundary", False)
+        "along a ragged boundary",
+        False,
+    )
     rerouting: Share = setting("share of the drivers with SUMO's own rerouting device", 0.0)
     metering: bool = setting(
-        "trips begin in a region no faster than is commanded; without a command, its accumulation is held", False)
+        "trips begin in a region no faster than is commanded; without a command, its accumulation is held", False
+    )
     metering_level: float = setting(
-        "the accumulation that metering holds a region at without a command, in critical accumulations", 1.2, unit="-",
-        gt=0.0, le=10.0)
+        "the accumulation that metering holds a region at without a command, in critical accumulations",
+        1.2,
+        unit="-",
+        gt=0.0,
+        le=10.0,
+    )
     metering_first: First = setting(
-        "who begins first of those who wait in a region: who is due first, or who has the shortest way to go", DUE)
+        "who begins first of those who wait in a region: who is due first, or who has the shortest way to go", DUE
+    )
     measurement: Literal["exact", "estimate"] = setting(
-        "what controllers see: the exact state, or what detectors and probes tell", EXACT)
+        "what controllers see: the exact state, or what detectors and probes tell", EXACT
+    )
     detector_share: Share = setting("share of the links with loop detectors", 0.3)
     probe_share: Share = setting("share of the vehicles that tell where they are bound for", 0.1)
     signals: Signals = setting("control of the signals", FIXED)
     routes: Texts = setting(
-        "route files of the city's own vehicles; without any, trips are drawn from the scenario's demand", ())
+        "route files of the city's own vehicles; without any, trips are drawn from the scenario's demand", ()
+    )
     background: Texts = setting("route files of what is no demand and is left alone: public transport, persons", ())
     additional: Texts = setting("SUMO's additional files: vehicle types, stops, signal programmes", ())
     begin: Seconds = setting("simulation time at which interval 0 begins", 0.0)
     departure_jitter: Seconds = setting(
-        "departures of the city's own vehicles are moved by up to this, either way, by the seed", 10.0)
+        "departures of the city's own vehicles are moved by up to this, either way, by the seed", 10.0
+    )
     leave_signals: Texts = setting("signals that perimeter control leaves alone", ())
     book_standstill: bool = setting(
         "once every trip is due and nothing moves any more, the rest of the run is booked without simulating it, "
-        "within 0.1 % of the total time spent", False)
+        "within 0.1 % of the total time spent",
+        False,
+    )
     mesoscopic: bool = setting(
         "SUMO's queue model instead of its car-following, about ten times as fast, for quick studies: no lanes and no "
         "positions on them, queues hold the vehicles that fit on an edge, signals cap the flow by their green share",
-        False)
+        False,
+    )
 
     @model_validator(mode="after")
     def _is_measured(self) -> Self:
         if self.measurement == ESTIMATE and self.detector_share == self.probe_share == 0:
-            raise Problem("measurement", "\"estimate\" needs detectors or probes, but sumo.detector_share and "
-                          "sumo.probe_share are both 0; raise one of them")
+            raise Problem(
+                "measurement",
+                '"estimate" needs detectors or probes, but sumo.detector_share and '
+                "sumo.probe_share are both 0; raise one of them",
+            )
         if self.metering_first == SHORT and not self.metering:
-            raise Problem("metering_first", "\"short\" says whom sumo.metering lets begin first; set that to true, or "
-                          "omit it")
+            raise Problem(
+                "metering_first", '"short" says whom sumo.metering lets begin first; set that to true, or omit it'
+            )
         if self.max_green < self.min_green:
-            raise Problem("max_green", f"expected {self.min_green:g} s, the sumo.min_green, or more, got "
-                          f"{self.max_green:g} instead")
+            raise Problem(
+                "max_green",
+                f"expected {self.min_green:g} s, the sumo.min_green, or more, got {self.max_green:g} instead",
+            )
         return self
 
 
@@ -111,8 +140,8 @@ def scenario_file(scenario: "Scenario") -> Path:
 def settings(scenario: "Scenario") -> Settings:
     """Read and check the table [sumo] of the scenario. Raises InputError.
 
-        >>> settings(nmfd.load_scenario("grid7_peak")).signals
-        'fixed'
+    >>> settings(nmfd.load_scenario("grid7_peak")).signals
+    'fixed'
     """
     if scenario.folder is None:
         return Settings()
@@ -124,8 +153,12 @@ def settings(scenario: "Scenario") -> Settings:
         for name in getattr(chosen, key):
             if not Path(scenario.folder, name).is_file():
                 raise config.error(
-                    path, f"sumo.{key}", f"no such file: {scenario.folder / name}; give the path of an existing one")
+                    path, f"sumo.{key}", f"no such file: {scenario.folder / name}; give the path of an existing one"
+                )
     if abs(scenario.step / chosen.step_length - round(scenario.step / chosen.step_length)) > 1e-9:
-        raise config.error(path, "sumo.step_length", config.got(
-            f"a divisor of the control interval {scenario.step:g} s", chosen.step_length))
+        raise config.error(
+            path,
+            "sumo.step_length",
+            config.got(f"a divisor of the control interval {scenario.step:g} s", chosen.step_length),
+        )
     return chosen

@@ -10,9 +10,9 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from cosim.sumo.arrays import EdgeMask, GatewayMask, MoveEnds, PerEdge, PerGateway, PerMove
 
-FAR = 1e9               # s, longer than any way
+FAR = 1e9  # s, longer than any way
 MOST_KEPT = 20_000_000  # nodes of the trees that are kept, of 4 to 12 bytes each
-FEWEST_KEPT = 8         # trees, however large the city: those that a decision needs at once
+FEWEST_KEPT = 8  # trees, however large the city: those that a decision needs at once
 
 
 class Moves:
@@ -33,9 +33,7 @@ class Moves:
         self._begins = np.searchsorted(rows[kept], np.arange(len(self.edges) + 1)).astype(np.int32)
         self._ids = self.edges.tolist()
 
-    def costing(
-        self, time: PerEdge, turns: PerMove, ahead: Float[np.ndarray, " nodes"] | None = None,
-    ) -> csr_array:
+    def costing(self, time: PerEdge, turns: PerMove, ahead: Float[np.ndarray, " nodes"] | None = None) -> csr_array:
         """A move costs its own time, of `turns` (M,) [s], and `time` (E,) [s] of the edge that it leads to; less the
         time by which it comes nearer, of `ahead` (nodes,) [s], if that is given: then a search from t finds cost +
         ahead - ahead[t], and what leads astray last (A*)."""
@@ -46,16 +44,13 @@ class Moves:
 
     def leading_to(self, nodes: Int[np.ndarray, " G"]) -> Bool[np.ndarray, "nodes G"]:
         """(all nodes, G) bool: from which of all nodes each of `nodes` (G,) can be reached."""
-        moves = csr_array(
-            (np.ones(len(self._columns)), self._columns, self._begins), shape=(len(self.edges),) * 2)
+        moves = csr_array((np.ones(len(self._columns)), self._columns, self._begins), shape=(len(self.edges),) * 2)
         # Nodes that lead to each other are reached from the same ones: in most cities nearly all.
         _, part = connected_components(moves, connection="strong")
         _, once, which = np.unique(part[nodes], return_index=True, return_inverse=True)
         return np.isfinite(dijkstra(moves.T.tocsr(), indices=nodes[once], unweighted=True)).T[:, which]
 
-    def ahead(
-        self, nodes: Int[np.ndarray, " G"], time: PerEdge, turns: PerMove,
-    ) -> Float[np.ndarray, " nodes"]:
+    def ahead(self, nodes: Int[np.ndarray, " G"], time: PerEdge, turns: PerMove) -> Float[np.ndarray, " nodes"]:
         """(all nodes,) [s]: hardly less than the time from each to the nearest of `nodes` (G,) at `time` (E,) [s] and
         `turns` (M,) [s], and FAR where none can be reached."""
         least = dijkstra(self.costing(time, turns).T.tocsr(), indices=nodes, min_only=True)
@@ -114,8 +109,7 @@ class Trees:
         be infinite."""
         found = self._searches.get(self._owner, begin)
         if found is None or found[0] < most:
-            cost, before = dijkstra(
-                self._costs, indices=self.number[begin], return_predecessors=True, limit=most)
+            cost, before = dijkstra(self._costs, indices=self.number[begin], return_predecessors=True, limit=most)
             found = self._searches.put(self._owner, begin, (most, cost, before), len(cost))
         return found[1]
 
@@ -151,10 +145,21 @@ class Ways:
     """
 
     def __init__(
-        self, first: Int[np.ndarray, " G"], second: Int[np.ndarray, " G"], next_region: Int[np.ndarray, " G"], *,
-        inside: Moves, outside: Moves, crossing: PerGateway, leading: Bool[np.ndarray, "inside G"],
-        reached: Bool[np.ndarray, "nodes G"], ahead: Float[np.ndarray, " nodes"], time: PerEdge, turns: PerMove,
-        searches: Searches, everywhere: tuple[Trees, PerGateway, PerGateway] | None = None,
+        self,
+        first: Int[np.ndarray, " G"],
+        second: Int[np.ndarray, " G"],
+        next_region: Int[np.ndarray, " G"],
+        *,
+        inside: Moves,
+        outside: Moves,
+        crossing: PerGateway,
+        leading: Bool[np.ndarray, "inside G"],
+        reached: Bool[np.ndarray, "nodes G"],
+        ahead: Float[np.ndarray, " nodes"],
+        time: PerEdge,
+        turns: PerMove,
+        searches: Searches,
+        everywhere: tuple[Trees, PerGateway, PerGateway] | None = None,
     ):
         """first, second, next_region: (G,), the last in rising order; inside: moves in the region; outside: those
         elsewhere, back; crossing: (G,) [s], over each gateway; leading: (nodes of `inside`, G), from which edges
@@ -183,10 +188,12 @@ class Ways:
         found = self._searches.get(self._from_here, here)
         if found is None or found[0] < within:
             cost, before = dijkstra(
-                self._costs[0], indices=self._inside.number[here], return_predecessors=True, limit=within)
+                self._costs[0], indices=self._inside.number[here], return_predecessors=True, limit=within
+            )
             there = cost[self._first] + self._entering
             found = self._searches.put(
-                self._from_here, here, (within, there, float(there.min(initial=np.inf)), before), len(before))
+                self._from_here, here, (within, there, float(there.min(initial=np.inf)), before), len(before)
+            )
         _, there, nearest, _ = found
         if nearest == np.inf:
             return there, open_ways
@@ -195,7 +202,8 @@ class Ways:
         if onward is None or onward[0] < left:
             cost, after = dijkstra(self._costs[1], indices=last, return_predecessors=True, limit=left)
             onward = self._searches.put(
-                self._to_there, target, (left, cost[self._second] + self._ahead[last], after), len(after))
+                self._to_there, target, (left, cost[self._second] + self._ahead[last], after), len(after)
+            )
         return there + onward[1], open_ways
 
     def returning(self, here: int, target: int, most: float) -> tuple[float, int]:

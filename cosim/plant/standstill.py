@@ -11,8 +11,8 @@ from collections import deque
 
 from nmfd.types import State
 
-LOOK = 4       # control intervals
-ERROR = 5e-4   # of the total time spent
+LOOK = 4  # control intervals
+ERROR = 5e-4  # of the total time spent
 
 
 class Standstill:

@@ -1,9 +1,9 @@
 """Strategies by name: CONTROLLER[+OPTION...], a regional controller and what else the city does.
 
-    dpc-pc+max-pressure      max-pressure at all signals, DPC limits the green of the gateways
-    no-control+rerouting-30  nobody controls, 30 % of the drivers reroute; `rerouting-30` for short
-    pi-gating+guided         PI gating, and drivers are guided by travel times
-    mine.py:Gate+actuated    a controller of one's own (nmfd.controllers.custom), actuated signals elsewhere
+dpc-pc+max-pressure      max-pressure at all signals, DPC limits the green of the gateways
+no-control+rerouting-30  nobody controls, 30 % of the drivers reroute; `rerouting-30` for short
+pi-gating+guided         PI gating, and drivers are guided by travel times
+mine.py:Gate+actuated    a controller of one's own (nmfd.controllers.custom), actuated signals elsewhere
 """
 
 from collections.abc import Iterable
@@ -22,15 +22,22 @@ GUIDED = "guided"
 
 # Option -> (field of cosim.plant.settings.Settings, its value).
 _WORDS = {
-    **{name: ("signals", name) for name in SIGNALS[1:]}, **{name: ("actuation", name) for name in MODES},
-    "estimate": ("measurement", "estimate"), "metering": ("metering", True),
-    "short-first": ("metering_first", "short"), GUIDED: ("guided", True)}
+    **{name: ("signals", name) for name in SIGNALS[1:]},
+    **{name: ("actuation", name) for name in MODES},
+    "estimate": ("measurement", "estimate"),
+    "metering": ("metering", True),
+    "short-first": ("metering_first", "short"),
+    GUIDED: ("guided", True),
+}
 PERCENT, SECONDS = "percent", "seconds"
 # Option with a whole number -> (field of cosim.plant.settings.Settings, least, most, its unit).
 _NUMBERS = {
-    "rerouting": ("rerouting", 1, 100, PERCENT), "compliance": ("compliance", 0, 100, PERCENT),
-    "queue-override": ("queue_override", 1, 100, PERCENT), "metering": ("metering_level", 1, 1000, PERCENT),
-    "guidance-period": ("guidance_period", 1, 3600, SECONDS)}
+    "rerouting": ("rerouting", 1, 100, PERCENT),
+    "compliance": ("compliance", 0, 100, PERCENT),
+    "queue-override": ("queue_override", 1, 100, PERCENT),
+    "metering": ("metering_level", 1, 1000, PERCENT),
+    "guidance-period": ("guidance_period", 1, 3600, SECONDS),
+}
 METERING = ("metering", "metering_level")  # of these settings, those whose options make trips wait
 OPTIONS = (*_WORDS, *(f"{name}-N" for name in _NUMBERS))
 _TEXTS = {
@@ -48,7 +55,8 @@ _TEXTS = {
     "rerouting-N": "N percent of the drivers take another route by themselves, every minute",
     "compliance-N": "N percent of the drivers follow the guidance",
     "queue-override-N": "a gateway is left open while its road is N percent full",
-    "guidance-period-N": "drivers within a region are guided anew every N seconds"}
+    "guidance-period-N": "drivers within a region are guided anew every N seconds",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,9 +77,9 @@ class Strategy:
 def parse(name: str) -> Strategy:
     """The strategy `name`. InputError for a controller or option that there is not, and for contradictory ones.
 
-        >>> strategy = parse("pi-gating+max-pressure")
-        >>> strategy.controller, strategy.overrides["signals"]
-        ('pi-gating', 'max-pressure')
+    >>> strategy = parse("pi-gating+max-pressure")
+    >>> strategy.controller, strategy.overrides["signals"]
+    ('pi-gating', 'max-pressure')
     """
     first, words = registry.split(name)
     controller = first
@@ -99,6 +107,7 @@ def parse(name: str) -> Strategy:
 def options() -> list[tuple[str, str]]:
     """Of every option, which is joined to a controller by +, what it does."""
     return [(f"+{name}", _TEXTS[name]) for name in OPTIONS]
+
 
 def ready(scenario: Scenario) -> tuple[str, ...]:
     """The strategies of which a pattern such as dpc-* may speak: controllers that can be made for `scenario`, those
@@ -141,7 +150,8 @@ def configured(name: str, tables: Iterable[str]) -> str:
         raise InputError(
             f"scenario.toml: strategy {name!r}: the tables "
             + " and ".join(f'[controllers."{table}"]' for table in rivals)
-            + f' fit it equally well; which one counts, say in a table [controllers."{name}"] of its own')
+            + f' fit it equally well; which one counts, say in a table [controllers."{name}"] of its own'
+        )
     return best
 
 
@@ -158,8 +168,11 @@ def planning_of(scenario: Scenario, strategy: str, model: Path | None = None) ->
     if model is not None:
         return with_model(planning_model(scenario), scenario, model)
     planned = planning_model(scenario, variant)
-    if planned.network.folder == scenario.network.folder and parsed.guides and (
-            folder := guided_model(scenario.network)) is not None:
+    if (
+        planned.network.folder == scenario.network.folder
+        and parsed.guides
+        and (folder := guided_model(scenario.network)) is not None
+    ):
         return with_model(planned, scenario, folder)
     return planned
 

@@ -17,11 +17,11 @@ from cosim.plant.sampling import StreetMeans
 from cosim.sumo.arrays import MoveEnds, PerEdge, PerInside, PerMove
 from cosim.sumo.net import City
 
-SMOOTHING = 0.5    # weight of the newest control interval in the mesoscopic model
-WINDOW = 300.0     # s in which what was seen comes to count a third
-EMPTY = 0.5        # of what was seen counts yet where there was nobody for a control interval
-UNSEEN = 3.0       # veh s at the speed limit that count besides
-SLOWEST = 0.1      # m/s; slower is as good as standing
+SMOOTHING = 0.5  # weight of the newest control interval in the mesoscopic model
+WINDOW = 300.0  # s in which what was seen comes to count a third
+EMPTY = 0.5  # of what was seen counts yet where there was nobody for a control interval
+UNSEEN = 3.0  # veh s at the speed limit that count besides
+SLOWEST = 0.1  # m/s; slower is as good as standing
 
 
 class TravelTimes:
@@ -74,8 +74,7 @@ class TravelTimes:
         self.edges = np.maximum(self._length / np.maximum(speed, SLOWEST), self.free)
         self._crossing = kept * self._crossing + seen.crossing * seen.duration
         self._crossed = kept * self._crossed + seen.crossed * seen.duration
-        self.turns = np.maximum(
-            np.bincount(self._move, self._over()[self._via], len(self.turns)), self.free_turns)
+        self.turns = np.maximum(np.bincount(self._move, self._over()[self._via], len(self.turns)), self.free_turns)
 
     def _over(self) -> PerInside:
         """[s] over each internal edge; 0 where nobody was."""

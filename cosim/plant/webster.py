@@ -29,15 +29,15 @@ from nmfd.errors import InputError
 from nmfd.runs import shipped
 
 CYCLES = (40, 50, 60, 70, 80, 90, 100, 110, 120)  # s
-MIN_GREEN = 5.0           # s
-STEP = 1.0                # s, of the splits
-SATURATION = 0.5          # veh/s and lane: 1,800 an hour, straight on
+MIN_GREEN = 5.0  # s
+STEP = 1.0  # s, of the splits
+SATURATION = 0.5  # veh/s and lane: 1,800 an hour, straight on
 TURNING = {"l": 0.95, "r": 0.85}  # of that in turns (HCM)
-LOST = 1.0                # s of every green window, more than what is used of the yellow
+LOST = 1.0  # s of every green window, more than what is used of the yellow
 GAP, FOLLOW_UP = 4.5, 2.5  # s, critical gap and follow-up time of permitted left turns (HCM)
-SNEAKERS = 1.0            # veh per lane, which wait on the junction and turn when the green ends
-PERIOD = 900.0            # s, for which an excess flow lasts (HCM: a quarter of an hour)
-LEAST = 1e-4              # veh/s, so that a capacity is never zero
+SNEAKERS = 1.0  # veh per lane, which wait on the junction and turn when the green ends
+PERIOD = 900.0  # s, for which an excess flow lasts (HCM: a quarter of an hour)
+LEAST = 1e-4  # veh/s, so that a capacity is never zero
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +69,12 @@ def optimised(city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, s
 
 
 def plan(
-    city: City, signals: Sequence[Signal], demand: PairsOverTime, step: float, *, folder: Path,
+    city: City,
+    signals: Sequence[Signal],
+    demand: PairsOverTime,
+    step: float,
+    *,
+    folder: Path,
     flows: Mapping[tuple[str, str], float] | None = None,
 ) -> Path:
     """The additional file for SUMO with `signals` optimised for the peak of `demand` (T, R, R) [veh/s], or for `flows`
@@ -79,7 +84,12 @@ def plan(
     """
     content = hashlib.sha256(metadata.version("numpy").encode())
     sources = (
-        cosim.sumo.turning_flows, cosim.plant.offsets, cosim.sumo.signals, cosim.sumo.trips, sys.modules[__name__])
+        cosim.sumo.turning_flows,
+        cosim.plant.offsets,
+        cosim.sumo.signals,
+        cosim.sumo.trips,
+        sys.modules[__name__],
+    )
     for source in sources:
         content.update(Path(inspect.getfile(source)).read_bytes())
     content.update(city.net_file.read_bytes())
@@ -113,8 +123,9 @@ def _lanes(signal: Signal, flows: Mapping[tuple[str, str], float]) -> list[_Lane
     lanes = []
     for (edge, _), parts in found.items():
         total = sum(flow for _, flow, _ in parts)
-        lanes.append(_Lane(
-            edge=edge, flow=total, shares=tuple((index, flow / total, rate) for index, flow, rate in parts)))
+        lanes.append(
+            _Lane(edge=edge, flow=total, shares=tuple((index, flow / total, rate) for index, flow, rate in parts))
+        )
     return lanes
 
 
@@ -146,14 +157,20 @@ def _opposing(signal: Signal, lanes: list[_Lane]) -> dict[tuple[int, str], tuple
     for n in signal.stages:
         state = signal.phases[n].state
         for edge in {lane.edge for lane in lanes}:
-            flows = [lane.flow * sum(share for index, share, _ in lane.shares if state[index] == "G")
-                     for lane in lanes if lane.edge != edge]
+            flows = [
+                lane.flow * sum(share for index, share, _ in lane.shares if state[index] == "G")
+                for lane in lanes
+                if lane.edge != edge
+            ]
             found[n, edge] = sum(flows), max(flows, default=0.0)
     return found
 
 
 def _delay(
-    signal: Signal, durations: list[float], lanes: list[_Lane], opposing: Mapping[tuple[int, str], tuple[float, float]],
+    signal: Signal,
+    durations: list[float],
+    lanes: list[_Lane],
+    opposing: Mapping[tuple[int, str], tuple[float, float]],
     cycle: float,
 ) -> float:
     """Sum over the lanes of flow times delay [veh s/s]; opposing: see `_opposing`."""
@@ -187,5 +204,3 @@ def _permitted(flow: float, fullest: float, green: float, cycle: float) -> float
     queue = fullest * (cycle - green) / max(SATURATION - fullest, 0.05)  # s until the opposing queue is gone
     gaps = flow * math.exp(-flow * GAP) / (1.0 - math.exp(-flow * FOLLOW_UP)) if flow > 1e-6 else 1.0 / FOLLOW_UP
     return min(max(1.0 - queue / green, 0.0) * gaps + SNEAKERS / green, SATURATION)
-
-

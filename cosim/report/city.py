@@ -72,9 +72,14 @@ class City:
         demand = self.scenario.demand
         trips = self.scenario.step * demand.sum(axis=0)
         pairs = np.argwhere(trips > 0)
-        return pd.DataFrame({
-            "origin": pairs[:, 0], "destination": pairs[:, 1], "trips_veh": trips[trips > 0],
-            "peak_veh_s": demand.max(axis=0)[trips > 0]})
+        return pd.DataFrame(
+            {
+                "origin": pairs[:, 0],
+                "destination": pairs[:, 1],
+                "trips_veh": trips[trips > 0],
+                "peak_veh_s": demand.max(axis=0)[trips > 0],
+            }
+        )
 
     def plot(self, ax: Axes | None = None, *, flows: bool = True) -> Axes:
         """The map: streets in the colour of their region, gateways with and without control, and with `flows` arrows
@@ -96,10 +101,22 @@ class City:
     def _repr_html_(self) -> str:
         """The regions, for notebooks."""
         headings = ["region", "lane-km", "signals", "gateways", "controlled", "critical [veh]", "max outflow [veh/s]"]
-        return html_table(headings, [
-            [f"{row.region} {row.title}", f"{row.lane_km:.1f}", row.signals, row.gateways, row.controlled_gateways,
-             f"{row.critical_veh:,.0f}", f"{row.max_outflow_veh_s:.3g}"]
-            for row in self.regions.rename(columns={"name": "title"}).itertuples(index=False)], repr(self)[1:-1])
+        return html_table(
+            headings,
+            [
+                [
+                    f"{row.region} {row.title}",
+                    f"{row.lane_km:.1f}",
+                    row.signals,
+                    row.gateways,
+                    row.controlled_gateways,
+                    f"{row.critical_veh:,.0f}",
+                    f"{row.max_outflow_veh_s:.3g}",
+                ]
+                for row in self.regions.rename(columns={"name": "title"}).itertuples(index=False)
+            ],
+            repr(self)[1:-1],
+        )
 
     @cached_property
     def _city(self) -> net.City:
@@ -117,8 +134,9 @@ class City:
     @cached_property
     def _places(self) -> Positions:
         streets = self._streets
-        return np.stack([
-            streets.centre[streets.drivable & (self._regions == r)].mean(axis=0) for r in range(self.network.regions)])
+        return np.stack(
+            [streets.centre[streets.drivable & (self._regions == r)].mean(axis=0) for r in range(self.network.regions)]
+        )
 
     @cached_property
     def _tables(self) -> quality.Tables:

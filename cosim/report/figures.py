@@ -17,8 +17,10 @@ from nmfd.studies import plots
 from nmfd.studies.benchmark import REFERENCE
 
 JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
-DENSITIES = ScalarMappable(Normalize(0.0, JAM_DENSITY), LinearSegmentedColormap.from_list(
-    "density", ["#d9d9d9", "#fecc5c", "#e31a1c", "#4d0010"]))
+DENSITIES = ScalarMappable(
+    Normalize(0.0, JAM_DENSITY),
+    LinearSegmentedColormap.from_list("density", ["#d9d9d9", "#fecc5c", "#e31a1c", "#4d0010"]),
+)
 ASIDE = 0.007  # of the map's width: how far the lines of the two directions of a street are drawn apart
 LEAST_FLOW, WIDEST_FLOW = 0.05, 4.5  # of the largest one; points
 SATURATION = 0.5  # veh/s and lane
@@ -26,7 +28,7 @@ COMMANDED, GREEN_SHOWN, FLOWED = "#333333", "#009e73", "#0059a8"
 
 
 def link_densities(
-    ax: Axes, shapes: Sequence[Points], density: PerEdge, lanes: EdgeNumbers, region: EdgeNumbers,
+    ax: Axes, shapes: Sequence[Points], density: PerEdge, lanes: EdgeNumbers, region: EdgeNumbers
 ) -> Axes:
     """A map of the edges in the colours of DENSITIES.
 
@@ -35,13 +37,25 @@ def link_densities(
     points = np.concatenate(shapes)
     apart = ASIDE * np.ptp(points[:, 0])
     order = np.argsort(density, kind="stable")  # the full ones on top
-    ax.add_collection(LineCollection(
-        [_to_the_right(shapes[n], apart) for n in order], colors=DENSITIES.to_rgba(density[order]),
-        linewidths=0.5 + 0.4 * lanes[order], capstyle="butt"))
+    ax.add_collection(
+        LineCollection(
+            [_to_the_right(shapes[n], apart) for n in order],
+            colors=DENSITIES.to_rgba(density[order]),
+            linewidths=0.5 + 0.4 * lanes[order],
+            capstyle="butt",
+        )
+    )
     for r in np.unique(region):
         middle = np.mean([shapes[n].mean(axis=0) for n in np.flatnonzero(region == r)], axis=0)
-        ax.text(*middle, str(r), fontsize=8, fontweight="bold", ha="center", va="center",
-                bbox={"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": "#30506f", "linewidth": 0.8})
+        ax.text(
+            *middle,
+            str(r),
+            fontsize=8,
+            fontweight="bold",
+            ha="center",
+            va="center",
+            bbox={"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": "#30506f", "linewidth": 0.8},
+        )
     ax.autoscale_view()
     ax.set_aspect("equal")
     ax.set_axis_off()
@@ -62,9 +76,21 @@ def flow_arrows(ax: Axes, places: Positions, trips: PerPair) -> Axes:
     between = trips * ~np.eye(len(trips), dtype=bool)
     most = float(between.max(initial=0.0))
     for i, j in np.argwhere((between > 0) & (between >= LEAST_FLOW * most)):
-        ax.annotate("", places[j], places[i], zorder=4, arrowprops={
-            "arrowstyle": "-|>", "connectionstyle": "arc3,rad=0.15", "color": "black", "alpha": 0.35, "shrinkA": 14,
-            "shrinkB": 14, "linewidth": WIDEST_FLOW * between[i, j] / most})
+        ax.annotate(
+            "",
+            places[j],
+            places[i],
+            zorder=4,
+            arrowprops={
+                "arrowstyle": "-|>",
+                "connectionstyle": "arc3,rad=0.15",
+                "color": "black",
+                "alpha": 0.35,
+                "shrinkA": 14,
+                "shrinkB": 14,
+                "linewidth": WIDEST_FLOW * between[i, j] / most,
+            },
+        )
     if most:
         ax.set_title(f"demand between regions, widest arrow {most:,.0f} trips", fontsize="medium")
     return ax
@@ -75,9 +101,10 @@ def perimeter(ax: Axes, step: float, commanded: Series, green: Series, flow: Ser
     of what passes in that at saturation."""
     time = plots.time_axis(ax, step * np.arange(len(commanded) + 1))
     for values, tone, label, width in (
-            (flow, FLOWED, "flow / saturation flow of the original green", 1.2),
-            (green, GREEN_SHOWN, "green shown / original green", 1.6),
-            (commanded, COMMANDED, "commanded u", 1.6)):
+        (flow, FLOWED, "flow / saturation flow of the original green", 1.2),
+        (green, GREEN_SHOWN, "green shown / original green", 1.6),
+        (commanded, COMMANDED, "commanded u", 1.6),
+    ):
         ax.stairs(values, time, color=tone, linewidth=width, label=label, baseline=None)
     ax.set_ylim(0.0, max(1.08, 1.05 * float(np.nanmax([green, flow], initial=1.0))))
     ax.set_ylabel("share [-]")
@@ -86,23 +113,26 @@ def perimeter(ax: Axes, step: float, commanded: Series, green: Series, flow: Ser
 
 
 def by_region(
-    ax: Axes, step: float, values: Float[np.ndarray, "T R"], regions: Sequence[int], network: RegionalModel,
-    label: str,
+    ax: Axes, step: float, values: Float[np.ndarray, "T R"], regions: Sequence[int], network: RegionalModel, label: str
 ) -> Axes:
     """Something of these regions over time: `values` (T, R), one per control interval; `label` of the axis."""
     time = plots.time_axis(ax, step * np.arange(len(values) + 1))
     for region in regions:
-        ax.stairs(values[:, region], time, color=colormaps["tab10"](region % 10), linewidth=1.6, baseline=None,
-                  label=plots.region_title(network, region))
+        ax.stairs(
+            values[:, region],
+            time,
+            color=colormaps["tab10"](region % 10),
+            linewidth=1.6,
+            baseline=None,
+            label=plots.region_title(network, region),
+        )
     ax.set_ylim(bottom=0.0)
     ax.set_ylabel(label)
     ax.spines[["top", "right"]].set_visible(False)
     return ax
 
 
-def green_against_command(
-    ax: Axes, commanded: Float[np.ndarray, " n"], green: Float[np.ndarray, " n"],
-) -> Axes:
+def green_against_command(ax: Axes, commanded: Float[np.ndarray, " n"], green: Float[np.ndarray, " n"]) -> Axes:
     """Every boundary and interval: share of the original green that was shown against the commanded u, both (n,)."""
     ax.scatter(commanded, green, s=5, color=GREEN_SHOWN, alpha=0.35, linewidths=0)
     ax.set_xlabel("commanded u [-]")
@@ -114,7 +144,10 @@ def green_against_command(
 
 
 def splits(
-    ax: Axes, step: float, commanded: Float[np.ndarray, "T H"], realised: Float[np.ndarray, "T H"],
+    ax: Axes,
+    step: float,
+    commanded: Float[np.ndarray, "T H"],
+    realised: Float[np.ndarray, "T H"],
     neighbours: Sequence[int],
 ) -> Axes:
     """The vehicles of one region for one destination over time: theta (T, H) as commanded (lines) and the shares that
@@ -131,12 +164,19 @@ def splits(
 
 
 def split_totals(
-    ax: Axes, commanded: Float[np.ndarray, " n"], realised: Float[np.ndarray, " n"], vehicles: Real[np.ndarray, " n"],
+    ax: Axes, commanded: Float[np.ndarray, " n"], realised: Float[np.ndarray, " n"], vehicles: Real[np.ndarray, " n"]
 ) -> Axes:
     """theta as commanded against as realised, (n,) each, over the whole run; area by `vehicles` (n,)."""
     ax.plot([0, 1], [0, 1], color="#bbbbbb", linewidth=1.0, zorder=1)
-    ax.scatter(commanded, realised, s=90.0 * vehicles / max(vehicles.max(initial=0.0), 1.0) + 3.0, color=FLOWED,
-               alpha=0.45, linewidths=0, zorder=2)
+    ax.scatter(
+        commanded,
+        realised,
+        s=90.0 * vehicles / max(vehicles.max(initial=0.0), 1.0) + 3.0,
+        color=FLOWED,
+        alpha=0.45,
+        linewidths=0,
+        zorder=2,
+    )
     ax.set_xlabel("commanded θ [-], mean of the run")
     ax.set_ylabel("share that went there [-]")
     ax.set_xlim(-0.04, 1.04)
@@ -145,9 +185,7 @@ def split_totals(
     return ax
 
 
-def over_demand(
-    ax: Axes, ratios: Mapping[str, Mapping[float, tuple[float, float]]], against: str = REFERENCE,
-) -> Axes:
+def over_demand(ax: Axes, ratios: Mapping[str, Mapping[float, tuple[float, float]]], against: str = REFERENCE) -> Axes:
     """Total time spent as a share of that of `against`, over the demand level: controller -> level -> mean over seeds
     and half of its 95 % interval (NaN of a single seed)."""
     tones = plots.colours([against, *ratios])
@@ -156,9 +194,17 @@ def over_demand(
     aside = 0.012 * max(levels[-1] - levels[0], 0.1)  # so that intervals do not hide each other
     for number, (controller, points) in enumerate(ratios.items()):
         mean, half = np.array(list(points.values())).reshape(-1, 2).T
-        ax.errorbar(np.array(list(points)) + aside * (number - (len(ratios) - 1) / 2), mean, np.nan_to_num(half),
-                    color=tones[controller], linewidth=1.6, capsize=3, marker="o^sDv"[number % 5], markersize=4,
-                    label=controller)
+        ax.errorbar(
+            np.array(list(points)) + aside * (number - (len(ratios) - 1) / 2),
+            mean,
+            np.nan_to_num(half),
+            color=tones[controller],
+            linewidth=1.6,
+            capsize=3,
+            marker="o^sDv"[number % 5],
+            markersize=4,
+            label=controller,
+        )
     ax.set_xticks(levels, [f"{level:g}" for level in levels])
     ax.set_xlabel("demand, multiple of the scenario's")
     ax.set_ylabel(f"total time spent / that of {against} [-]")

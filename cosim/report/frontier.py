@@ -22,15 +22,23 @@ def draw(path: Path, table: pd.DataFrame) -> Path:
     for number, name in enumerate(names):
         part = table[table["controller"] == name].sort_values("demand")
         label = f"{name}: up to {reached[name]:g}" if reached[name] else f"{name}: at none"
-        manner = {"color": tones[name], "marker": MARKERS[number % len(MARKERS)], "markersize": 5, "linewidth": 1.6,
-                  "capsize": 3, "label": label}
+        manner = {
+            "color": tones[name],
+            "marker": MARKERS[number % len(MARKERS)],
+            "markersize": 5,
+            "linewidth": 1.6,
+            "capsize": 3,
+            "label": label,
+        }
         aside = 0.006 * (number - (len(names) - 1) / 2)  # so that points on one another can be told apart
         at, share = part["demand"].to_numpy() + aside, part["served_share"].to_numpy()
-        served.errorbar(at, share, np.abs(np.stack([
-            share - part["served_share_low"], part["served_share_high"] - share])), **manner)
+        served.errorbar(
+            at, share, np.abs(np.stack([share - part["served_share_low"], part["served_share_high"] - share])), **manner
+        )
         per_trip = 60.0 * part["mean_trips"].clip(lower=1.0)
-        minutes.errorbar(at, part[f"mean_{TTS}"] / per_trip,
-                         (part[f"half_interval_{TTS}"] / per_trip).fillna(0.0), **manner)
+        minutes.errorbar(
+            at, part[f"mean_{TTS}"] / per_trip, (part[f"half_interval_{TTS}"] / per_trip).fillna(0.0), **manner
+        )
     served.axhline(SERVED, color="#777777", linestyle="--", linewidth=1.0)
     served.set_ylabel("share of the seeds in which\nall trips are served [-]")
     served.set_ylim(-0.04, 1.04)
@@ -42,7 +50,8 @@ def draw(path: Path, table: pd.DataFrame) -> Path:
     seeds = f"{table['seeds'].min()}" + (f" to {table['seeds'].max()}" if table["seeds"].nunique() > 1 else "")
     drawing.suptitle(
         f"all trips served in {SERVED:.0%} of the seeds up to ... times the demand; {seeds} seeds, 95 % intervals",
-        fontsize="medium")
+        fontsize="medium",
+    )
     plots.legend_below(drawing, [served], columns=2)
     return plots.save(drawing, path)
 

@@ -17,17 +17,20 @@ from nmfd.studies import mfd_bands, plots
 from nmfd.studies.benchmark import draw_accumulations
 from nmfd.types import Trajectory
 
-PANELS = 11    # boundaries, or pairs of region and destination, that are shown one by one
-FEW = 5        # trips of one region; so many wait at any time for a gap in traffic
-NAMED = 2      # controllers with the most teleports in a title
-WINDOW = 3     # control intervals over which realised shares are taken
+PANELS = 11  # boundaries, or pairs of region and destination, that are shown one by one
+FEW = 5  # trips of one region; so many wait at any time for a gap in traffic
+NAMED = 2  # controllers with the most teleports in a title
+WINDOW = 3  # control intervals over which realised shares are taken
 DRAWN = (  # what pictures of gateways and guidance need of a record
-    "gateway_flow", "gateway_green", "gateway_original_green", "crossings", "guided")
+    "gateway_flow",
+    "gateway_green",
+    "gateway_original_green",
+    "crossings",
+    "guided",
+)
 
 
-def draw(
-    folder: Path, scenario: Scenario, city: City | None, rows: pd.DataFrame, out: Path | None = None,
-) -> None:
+def draw(folder: Path, scenario: Scenario, city: City | None, rows: pd.DataFrame, out: Path | None = None) -> None:
     """All pictures of one demand level into `out`, or into its run folder; `rows` of this level, as in statistics.
 
     Those of gateways and guidance need the `city`, and records that hold DRAWN.
@@ -35,12 +38,20 @@ def draw(
     out = folder if out is None else out
     seed = shown_seed(rows)
     order = list(dict.fromkeys(rows["controller"]))
-    runs = sorted((t for t in run_folder.trajectories(folder) if t.controller in order),
-                  key=lambda t: (order.index(t.controller), t.seed))
+    runs = sorted(
+        (t for t in run_folder.trajectories(folder) if t.controller in order),
+        key=lambda t: (order.index(t.controller), t.seed),
+    )
     note = teleports(rows)
     shaded = ", shaded: all seeds" if rows["seed"].nunique() > 1 else ""
-    draw_accumulations(out, scenario, runs, seed=seed, title=f"seed {seed}{shaded}; {note}",
-                       outflow=experiment.measured_outflow(folder))
+    draw_accumulations(
+        out,
+        scenario,
+        runs,
+        seed=seed,
+        title=f"seed {seed}{shaded}; {note}",
+        outflow=experiment.measured_outflow(folder),
+    )
     if city is None:
         return
     results = [run for run in recorded(folder, rows, seed).values() if set(DRAWN) <= set(run.record)]  # best first
@@ -99,8 +110,11 @@ def perimeter(path: Path, city: City, network: RegionalModel, result: Result, no
     trajectory, record = result.trajectory, result.record
     pairs = {}
     for pair in map(tuple, np.argwhere(network.adjacency)):
-        members = [n for n, g in enumerate(city.gateways)
-                   if (g.source, g.target) == pair and not np.isnan(record["gateway_original_green"][0, n])]
+        members = [
+            n
+            for n, g in enumerate(city.gateways)
+            if (g.source, g.target) == pair and not np.isnan(record["gateway_original_green"][0, n])
+        ]
         original = record["gateway_original_green"][:, members] * [len(city.gateways[n].links) for n in members]
         shown = record["gateway_green"][:, members] * [len(city.gateways[n].links) for n in members]
         if members and original.sum() > 0:
@@ -115,8 +129,10 @@ def perimeter(path: Path, city: City, network: RegionalModel, result: Result, no
         figures.perimeter(ax, trajectory.step, *pairs[pair])
         ax.set_title(f"{pair[0]} > {pair[1]}", fontsize="medium")
     figures.green_against_command(
-        axes[-1], np.concatenate([u for u, _, _ in pairs.values()]),
-        np.concatenate([green for _, green, _ in pairs.values()]))
+        axes[-1],
+        np.concatenate([u for u, _, _ in pairs.values()]),
+        np.concatenate([green for _, green, _ in pairs.values()]),
+    )
     axes[-1].set_title("all boundaries", fontsize="medium")
     drawing.suptitle(f"{trajectory.controller}, seed {trajectory.seed}; {note}", fontsize="medium")
     plots.legend_below(drawing, axes)
@@ -129,8 +145,10 @@ def splits(path: Path, network: RegionalModel, result: Result, note: str) -> Non
     trajectory, crossings = result.trajectory, result.record["crossings"].astype(float)
     leaving = crossings.sum(axis=2)  # (T, R, R), from i bound for j
     choices = [
-        (i, j) for i, j in np.ndindex(network.adjacency.shape)
-        if i != j and network.split_mask[i, :, j].sum() > 1 and leaving[:, i, j].sum() > 0]
+        (i, j)
+        for i, j in np.ndindex(network.adjacency.shape)
+        if i != j and network.split_mask[i, :, j].sum() > 1 and leaving[:, i, j].sum() > 0
+    ]
     if not choices:
         return
     totals = []
@@ -146,14 +164,21 @@ def splits(path: Path, network: RegionalModel, result: Result, note: str) -> Non
         neighbours = np.flatnonzero(network.split_mask[i, :, j])
         moved = _moving_sum(crossings[:, i, neighbours, j])
         every = moved.sum(axis=1, keepdims=True)
-        figures.splits(ax, trajectory.step, trajectory.splits[:, i, neighbours, j],
-                       np.where(every > 0, moved / np.maximum(every, 1.0), np.nan), neighbours)
+        figures.splits(
+            ax,
+            trajectory.step,
+            trajectory.splits[:, i, neighbours, j],
+            np.where(every > 0, moved / np.maximum(every, 1.0), np.nan),
+            neighbours,
+        )
         ax.set_title(f"in {i}, bound for {j}", fontsize="medium")
     figures.split_totals(axes[-1], *np.concatenate(totals, axis=1))
     axes[-1].set_title("all", fontsize="medium")
     drawing.suptitle(
         f"{trajectory.controller}, seed {trajectory.seed}: commanded θ (lines), shares that went there (dots, over "
-        f"{WINDOW} intervals); {note}", fontsize="medium")
+        f"{WINDOW} intervals); {note}",
+        fontsize="medium",
+    )
     plots.legend_below(drawing, axes, columns=8)
     plots.save(drawing, path)
 
@@ -210,16 +235,18 @@ def draw_more(out: Path, scenario: Scenario, folder: Path, rows: pd.DataFrame) -
     results = recorded(folder, rows, shown_seed(rows))
     against = statistics.compared_with(rows)
     best = next((name for name in results if name != against), None)
-    outflows(out / "mfd.png", scenario.network, {
-        name: results[name] for name in (against, best) if name in results})
+    outflows(out / "mfd.png", scenario.network, {name: results[name] for name in (against, best) if name in results})
 
 
 def outflows(path: Path, network: RegionalModel, results: dict[str, Result]) -> None:
     """The MFD of every region: of the regional model as a curve, in these runs as dots."""
     samples = []
     for region in range(network.regions):
-        clouds = {name: model_validation.outflow_samples(
-            [result.trajectory], [result.record], network.u_max, region, network.adjacency)
-            for name, result in results.items()}
+        clouds = {
+            name: model_validation.outflow_samples(
+                [result.trajectory], [result.record], network.u_max, region, network.adjacency
+            )
+            for name, result in results.items()
+        }
         samples.append({name: np.concatenate(list(parts.values())) for name, parts in clouds.items()})
     mfd_bands.draw_mfds(path, network, samples)

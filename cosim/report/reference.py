@@ -30,19 +30,39 @@ def scenarios_page() -> str:
     """Every key of scenario.toml, in Markdown."""
     options = _options()
     same = {tuple(name for name in options if options[name] == table): table for table in options.values()}
-    return "\n".join([
-        "\n## scenario.toml\n", *sections(schema.of(ScenarioTable), "Top level"),
-        *sections(schema.of(SumoTable), "`[sumo]`"), *sections(schema.of(PlanningOptions), "`[controllers.NAME]`"),
-        *(section for names, table in same.items() if table["properties"]
-          for section in sections(table, ", ".join(f"`[controllers.{name}]`" for name in names)))]) + "\n"
+    return (
+        "\n".join(
+            [
+                "\n## scenario.toml\n",
+                *sections(schema.of(ScenarioTable), "Top level"),
+                *sections(schema.of(SumoTable), "`[sumo]`"),
+                *sections(schema.of(PlanningOptions), "`[controllers.NAME]`"),
+                *(
+                    section
+                    for names, table in same.items()
+                    if table["properties"]
+                    for section in sections(table, ", ".join(f"`[controllers.{name}]`" for name in names))
+                ),
+            ]
+        )
+        + "\n"
+    )
 
 
 def networks_page() -> str:
     """Every key of network.toml and of the recipe of a city, in Markdown."""
-    return "\n".join([
-        "\n## network.toml\n", *sections(schema.of(NetworkTable), "Top level"),
-        *sections(schema.of(CityTable), "`[sumo]`"),
-        "## city.toml, the recipe of a city\n", *sections(schema.of(RecipeTable), "Top level")]) + "\n"
+    return (
+        "\n".join(
+            [
+                "\n## network.toml\n",
+                *sections(schema.of(NetworkTable), "Top level"),
+                *sections(schema.of(CityTable), "`[sumo]`"),
+                "## city.toml, the recipe of a city\n",
+                *sections(schema.of(RecipeTable), "Top level"),
+            ]
+        )
+        + "\n"
+    )
 
 
 def scenario_schema() -> Schema:
@@ -55,8 +75,11 @@ def scenario_schema() -> Schema:
     tables = {name: {"$ref": f"#/$defs/{name}"} for name in _options()}
     root["properties"]["sumo"] = schema.of(SumoTable)
     root["properties"]["controllers"] = {
-        "type": "object", "properties": {**tables, registry.OWN: {"type": "object"}}, "additionalProperties": False,
-        "patternProperties": {f"^{name}\\+": table for name, table in tables.items()}}
+        "type": "object",
+        "properties": {**tables, registry.OWN: {"type": "object"}},
+        "additionalProperties": False,
+        "patternProperties": {f"^{name}\\+": table for name, table in tables.items()},
+    }
     return root
 
 

@@ -11,8 +11,12 @@ from nmfd.studies.benchmark import REFERENCE
 
 # Of decisions: column of summary.csv -> what is said of so many.
 WORDS = {
-    "solver_failures": "without an answer of the solver or policy", "fallbacks": "by a fallback",
-    "late_decisions": "late", "sensor_faults": "on a faulty measurement", "plant_faults": "in a faulty city"}
+    "solver_failures": "without an answer of the solver or policy",
+    "fallbacks": "by a fallback",
+    "late_decisions": "late",
+    "sensor_faults": "on a faulty measurement",
+    "plant_faults": "in a faulty city",
+}
 
 
 def opening(name: str, steps: int, step: float, levels: int, rows: pd.DataFrame) -> str:
@@ -23,7 +27,8 @@ def opening(name: str, steps: int, step: float, levels: int, rows: pd.DataFrame)
         f"{_count(len(controllers), 'strategy', 'strategies')} for the signals and routes of a simulated city were run "
         f"in the microsimulation SUMO on the scenario {name}, at {at} and with {_seeds(rows)}, "
         f"for {_count(steps, 'control interval')} of {step:g} s each ({steps * step / 60:.0f} min). With the same seed "
-        f"every strategy meets the same trips.")
+        f"every strategy meets the same trips."
+    )
 
 
 def head(rows: pd.DataFrame) -> str:
@@ -44,30 +49,40 @@ def best(rows: pd.DataFrame) -> str:
     if not others:
         return f"Only {against} was run: total time spent {_time(rows, against)}."
     first = others[0]
-    pair = statistics.paired(
-        statistics.by_seed(rows, level, first), statistics.by_seed(rows, level, against))
+    pair = statistics.paired(statistics.by_seed(rows, level, first), statistics.by_seed(rows, level, against))
     if not pair.seeds:
-        return (f"The lowest total time spent was that of {first}, {_time(rows, first)}; there is no run of "
-                f"{against} with the same seed to compare it with.")
+        return (
+            f"The lowest total time spent was that of {first}, {_time(rows, first)}; there is no run of "
+            f"{against} with the same seed to compare it with."
+        )
     if math.isnan(pair.percent):
-        return (f"The total time spent of {against} was {_time(rows, against)}, that of {first} "
-                f"{_time(rows, first)}: a change in percent is not defined.")
+        return (
+            f"The total time spent of {against} was {_time(rows, against)}, that of {first} "
+            f"{_time(rows, first)}: a change in percent is not defined."
+        )
     if pair.percent < 0:
-        text = (f"The best strategy was {first}: total time spent {_time(rows, first)}, {-pair.percent:.1f} % less "
-                f"than {statistics.than(against)}.")
+        text = (
+            f"The best strategy was {first}: total time spent {_time(rows, first)}, {-pair.percent:.1f} % less "
+            f"than {statistics.than(against)}."
+        )
     else:
         other = "no control" if against == REFERENCE else against
-        text = (f"No strategy was better than {other}; the nearest was {first}, whose total time spent "
-                f"{_time(rows, first)} is {pair.percent:.1f} % more.")
+        text = (
+            f"No strategy was better than {other}; the nearest was {first}, whose total time spent "
+            f"{_time(rows, first)} is {pair.percent:.1f} % more."
+        )
     text += " " + _certainty(pair)
     if len(others) > 1:
-        text += (f" It was chosen among {len(others)} on these very runs ({_seeds(rows)}), so its lead is "
-                 "flattered; only other seeds would tell its true size.")
+        text += (
+            f" It was chosen among {len(others)} on these very runs ({_seeds(rows)}), so its lead is "
+            "flattered; only other seeds would tell its true size."
+        )
         second = others[1]
         lead = statistics.paired(statistics.by_seed(rows, level, first), statistics.by_seed(rows, level, second))
         if lead.seeds and not math.isnan(lead.percent):
-            text += (f" Against the second, {second}, total time spent changes by {lead.percent:+.1f} %. "
-                     f"{_certainty(lead)}")
+            text += (
+                f" Against the second, {second}, total time spent changes by {lead.percent:+.1f} %. {_certainty(lead)}"
+            )
     return text
 
 
@@ -75,10 +90,11 @@ def _certainty(pair: statistics.Paired) -> str:
     if pair.seeds < 2:
         return "That is a single seed: there is no interval, and it may be chance."
     low, high = pair.percent - pair.percent_half, pair.percent + pair.percent_half
-    verdict = ("excludes zero: more than chance" if pair.excludes_zero else
-               "includes zero: the difference may be chance")
-    return (f"The 95 % interval of that change, paired over {pair.seeds} seeds, is {low:+.1f} to {high:+.1f} % and "
-            f"{verdict}.")
+    verdict = "excludes zero: more than chance" if pair.excludes_zero else "includes zero: the difference may be chance"
+    return (
+        f"The 95 % interval of that change, paired over {pair.seeds} seeds, is {low:+.1f} to {high:+.1f} % and "
+        f"{verdict}."
+    )
 
 
 def _beyond_chance(rows: pd.DataFrame) -> str:
@@ -92,9 +108,14 @@ def _beyond_chance(rows: pd.DataFrame) -> str:
         if name != against and pair.seeds > 1 and not math.isnan(pair.percent):
             (open_ if not pair.excludes_zero else better if pair.percent < 0 else worse).append(name)
     parts = [
-        f"{what}: {', '.join(names)}" for what, names in (
-            (f"less time than {statistics.than(against)}", better), ("more", worse),
-            ("not told apart from it", open_)) if names]
+        f"{what}: {', '.join(names)}"
+        for what, names in (
+            (f"less time than {statistics.than(against)}", better),
+            ("more", worse),
+            ("not told apart from it", open_),
+        )
+        if names
+    ]
     return f"By intervals that exclude zero or do not, {'; '.join(parts)}." if better or worse or open_ else ""
 
 
@@ -104,8 +125,10 @@ def _uneven(rows: pd.DataFrame) -> str:
         return ""
     most = counts.max()
     fewer = ", ".join(f"{name} {count}" for name, count in counts.items() if count < most)
-    return (f"Not all strategies have all {most} seeds ({fewer}): their mean times are of different trips; only the "
-            "changes, which are paired by seed, compare like with like.")
+    return (
+        f"Not all strategies have all {most} seeds ({fewer}): their mean times are of different trips; only the "
+        "changes, which are paired by seed, compare like with like."
+    )
 
 
 def _unfinished(rows: pd.DataFrame) -> str:
@@ -127,9 +150,11 @@ def _removed(rows: pd.DataFrame) -> str:
         return ""
     counts = rows.groupby("controller", sort=False)["removed_veh"].mean()
     parts = ", ".join(f"{name} {count:,.1f}" for name, count in counts.items() if count > 0)
-    return (f"Vehicles removed before the last edge of their route (by calibrators, collisions, teleports off the net, "
-            f"waits too long or other programs), mean per run: {parts}. They are no completed trips, and total time "
-            "spent has them as if they were there to the end; those whom they no longer hinder gain all the same.")
+    return (
+        f"Vehicles removed before the last edge of their route (by calibrators, collisions, teleports off the net, "
+        f"waits too long or other programs), mean per run: {parts}. They are no completed trips, and total time "
+        "spent has them as if they were there to the end; those whom they no longer hinder gain all the same."
+    )
 
 
 def _teleports(rows: pd.DataFrame) -> str:
@@ -142,8 +167,11 @@ def _teleports(rows: pd.DataFrame) -> str:
 
 def _decisions(rows: pd.DataFrame) -> str:
     parts = [
-        f"{name} {count:.0f} {WORDS[column]}" for column in WORDS
-        for name, count in rows.groupby("controller", sort=False)[column].sum().items() if count]
+        f"{name} {count:.0f} {WORDS[column]}"
+        for column in WORDS
+        for name, count in rows.groupby("controller", sort=False)[column].sum().items()
+        if count
+    ]
     if parts:
         return f"Decisions that did not come as they should: {', '.join(parts)}; all runs together."
     return "Every decision came within its control interval, and none was a fallback."

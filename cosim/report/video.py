@@ -19,14 +19,15 @@ from nmfd.runs import trail
 from nmfd.runs.files import atomic, file_name
 from nmfd.studies import plots
 
-FRAMES = 120        # at most: of a longer run every second, third ... interval is shown
+FRAMES = 120  # at most: of a longer run every second, third ... interval is shown
 DPI = 80
 SUFFIXES = (".gif", ".mp4")
 FFMPEG_HINT = "install ffmpeg, or pip install 'perimeter-cosim[video]', or choose a name that ends in .gif"
 
 
-def choose(finished: Finished, level: Level, controller: str | None, against: str | None, seed: int | None,
-           ) -> tuple[list[str], int]:
+def choose(
+    finished: Finished, level: Level, controller: str | None, against: str | None, seed: int | None
+) -> tuple[list[str], int]:
     """Names and seed of the runs to show: the best controller, and the first seed that all of them have.
 
     Raises InputError, also where there is no map to show them on.
@@ -37,17 +38,22 @@ def choose(finished: Finished, level: Level, controller: str | None, against: st
         names.append(against)
     for name in names:
         if name not in set(rows["controller"]):
-            raise InputError(f"{option}: {level.folder} has no runs of {name!r}"
-                             f"{did_you_mean(name, rows['controller'])}; choose from "
-                             f"{', '.join(dict.fromkeys(rows['controller']))}")
+            raise InputError(
+                f"{option}: {level.folder} has no runs of {name!r}"
+                f"{did_you_mean(name, rows['controller'])}; choose from "
+                f"{', '.join(dict.fromkeys(rows['controller']))}"
+            )
         option = "--against"
     common = set.intersection(*(set(rows.loc[rows["controller"] == name, "seed"]) for name in names))
     if not common:
         raise InputError(
-            f"--against: {' and '.join(names)} have no seed in common in {level.folder}; run one seed with both")
+            f"--against: {' and '.join(names)} have no seed in common in {level.folder}; run one seed with both"
+        )
     if seed is not None and seed not in common:
-        raise InputError(f"--seed: {level.folder} has no run of {' and '.join(names)} with seed {seed}; choose from "
-                         f"{', '.join(map(str, sorted(common)))}")
+        raise InputError(
+            f"--seed: {level.folder} has no run of {' and '.join(names)} with seed {seed}; choose from "
+            f"{', '.join(map(str, sorted(common)))}"
+        )
     finished.map()
     return names, int(min(common) if seed is None else seed)
 
@@ -58,7 +64,13 @@ def default_path(level: Level, names: Sequence[str], seed: int) -> Path:
 
 
 def film(
-    path: Path, finished: Finished, level: Level, names: Sequence[str], seed: int, *, rate: int = 8,
+    path: Path,
+    finished: Finished,
+    level: Level,
+    names: Sequence[str],
+    seed: int,
+    *,
+    rate: int = 8,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Write the film, atomically; the suffix of `path` chooses the format. rate: frames per second.
@@ -112,11 +124,14 @@ def scene(city: City, results: dict[str, Result], title: str) -> tuple[Figure, C
         for ax, (name, result) in zip(maps, results.items(), strict=True):
             trajectory = result.trajectory
             ax.collections[0].set_color(
-                figures.DENSITIES.to_rgba(result.record["edge_vehicles"][k].astype(float) / km / lanes))
+                figures.DENSITIES.to_rgba(result.record["edge_vehicles"][k].astype(float) / km / lanes)
+            )
             ax.set_title(
                 f"{name}, seed {trajectory.seed}, {(k + 1) * step / 60:.0f} min\n"
                 f"{trajectory.accumulation[k + 1].sum():,.0f} inside, {trajectory.backlog[k + 1].sum():,.0f} waiting, "
-                f"{trajectory.completed[k + 1]:,.0f} trips completed", fontsize="medium")
+                f"{trajectory.completed[k + 1]:,.0f} trips completed",
+                fontsize="medium",
+            )
         hand.set_xdata([(k + 1) * step / minute] * 2)
 
     return drawing, update
@@ -132,8 +147,9 @@ def _writer(path: Path, rate: int) -> Iterator[animation.AbstractMovieWriter]:
         if program is None:
             raise InputError(f"--out: {path}: there is no ffmpeg for mp4; {FFMPEG_HINT}")
         with rc_context({"animation.ffmpeg_path": program}):
-            yield animation.FFMpegWriter(fps=rate, codec="h264", bitrate=1500,
-                                         metadata={"comment": trail.text(trail.of(path))})
+            yield animation.FFMpegWriter(
+                fps=rate, codec="h264", bitrate=1500, metadata={"comment": trail.text(trail.of(path))}
+            )
     else:
         raise InputError(f"--out: {path}: expected a name that ends in {' or '.join(SUFFIXES)}; choose another")
 

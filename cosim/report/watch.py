@@ -55,7 +55,11 @@ class WindowClosed(Exception):
 
 
 def watch(
-    task: Task, *, delay: float = 20.0, program: str = "sumo-gui", options: tuple[str, ...] = (),
+    task: Task,
+    *,
+    delay: float = 20.0,
+    program: str = "sumo-gui",
+    options: tuple[str, ...] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
     """Run `task` in a window and return its trajectory, the same as without one.
@@ -66,26 +70,44 @@ def watch(
     if program == "sumo-gui" and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         raise InputError(
             "DISPLAY is not set: there is no screen to open a window on; record the run with `cosim run` and make a "
-            "film of it with `cosim video RUN`")
+            "film of it with `cosim video RUN`"
+        )
     scenario, strategy = scenario_of(task), parse(task.controller)
     controller = registry.make(configured(task.controller, scenario.controller_options), scenario, policy=task.policy)
     with Scratch("cosim-") as scratch:
         drawn, view = scratch / "regions.add.xml", scratch / "view.xml"
         window = Window(
-            options=("--gui-settings-file", str(view), "--start", "true", "--quit-on-end", "true",
-                     "--window-size", "1200,900", *options),
-            additional=(drawn,), program=program)
+            options=(
+                "--gui-settings-file",
+                str(view),
+                "--start",
+                "true",
+                "--quit-on-end",
+                "true",
+                "--window-size",
+                "1200,900",
+                *options,
+            ),
+            additional=(drawn,),
+            program=program,
+        )
         plant = SumoPlant(
-            scenario, overrides=settings(scenario).changed(**strategy.overrides), window=window,
-            planning=planning_of(scenario, task.controller))
+            scenario,
+            overrides=settings(scenario).changed(**strategy.overrides),
+            window=window,
+            planning=planning_of(scenario, task.controller),
+        )
         shapes = edge_shapes(plant.city)
         drawn.write_text(layers_xml(plant.city, shapes), encoding="utf-8")
         view.write_text(view_xml(shapes, delay), encoding="utf-8")
         try:
             trajectory = run_folder.labelled(
-                closed_loop.run(Painted(plant, scenario.network), controller, scenario, seed=task.seed,
-                                progress=progress),
-                controller=task.controller, plant="sumo")
+                closed_loop.run(
+                    Painted(plant, scenario.network), controller, scenario, seed=task.seed, progress=progress
+                ),
+                controller=task.controller,
+                plant="sumo",
+            )
             plant.trip_facts()
             return settled(trajectory, plant.record())
         except LOST:
@@ -112,9 +134,12 @@ class Painted:
     def step(self, controls: Controls) -> State:
         """Paint the gateways that a command reaches, then simulate a control interval."""
         low, high = self._network.u_min, self._network.u_max
-        self._plant.session.paint({
-            mark: colour((controls.perimeter[g.source, g.target] - low) / (high - low))
-            for mark, g in self._controlled.items()})
+        self._plant.session.paint(
+            {
+                mark: colour((controls.perimeter[g.source, g.target] - low) / (high - low))
+                for mark, g in self._controlled.items()
+            }
+        )
         return self._plant.step(controls)
 
     def observe(self) -> Observation | None:
@@ -160,13 +185,15 @@ def layers_xml(city: City, shapes: Sequence[Points]) -> str:
     lines = [
         f'  <poly id={quoteattr("region-" + edge)} color="{_rgb(city.region_of[edge])}" fill="0" layer="-1" '
         f'lineWidth="{width:.1f}" shape="{" ".join(f"{x:.1f},{y:.1f}" for x, y in shape)}"/>\n'
-        for edge, shape in lines_of.items()]
+        for edge, shape in lines_of.items()
+    ]
     grey = ",".join(map(str, LEFT_ALONE))
     for mark, gateway in marked(city).items():
         x, y = lines_of[gateway.from_edge][-1]
         lines.append(
             f'  <poi id="{mark}" type="{gateway.source} &gt; {gateway.target}" color="{grey}" layer="5" x="{x:.1f}" '
-            f'y="{y:.1f}"/>\n')
+            f'y="{y:.1f}"/>\n'
+        )
     return f"<additional>\n{''.join(lines)}</additional>\n"
 
 

@@ -100,7 +100,8 @@ def sources(network: RegionalModel) -> tuple[Path, ...]:
     content = config.read(path)
     if "sumo" not in content:
         raise InputError(
-            f'{path}: sumo: missing; this network has no city to simulate: add [sumo] with recipe = "city.toml"')
+            f'{path}: sumo: missing; this network has no city to simulate: add [sumo] with recipe = "city.toml"'
+        )
     table = config.checked(CityTable, content["sumo"], path, "sumo.")
     if table.recipe is not None:
         return (folder / table.recipe,)
@@ -114,8 +115,12 @@ def _built(recipe_file: Path, network: RegionalModel) -> SumoFiles:
     stamp_file = folder / f"{network.name}.stamp"
     recipe = read_recipe(recipe_file, network.regions)
     stamp = _stamp(recipe_file)
-    if stamp_file.is_file() and stamp_file.read_text(encoding="utf-8") == stamp and files.net_file.is_file() and (
-            files.regions_csv.is_file()):
+    if (
+        stamp_file.is_file()
+        and stamp_file.read_text(encoding="utf-8") == stamp
+        and files.net_file.is_file()
+        and (files.regions_csv.is_file())
+    ):
         return files
     shipped.made(folder)
     stamp_file.unlink(missing_ok=True)  # nothing here counts until it is written again
@@ -152,7 +157,8 @@ def read_recipe(path: Path, regions: int) -> Recipe:
             if inside or word not in map(str, range(regions)):
                 allowed = "a dot (it lies in the centre)" if inside else f"a region from 0 to {regions - 1}"
                 raise config.error(
-                    path, "outer.regions", f"expected {allowed} at x = {x:g}, y = {y:g}, got {word!r} instead")
+                    path, "outer.regions", f"expected {allowed} at x = {x:g}, y = {y:g}, got {word!r} instead"
+                )
             nodes[f"o{i}{j}"] = Node(id=f"o{i}{j}", x=x, y=y, region=int(word), centre=False)
     return Recipe(table=table, nodes=nodes, streets=_streets(nodes))
 
@@ -197,8 +203,10 @@ def _plain_xml(recipe: Recipe) -> tuple[str, str, str, dict[str, int]]:
     """nodes, edges and connections for netconvert, and the region of every edge."""
     nodes = recipe.nodes
     legs = {name: sum(a == name for a, _ in recipe.streets) for name in nodes}
-    node_rows = [_row("node", id=n.id, x=n.x, y=n.y, type="traffic_light" if legs[n.id] > 2 else "priority")
-                 for n in nodes.values()]
+    node_rows = [
+        _row("node", id=n.id, x=n.x, y=n.y, type="traffic_light" if legs[n.id] > 2 else "priority")
+        for n in nodes.values()
+    ]
     edge_rows, connection_rows, region_of, first, last, lanes = [], [], {}, {}, {}, {}
     for a, b in recipe.streets:
         start, end, name = nodes[a], nodes[b], f"{a}-{b}"
@@ -210,9 +218,15 @@ def _plain_xml(recipe: Recipe) -> tuple[str, str, str, dict[str, int]]:
                 length = abs(end.x - start.x) + abs(end.y - start.y)
                 # netconvert cuts about 10 m off for the junction itself
                 share = 1.0 - (recipe.table.centre.pocket + 10.0) / length
-                node_rows.append(_row(
-                    "node", id=joint, x=start.x + share * (end.x - start.x), y=start.y + share * (end.y - start.y),
-                    type="priority"))
+                node_rows.append(
+                    _row(
+                        "node",
+                        id=joint,
+                        x=start.x + share * (end.x - start.x),
+                        y=start.y + share * (end.y - start.y),
+                        type="priority",
+                    )
+                )
                 pieces = [(name, a, joint, 1), (f"{name}.p", joint, b, 2)]
                 connection_rows += [_link(name, f"{name}.p", 0, lane) for lane in (0, 1)]
         else:
@@ -272,13 +286,29 @@ def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
             (folder / f"{kind}.xml").write_text(content, encoding="utf-8")
             options += [f"--{kind}-files", f"{kind}.xml"]
         command = [
-            str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"), *options, "--output-file", "net.xml",
-            "--no-turnarounds", "true", "--tls.cycle.time", str(signals.cycle),
-            "--tls.yellow.time", str(signals.yellow), "--tls.allred.time", str(signals.all_red),
-            "--tls.left-green.time", str(signals.left_green)]
+            str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"),
+            *options,
+            "--output-file",
+            "net.xml",
+            "--no-turnarounds",
+            "true",
+            "--tls.cycle.time",
+            str(signals.cycle),
+            "--tls.yellow.time",
+            str(signals.yellow),
+            "--tls.allred.time",
+            str(signals.all_red),
+            "--tls.left-green.time",
+            str(signals.left_green),
+        ]
         result = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, check=False,
-            env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME})
+            command,
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=False,
+            env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME},
+        )
         if result.returncode:
             lines = [line for line in result.stderr.splitlines() if line.startswith("Error")] or ["unknown error"]
             raise InputError(f"{where}: netconvert cannot build it: {lines[0]}; correct the recipe")

@@ -105,12 +105,14 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
     missing = [edge for edge in edges if lanes_of[edge] and edge not in given]
     if missing:
         raise InputError(
-            f"{regions_csv}: edge {missing[0]} has no region ({len(missing)} such edges); add a line for every edge")
+            f"{regions_csv}: edge {missing[0]} has no region ({len(missing)} such edges); add a line for every edge"
+        )
     edges = tuple(edge for edge in edges if lanes_of[edge])
     empty = set(range(regions)) - {given[edge] for edge in edges}
     if empty:
         raise InputError(
-            f"{regions_csv}: region {min(empty)} has no edges; every region from 0 to {regions - 1} needs one")
+            f"{regions_csv}: region {min(empty)} has no edges; every region from 0 to {regions - 1} needs one"
+        )
     links = [c for c in connections if (c.source, c.lane) in cars and (c.target, c.to_lane) in cars]
     turns = sorted({(c.source, c.target) for c in links})
     times = {(c.source, c.target): internal[c.via.rpartition("_")[0]][0] if c.via else 0.0 for c in links}
@@ -122,15 +124,25 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
     gateways = _gateways(links, region_of)
     region_of |= {edge: region for edge, region in given.items() if not edge.startswith(":")}
     return City(
-        net_file=Path(net_file), regions=regions,
-        region_of=region_of | _internal_regions(connections, region_of, internal), edges=edges,
-        length={e: lanes_of[e][0][0] for e in edges}, lanes={e: len(lanes_of[e]) for e in edges},
+        net_file=Path(net_file),
+        regions=regions,
+        region_of=region_of | _internal_regions(connections, region_of, internal),
+        edges=edges,
+        length={e: lanes_of[e][0][0] for e in edges},
+        lanes={e: len(lanes_of[e]) for e in edges},
         lane_ids={e: tuple(lane for _, _, lane in lanes_of[e]) for e in edges},
         speed={e: max(speed for _, speed, _ in lanes_of[e]) for e in edges},
-        successors={edge: tuple(after) for edge, after in successors.items()}, turn_time=times, gateways=gateways,
-        signals={c.source: c.signal for c in links if c.signal}, over=over,
-        inside={edge: internal[edge][1] for edge in sorted({edge for way in over.values() for edge in way})
-                if internal[edge][1] > 0.0})
+        successors={edge: tuple(after) for edge, after in successors.items()},
+        turn_time=times,
+        gateways=gateways,
+        signals={c.source: c.signal for c in links if c.signal},
+        over=over,
+        inside={
+            edge: internal[edge][1]
+            for edge in sorted({edge for way in over.values() for edge in way})
+            if internal[edge][1] > 0.0
+        },
+    )
 
 
 def check_adjacency(city: City, network: RegionalModel) -> None:
@@ -141,16 +153,19 @@ def check_adjacency(city: City, network: RegionalModel) -> None:
         if not (network.adjacency | network.adjacency.T)[gateway.source, gateway.target]:
             raise InputError(
                 f"{where}[{gateway.source}].adjacent: region {gateway.target} is missing, although edge "
-                f"{gateway.from_edge} leads to {gateway.to_edge}; add it, or move the edges to other regions")
+                f"{gateway.from_edge} leads to {gateway.to_edge}; add it, or move the edges to other regions"
+            )
         if not network.adjacency[gateway.source, gateway.target]:
             raise InputError(
                 f"{where}[{gateway.source}].no_way_to: lists {gateway.target}, but edge {gateway.from_edge} leads to "
-                f"{gateway.to_edge} there; remove it, or move the edges to other regions")
+                f"{gateway.to_edge} there; remove it, or move the edges to other regions"
+            )
         joined[gateway.source, gateway.target] = True
     for i, h in np.argwhere(network.adjacency & ~joined):
         raise InputError(
             f"{where}[{i}].adjacent: lists {h}, but no edge leads from region {i} to region {h} in {city.net_file}; "
-            f"remove it, add no_way_to = [{h}], or change the regions of edges")
+            f"remove it, add no_way_to = [{h}], or change the regions of edges"
+        )
 
 
 def edge_shapes(city: City) -> list[Points]:
@@ -161,7 +176,9 @@ def edge_shapes(city: City) -> list[Points]:
             if element.tag == "edge":
                 lanes = [
                     np.array([point.split(",")[:2] for point in attribute(lane, "shape").split()], dtype=float)
-                    for lane in element.iter("lane") if for_cars(lane)]
+                    for lane in element.iter("lane")
+                    if for_cars(lane)
+                ]
                 if lanes:
                     same = len(lanes[0]) == len(lanes[-1])
                     shapes[attribute(element, "id")] = (lanes[0] + lanes[-1]) / 2 if same else lanes[0]
@@ -169,9 +186,11 @@ def edge_shapes(city: City) -> list[Points]:
     return [shapes[edge] for edge in city.edges]
 
 
-def _read_net(path: Path) -> tuple[
-        dict[str, list[tuple[float, float, str]]], set[tuple[str, int]], dict[str, tuple[float, float]],
-        list[_Connection]]:
+def _read_net(
+    path: Path,
+) -> tuple[
+    dict[str, list[tuple[float, float, str]]], set[tuple[str, int]], dict[str, tuple[float, float]], list[_Connection]
+]:
     """(edge -> [(length, speed, id) of each car lane], the car lanes, internal edge -> (free-flow time [s],
     length [m]), links)."""
     cars: set[tuple[str, int]] = set()
@@ -182,22 +201,34 @@ def _read_net(path: Path) -> tuple[
         with opened(path) as stream:
             for _, element in ElementTree.iterparse(stream):
                 if element.tag == "edge":
-                    lanes = [(size(lane, "length"), size(lane, "speed"), attribute(lane, "id"))
-                             for lane in element.iter("lane") if for_cars(lane)]
+                    lanes = [
+                        (size(lane, "length"), size(lane, "speed"), attribute(lane, "id"))
+                        for lane in element.iter("lane")
+                        if for_cars(lane)
+                    ]
                     if element.get("function", "normal") in ("normal", "connector"):
                         edge = attribute(element, "id")
                         lanes_of[edge] = lanes
-                        cars |= {(edge, int(attribute(lane, "index")))
-                                 for lane in element.iter("lane") if for_cars(lane)}
+                        cars |= {
+                            (edge, int(attribute(lane, "index"))) for lane in element.iter("lane") if for_cars(lane)
+                        }
                     else:
                         internal[attribute(element, "id")] = max(
-                            ((length / speed, length) for length, speed, _ in lanes), default=(0.0, 0.0))
+                            ((length / speed, length) for length, speed, _ in lanes), default=(0.0, 0.0)
+                        )
                     element.clear()
                 elif element.tag == "connection":
-                    connections.append(_Connection(
-                        attribute(element, "from"), attribute(element, "to"), element.get("via"), element.get("tl"),
-                        int(element.get("linkIndex", -1)), int(attribute(element, "fromLane")),
-                        int(attribute(element, "toLane"))))
+                    connections.append(
+                        _Connection(
+                            attribute(element, "from"),
+                            attribute(element, "to"),
+                            element.get("via"),
+                            element.get("tl"),
+                            int(element.get("linkIndex", -1)),
+                            int(attribute(element, "fromLane")),
+                            int(attribute(element, "toLane")),
+                        )
+                    )
                     element.clear()
                 elif element.tag in ("junction", "tlLogic"):
                     element.clear()
@@ -245,7 +276,8 @@ def _read_regions(path: Path, regions: int) -> dict[str, int]:
         if len(row) != 2 or not row[1].isdecimal() or len(row[1]) > 9 or int(row[1]) >= regions:
             raise InputError(
                 f"{path}: line {number}: expected an edge and a region from 0 to {regions - 1}, got {','.join(row)} "
-                "instead")
+                "instead"
+            )
         if row[0] in region_of:
             raise InputError(f"{path}: line {number}: edge {row[0]} appears twice; remove one of the lines")
         region_of[row[0]] = int(row[1])
@@ -253,7 +285,7 @@ def _read_regions(path: Path, regions: int) -> dict[str, int]:
 
 
 def _internal_regions(
-    connections: Sequence[_Connection], region_of: Mapping[str, int], internal: Collection[str],
+    connections: Sequence[_Connection], region_of: Mapping[str, int], internal: Collection[str]
 ) -> dict[str, int]:
     """Internal edge -> region of the edge it leads to; crossings and walking areas, without cars, that of any edge of
     their junction."""
@@ -273,7 +305,7 @@ def _internal_regions(
 
 
 def _turns_over_junctions(
-    links: Sequence[_Connection], connections: Sequence[_Connection],
+    links: Sequence[_Connection], connections: Sequence[_Connection]
 ) -> dict[tuple[str, str], tuple[str, ...]]:
     """(from_edge, to_edge) -> the internal edges in between, of the last of several links: where a turn waits in the
     middle of a junction, it goes over two."""
@@ -299,11 +331,18 @@ def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gate
         if source != target:
             movements.setdefault((source, target, link.source, link.target), []).append(link)
     return tuple(
-        Gateway(source=key[0], target=key[1], from_edge=key[2], to_edge=key[3], signal=members[0].signal,
-                links=tuple(sorted(link.link for link in members if link.signal)),
-                lanes=tuple(sorted({link.lane for link in members})),
-                shared=tuple(sorted({link.lane for link in members if len(onward[key[2], link.lane]) > 1})))
-        for key, members in sorted(movements.items()))
+        Gateway(
+            source=key[0],
+            target=key[1],
+            from_edge=key[2],
+            to_edge=key[3],
+            signal=members[0].signal,
+            links=tuple(sorted(link.link for link in members if link.signal)),
+            lanes=tuple(sorted({link.lane for link in members})),
+            shared=tuple(sorted({link.lane for link in members if len(onward[key[2], link.lane]) > 1})),
+        )
+        for key, members in sorted(movements.items())
+    )
 
 
 def gateway_movements(city: City) -> dict[str, dict[int, tuple[int, int]]]:
@@ -312,7 +351,8 @@ def gateway_movements(city: City) -> dict[str, dict[int, tuple[int, int]]]:
     for gateway in city.gateways:
         if gateway.signal is not None:
             movements.setdefault(gateway.signal, {}).update(
-                dict.fromkeys(gateway.links, (gateway.source, gateway.target)))
+                dict.fromkeys(gateway.links, (gateway.source, gateway.target))
+            )
     return movements
 
 
@@ -322,7 +362,7 @@ def edge_room(city: City) -> PerEdge:
 
 
 def gateway_room_taken(
-    edge_vehicles: Float[np.ndarray, "*intervals E"], city: City,
+    edge_vehicles: Float[np.ndarray, "*intervals E"], city: City
 ) -> Float[np.ndarray, "*intervals G"]:
     """(..., G) [-]: the share of the room on the edge before each gateway that edge_vehicles (..., E) [veh] take."""
     index = {edge: n for n, edge in enumerate(city.edges)}

@@ -11,7 +11,11 @@ from nmfd.runs.run_folder import run_name
 
 # Kind -> ending of its file. The emissions of every vehicle in every step are gigabytes, unless compressed.
 KINDS = {
-    "tripinfo": "tripinfo.xml", "summary": "summary.xml", "edgedata": "edgedata.xml", "emission": "emission.xml.gz"}
+    "tripinfo": "tripinfo.xml",
+    "summary": "summary.xml",
+    "edgedata": "edgedata.xml",
+    "emission": "emission.xml.gz",
+}
 ZIPPED = "emission"  # where the disk is full, SUMO ends the process that it runs in
 TAIL = 200  # bytes that are sure to hold the end tag of the root
 
@@ -27,8 +31,10 @@ def check(kinds: Iterable[str]) -> None:
     """InputError for a kind that there is not."""
     for kind in kinds:
         if kind not in KINDS:
-            raise InputError(f"--sumo-output: {kind!r} is unknown{did_you_mean(kind, KINDS)}; choose from "
-                             f"{', '.join(KINDS)}, separated by commas")
+            raise InputError(
+                f"--sumo-output: {kind!r} is unknown{did_you_mean(kind, KINDS)}; choose from "
+                f"{', '.join(KINDS)}, separated by commas"
+            )
 
 
 def paths(kinds: tuple[str, ...], folder: Path, controller: str, seed: int) -> tuple[tuple[str, Path], ...]:
@@ -38,8 +44,9 @@ def paths(kinds: tuple[str, ...], folder: Path, controller: str, seed: int) -> t
 
 def options(outputs: Mapping[str, Path]) -> tuple[str, ...]:
     """Options of SUMO for `summary` and `emission`; tripinfo is written anyway (trip_facts)."""
-    return tuple(part for kind in ("summary", "emission") if kind in outputs
-                 for part in (f"--{kind}-output", str(outputs[kind])))
+    return tuple(
+        part for kind in ("summary", "emission") if kind in outputs for part in (f"--{kind}-output", str(outputs[kind]))
+    )
 
 
 def check_whole(outputs: Mapping[str, Path]) -> None:
@@ -68,5 +75,7 @@ def write_edge_data(path: Path, target: Path, every: float) -> Path:
     """An additional file that makes SUMO write means per edge over every `every` [s] to `target`."""
     path.write_text(
         f'<additional><edgeData id="edgedata" freq="{every:g}" excludeEmpty="true" '
-        f'file={quoteattr(str(target.resolve()))}/></additional>\n', encoding="utf-8")
+        f"file={quoteattr(str(target.resolve()))}/></additional>\n",
+        encoding="utf-8",
+    )
     return path

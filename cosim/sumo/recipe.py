@@ -62,8 +62,7 @@ class OuterTable(Streets):
     @model_validator(mode="after")
     def _fits_the_lines(self) -> Self:
         if [len(row) for row in self.picture] != [len(self.x)] * len(self.y):
-            raise Problem(
-                "regions", f"expected {len(self.y)} rows of {len(self.x)} regions or dots; correct it")
+            raise Problem("regions", f"expected {len(self.y)} rows of {len(self.x)} regions or dots; correct it")
         return self
 
 

@@ -18,15 +18,39 @@ from nmfd.runs import files
 STREAM = 7102  # keeps these random numbers apart from others of the same seed
 MESOSCOPIC = ("--mesosim", "true", "--meso-junction-control", "true")  # options of SUMO
 # Vehicle classes that keep to their lines, or do not use the road as cars do.
-BOUND = frozenset({
-    "bus", "coach", "tram", "rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car", "ship",
-    "aircraft", "bicycle", "pedestrian", "scooter", "wheelchair", "container", "drone"})
+BOUND = frozenset(
+    {
+        "bus",
+        "coach",
+        "tram",
+        "rail",
+        "rail_urban",
+        "rail_electric",
+        "rail_fast",
+        "subway",
+        "cable_car",
+        "ship",
+        "aircraft",
+        "bicycle",
+        "pedestrian",
+        "scooter",
+        "wheelchair",
+        "container",
+        "drone",
+    }
+)
 DrawnTrip = tuple[float, int, str]  # departure [s], number of the vehicle, id
-HELD = "held."   # names of routes that vehicles in the file have to themselves
+HELD = "held."  # names of routes that vehicles in the file have to themselves
 # Attributes of a vehicle -> arguments of libsumo.vehicle.add, whose defaults are those of the attributes.
 ORDERED = {
-    "type": "typeID", "departLane": "departLane", "departPos": "departPos", "departSpeed": "departSpeed",
-    "arrivalLane": "arrivalLane", "arrivalPos": "arrivalPos", "arrivalSpeed": "arrivalSpeed"}
+    "type": "typeID",
+    "departLane": "departLane",
+    "departPos": "departPos",
+    "departSpeed": "departSpeed",
+    "arrivalLane": "arrivalLane",
+    "arrivalPos": "arrivalPos",
+    "arrivalSpeed": "arrivalSpeed",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +77,8 @@ def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
         if element.tag not in ("vehicle", "trip"):
             raise InputError(
                 f"{path}: expected vehicle and trip elements only, got {element.tag} instead; move it to a file in "
-                "sumo.background or sumo.additional, or let cosim import do so")
+                "sumo.background or sumo.additional, or let cosim import do so"
+            )
         name = element.get("id")
         if not name or name in ids:
             raise InputError(f"{path}: {element.tag} {n}: id: expected one that no other has, got {name!r} instead")
@@ -65,7 +90,8 @@ def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
         except (KeyError, ValueError):
             raise InputError(
                 f"{path}: vehicle {element.get('id')}: depart: expected a time from 0 s up, got "
-                f"{element.get('depart')!r} instead; move it to a file in sumo.background") from None
+                f"{element.get('depart')!r} instead; move it to a file in sumo.background"
+            ) from None
     order = np.argsort(departs, kind="stable")
     return RecordedTrips(depart=departs[order], elements=tuple(elements[n][1] for n in order))
 
@@ -80,7 +106,8 @@ def check_edges(originals: RecordedTrips, city: City, where: str) -> None:
             if edge not in city.region_of:
                 raise InputError(
                     f"{where}: {element.tag} {element.get('id')}: edge {edge} is not in {city.net_file}; remove the "
-                    "vehicle, or give the routes of this network")
+                    "vehicle, or give the routes of this network"
+                )
 
 
 def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
@@ -110,9 +137,7 @@ def edges_of(element: ElementTree.Element, routes: Mapping[str, Sequence[str]]) 
     return [edge for key in ("from", "via", "to") for edge in element.get(key, "").split()], False
 
 
-def draw(
-    originals: RecordedTrips, *, seed: int, factor: float, jitter: float, begin: float,
-) -> list[DrawnTrip]:
+def draw(originals: RecordedTrips, *, seed: int, factor: float, jitter: float, begin: float) -> list[DrawnTrip]:
     """(departure [s], number of the vehicle, its id) sorted by departure, for one run.
 
     factor: the demand is multiplied by it. Vehicles are left out, or driven twice or more (ids with .1, .2 and so on),
@@ -148,7 +173,10 @@ def write_recorded_trips(originals: RecordedTrips, drawn: Sequence[DrawnTrip], p
 
 
 def write_held_trips(
-    originals: RecordedTrips, drawn: Sequence[DrawnTrip], path: Path, shared: Mapping[str, tuple[str, ...]],
+    originals: RecordedTrips,
+    drawn: Sequence[DrawnTrip],
+    path: Path,
+    shared: Mapping[str, tuple[str, ...]],
     region_of: Mapping[str, int],
 ) -> HeldTrips:
     """Those of one run that can be made to wait; their routes and all other vehicles are written to a SUMO route file.
@@ -174,7 +202,9 @@ def write_held_trips(
         depart=np.array([depart for depart, _, _ in held]),
         origin=np.array([region_of[route[0]] for _, route, _ in held], dtype=int),
         destination=np.array([region_of[route[-1]] for _, route, _ in held], dtype=int),
-        routes=tuple(route for _, route, _ in held), orders=tuple(order for _, _, order in held))
+        routes=tuple(route for _, route, _ in held),
+        orders=tuple(order for _, _, order in held),
+    )
 
 
 def _waiting_route(element: ElementTree.Element, shared: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
@@ -184,7 +214,8 @@ def _waiting_route(element: ElementTree.Element, shared: Mapping[str, tuple[str,
         return ()
     brings = int(element.tag == "vehicle" and "route" not in element.attrib)  # a route of its own
     if len(element) > brings or any(
-            one.tag != "route" or len(one) or not {"edges", "color"}.issuperset(one.attrib) for one in element):
+        one.tag != "route" or len(one) or not {"edges", "color"}.issuperset(one.attrib) for one in element
+    ):
         return ()
     edges, driven = edges_of(element, shared)
     if driven:

@@ -76,8 +76,15 @@ class Session:
     _open = False
 
     def __init__(
-        self, net_file: Path, route_file: Path | Sequence[Path], *, seed: int, step_length: float = 1.0,
-        time_to_teleport: float = -1.0, collision_action: str = "warn", options: tuple[str, ...] = (),
+        self,
+        net_file: Path,
+        route_file: Path | Sequence[Path],
+        *,
+        seed: int,
+        step_length: float = 1.0,
+        time_to_teleport: float = -1.0,
+        collision_action: str = "warn",
+        options: tuple[str, ...] = (),
         window: Window | None = None,
     ):
         """Raises RuntimeError if another session is open in this process, InputError if SUMO refuses to start."""
@@ -87,10 +94,27 @@ class Session:
         self.sumo_time, self.step_length, self._exits = 0.0, step_length, False
         routes = file_list([route_file] if isinstance(route_file, Path) else route_file)
         self.command = [
-            "sumo", "--net-file", str(net_file), "--route-files", routes, "--seed", str(seed),
-            "--step-length", str(step_length), "--time-to-teleport", str(time_to_teleport), "--collision.action",
-            collision_action, "--no-step-log", "true", "--no-warnings", "true", "--duration-log.disable", "true",
-            *options]
+            "sumo",
+            "--net-file",
+            str(net_file),
+            "--route-files",
+            routes,
+            "--seed",
+            str(seed),
+            "--step-length",
+            str(step_length),
+            "--time-to-teleport",
+            str(time_to_teleport),
+            "--collision.action",
+            collision_action,
+            "--no-step-log",
+            "true",
+            "--no-warnings",
+            "true",
+            "--duration-log.disable",
+            "true",
+            *options,
+        ]
         self._sumo = sumo = libsumo if window is None else traci
         try:
             if window is None:
@@ -101,7 +125,8 @@ class Session:
             if window is not None:
                 raise InputError(
                     f"{window.program} cannot show {net_file}: {_one_line(error)}; check DISPLAY, or use `cosim run` "
-                    "and `cosim video`") from None
+                    "and `cosim video`"
+                ) from None
             raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {_one_line(error)}") from None
         Session._open = True
         self._flush = _flush_all() if window is None else None
@@ -215,8 +240,10 @@ class Session:
     def is_free(self, vehicle: str) -> bool:
         """Whether its driver may choose another way: no public transport, and nothing to do on the way."""
         return (
-            self._sumo.vehicle.getVehicleClass(vehicle) not in BOUND and not self._sumo.vehicle.getLine(vehicle)
-            and not self._sumo.vehicle.getStops(vehicle, 1))
+            self._sumo.vehicle.getVehicleClass(vehicle) not in BOUND
+            and not self._sumo.vehicle.getLine(vehicle)
+            and not self._sumo.vehicle.getStops(vehicle, 1)
+        )
 
     def route_index(self, vehicle: str) -> int:
         """Where on its route a vehicle is."""
@@ -247,7 +274,8 @@ class Session:
         """How much of a lane is free at its beginning [m]."""
         rear = [
             self._sumo.vehicle.getLanePosition(vehicle) - self._sumo.vehicle.getLength(vehicle)
-            for vehicle in self._sumo.lane.getLastStepVehicleIDs(lane)]
+            for vehicle in self._sumo.lane.getLastStepVehicleIDs(lane)
+        ]
         return min(rear, default=self._sumo.lane.getLength(lane))
 
     def set_down(self, vehicle: str, lane: str, position: float) -> bool:
@@ -291,15 +319,17 @@ class Session:
         active, types = self._sumo.trafficlight.getProgram(signal), self._sumo.constants
         for logic in self._sumo.trafficlight.getAllProgramLogics(signal):
             if logic.programID == active:
-                elapsed = sum(p.duration for p in logic.phases[:self._sumo.trafficlight.getPhase(signal) + 1])
+                elapsed = sum(p.duration for p in logic.phases[: self._sumo.trafficlight.getPhase(signal) + 1])
                 left = self._sumo.trafficlight.getNextSwitch(signal) - self._sumo.simulation.getTime()
                 return Programme(
-                    signal=signal, id=active,
+                    signal=signal,
+                    id=active,
                     phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
                     position=elapsed - left,
                     static=logic.type == types.TRAFFICLIGHT_TYPE_STATIC
                     and not any(phase.next for phase in logic.phases),
-                    actuated=logic.type in (types.TRAFFICLIGHT_TYPE_ACTUATED, types.TRAFFICLIGHT_TYPE_DELAYBASED))
+                    actuated=logic.type in (types.TRAFFICLIGHT_TYPE_ACTUATED, types.TRAFFICLIGHT_TYPE_DELAYBASED),
+                )
         raise RuntimeError(f"signal {signal} has no programme {active}")
 
     def signals(self) -> tuple[str, ...]:
@@ -405,7 +435,8 @@ def _start(window: Window, command: list[str]) -> None:
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as said:
         port = getFreeSocketPort()
         process = subprocess.Popen(
-            [program, *command[1:], *window.options, "--remote-port", str(port)], stdout=said, stderr=said)
+            [program, *command[1:], *window.options, "--remote-port", str(port)], stdout=said, stderr=said
+        )
         try:
             with redirect_stdout(io.StringIO()):  # traci prints every attempt to connect
                 traci.init(port, numRetries=600, proc=process)  # one a second, while it reads its files

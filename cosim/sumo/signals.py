@@ -60,7 +60,7 @@ def is_stage(state: str) -> bool:
 
 
 def read_signals(
-    city: City, additional: Iterable[Path] = (), kinds: Collection[str] = (FIXED,),
+    city: City, additional: Iterable[Path] = (), kinds: Collection[str] = (FIXED,)
 ) -> tuple[list[Signal], list[str]]:
     """The simple signals of the city, and the names of all others, which no signal plan here touches: of other `kinds`
     (already actuated, unless these are asked for, with their nominal durations), fewer than two stages, phases out of
@@ -75,9 +75,7 @@ def read_signals(
         raise InputError(f"{city.net_file}: its signals cannot be read ({error}); build it with netconvert") from None
 
 
-def _signals(
-    city: City, additional: Iterable[Path], kinds: Collection[str],
-) -> tuple[list[Signal], list[str]]:
+def _signals(city: City, additional: Iterable[Path], kinds: Collection[str]) -> tuple[list[Signal], list[str]]:
     root = read_xml(city.net_file)
     links: dict[str, list[Link]] = {}
     closed: dict[str, list[Link]] = {}
@@ -86,13 +84,18 @@ def _signals(
         signal = connection.get("tl")
         if signal is not None and not source.startswith(":"):  # those are crossings for pedestrians
             open_ = source in city.lanes and target in city.lanes
-            (links if open_ else closed).setdefault(signal, []).append(Link(
-                index=int(attribute(connection, "linkIndex")), from_edge=source,
-                lane=int(attribute(connection, "fromLane")), to_edge=target,
-                turn=connection.get("dir", "s").lower()))
+            (links if open_ else closed).setdefault(signal, []).append(
+                Link(
+                    index=int(attribute(connection, "linkIndex")),
+                    from_edge=source,
+                    lane=int(attribute(connection, "fromLane")),
+                    to_edge=target,
+                    turn=connection.get("dir", "s").lower(),
+                )
+            )
     logics = {
-        attribute(logic, "id"): logic
-        for file in (root, *map(read_xml, additional)) for logic in file.iter("tlLogic")}
+        attribute(logic, "id"): logic for file in (root, *map(read_xml, additional)) for logic in file.iter("tlLogic")
+    }
     simple, others = [], []
     for name, logic in logics.items():
         found = _simple(logic, tuple(links.get(name, ())), tuple(closed.get(name, ())), kinds)
@@ -104,14 +107,15 @@ def _signals(
 
 
 def _simple(
-    logic: ElementTree.Element, links: tuple[Link, ...], others: tuple[Link, ...], kinds: Collection[str],
+    logic: ElementTree.Element, links: tuple[Link, ...], others: tuple[Link, ...], kinds: Collection[str]
 ) -> Signal | None:
     rows = list(logic.iter("phase"))
     if logic.get("type", FIXED) not in kinds or any(row.get("next") for row in rows) or not links:
         return None
     phases = tuple(Phase(duration=float(attribute(row, "duration")), state=attribute(row, "state")) for row in rows)
     signal = Signal(
-        id=attribute(logic, "id"), offset=float(logic.get("offset", 0.0)), phases=phases, links=links, others=others)
+        id=attribute(logic, "id"), offset=float(logic.get("offset", 0.0)), phases=phases, links=links, others=others
+    )
     plain = set("".join(phase.state for phase in phases)) <= set("Ggyr")
     return signal if plain and len(signal.stages) > 1 else None
 
@@ -131,5 +135,7 @@ def programme_row(signal: Signal, kind: str, *, limits: Mapping[int, tuple[float
         low, high = (limits or {}).get(n, (phase.duration, phase.duration))
         extra = "" if low == high else f' minDur="{low:g}" maxDur="{high:g}"'
         rows.append(f'    <phase duration="{phase.duration:g}"{extra} state="{phase.state}"/>\n')
-    return (f'  <tlLogic id={quoteattr(signal.id)} type="{kind}" programID="plan" offset="{signal.offset:g}">\n'
-            f"{''.join(rows)}  </tlLogic>\n")
+    return (
+        f'  <tlLogic id={quoteattr(signal.id)} type="{kind}" programID="plan" offset="{signal.offset:g}">\n'
+        f"{''.join(rows)}  </tlLogic>\n"
+    )

@@ -55,8 +55,15 @@ class End:
 def trip_options(path: Path) -> tuple[str, ...]:
     """Options of SUMO that make it write `path`, for `TripReader`, complete when the simulation ends."""
     return (
-        "--tripinfo-output", str(path), "--tripinfo-output.write-unfinished", "true",
-        "--tripinfo-output.write-undeparted", "true", "--device.emissions.probability", "1")
+        "--tripinfo-output",
+        str(path),
+        "--tripinfo-output.write-unfinished",
+        "true",
+        "--tripinfo-output.write-undeparted",
+        "true",
+        "--device.emissions.probability",
+        "1",
+    )
 
 
 class TripReader:
@@ -106,13 +113,19 @@ class TripReader:
             element = event[-1]
             if isinstance(element, Element) and element.tag == "tripinfo":
                 ended = float(attribute(element, "arrival")) >= 0 or (
-                    float(attribute(element, "depart")) >= 0 and left(element.get("id", "")))
+                    float(attribute(element, "depart")) >= 0 and left(element.get("id", ""))
+                )
                 reason = element.get("vaporized", "")
                 self.facts = _added(self.facts, element, ended=ended, completed=ended and not reason)
                 if ended:
-                    ends.append(End(
-                        vehicle=element.get("id", ""), edge=element.get("arrivalLane", "").rpartition("_")[0],
-                        reason=reason, time_loss=_time_loss(element)))
+                    ends.append(
+                        End(
+                            vehicle=element.get("id", ""),
+                            edge=element.get("arrivalLane", "").rpartition("_")[0],
+                            reason=reason,
+                            time_loss=_time_loss(element),
+                        )
+                    )
                 elif float(attribute(element, "depart")) >= 0:
                     self.under_way[element.get("id", "")] = _time_loss(element)
                 element.clear()
@@ -136,7 +149,12 @@ def _added(facts: TripFacts, trip: Element, *, ended: bool, completed: bool) -> 
         co2 += MILLIGRAMS * float(attribute(emissions, "CO2_abs"))
         fuel += MILLIGRAMS * float(attribute(emissions, "fuel_abs"))
     return TripFacts(
-        trips=facts.trips + 1, completed=facts.completed + completed, removed=facts.removed + (ended and not completed),
+        trips=facts.trips + 1,
+        completed=facts.completed + completed,
+        removed=facts.removed + (ended and not completed),
         travel_time=facts.travel_time + max(float(attribute(trip, "duration")), 0.0),
         departure_delay=facts.departure_delay + float(attribute(trip, "departDelay")),
-        time_loss=facts.time_loss + _time_loss(trip), co2=co2, fuel=fuel)
+        time_loss=facts.time_loss + _time_loss(trip),
+        co2=co2,
+        fuel=fuel,
+    )

@@ -16,11 +16,11 @@ from cosim.sumo.net import City
 from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
 
-STREAM = 7101       # keeps the random numbers of trips apart from others of the same seed
-DRIVER_CLASSES = 8          # groups of drivers who see different travel times
+STREAM = 7101  # keeps the random numbers of trips apart from others of the same seed
+DRIVER_CLASSES = 8  # groups of drivers who see different travel times
 CLASS_SPREAD = 0.15  # standard deviation of the logarithm of their travel times
 DEPARTING = {"departLane": "best", "departSpeed": "max", "departPos": "random_free"}  # attributes of every trip
-SHORT = 30.0        # m; no trip starts or ends on a shorter edge where its region has longer ones
+SHORT = 30.0  # m; no trip starts or ends on a shorter edge where its region has longer ones
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,13 +61,15 @@ def held(trips: Trips) -> HeldTrips:
     """Trips of `write_trips`, metered."""
     orders = tuple(
         {"vehID": f"v{n}", "routeID": f"r{n}", "typeID": "car", "arrivalPos": f"{arrival:.1f}", **DEPARTING}
-        for n, arrival in enumerate(trips.arrival))
+        for n, arrival in enumerate(trips.arrival)
+    )
     return HeldTrips(
-        depart=trips.depart, origin=trips.origin, destination=trips.destination, routes=trips.routes, orders=orders)
+        depart=trips.depart, origin=trips.origin, destination=trips.destination, routes=trips.routes, orders=orders
+    )
 
 
 def write_trips(
-    city: City, demand: PairsOverTime, step: float, seed: int, path: Path, *, metered: bool = False,
+    city: City, demand: PairsOverTime, step: float, seed: int, path: Path, *, metered: bool = False
 ) -> Trips:
     """Write the trips of `demand` (T, R, R) [veh/s], intervals of `step` [s], to a SUMO route file.
 
@@ -78,9 +80,14 @@ def write_trips(
     departing = " ".join(f'{key}="{value}"' for key, value in DEPARTING.items())
     for n, route in enumerate(trips.routes):
         edges = quoteattr(" ".join(route))
-        lines.append(f'  <route id="r{n}" edges={edges}/>\n' if metered else (
-            f'  <vehicle id="v{n}" type="car" depart="{trips.depart[n]:.2f}" {departing} '
-            f'arrivalPos="{trips.arrival[n]:.1f}"><route edges={edges}/></vehicle>\n'))
+        lines.append(
+            f'  <route id="r{n}" edges={edges}/>\n'
+            if metered
+            else (
+                f'  <vehicle id="v{n}" type="car" depart="{trips.depart[n]:.2f}" {departing} '
+                f'arrivalPos="{trips.arrival[n]:.1f}"><route edges={edges}/></vehicle>\n'
+            )
+        )
     lines.append("</routes>\n")
     path = Path(path)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -121,14 +128,20 @@ def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Tri
         if len(route) < 2:
             raise InputError(
                 f"{city.net_file}: no way leads from edge {city.edges[first[n]]} (region {origin[n]}) to "
-                f"{city.edges[last[n]]} (region {destination[n]}); leave out edges that are not connected")
+                f"{city.edges[last[n]]} (region {destination[n]}); leave out edges that are not connected"
+            )
     lengths = np.array([city.length[route[-1]] for route in routes])
-    return Trips(depart=depart, origin=origin, destination=destination, routes=tuple(routes),
-                 arrival=lengths * (0.1 + 0.8 * positions))
+    return Trips(
+        depart=depart,
+        origin=origin,
+        destination=destination,
+        routes=tuple(routes),
+        arrival=lengths * (0.1 + 0.8 * positions),
+    )
 
 
 def _departures(
-    demand: PairsOverTime, step: float, rng: np.random.Generator,
+    demand: PairsOverTime, step: float, rng: np.random.Generator
 ) -> tuple[PerTrip, TripNumbers, TripNumbers]:
     """(times, origins, destinations), sorted by time, rounded to 0.01 s."""
     clock = step * np.arange(len(demand) + 1)
@@ -140,7 +153,7 @@ def _departures(
             count = int(np.floor(cumulated[-1] + phase))
             marks = np.arange(1, count + 1) - phase
             rising = np.concatenate([[True], np.diff(cumulated) > 0])
-            keep = rising | np.concatenate([rising[1:], [False]])   # the end of a pause begins the next rise
+            keep = rising | np.concatenate([rising[1:], [False]])  # the end of a pause begins the next rise
             times.append(np.interp(marks, cumulated[keep], clock[keep]))
             origins.append(np.full(count, i))
             destinations.append(np.full(count, j))
@@ -159,8 +172,11 @@ def _ends(city: City, region: int, *, departing: bool) -> tuple[list[str], np.nd
     edges = [edge for edge in city.edges if city.region_of[edge] == region]
     before = _predecessors(city)
     onward: Mapping[str, Sequence[str]] = city.successors if departing else before
-    good = [edge for edge in edges if _stays(city, edge, onward) and city.length[edge] >= SHORT
-            and not _is_pocket(city, edge, before[edge])]
+    good = [
+        edge
+        for edge in edges
+        if _stays(city, edge, onward) and city.length[edge] >= SHORT and not _is_pocket(city, edge, before[edge])
+    ]
     chosen = good if len(good) >= 2 else edges
     weights = np.cumsum([city.length[edge] * city.lanes[edge] for edge in chosen])
     return chosen, weights / weights[-1]
@@ -188,8 +204,12 @@ def _stays(city: City, edge: str, onward: Mapping[str, Sequence[str]]) -> bool:
 
 def _is_pocket(city: City, edge: str, before: list[str]) -> bool:
     """A short piece with more lanes at the end of a road."""
-    return len(before) == 1 and city.length[edge] < 80.0 and city.lanes[edge] > city.lanes[before[0]] and (
-        city.successors[before[0]] == (edge,))
+    return (
+        len(before) == 1
+        and city.length[edge] < 80.0
+        and city.lanes[edge] > city.lanes[before[0]]
+        and (city.successors[before[0]] == (edge,))
+    )
 
 
 def _draw(ends: tuple[list[str], np.ndarray], uniform: float) -> str:

@@ -34,7 +34,7 @@ def turning_flows(city: City, demand: PairsOverTime, step: float) -> Mapping[tup
 
 
 def own_flows(
-    city: City, originals: RecordedTrips, routes: Mapping[str, Sequence[str]], factor: float,
+    city: City, originals: RecordedTrips, routes: Mapping[str, Sequence[str]], factor: float
 ) -> Mapping[tuple[str, str], float]:
     """The same of a city's own vehicles, `factor` times as many: of those that have a route on it; the others, which
     have a beginning and an end only, are thought to take a fastest way. routes: those that vehicles name."""
@@ -48,8 +48,13 @@ def own_flows(
     for edges, driven in busiest:
         if driven:
             turns.update(pair for pair in pairwise(edges) if known.issuperset(pair))
-    legs = [leg for edges, driven in busiest if not driven for leg in pairwise(edges)
-            if leg[0] != leg[1] and known.issuperset(leg)]
+    legs = [
+        leg
+        for edges, driven in busiest
+        if not driven
+        for leg in pairwise(edges)
+        if leg[0] != leg[1] and known.issuperset(leg)
+    ]
     if legs:
         number = {edge: n for n, edge in enumerate(city.edges)}
         random = np.random.default_rng(PLANNING_SEEDS[0])

@@ -55,8 +55,11 @@ def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:
         if depth > DEEPEST:
             raise InputError(f"{path}: include: files include each other without end; remove one of the includes")
         parts = list(root)
-        root[:] = [found for part in parts for found in (
-            read_xml(path.parent / part.get("href", ""), depth + 1) if part.tag == "include" else [part])]
+        root[:] = [
+            found
+            for part in parts
+            for found in (read_xml(path.parent / part.get("href", ""), depth + 1) if part.tag == "include" else [part])
+        ]
     return root
 
 

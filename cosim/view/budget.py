@@ -3,20 +3,18 @@
 import time
 from collections.abc import Callable
 
-SHARE = 0.2    # of a core, for pages and pictures
-SAVED = 2.0    # s of processor time that may be spent at once: the first few pages
-PAGE = 0.7     # s that one page takes, of a city with 5,747 streets: paid in advance
+SHARE = 0.2  # of a core, for pages and pictures
+SAVED = 2.0  # s of processor time that may be spent at once: the first few pages
+PAGE = 0.7  # s that one page takes, of a city with 5,747 streets: paid in advance
 SETTLED = 1.0  # s after which a page is made, and what was paid too much comes back
-WINDOW = 2.0   # s, over which pictures are counted
+WINDOW = 2.0  # s, over which pictures are counted
 SLOWEST = 40.0  # times the usual period
 
 
 class Budget:
     """Counts the processor time of this process, whatever it is spent on."""
 
-    def __init__(
-        self, *, clock: Callable[[], float] = time.monotonic, spent: Callable[[], float] = time.process_time,
-    ):
+    def __init__(self, *, clock: Callable[[], float] = time.monotonic, spent: Callable[[], float] = time.process_time):
         """clock, spent: wall time and processor time so far [s]"""
         self._clock, self._spent, self._saved, self._slower = clock, spent, SAVED, 1.0
         self._at, self._since = (clock(), spent()), (clock(), spent())

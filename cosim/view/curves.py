@@ -19,9 +19,9 @@ from bokeh.plotting import figure
 from cosim.view import colours
 from cosim.view.picture import CityPicture, Frame
 
-TRAIL = 30     # control intervals behind the present point in the MFD plane
-HEIGHT = 230   # pixels
-OVER = 2.0     # critical accumulations: the dark end of the scale of `Load`
+TRAIL = 30  # control intervals behind the present point in the MFD plane
+HEIGHT = 230  # pixels
+OVER = 2.0  # critical accumulations: the dark end of the scale of `Load`
 HOUR = 3600.0
 MINUTE = 60.0
 
@@ -39,13 +39,33 @@ class Load:
         plot.grid.visible = False
         self._source = ColumnDataSource({"image": [self._values([])]})
         mapper = LinearColorMapper(palette=colours.scale(), low=0.0, high=OVER, nan_color=colours.LAND)
-        plot.image("image", x=0.0, y=-0.5, dw=picture.steps * picture.step / MINUTE, dh=picture.regions,
-                   source=self._source, color_mapper=mapper)
-        plot.add_layout(ColorBar(
-            color_mapper=mapper, title="accumulation / critical [-]", orientation="horizontal", height=8, width=220,
-            ticker=FixedTicker(ticks=[0.0, 1.0, 2.0]), title_text_font_style="normal", title_text_font_size="11px",
-            title_text_color=colours.FAINT, bar_line_color=None, padding=4, location=(0, 0),
-            major_tick_line_color=None), "below")
+        plot.image(
+            "image",
+            x=0.0,
+            y=-0.5,
+            dw=picture.steps * picture.step / MINUTE,
+            dh=picture.regions,
+            source=self._source,
+            color_mapper=mapper,
+        )
+        plot.add_layout(
+            ColorBar(
+                color_mapper=mapper,
+                title="accumulation / critical [-]",
+                orientation="horizontal",
+                height=8,
+                width=220,
+                ticker=FixedTicker(ticks=[0.0, 1.0, 2.0]),
+                title_text_font_style="normal",
+                title_text_font_size="11px",
+                title_text_color=colours.FAINT,
+                bar_line_color=None,
+                padding=4,
+                location=(0, 0),
+                major_tick_line_color=None,
+            ),
+            "below",
+        )
         self.now = _now(plot)
 
     def show(self, whole: Sequence[Frame]) -> None:
@@ -75,40 +95,98 @@ class Curves:
         self.spent = _figure("Total time spent so far", "time [min]", "time spent [veh h]")
         self.street = _figure("", "time [min]", "density [veh/km and lane]")
         self.street.extra_y_ranges = {"speed": Range1d(0.0, 1.1)}
-        self.street.add_layout(LinearAxis(
-            y_range_name="speed", axis_label="speed / allowed [-]", axis_label_text_font_style="normal",
-            axis_label_text_color=colours.FAINT, major_label_text_color=colours.FAINT, minor_tick_line_color=None,
-            axis_line_color=colours.LINE, major_tick_line_color=colours.LINE), "right")
+        self.street.add_layout(
+            LinearAxis(
+                y_range_name="speed",
+                axis_label="speed / allowed [-]",
+                axis_label_text_font_style="normal",
+                axis_label_text_color=colours.FAINT,
+                major_label_text_color=colours.FAINT,
+                minor_tick_line_color=None,
+                axis_line_color=colours.LINE,
+                major_tick_line_color=colours.LINE,
+            ),
+            "right",
+        )
         overtime = (self.region, self.gate, self.trips, self.spent, self.street)
         self.lines, self.points, self.trails = [], [], []
         for plot in overtime:
             plot.x_range.start, plot.x_range.end = 0.0, horizon
         self.gate.y_range.start, self.gate.y_range.end = -0.04, 1.08
         self.critical = ColumnDataSource({"x": [], "y": []})
-        self.region.line("x", "y", source=self.critical, color=colours.INK, line_dash="dotted", line_width=1.5,
-                         legend_label="critical")
+        self.region.line(
+            "x",
+            "y",
+            source=self.critical,
+            color=colours.INK,
+            line_dash="dotted",
+            line_width=1.5,
+            legend_label="critical",
+        )
         self.curve = ColumnDataSource({"x": [], "y": []})
         self.plane.line("x", "y", source=self.curve, color=colours.FAINT, line_width=2, legend_label="fitted MFD")
         for n, name in enumerate(names):
             colour, dash = colours.RUNS[n]
-            empty: dict[str, list[float]] = {key: [] for key in (
-                "time", "accumulation", "outflow", "u", "green", "completed", "spent", "density", "speed")}
+            empty: dict[str, list[float]] = {
+                key: []
+                for key in ("time", "accumulation", "outflow", "u", "green", "completed", "spent", "density", "speed")
+            }
             line = ColumnDataSource(empty)
             for plot, key in ((self.region, "accumulation"), (self.trips, "completed"), (self.spent, "spent")):
                 plot.line("time", key, source=line, color=colour, line_dash=dash, line_width=2, legend_label=name)
-            self.gate.step("time", "u", source=line, color=colour, line_dash=dash, line_width=2, mode="before",
-                           legend_label=f"u, {name}")
-            self.gate.scatter("time", "green", source=line, size=5, marker=("circle", "square")[n], line_color=colour,
-                              fill_color=colours.PAPER, legend_label=f"green, {name}")
-            self.street.line("time", "density", source=line, color=colour, line_dash=dash, line_width=2,
-                             legend_label=f"density, {name}")
-            self.street.scatter("time", "speed", source=line, y_range_name="speed", size=5, line_color=colour,
-                                marker=("circle", "square")[n], fill_color=colours.PAPER, legend_label=f"speed, {name}")
+            self.gate.step(
+                "time",
+                "u",
+                source=line,
+                color=colour,
+                line_dash=dash,
+                line_width=2,
+                mode="before",
+                legend_label=f"u, {name}",
+            )
+            self.gate.scatter(
+                "time",
+                "green",
+                source=line,
+                size=5,
+                marker=("circle", "square")[n],
+                line_color=colour,
+                fill_color=colours.PAPER,
+                legend_label=f"green, {name}",
+            )
+            self.street.line(
+                "time",
+                "density",
+                source=line,
+                color=colour,
+                line_dash=dash,
+                line_width=2,
+                legend_label=f"density, {name}",
+            )
+            self.street.scatter(
+                "time",
+                "speed",
+                source=line,
+                y_range_name="speed",
+                size=5,
+                line_color=colour,
+                marker=("circle", "square")[n],
+                fill_color=colours.PAPER,
+                legend_label=f"speed, {name}",
+            )
             trail, point = ColumnDataSource({"x": [], "y": []}), ColumnDataSource({"x": [], "y": []})
             self.plane.line("x", "y", source=trail, color=colour, line_dash=dash, alpha=0.5, line_width=1.5)
             self.plane.scatter("x", "y", source=trail, color=colour, alpha=0.35, size=4)
-            self.plane.scatter("x", "y", source=point, color=colour, size=12, marker=("circle", "square")[n],
-                               line_color=colours.PAPER, legend_label=name)
+            self.plane.scatter(
+                "x",
+                "y",
+                source=point,
+                color=colour,
+                size=12,
+                marker=("circle", "square")[n],
+                line_color=colours.PAPER,
+                legend_label=name,
+            )
             self.lines.append(line)
             self.trails.append(trail)
             self.points.append(point)
@@ -129,17 +207,23 @@ class Curves:
         self._members = [n for one in picture.gates if (one.source, one.target) == gate for n in one.gateways]
         self.region.title.text = f"Region {region}, {name}: accumulation"
         self.plane.title.text = f"Region {region}, {name}: MFD plane"
-        self.gate.title.text = "No gate with a signal" if gate is None else (
-            f"Gate {gate[0]} → {gate[1]}: command and green")
-        self.critical.data = {"x": [0.0, picture.steps * picture.step / MINUTE],
-                               "y": [float(picture.critical[region])] * 2}
+        self.gate.title.text = (
+            "No gate with a signal" if gate is None else (f"Gate {gate[0]} → {gate[1]}: command and green")
+        )
+        self.critical.data = {
+            "x": [0.0, picture.steps * picture.step / MINUTE],
+            "y": [float(picture.critical[region])] * 2,
+        }
         self.curve.data = {"x": curve[:, 0].astype(np.float32), "y": curve[:, 1].astype(np.float32)}
 
     def choose_street(self, street: int | None) -> None:
         """The street whose curves are shown."""
         self._street = street
-        self.street.title.text = "Click a street of the map" if street is None else (
-            f"Street {self._picture.edges[street]}: density and speed")
+        self.street.title.text = (
+            "Click a street of the map"
+            if street is None
+            else (f"Street {self._picture.edges[street]}: density and speed")
+        )
 
     def show(self, runs: Sequence[Sequence[Frame]], time: float) -> None:
         """runs: the whole frames of every run so far; time: [s], that is looked at"""
@@ -155,11 +239,22 @@ class Curves:
                 "completed": np.array([frame.completed for frame in whole], np.float32),
                 "spent": np.array([frame.time_spent / HOUR for frame in whole], np.float32),
                 # Zero where no street is chosen: of nothing at all Bokeh finds no range.
-                **{name: np.array([0.0 if self._street is None else getattr(frame, name)[self._street]
-                                   for frame in whole], np.float32) for name in ("density", "speed")}}
+                **{
+                    name: np.array(
+                        [0.0 if self._street is None else getattr(frame, name)[self._street] for frame in whole],
+                        np.float32,
+                    )
+                    for name in ("density", "speed")
+                },
+            }
             past = [frame for frame in later if frame.time <= time][-TRAIL:]
-            x, y = (np.array(values, np.float32) for values in (
-                [frame.accumulation[self._region] for frame in past], [frame.outflow[self._region] for frame in past]))
+            x, y = (
+                np.array(values, np.float32)
+                for values in (
+                    [frame.accumulation[self._region] for frame in past],
+                    [frame.outflow[self._region] for frame in past],
+                )
+            )
             self.trails[n].data = {"x": x, "y": y}
             self.points[n].data = {"x": x[-1:], "y": y[-1:]}
 
@@ -174,13 +269,22 @@ class Curves:
             return float("nan"), float("nan")
         green = frame.green[self._members]
         return float(frame.perimeter[self._gate]), float(np.nanmean(green)) if not np.isnan(green).all() else (
-            float("nan"))
+            float("nan")
+        )
 
 
 def _figure(title: str, x: str, y: str, height: int = HEIGHT) -> Plot:
     plot = figure(
-        title=title, height=height, sizing_mode="stretch_width", tools="", toolbar_location=None, x_axis_label=x,
-        y_axis_label=y, outline_line_color=None, background_fill_color=colours.PAPER)
+        title=title,
+        height=height,
+        sizing_mode="stretch_width",
+        tools="",
+        toolbar_location=None,
+        x_axis_label=x,
+        y_axis_label=y,
+        outline_line_color=None,
+        background_fill_color=colours.PAPER,
+    )
     plot.axis.axis_label_text_font_style = "normal"
     plot.axis.axis_label_text_color = plot.axis.major_label_text_color = colours.FAINT
     plot.axis.axis_line_color = plot.axis.major_tick_line_color = colours.LINE

@@ -35,8 +35,13 @@ class Viewer:
             one.gates.selected.on_change("indices", partial(self._gate_clicked, n))
             one.streets.selected.on_change("indices", partial(self._street_clicked, n))
         self._page.place(
-            document, f"{len(picture.edges):,} streets, {picture.regions} regions, control interval "
-            f"{picture.step:g} s, {picture.steps} intervals", bar, choices, streets=True)
+            document,
+            f"{len(picture.edges):,} streets, {picture.regions} regions, control interval "
+            f"{picture.step:g} s, {picture.steps} intervals",
+            bar,
+            choices,
+            streets=True,
+        )
         self._next, self._budget = 0.0, budget
         self.refresh()
         document.add_periodic_callback(self._look, EVERY)
@@ -53,8 +58,14 @@ class Viewer:
         show = self._show
         now = show.now if self._at is None else min(self._at, show.now)
         frames = [seen.at(now) for seen in show.runs]
-        held = [frozenset((i, h) for (i, h), share in {
-            (i, h): share for _, i, h, share in seen.switched}.items() if share is not None) for seen in show.runs]
+        held = [
+            frozenset(
+                (i, h)
+                for (i, h), share in {(i, h): share for _, i, h, share in seen.switched}.items()
+                if share is not None
+            )
+            for seen in show.runs
+        ]
         drawn = (now, self._by, *held, *(None if frame is None else (frame.time, frame.whole) for frame in frames))
         whole = [[frame for frame in seen.whole if frame.time <= show.now] for seen in show.runs]
         traced = (self._page.region, self._page.gate, self._page.street, self._at, *(len(frames) for frames in whole))
@@ -77,8 +88,14 @@ class Viewer:
         faster.on_click(lambda: self._do(partial(self._show.hurry, 1)))
         picture = self._page.picture
         self._time = Slider(
-            start=0.0, end=picture.steps * picture.step / MINUTE, value=0.0, step=picture.step / MINUTE, name="time",
-            title="time [min]", sizing_mode="stretch_width")
+            start=0.0,
+            end=picture.steps * picture.step / MINUTE,
+            value=0.0,
+            step=picture.step / MINUTE,
+            name="time",
+            title="time [min]",
+            sizing_mode="stretch_width",
+        )
         self._time.on_change("value", self._jumped)
         self._live = Button(label="Live", name="live", width=70, button_type="success")
         self._live.on_click(self._back_to_live)
@@ -90,19 +107,36 @@ class Viewer:
         colour = RadioButtonGroup(labels=["Density", "Speed"], active=0, name="colour")
         colour.on_change("active", lambda _, __, new: self._coloured((DENSITY, SPEED)[new]))
         self._regions = Select(
-            title="Region", name="region", value=str(self._page.region), width=210,
-            options=[(str(n), f"{n} {name}") for n, name in enumerate(picture.region_names)])
+            title="Region",
+            name="region",
+            value=str(self._page.region),
+            width=210,
+            options=[(str(n), f"{n} {name}") for n, name in enumerate(picture.region_names)],
+        )
         self._regions.on_change("value", lambda _, __, new: self._choose(int(new), None))
-        self._gates = Select(title="Gate", name="gate", value=_text(self._page.gate), width=110, options=[
-            _text(gate) for gate in picture.boundaries])
+        self._gates = Select(
+            title="Gate",
+            name="gate",
+            value=_text(self._page.gate),
+            width=110,
+            options=[_text(gate) for gate in picture.boundaries],
+        )
         self._gates.on_change("value", lambda _, __, new: self._choose(self._page.region, _pair(new)))
-        self._whose = Select(title="of the run", name="whose", value="0", width=200, options=[
-            (str(n), seen.name) for n, seen in enumerate(self._show.runs)])
+        self._whose = Select(
+            title="of the run",
+            name="whose",
+            value="0",
+            width=200,
+            options=[(str(n), seen.name) for n, seen in enumerate(self._show.runs)],
+        )
         self._street = TextInput(title="Street", name="street", placeholder="its name, or click it", width=170)
         self._street.on_change("value", lambda _, __, new: self._choose_street(new))
         buttons: list[Button] = []
         for label, name, share in (
-                ("Close gate", "close", 0.0), ("Open gate", "open", 1.0), ("Let go", "release", None)):
+            ("Close gate", "close", 0.0),
+            ("Open gate", "open", 1.0),
+            ("Let go", "release", None),
+        ):
             button = Button(label=label, name=name, width=100, disabled=self._page.gate is None)
             button.on_click(partial(self._switch, share))
             buttons.append(button)

@@ -15,8 +15,7 @@ from cosim.view.picture import CityPicture, Frame
 
 HERE = Path(__file__).parent
 WIDE = ".bk-clearfix { display: block !important; }"  # of a Div, which else is no wider than its words
-TEMPLATES = Environment(
-    loader=PackageLoader("cosim.view", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+TEMPLATES = Environment(loader=PackageLoader("cosim.view", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
 
 
 class Page:
@@ -38,8 +37,9 @@ class Page:
     def gate_of(self, region: int) -> tuple[int, int] | None:
         """The first gate into a region, or out of it; None where there is none with a signal."""
         gates = self.picture.boundaries
-        return next((gate for gate in gates if gate[1] == region), next(
-            (gate for gate in gates if gate[0] == region), None))
+        return next(
+            (gate for gate in gates if gate[1] == region), next((gate for gate in gates if gate[0] == region), None)
+        )
 
     def choose(self, region: int, gate: tuple[int, int] | None) -> None:
         """The region and the gate whose curves are shown, from the next `curves` on."""
@@ -56,7 +56,10 @@ class Page:
         self.curves.choose_street(street)
 
     def show(
-        self, frames: Sequence[Frame | None], time: float, by: str = DENSITY,
+        self,
+        frames: Sequence[Frame | None],
+        time: float,
+        by: str = DENSITY,
         held: Sequence[frozenset[tuple[int, int]]] = (),
     ) -> None:
         """The runs at `time` [s]: a frame of each, None where there is none yet; by: the colour of streets; held: of
@@ -76,7 +79,7 @@ class Page:
         self.curves.show(runs, time)
 
     def layout(
-        self, bar: Sequence[Model], choices: Sequence[Model], *, streets: bool = False,
+        self, bar: Sequence[Model], choices: Sequence[Model], *, streets: bool = False
     ) -> tuple[dict[str, Model], dict[str, list[str]]]:
         """What stands on the page: models by name, and which of them is where (`body.html.j2`). bar, choices: what one
         can press, with names; streets: whether one can be chosen."""
@@ -85,18 +88,31 @@ class Page:
             "numbers": self.numbers,
             **{f"map{n}": one.plot for n, one in enumerate(self.maps)},
             **{f"load{n}": one.plot for n, one in enumerate(self.loads)},
-            "region_curve": curves.region, "plane": curves.plane, "gate_curve": curves.gate, "trips": curves.trips,
-            "spent": curves.spent, **street, **{str(model.name): model for model in (*bar, *choices)}}
+            "region_curve": curves.region,
+            "plane": curves.plane,
+            "gate_curve": curves.gate,
+            "trips": curves.trips,
+            "spent": curves.spent,
+            **street,
+            **{str(model.name): model for model in (*bar, *choices)},
+        }
         for name, model in roots.items():
             model.name = name
         return roots, {
-            "bar": [str(model.name) for model in bar], "choices": [str(model.name) for model in choices],
+            "bar": [str(model.name) for model in bar],
+            "choices": [str(model.name) for model in choices],
             "maps": [name for name in roots if name.startswith("map")],
             "loads": [name for name in roots if name.startswith("load")],
-            "curves": ["region_curve", "plane", "gate_curve", *street, "trips", "spent"]}
+            "curves": ["region_curve", "plane", "gate_curve", *street, "trips", "spent"],
+        }
 
     def place(
-        self, document: Document, subtitle: str, bar: Sequence[Model], choices: Sequence[Model], *,
+        self,
+        document: Document,
+        subtitle: str,
+        bar: Sequence[Model],
+        choices: Sequence[Model],
+        *,
         streets: bool = False,
     ) -> None:
         """Put it into a document; arguments as in `layout`."""
@@ -107,7 +123,8 @@ class Page:
         document.title = f"{self.picture.name}: {' against '.join(self.names)}"
         document.template = TEMPLATES.get_template("page.html.j2")
         document.template_variables.update(
-            heading=document.title, subtitle=subtitle, css=style("page.css", "runs.css"), **places)
+            heading=document.title, subtitle=subtitle, css=style("page.css", "runs.css"), **places
+        )
 
 
 def style(*names: str) -> str:
@@ -119,21 +136,35 @@ def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -
     """What has come of the runs so far, in HTML."""
     lines = []
     for n, (name, frame) in enumerate(zip(names, frames, strict=True)):
-        told = () if frame is None else (
-            ("inside [veh]", frame.accumulation.sum()), ("waiting to enter [veh]", frame.waiting),
-            ("completed trips [veh]", frame.completed), ("time spent [veh h]", frame.time_spent / HOUR),
-            ("removed [veh]", frame.removed))
+        told = (
+            ()
+            if frame is None
+            else (
+                ("inside [veh]", frame.accumulation.sum()),
+                ("waiting to enter [veh]", frame.waiting),
+                ("completed trips [veh]", frame.completed),
+                ("time spent [veh h]", frame.time_spent / HOUR),
+                ("removed [veh]", frame.removed),
+            )
+        )
         cells = "".join(
             f"<div style='flex:0 0 138px'><div style='font-size:19px;font-variant-numeric:tabular-nums'>{value:,.0f}"
-            f"</div><div style='font-size:12px;color:{colours.FAINT}'>{text}</div></div>" for text, value in told)
-        note = "" if frame is None or not frame.note else (
-            f"<div style='flex-basis:100%;font-size:13px;color:{colours.QUEUE}'>{escape(frame.note[:200])}</div>")
+            f"</div><div style='font-size:12px;color:{colours.FAINT}'>{text}</div></div>"
+            for text, value in told
+        )
+        note = (
+            ""
+            if frame is None or not frame.note
+            else (f"<div style='flex-basis:100%;font-size:13px;color:{colours.QUEUE}'>{escape(frame.note[:200])}</div>")
+        )
         colour, dash = colours.RUNS[n]
         lines.append(
             f"<div style='display:flex;flex-wrap:wrap;gap:2px 10px;align-items:center;border-left:4px {dash} {colour};"
             f"padding-left:12px;margin:5px 0'><div style='flex:1 1 140px;font-weight:650;color:{colour}'>{escape(name)}"
-            f"</div>{cells}{note}</div>")
+            f"</div>{cells}{note}</div>"
+        )
     return (
         "<div style='display:flex;flex-wrap:wrap;gap:4px 36px;align-items:center'>"
         f"<div style='font-size:24px;font-weight:650;flex:0 0 130px;white-space:nowrap'>{time / MINUTE:.1f} min</div>"
-        f"<div style='flex:1 1 280px;min-width:0'>{''.join(lines)}</div></div>")
+        f"<div style='flex:1 1 280px;min-width:0'>{''.join(lines)}</div></div>"
+    )

@@ -19,9 +19,9 @@ from nmfd.arrays import PerPair, PerRegion
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, State, Trajectory
 
-CURVE = 60    # points of an MFD
+CURVE = 60  # points of an MFD
 BLOCKS = 0.06  # of the map's extent: no hole in a region
-BACK = 0.015   # of it: how far before the end of a street its gate is drawn
+BACK = 0.015  # of it: how far before the end of a street its gate is drawn
 BEYOND = 2.0  # critical accumulations: where a curve ends, or at the jam if that comes first
 
 
@@ -83,16 +83,24 @@ class CityPicture:
         region = np.array([city.region_of[edge] for edge in city.edges])
         middles = np.array([shape.mean(axis=0) for shape in shapes])
         return cls(
-            name=scenario.name, region_names=network.region_names, edges=city.edges, shapes=shapes,
+            name=scenario.name,
+            region_names=network.region_names,
+            edges=city.edges,
+            shapes=shapes,
             lane_km=np.array([city.length[edge] * city.lanes[edge] for edge in city.edges]) / 1000.0,
             limit=np.array([city.speed[edge] for edge in city.edges]),
-            lanes=np.array([city.lanes[edge] for edge in city.edges]), region=region,
+            lanes=np.array([city.lanes[edge] for edge in city.edges]),
+            region=region,
             outlines=rings_round(shapes, np.ones(len(shapes), dtype=bool), region, BLOCKS),
             places=np.stack([middles[region == r].mean(axis=0) for r in range(city.regions)]),
             gates=_gates(city, dict(zip(city.edges, shapes, strict=True))),
             critical=network.critical,
             curves=[_curve(mfd.critical, mfd.jam, mfd.outflow) for mfd in network.mfds],
-            step=scenario.step, steps=scenario.steps, low=network.u_min, high=network.u_max)
+            step=scenario.step,
+            steps=scenario.steps,
+            low=network.u_min,
+            high=network.u_max,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,28 +138,46 @@ def first(picture: CityPicture, gateways: int, state: State) -> Frame:
     """At the beginning. gateways: of the city"""
     edges, regions = len(picture.edges), picture.regions
     return Frame(
-        time=0.0, intervals=0, whole=True, density=np.zeros(edges, np.float16),
-        speed=np.full(edges, np.nan, np.float16), accumulation=state.accumulation.sum(axis=1),
-        outflow=np.zeros(regions), waiting=float(state.backlog.sum()), completed=0.0, removed=0.0, time_spent=0.0,
-        perimeter=np.full((regions, regions), picture.high), green=np.full(gateways, np.nan),
-        queue=np.zeros(gateways), guided=np.zeros((regions, regions)))
+        time=0.0,
+        intervals=0,
+        whole=True,
+        density=np.zeros(edges, np.float16),
+        speed=np.full(edges, np.nan, np.float16),
+        accumulation=state.accumulation.sum(axis=1),
+        outflow=np.zeros(regions),
+        waiting=float(state.backlog.sum()),
+        completed=0.0,
+        removed=0.0,
+        time_spent=0.0,
+        perimeter=np.full((regions, regions), picture.high),
+        green=np.full(gateways, np.nan),
+        queue=np.zeros(gateways),
+        guided=np.zeros((regions, regions)),
+    )
 
 
-def between(
-    picture: CityPicture, before: Frame, time: float, vehicles: PerEdge, speed: PerEdge,
-) -> Frame:
+def between(picture: CityPicture, before: Frame, time: float, vehicles: PerEdge, speed: PerEdge) -> Frame:
     """In the middle of a control interval: `before` with what streets do at `time` [s] since the start.
 
     vehicles: (E,) [veh]; speed: (E,) [m/s]
     """
     return replace(
-        before, time=time, whole=False, **_streets(picture, vehicles, speed),
-        accumulation=np.bincount(picture.region, vehicles, picture.regions))
+        before,
+        time=time,
+        whole=False,
+        **_streets(picture, vehicles, speed),
+        accumulation=np.bincount(picture.region, vehicles, picture.regions),
+    )
 
 
 def after(
-    picture: CityPicture, before: Frame, spent: float, controls: Controls, state: State,
-    row: Mapping[str, np.ndarray], speed: PerEdge | None = None,
+    picture: CityPicture,
+    before: Frame,
+    spent: float,
+    controls: Controls,
+    state: State,
+    row: Mapping[str, np.ndarray],
+    speed: PerEdge | None = None,
 ) -> Frame:
     """At the end of a control interval.
 
@@ -162,22 +188,37 @@ def after(
         green = row["gateway_green"] / row["gateway_original_green"]
     flows = {name: row[name][None] for name in ("arrivals", "crossings")}
     return Frame(
-        time=state.time, intervals=state.step, whole=True,
+        time=state.time,
+        intervals=state.step,
+        whole=True,
         **_streets(picture, row["edge_vehicles"].astype(float), speed),
-        accumulation=state.accumulation.sum(axis=1), outflow=regional_outflow(flows, picture.step)[0],
-        waiting=float(state.backlog.sum()), completed=state.completed,
+        accumulation=state.accumulation.sum(axis=1),
+        outflow=regional_outflow(flows, picture.step)[0],
+        waiting=float(state.backlog.sum()),
+        completed=state.completed,
         removed=0.0 if state.removed is None else float(state.removed.sum()),
-        time_spent=before.time_spent + picture.step * spent, perimeter=controls.perimeter, green=green,
-        queue=row["gateway_queue"].astype(float), guided=row["guided"].sum(axis=2).astype(float),
-        note="; ".join(filter(None, (controls.note, state.problem))))
+        time_spent=before.time_spent + picture.step * spent,
+        perimeter=controls.perimeter,
+        green=green,
+        queue=row["gateway_queue"].astype(float),
+        guided=row["guided"].sum(axis=2).astype(float),
+        note="; ".join(filter(None, (controls.note, state.problem))),
+    )
 
 
 def frames(picture: CityPicture, trajectory: Trajectory, record: Mapping[str, np.ndarray]) -> list[Frame]:
     """Of a finished run, one at its beginning and one at the end of every control interval."""
     states = [
-        State(step=k, time=k * trajectory.step, accumulation=trajectory.accumulation[k], backlog=trajectory.backlog[k],
-              completed=float(trajectory.completed[k]), removed=trajectory.removed[k])
-        for k in range(len(trajectory.accumulation))]
+        State(
+            step=k,
+            time=k * trajectory.step,
+            accumulation=trajectory.accumulation[k],
+            backlog=trajectory.backlog[k],
+            completed=float(trajectory.completed[k]),
+            removed=trajectory.removed[k],
+        )
+        for k in range(len(trajectory.accumulation))
+    ]
     found = [first(picture, record["gateway_green"].shape[1], states[0])]
     for k, state in enumerate(states[1:]):
         controls = Controls(perimeter=trajectory.perimeter[k], splits=None, note=trajectory.note[k])
@@ -211,6 +252,12 @@ def _gates(city: City, shapes: Mapping[str, Float[np.ndarray, "n 2"]]) -> tuple[
         members.setdefault((gateway.from_edge, gateway.target), []).append(n)
     back = BACK * float(np.ptp(np.concatenate(list(shapes.values())), axis=0).max())
     return tuple(
-        Gate(source=city.gateways[numbers[0]].source, target=target, place=_before_end(shapes[edge], back),
-             gateways=tuple(numbers), signal=any(city.gateways[n].signal is not None for n in numbers))
-        for (edge, target), numbers in members.items())
+        Gate(
+            source=city.gateways[numbers[0]].source,
+            target=target,
+            place=_before_end(shapes[edge], back),
+            gateways=tuple(numbers),
+            signal=any(city.gateways[n].signal is not None for n in numbers),
+        )
+        for (edge, target), numbers in members.items()
+    )

@@ -34,9 +34,7 @@ def embedded(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> Repla
     return Replay(scripts=(*library, script), roots=roots, places=places)
 
 
-def layout(
-    picture: CityPicture, runs: Mapping[str, Sequence[Frame]],
-) -> tuple[dict[str, Model], dict[str, list[str]]]:
+def layout(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> tuple[dict[str, Model], dict[str, list[str]]]:
     """The models, as `Page.layout` gives them. They show at first when runs differ most, or a single one is fullest."""
     page, whole = Page(picture, list(runs)), list(runs.values())
     first, moving, chosen = page.region, _moving(page), _chosen(page)
@@ -60,35 +58,65 @@ def layout(
             for n, title in enumerate(titles):
                 choices[f"title{n}"].append(title.text)
     slider = Slider(
-        start=0.0, end=last * step, value=begin * step, step=step, title="time [min]", name="time",
-        sizing_mode="stretch_width")
-    region = Select(title="Region", name="region", value=str(first), width=230, options=[
-        (str(n), f"{n} {name}") for n, name in enumerate(picture.region_names)])
+        start=0.0,
+        end=last * step,
+        value=begin * step,
+        step=step,
+        title="time [min]",
+        name="time",
+        sizing_mode="stretch_width",
+    )
+    region = Select(
+        title="Region",
+        name="region",
+        value=str(first),
+        width=230,
+        options=[(str(n), f"{n} {name}") for n, name in enumerate(picture.region_names)],
+    )
     play = Toggle(label="Play", name="play", width=90, button_type="primary")
     curves = page.curves
     callback = CustomJS(
-        args={"slider": slider, "region": region, "film": ColumnDataSource(film), "choices": ColumnDataSource(choices),
-              "moving": moving, "chosen": chosen, "titles": titles, "numbers": page.numbers, "lines": curves.lines,
-              "trails": curves.trails, "points": curves.points, "trail": TRAIL,
-              "spans": [*(load.now for load in page.loads), *curves.now]},
-        code=(HERE / "replay.js").read_text(encoding="utf-8"))
+        args={
+            "slider": slider,
+            "region": region,
+            "film": ColumnDataSource(film),
+            "choices": ColumnDataSource(choices),
+            "moving": moving,
+            "chosen": chosen,
+            "titles": titles,
+            "numbers": page.numbers,
+            "lines": curves.lines,
+            "trails": curves.trails,
+            "points": curves.points,
+            "trail": TRAIL,
+            "spans": [*(load.now for load in page.loads), *curves.now],
+        },
+        code=(HERE / "replay.js").read_text(encoding="utf-8"),
+    )
     slider.js_on_change("value", callback)
     region.js_on_change("value", callback)
-    play.js_on_change("active", CustomJS(args={"slider": slider, "wait": PLAYED}, code="""
+    play.js_on_change(
+        "active",
+        CustomJS(
+            args={"slider": slider, "wait": PLAYED},
+            code="""
         clearInterval(window.replaying)
         cb_obj.label = cb_obj.active ? "Pause" : "Play"
         if (cb_obj.active && slider.value > slider.end - slider.step / 2) slider.value = slider.start
         if (cb_obj.active) window.replaying = setInterval(() => {
             if (slider.value > slider.end - slider.step / 2) cb_obj.active = false
             else slider.value = Math.min(slider.value + slider.step, slider.end)
-        }, wait)"""))
+        }, wait)""",
+        ),
+    )
     return page.layout([play, slider], [region])
 
 
 def _most_telling(runs: Sequence[Sequence[Frame]], last: int) -> int:
     """The interval at whose end two runs have the most different numbers of vehicles inside, or one has the most."""
-    inside = [np.array([frames[min(k, len(frames) - 1)].accumulation.sum() for k in range(last + 1)])
-              for frames in runs]
+    inside = [
+        np.array([frames[min(k, len(frames) - 1)].accumulation.sum() for k in range(last + 1)]) for frames in runs
+    ]
     return int(np.argmax(np.abs(inside[0] - inside[1]) if len(inside) > 1 else inside[0]))
 
 
@@ -99,7 +127,8 @@ def _moving(page: Page) -> Sources:
         found += [
             (f"streets{n}", one.streets, ["value"]),
             (f"gates{n}", one.gates, ["end", "green", "queue", "halo"]),
-            (f"arrows{n}", one.arrows, ["width", "head", "guided"])]
+            (f"arrows{n}", one.arrows, ["width", "head", "guided"]),
+        ]
     return found
 
 
@@ -109,7 +138,9 @@ def _chosen(page: Page) -> Sources:
     return [
         *((f"regions{n}", one.regions, ["width", "line", "fill"]) for n, one in enumerate(page.maps)),
         *((f"lines{n}", line, ["accumulation", "outflow", "u", "green"]) for n, line in enumerate(curves.lines)),
-        ("critical", curves.critical, ["x", "y"]), ("curve", curves.curve, ["x", "y"])]
+        ("critical", curves.critical, ["x", "y"]),
+        ("curve", curves.curve, ["x", "y"]),
+    ]
 
 
 def _keep(table: dict[str, list], sources: Sources) -> None:

@@ -30,10 +30,10 @@ from cosim.view.budget import Budget
 from nmfd.errors import InputError
 
 LOOPBACK = "127.0.0.1"
-MOST_VIEWERS = 12    # at a time
-RETRY = 5            # s, until somebody for whom there is no room asks again
+MOST_VIEWERS = 12  # at a time
+RETRY = 5  # s, until somebody for whom there is no room asks again
 LARGEST = 1_000_000  # bytes of a message to the server
-LEFT = 5.0           # s without a viewer, after which nobody is looking
+LEFT = 5.0  # s without a viewer, after which nobody is looking
 
 
 class Guarded(BokehTornado):
@@ -44,9 +44,16 @@ class Guarded(BokehTornado):
         and pictures"""
         self._names, self._token, self._budget = names, token, budget
         super().__init__(
-            application, extra_websocket_origins=["*"], sign_sessions=True, secret_key=secrets.token_bytes(32),
-            websocket_max_message_size_bytes=LARGEST, unused_session_lifetime_milliseconds=int(1000 * LEFT),
-            check_unused_sessions_milliseconds=1000, keep_alive_milliseconds=10_000, use_index=False)
+            application,
+            extra_websocket_origins=["*"],
+            sign_sessions=True,
+            secret_key=secrets.token_bytes(32),
+            websocket_max_message_size_bytes=LARGEST,
+            unused_session_lifetime_milliseconds=int(1000 * LEFT),
+            check_unused_sessions_milliseconds=1000,
+            keep_alive_milliseconds=10_000,
+            use_index=False,
+        )
 
     def find_handler(self, request: HTTPServerRequest, **more: object) -> object:
         """403 instead of an answer, unless all is well; a page that asks again where too many look."""
@@ -104,14 +111,16 @@ class Waiting(RequestHandler):
         self.finish(
             f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta http-equiv="refresh" content="{RETRY}">'
             "<title>One moment</title><p>Many are watching, and the runs go first. This page asks again in "
-            f"{RETRY} s.")
+            f"{RETRY} s."
+        )
 
 
 class Server:
     """Shows `page` to whoever opens `address`, in the thread that calls `serve`."""
 
-    def __init__(self, page: Callable[[Document], object], *, host: str = LOOPBACK, port: int = 0,
-                 budget: Budget | None = None):
+    def __init__(
+        self, page: Callable[[Document], object], *, host: str = LOOPBACK, port: int = 0, budget: Budget | None = None
+    ):
         """port: 0 for any that is free; budget: of what pages and pictures cost. Raises InputError for a port that is
         not free, and a host that is not this machine's"""
         try:
@@ -120,7 +129,8 @@ class Server:
             reason = getattr(error, "strerror", None) or str(error)
             raise InputError(
                 f"--host {host}, --port {port}: cannot be listened at ({reason}); choose another port, or omit --port "
-                "for any that is free") from None
+                "for any that is free"
+            ) from None
         self.port = sockets[0].getsockname()[1]
         local = all(_is_loopback(one.getsockname()[0]) for one in sockets)
         self._token = "" if local else secrets.token_urlsafe(24)
@@ -131,7 +141,8 @@ class Server:
         self._loop = IOLoop.current()
         self._tornado = Guarded(application, frozenset(names), self._token, budget or Budget())
         http = HTTPServer(
-            self._tornado, max_buffer_size=10 * LARGEST, max_body_size=LARGEST, idle_connection_timeout=60)
+            self._tornado, max_buffer_size=10 * LARGEST, max_body_size=LARGEST, idle_connection_timeout=60
+        )
         http.add_sockets(sockets)
         self._server = BaseServer(self._loop, self._tornado, http)
         shown = host if host not in ("0.0.0.0", "::") else socket.gethostname()
@@ -145,6 +156,7 @@ class Server:
 
     def serve(self, every: float, look: Callable[[], bool]) -> None:
         """Until `look`, asked every so many seconds, says that it is enough, or somebody presses Ctrl-C."""
+
         def ask() -> None:
             if look():
                 self._loop.stop()

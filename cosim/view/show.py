@@ -51,7 +51,7 @@ class Show:
     """Runs side by side. All of it may be asked from any thread; frames come by threads of its own."""
 
     def __init__(
-        self, tasks: Sequence[Task], *, delay: float = 0.0, progress: Callable[[int, int], None] | None = None,
+        self, tasks: Sequence[Task], *, delay: float = 0.0, progress: Callable[[int, int], None] | None = None
     ):
         """Starts them. delay: [s] of wall time per simulated second at least; progress: of the first one"""
         self.runs = [Seen(task.controller) for task in tasks]
@@ -71,7 +71,8 @@ class Show:
             self._pipes.append(here)
             self._threads += [
                 threading.Thread(target=self._listen, args=(n,), daemon=True),
-                threading.Thread(target=self._conclude, args=(n,), daemon=True)]
+                threading.Thread(target=self._conclude, args=(n,), daemon=True),
+            ]
         for thread in self._threads:
             thread.start()
 

@@ -15,14 +15,20 @@ from cosim.view.server import LOOPBACK, Server
 from cosim.view.show import Seen, Show
 from nmfd.runs.workers import Failure, ended
 
-LOOK = 0.2     # s, between two looks at whether all is over
+LOOK = 0.2  # s, between two looks at whether all is over
 PATIENCE = 10.0  # s, for somebody to open the page of runs that have ended
-NICER = 10     # how much the server gives way to the runs
+NICER = 10  # how much the server gives way to the runs
 
 
 def watch(
-    tasks: Sequence[Task], *, host: str = LOOPBACK, port: int = 0, delay: float = 0.0, browse: bool = False,
-    tell: Callable[[str], None] = print, progress: Callable[[int, int], None] | None = None,
+    tasks: Sequence[Task],
+    *,
+    host: str = LOOPBACK,
+    port: int = 0,
+    delay: float = 0.0,
+    browse: bool = False,
+    tell: Callable[[str], None] = print,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[Seen]:
     """Run the tasks side by side with a live page, until they have ended and nobody looks any more; what they showed.
 
@@ -50,8 +56,11 @@ def watch(
             show.changed.wait(LOOK)
         if show.picture is not None:
             with suppress(psutil.Error, OSError):  # what the runs need goes first
-                psutil.Process().nice(NICER if not hasattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS") else (
-                    psutil.BELOW_NORMAL_PRIORITY_CLASS))
+                psutil.Process().nice(
+                    NICER
+                    if not hasattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS")
+                    else (psutil.BELOW_NORMAL_PRIORITY_CLASS)
+                )
             tell(f"Watch it at {server.address}")
             if browse:
                 webbrowser.open(server.address)

@@ -12,6 +12,7 @@ KINDS = ("scenarios", "networks", "policies", "controllers")
 
 def about(name: str) -> Callable[[Callable], Callable]:
     """--version and --cite of the command line `name`."""
+
     def cite(context: click.Context, _: click.Parameter, wanted: bool) -> None:
         if wanted and not context.resilient_parsing:
             text = resources.files("nmfd").joinpath("CITATION.cff").read_text(encoding="utf-8")
@@ -20,8 +21,13 @@ def about(name: str) -> Callable[[Callable], Callable]:
 
     def decorate(command: Callable) -> Callable:
         command = click.option(
-            "--cite", is_flag=True, expose_value=False, is_eager=True, callback=cite,
-            help="Show how to cite this software, as CITATION.cff, and exit.")(command)
+            "--cite",
+            is_flag=True,
+            expose_value=False,
+            is_eager=True,
+            callback=cite,
+            help="Show how to cite this software, as CITATION.cff, and exit.",
+        )(command)
         return click.version_option(__version__, prog_name=name)(command)
 
     return decorate
@@ -30,7 +36,8 @@ def about(name: str) -> Callable[[Callable], Callable]:
 def listing(*more: str) -> click.Command:
     """The command list. more: "module:function" of further kinds, each named like its function."""
     where = {kind: "nmfd.cli.catalogue" for kind in KINDS} | {
-        kind: module for module, _, kind in (place.partition(":") for place in more)}
+        kind: module for module, _, kind in (place.partition(":") for place in more)
+    }
 
     @click.command(name="list")
     @click.argument("kinds", nargs=-1, type=click.Choice(list(where)), metavar=f"[{'|'.join(where)}]...")

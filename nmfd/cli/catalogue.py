@@ -19,16 +19,26 @@ def scenarios() -> Rows:
     """What the comment at the top of scenario.toml says, network, duration."""
     for folder in shipped.folders(shipped.SCENARIO):
         table = config.checked(ScenarioTable, read_tables(folder), folder / "scenario.toml")
-        yield folder.name, (f"{_about(folder / 'scenario.toml')} ({(folder / table.network).resolve().name}, "
-                            f"{table.steps} intervals of {table.step:g} s)")
+        yield (
+            folder.name,
+            (
+                f"{_about(folder / 'scenario.toml')} ({(folder / table.network).resolve().name}, "
+                f"{table.steps} intervals of {table.step:g} s)"
+            ),
+        )
 
 
 def networks() -> Rows:
     """How many regions, whether there is a city to simulate, and what the comment at the top of network.toml says."""
     for folder in shipped.folders(shipped.NETWORK):
         table = config.checked(NetworkTable, config.read(folder / "network.toml"), folder / "network.toml")
-        yield folder.name, (f"{len(table.regions)} regions, {'SUMO city' if table.sumo else 'regional model only'}: "
-                            f"{_about(folder / 'network.toml')}")
+        yield (
+            folder.name,
+            (
+                f"{len(table.regions)} regions, {'SUMO city' if table.sumo else 'regional model only'}: "
+                f"{_about(folder / 'network.toml')}"
+            ),
+        )
 
 
 def policies() -> Rows:
@@ -38,9 +48,13 @@ def policies() -> Rows:
             content = read_policy_file(file)
             of, numbers = content["configuration"], content["weights"].get("numbers")
             compact = "" if numbers is None else f": {', '.join(f'{number:.3g}' for number in numbers.tolist())}"
-            yield f"{folder.name}/{file.name}", (
-                f"{of['steps']} Adam steps, seed {of['seed']}, {of['validation_veh_s']:.4g} veh s in validation"
-                f"{compact}")
+            yield (
+                f"{folder.name}/{file.name}",
+                (
+                    f"{of['steps']} Adam steps, seed {of['seed']}, {of['validation_veh_s']:.4g} veh s in validation"
+                    f"{compact}"
+                ),
+            )
         for file in sorted(folder.glob("bound-*.npz")):
             yield f"{folder.name}/{file.name}", "a plan found with all demand known"
 

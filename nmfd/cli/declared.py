@@ -93,10 +93,12 @@ def shown(value: Any) -> str:
 
 def declared(declaration: str, *keys: str, **options: Any) -> Callable[[Callable], Callable]:
     """A decorator: an option for every one of these keys of a declaration. The rest as of `Declared`."""
+
     def decorate(command: Callable) -> Callable:
         for key in reversed(keys):
-            command = click.option(
-                f"--{key.replace('_', '-')}", cls=Declared, declaration=declaration, **options)(command)
+            command = click.option(f"--{key.replace('_', '-')}", cls=Declared, declaration=declaration, **options)(
+                command
+            )
         return command
 
     return decorate

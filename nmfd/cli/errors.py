@@ -29,7 +29,7 @@ class Commands(click.Group):
 
     # Not click's signature: the parameters that it has besides these go through `extra`.
     def main(  # type: ignore[override]
-        self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any,
+        self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any
     ) -> NoReturn:
         """Run the command that `args` name, and exit."""
         arguments = list(sys.argv[1:] if args is None else args) or ["--help"]

@@ -31,15 +31,21 @@ def new_controller(file: Path) -> None:
         raise InputError(f"{file.parent}: no such folder; make it first")
     text = resources.files("nmfd.controllers").joinpath("template.py").read_text(encoding="utf-8")
     file.write_text(text.replace("FILE", str(file)), encoding="utf-8")
-    click.echo(f"Written to {file}; try it with: nmfd benchmark economic_mpc "
-               f"--controllers no-control,pi-gating,{quoted(file)}:MyController")
+    click.echo(
+        f"Written to {file}; try it with: nmfd benchmark economic_mpc "
+        f"--controllers no-control,pi-gating,{quoted(file)}:MyController"
+    )
 
 
 @click.command()
 @click.argument("policy", type=FILE)
 @click.option("--out", type=FILE, required=True, metavar="FILE", help="The ONNX file.")
-@click.option("--scenario", type=FOLDER, metavar="DIR",
-              help="For which the policy was trained. [default: the folder that it lies in]")
+@click.option(
+    "--scenario",
+    type=FOLDER,
+    metavar="DIR",
+    help="For which the policy was trained. [default: the folder that it lies in]",
+)
 def export(policy: Path, out: Path, scenario: Path | None) -> None:
     """Export a policy with its constraint layers to ONNX, and check it against torch. Needs the extra onnx.
 
@@ -55,21 +61,35 @@ def export(policy: Path, out: Path, scenario: Path | None) -> None:
     if not out.parent.is_dir():
         raise InputError(f"{out.parent}: no such folder; make it first or choose another --out")
     done = onnx_export.export(policy, out, scenario)
-    click.echo(f"{done['controller']}, {done['regions']} regions: differs from torch by at most "
-               f"{done['difference']:.1e} over {done['samples']} random states")
+    click.echo(
+        f"{done['controller']}, {done['regions']} regions: differs from torch by at most "
+        f"{done['difference']:.1e} over {done['samples']} random states"
+    )
     click.echo(f"Written to {out}")
 
 
 @click.command()
 @click.argument("counts", type=FILE)
-@click.option("--detectors", type=FILE, metavar="CSV",
-              help="detid, length [km of its link], and lanes, linkid, pos, long, lat (or x, y [m]), region if known.")
+@click.option(
+    "--detectors",
+    type=FILE,
+    metavar="CSV",
+    help="detid, length [km of its link], and lanes, linkid, pos, long, lat (or x, y [m]), region if known.",
+)
 @click.option("--regions", type=FILE, metavar="CSV", help="detid,region, where no other table has a column region.")
-@click.option("--about", type=FILE, metavar="CSV",
-              help="Of the regions: region, and any of lane_km, trip_length [m], x and y [m].")
-@click.option("--adjacency", type=FILE, metavar="CSV|TOML",
-              help="Neighbours: region,neighbour, or the network.toml of the same regions. [default: by the detectors' "
-                   "positions]")
+@click.option(
+    "--about",
+    type=FILE,
+    metavar="CSV",
+    help="Of the regions: region, and any of lane_km, trip_length [m], x and y [m].",
+)
+@click.option(
+    "--adjacency",
+    type=FILE,
+    metavar="CSV|TOML",
+    help="Neighbours: region,neighbour, or the network.toml of the same regions. [default: by the detectors' "
+    "positions]",
+)
 @declared("nmfd.studies.settings:Measured", "trip_length", instead="assumed from the region's size, with a warning")
 @declared("nmfd.studies.settings:Measured", "vehicle_length", "least_share")
 @click.option("--city", metavar="NAME", help="Of several in the tables.")
@@ -78,9 +98,19 @@ def export(policy: Path, out: Path, scenario: Path | None) -> None:
 @click.option("--out", type=FOLDER, required=True, metavar="DIR", help="The network's folder, such as networks/zurich.")
 @click.option("--force", is_flag=True, help="Replace a network.toml that is there.")
 def identify(
-    counts: Path, detectors: Path | None, regions: Path | None, about: Path | None, adjacency: Path | None,
-    trip_length: float | None, vehicle_length: float, least_share: float, city: str | None, skip_bad: bool,
-    name: str | None, out: Path, force: bool,
+    counts: Path,
+    detectors: Path | None,
+    regions: Path | None,
+    about: Path | None,
+    adjacency: Path | None,
+    trip_length: float | None,
+    vehicle_length: float,
+    least_share: float,
+    city: str | None,
+    skip_bad: bool,
+    name: str | None,
+    out: Path,
+    force: bool,
 ) -> None:
     """Make a network of measured data: counts and occupancies of detectors become an MFD per region.
 
@@ -100,9 +130,18 @@ def identify(
 
     found = measured.identify(
         measured.Sources(
-            counts=counts, detectors=detectors, regions=regions, about=about, adjacency=adjacency, city=city,
-            skip_bad=skip_bad),
+            counts=counts,
+            detectors=detectors,
+            regions=regions,
+            about=about,
+            adjacency=adjacency,
+            city=city,
+            skip_bad=skip_bad,
+        ),
         Measured(vehicle_length=vehicle_length, trip_length=trip_length, least_share=least_share),
-        out=out, name=name, force=force)
+        out=out,
+        name=name,
+        force=force,
+    )
     click.echo(found.text)
     click.echo(f"Written to {out}: see network.toml, mfd.png and identify.txt")

@@ -41,11 +41,13 @@ def main() -> None:
 
 @main.command()
 @SCENARIO
-@controllers_option("Which to run: no-control, route-guidance, pi-gating, greedy, mpc-pc, mpc-pcrg, "
-                    "mpc-pc-terminal, mpc-pcrg-terminal, probing-pc, "
-                    "probing-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, dpc-pcrg-robust, dpc-pc-guarded, "
-                    "dpc-pcrg-guarded, dpc-pc-online, dpc-pcrg-online, bound-pc, bound-pcrg, or file.py:Class "
-                    "(see nmfd new-controller).")
+@controllers_option(
+    "Which to run: no-control, route-guidance, pi-gating, greedy, mpc-pc, mpc-pcrg, "
+    "mpc-pc-terminal, mpc-pcrg-terminal, probing-pc, "
+    "probing-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, dpc-pcrg-robust, dpc-pc-guarded, "
+    "dpc-pcrg-guarded, dpc-pc-online, dpc-pcrg-online, bound-pc, bound-pcrg, or file.py:Class "
+    "(see nmfd new-controller)."
+)
 @declared("nmfd.studies.settings:Study", "seeds", "plant", "workers")
 @POLICIES
 @PARQUET
@@ -53,8 +55,16 @@ def main() -> None:
 @TIME_LIMIT
 @out_option()
 def benchmark(
-    scenario: Path, controllers: str, seeds: int, plant: str, workers: int, policies: tuple[str, ...],
-    parquet: bool, faults: tuple[str, ...], own_time_limit: float | None, out: Path | None,
+    scenario: Path,
+    controllers: str,
+    seeds: int,
+    plant: str,
+    workers: int,
+    policies: tuple[str, ...],
+    parquet: bool,
+    faults: tuple[str, ...],
+    own_time_limit: float | None,
+    out: Path | None,
 ) -> None:
     """Run controllers on a regional model; print a table and write a run folder.
 
@@ -80,8 +90,7 @@ def benchmark(
     loaded = with_time_limit(with_faults(load_scenario(scenario), faults), own_time_limit)
     out = run_folder.default_folder(loaded.name) if out is None else out
     with resumable("benchmark", out, "summary.csv") as progress:
-        rows = run_all(
-            loaded, names, range(seeds), plant, out=out, policies=files, workers=workers, progress=progress)
+        rows = run_all(loaded, names, range(seeds), plant, out=out, policies=files, workers=workers, progress=progress)
     if parquet:
         import pandas as pd  # heavy
 
@@ -95,24 +104,42 @@ def benchmark(
 
 @main.command()
 @SCENARIO
-@click.option("--controller", required=True, metavar="NAME",
-              help="dpc-pc, dpc-pcrg, dpc-pc-robust or dpc-pcrg-robust.")
-@click.option("--seed", type=SEED, default=0, show_default=True,
-              help="Of the initial weights and the training scenarios.")
+@click.option("--controller", required=True, metavar="NAME", help="dpc-pc, dpc-pcrg, dpc-pc-robust or dpc-pcrg-robust.")
+@click.option(
+    "--seed", type=SEED, default=0, show_default=True, help="Of the initial weights and the training scenarios."
+)
 @ADAM_STEPS
 @click.option("--out", type=FILE, metavar="FILE", help="The policy file. [default: SCENARIO/NAME.pt]")
 @click.option("--resume", is_flag=True, help="Go on with an interrupted training.")
 @click.option("--anyway", is_flag=True, help="Even on placeholder MFDs, or where no gateway can be controlled.")
-@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True,
-              help="auto: a GPU where there is one. The CPU gives the same weights every time.")
-@click.option("--compile/--no-compile", "compiled", default=None,
-              help="Compile the rollout: a minute or two first, then about twice as fast. [default: from 200 Adam "
-                   "steps up, where there is a C++ compiler]")
-@click.option("--log", "logged", type=click.Choice(["tensorboard"]),
-              help="Also write logs for TensorBoard, to runs/tensorboard.")
+@click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    default="auto",
+    show_default=True,
+    help="auto: a GPU where there is one. The CPU gives the same weights every time.",
+)
+@click.option(
+    "--compile/--no-compile",
+    "compiled",
+    default=None,
+    help="Compile the rollout: a minute or two first, then about twice as fast. [default: from 200 Adam "
+    "steps up, where there is a C++ compiler]",
+)
+@click.option(
+    "--log", "logged", type=click.Choice(["tensorboard"]), help="Also write logs for TensorBoard, to runs/tensorboard."
+)
 def train(
-    scenario: Path, controller: str, seed: int, steps: int | None, out: Path | None, resume: bool, anyway: bool,
-    device: str, compiled: bool | None, logged: str | None,
+    scenario: Path,
+    controller: str,
+    seed: int,
+    steps: int | None,
+    out: Path | None,
+    resume: bool,
+    anyway: bool,
+    device: str,
+    compiled: bool | None,
+    logged: str | None,
 ) -> None:
     """Train a DPC policy on a scenario. The -robust ones are trained with noise on the demand.
 
@@ -142,7 +169,8 @@ def train(
             if doubts:
                 click.echo(f"nmfd: the model of region {name} is doubtful: {'; '.join(doubts)}", err=True)
     file = out or shipped.beside(
-        shipped.found(scenario, shipped.SCENARIO), f"{controller}.pt", "--out FILE", scenario=True)
+        shipped.found(scenario, shipped.SCENARIO), f"{controller}.pt", "--out FILE", scenario=True
+    )
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the policy; make it or choose another --out")
     default = compiled is None
@@ -150,24 +178,39 @@ def train(
         compiled = chosen.descend and chosen.steps >= training.WORTH_COMPILING
     if compiled and not rollout.can_compile(device):
         if not default:
-            raise InputError("--compile: does not work here, most likely for want of a C++ compiler; install g++ or "
-                             "omit it")
+            raise InputError(
+                "--compile: does not work here, most likely for want of a C++ compiler; install g++ or omit it"
+            )
         compiled = False
-        click.echo("nmfd: cannot compile here, most likely for want of a C++ compiler; training goes on uncompiled, "
-                   "about half as fast", err=True)
+        click.echo(
+            "nmfd: cannot compile here, most likely for want of a C++ compiler; training goes on uncompiled, "
+            "about half as fast",
+            err=True,
+        )
     state = file.with_name(file.name + ".resume")
     before = _stamp(state)
     notes = ["no validation yet"]
     board = Path("runs", "tensorboard", file_name(f"{loaded.name}-{controller}-{seed}")) if logged else None
     try:
         with learning.Curve(board) as curve, progress_line(controller) as line:
+
             def progress(done: int, total: int, note: str) -> None:
                 notes.append(note)
                 line(done, total, note)
 
             training.train(
-                loaded, controller, seed=seed, out=file, steps=steps, resume=resume, device=device, compiled=compiled,
-                anyway=anyway, progress=progress, log=curve.log)
+                loaded,
+                controller,
+                seed=seed,
+                out=file,
+                steps=steps,
+                resume=resume,
+                device=device,
+                compiled=compiled,
+                anyway=anyway,
+                progress=progress,
+                log=curve.log,
+            )
     except KeyboardInterrupt:
         if not resume and _stamp(state) == before:
             raise Interrupted("interrupted before the first validation; nothing is kept") from None
@@ -209,7 +252,8 @@ def show(scenario: Path, out: Path | None) -> None:
     click.echo(
         f"{loaded.name}: {loaded.network.regions} regions, {total:,.0f} trips between "
         f"{int((loaded.demand.sum(axis=0) > 0).sum())} pairs, peak {loaded.demand.sum(axis=(1, 2)).max():.3g} veh/s, "
-        f"{loaded.steps} control intervals of {loaded.step:g} s")
+        f"{loaded.steps} control intervals of {loaded.step:g} s"
+    )
     for file in files:
         click.echo(f"Written to {file}")
 
@@ -219,6 +263,5 @@ def _stamp(path: Path) -> int | None:
     return path.stat().st_mtime_ns if path.exists() else None
 
 
-for command in (
-        listing(), bound, value, robustness, adaptation, ablation, scaling, new_controller, export, identify):
+for command in (listing(), bound, value, robustness, adaptation, ablation, scaling, new_controller, export, identify):
     main.add_command(command)

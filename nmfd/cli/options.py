@@ -16,13 +16,21 @@ SEED = click.IntRange(0, 2**31 - 1)  # SUMO's are 32 bits long
 SCENARIO = click.argument("scenario", type=FOLDER)
 STEPS = declared("nmfd.model.scenario_file:ScenarioTable", "steps", instead="the scenario's")
 TIME_LIMIT = click.option(
-    "--time-limit", "own_time_limit", cls=Declared, declaration="nmfd.model.scenario_file:ScenarioTable",
-    instead="the scenario's, else {}", metavar="SECONDS")
-ADAM_STEPS = declared(
-    "nmfd.controllers.dpc.options:Training", "steps", instead="what scenario.toml says, else {}")
+    "--time-limit",
+    "own_time_limit",
+    cls=Declared,
+    declaration="nmfd.model.scenario_file:ScenarioTable",
+    instead="the scenario's, else {}",
+    metavar="SECONDS",
+)
+ADAM_STEPS = declared("nmfd.controllers.dpc.options:Training", "steps", instead="what scenario.toml says, else {}")
 POLICIES = click.option(
-    "--policy", "policies", multiple=True, metavar="NAME=FILE",
-    help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.")
+    "--policy",
+    "policies",
+    multiple=True,
+    metavar="NAME=FILE",
+    help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.",
+)
 PARQUET = click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.runs.frames).")
 
 
@@ -39,17 +47,26 @@ def out_option(kind: str = "<time>", text: str = "The run folder.") -> Callable[
 
 def fault_option(more: str = "") -> Callable[[Callable], Callable]:
     """--fault, which may be repeated. more: kinds besides those of every plant"""
-    kinds = ("frozen, delayed:N, missing:REGION, detectors:SHARE, off:FACTOR, solver-fails, solver-diverges, "
-             "solver-late, ")
+    kinds = (
+        "frozen, delayed:N, missing:REGION, detectors:SHARE, off:FACTOR, solver-fails, solver-diverges, solver-late, "
+    )
     return click.option(
-        "--fault", "faults", multiple=True, metavar="KIND[:VALUE][@FROM-TO]",
+        "--fault",
+        "faults",
+        multiple=True,
+        metavar="KIND[:VALUE][@FROM-TO]",
         help=f"Inject a fault, in the control intervals FROM to TO - 1: {kinds}policy-nan{', ' if more else ''}{more}. "
-             "May be repeated; what is done instead is in the status of every decision.")
+        "May be repeated; what is done instead is in the status of every decision.",
+    )
 
 
 def controller_names(
-    controllers: str, scenario: Path | None = None, *, policies: Sequence[str] = (),
-    check: Callable[[str], object] | None = None, ready: Callable[..., Iterable[str]] | None = None,
+    controllers: str,
+    scenario: Path | None = None,
+    *,
+    policies: Sequence[str] = (),
+    check: Callable[[str], object] | None = None,
+    ready: Callable[..., Iterable[str]] | None = None,
     where: str = "--controllers",
 ) -> list[str]:
     """The controllers in a list separated by commas, patterns replaced (nmfd.controllers.names). InputError.
@@ -77,8 +94,10 @@ def policy_files(options: tuple[str, ...], names: list[str]) -> dict[str, Path]:
         if not equals or not file:
             raise InputError(f"--policy: expected NAME=FILE, such as dpc-pc=mine.pt, got {option!r} instead")
         if name not in names:
-            raise InputError(f"--policy: {name!r} is not among --controllers {','.join(names)}"
-                             f"{did_you_mean(name, names)}; add it there")
+            raise InputError(
+                f"--policy: {name!r} is not among --controllers {','.join(names)}"
+                f"{did_you_mean(name, names)}; add it there"
+            )
         if name in files:
             raise InputError(f"--policy: {name} is there twice; give one file for each controller")
         files[name] = Path(file)

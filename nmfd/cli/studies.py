@@ -30,8 +30,15 @@ from nmfd.errors import InputError
 @POLICIES
 @out_option()
 def robustness(
-    scenario: Path, controllers: str, sigmas: tuple[float, ...], scenarios: int, where: str, plant: str, workers: int,
-    policies: tuple[str, ...], out: Path | None,
+    scenario: Path,
+    controllers: str,
+    sigmas: tuple[float, ...],
+    scenarios: int,
+    where: str,
+    plant: str,
+    workers: int,
+    policies: tuple[str, ...],
+    out: Path | None,
 ) -> None:
     """Run controllers against perturbed demand; print a table and draw the improvement over no control.
 
@@ -55,22 +62,39 @@ def robustness(
     out = run_folder.default_folder(loaded.name) if out is None else out
     with resumable("robustness", out, "robustness.csv") as progress:
         rows = method.robustness(
-            loaded, names, sigmas, scenarios, where=where, plant=plant, out=out, policies=files, workers=workers,
-            progress=progress)
+            loaded,
+            names,
+            sigmas,
+            scenarios,
+            where=where,
+            plant=plant,
+            out=out,
+            policies=files,
+            workers=workers,
+            progress=progress,
+        )
     click.echo(method.improvement_table(rows))
     click.echo(f"Written to {out}")
 
 
 @click.command()
 @SCENARIO
-@controllers_option("Made for the scenario as it is; those in -online are fine-tuned between control steps.",
-                    "no-control,dpc-pcrg,dpc-pcrg-online")
+@controllers_option(
+    "Made for the scenario as it is; those in -online are fine-tuned between control steps.",
+    "no-control,dpc-pcrg,dpc-pcrg-online",
+)
 @declared("nmfd.studies.settings:Adaptation", "cases", "seeds", "plant", "workers")
 @POLICIES
 @out_option("adaptation")
 def adaptation(
-    scenario: Path, controllers: str, cases: tuple[str, ...], seeds: int, plant: str, workers: int,
-    policies: tuple[str, ...], out: Path | None,
+    scenario: Path,
+    controllers: str,
+    cases: tuple[str, ...],
+    seeds: int,
+    plant: str,
+    workers: int,
+    policies: tuple[str, ...],
+    out: Path | None,
 ) -> None:
     """Compare controllers where demand or capacity is not what they were made for; print a table.
 
@@ -92,8 +116,16 @@ def adaptation(
     out = Path("runs") / f"{file_name(loaded.name)}-adaptation" if out is None else out
     with resumable("adaptation", out, "adaptation.csv") as progress:
         rows = method.adaptation(
-            loaded, names, list(dict.fromkeys(cases)), range(seeds), out=out, plant=plant, policies=files,
-            workers=workers, progress=progress)
+            loaded,
+            names,
+            list(dict.fromkeys(cases)),
+            range(seeds),
+            out=out,
+            plant=plant,
+            policies=files,
+            workers=workers,
+            progress=progress,
+        )
     click.echo(method.adaptation_table(rows))
     click.echo(f"Written to {out}")
 
@@ -101,9 +133,13 @@ def adaptation(
 @click.command()
 @SCENARIO
 @click.option("--controller", required=True, metavar="NAME", help="bound-pc or bound-pcrg.")
-@click.option("--from", "starts", metavar="A,B,...",
-              help="Controllers whose closed loops it starts from, besides open and half-closed perimeters. "
-                   "[default: pi-gating and the DPC policies there are]")
+@click.option(
+    "--from",
+    "starts",
+    metavar="A,B,...",
+    help="Controllers whose closed loops it starts from, besides open and half-closed perimeters. "
+    "[default: pi-gating and the DPC policies there are]",
+)
 @declared("nmfd.studies.settings:Bound", "iterations")
 @click.option("--out", type=FILE, metavar="FILE", help="The plan file. [default: SCENARIO/NAME.npz]")
 def bound(scenario: Path, controller: str, starts: str | None, iterations: int, out: Path | None) -> None:
@@ -126,7 +162,8 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int, 
     names = None if starts is None else controller_names(starts, scenario, where="--from")
     loaded = load_scenario(scenario)
     file = out or shipped.beside(
-        shipped.found(scenario, shipped.SCENARIO), f"{controller}.npz", "--out FILE", scenario=True)
+        shipped.found(scenario, shipped.SCENARIO), f"{controller}.npz", "--out FILE", scenario=True
+    )
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the plan; make it or choose another --out")
     with progress_line(controller) as progress:
@@ -142,11 +179,21 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int, 
 @SCENARIO
 @click.option("--controller", required=True, metavar="NAME", help="mpc-pc-terminal or mpc-pcrg-terminal.")
 @declared("nmfd.studies.settings:Value", "seed", "samples", "rounds", "steps")
-@click.option("--policy", type=FILE, metavar="FILE",
-              help="Of dpc-pc or dpc-pcrg, which take over after the horizon. [default: the scenario's own]")
+@click.option(
+    "--policy",
+    type=FILE,
+    metavar="FILE",
+    help="Of dpc-pc or dpc-pcrg, which take over after the horizon. [default: the scenario's own]",
+)
 @click.option("--out", type=FILE, metavar="FILE", help="The file. [default: SCENARIO/NAME.npz]")
 def value(
-    scenario: Path, controller: str, seed: int, samples: int, rounds: int, steps: int, policy: Path | None,
+    scenario: Path,
+    controller: str,
+    seed: int,
+    samples: int,
+    rounds: int,
+    steps: int,
+    policy: Path | None,
     out: Path | None,
 ) -> None:
     """Learn the terminal cost of MPC: what a DPC policy makes of the state at the end of its horizon.
@@ -165,13 +212,21 @@ def value(
 
     method.check(controller)
     file = out or shipped.beside(
-        shipped.found(scenario, shipped.SCENARIO), f"{controller}.npz", "--out FILE", scenario=True)
+        shipped.found(scenario, shipped.SCENARIO), f"{controller}.npz", "--out FILE", scenario=True
+    )
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the value function; make it or choose another --out")
     with progress_line(controller) as progress:
         found = method.learn(
-            load_scenario(scenario), controller, seed=seed, samples=samples, rounds=rounds, steps=steps, policy=policy,
-            progress=progress)
+            load_scenario(scenario),
+            controller,
+            seed=seed,
+            samples=samples,
+            rounds=rounds,
+            steps=steps,
+            policy=policy,
+            progress=progress,
+        )
     terminal.write(found, file)
     click.echo(f"Written to {file}")
 
@@ -185,8 +240,16 @@ def value(
 @controllers_option("Horizon: which MPC.", "mpc-pc,mpc-pcrg")
 @out_option()
 def ablation(
-    what: str, scenario: Path, seeds: int, controller: str, steps: int | None, horizons: tuple[int, ...],
-    controllers: str, plant: str, workers: int, out: Path | None,
+    what: str,
+    scenario: Path,
+    seeds: int,
+    controller: str,
+    steps: int | None,
+    horizons: tuple[int, ...],
+    controllers: str,
+    plant: str,
+    workers: int,
+    out: Path | None,
 ) -> None:
     """Vary one thing and draw its effect: the training of DPC with route guidance, or the horizon of MPC.
 
@@ -213,11 +276,17 @@ def ablation(
     with resumable(f"ablation {what}", out, f"{what}.csv") as progress:
         if what == "training":
             rows = method.alternating_or_joint(
-                loaded, range(seeds), plant=plant, out=out, controller=controller, steps=steps, workers=workers,
-                progress=progress)
+                loaded,
+                range(seeds),
+                plant=plant,
+                out=out,
+                controller=controller,
+                steps=steps,
+                workers=workers,
+                progress=progress,
+            )
         else:
-            rows = method.horizons(
-                loaded, names, horizons, plant=plant, out=out, workers=workers, progress=progress)
+            rows = method.horizons(loaded, names, horizons, plant=plant, out=out, workers=workers, progress=progress)
     click.echo(method.ablation_table(rows))
     click.echo(f"Written to {out}")
 
@@ -226,11 +295,18 @@ def ablation(
 @declared("nmfd.studies.settings:Scaling", "regions", instead="2,4,8,... to 64, hexagonal to 256")
 @controllers_option("Which to measure, out of these four and dpc-pc-local.", "dpc-pc,dpc-pcrg,mpc-pc,mpc-pcrg")
 @declared("nmfd.studies.settings:Scaling", "family", "load", "workers", "memory", "time_limit")
-@click.option("--out", type=FOLDER, default=Path("runs/scaling"), show_default=True, metavar="DIR",
-              help="The run folder.")
+@click.option(
+    "--out", type=FOLDER, default=Path("runs/scaling"), show_default=True, metavar="DIR", help="The run folder."
+)
 def scaling(
-    regions: tuple[int, ...] | None, controllers: str, family: str, load: str, workers: int, memory: float,
-    time_limit: float, out: Path,
+    regions: tuple[int, ...] | None,
+    controllers: str,
+    family: str,
+    load: str,
+    workers: int,
+    memory: float,
+    time_limit: float,
+    out: Path,
 ) -> None:
     """Measure the time of a decision and its memory against the number of regions; print a table and draw it.
 
@@ -249,7 +325,15 @@ def scaling(
 
     with resumable("scaling", out, "scaling.csv") as progress:
         rows = method.scaling(
-            names, out=out, family=family, load=load, regions=regions or (), workers=workers, memory_gib=memory,
-            time_limit=time_limit, progress=progress)
+            names,
+            out=out,
+            family=family,
+            load=load,
+            regions=regions or (),
+            workers=workers,
+            memory_gib=memory,
+            time_limit=time_limit,
+            progress=progress,
+        )
     click.echo(method.scaling_table(rows))
     click.echo(f"Written to {out}")

@@ -41,8 +41,8 @@ GROUP = "nmfd.controllers"
 FILE_AND_CLASS = re.compile(r"(?P<file>.+\.py):(?P<cls>[^\W\d]\w*)")
 ROUNDING = 1e-5  # by how much bounds and sums may be missed: float32
 MOST_PRICE = 100.0  # beyond which nobody would take a way through the region, whatever the others cost
-MOST_RATE = 1e6      # veh/s, as good as no limit
-LONGEST = 300    # characters of what the user's code says
+MOST_RATE = 1e6  # veh/s, as good as no limit
+LONGEST = 300  # characters of what the user's code says
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +53,8 @@ class Facts:
     files: tuple[str, ...]
 
 
-_asked: dict[tuple, Facts] = {}          # of the processes of their own, so far
-_asker: list[workers.Worker] = []        # the one that is there, if any
+_asked: dict[tuple, Facts] = {}  # of the processes of their own, so far
+_asker: list[workers.Worker] = []  # the one that is there, if any
 
 
 def entry_points() -> dict[str, metadata.EntryPoint]:
@@ -89,8 +89,10 @@ def fingerprint(name: str) -> dict[str, object]:
         return {"entry_point": point.value, "package": f"{point.dist.name} {point.dist.version}" if point.dist else ""}
     path, _ = _file_and_class(name)
     beside = [path.parent / file for file in facts(name).files]
-    return {"source_hash": file_hash(path), **{
-        f"{file.name}_hash": file_hash(file) if file.is_file() else None for file in beside}}
+    return {
+        "source_hash": file_hash(path),
+        **{f"{file.name}_hash": file_hash(file) if file.is_file() else None for file in beside},
+    }
 
 
 def table_name(name: str) -> str:
@@ -140,8 +142,11 @@ def _answer(task: tuple[str, Scenario | None, str]) -> Facts:
 
 def _facts(name: str) -> Facts:
     cls = _class(name)
-    return _guarded(name, "name and files", lambda: Facts(
-        table=str(getattr(cls, "name", name)), files=tuple(map(str, getattr(cls, "files", ())))))
+    return _guarded(
+        name,
+        "name and files",
+        lambda: Facts(table=str(getattr(cls, "name", name)), files=tuple(map(str, getattr(cls, "files", ())))),
+    )
 
 
 def _version(name: str) -> tuple:
@@ -165,14 +170,16 @@ def make(name: str, scenario: Scenario) -> "OwnController":
     except TypeError as error:
         raise InputError(
             f"{name}: expected a class that is made with one argument, the planning model, but {error}; write "
-            "__init__(self, planning)") from None
+            "__init__(self, planning)"
+        ) from None
     except ValueError:  # of a class without a signature, such as one written in C
         pass
     controller = _guarded(name, f"{name.rpartition(':')[2]}()", cls, planning, limit=limit)
     for method in ("reset", "act"):
         if not callable(_guarded(name, method, getattr, controller, method, None)):
             raise InputError(
-                f"{name}: has no method {method}; a controller needs reset(self, seed=0) and act(self, observation)")
+                f"{name}: has no method {method}; a controller needs reset(self, seed=0) and act(self, observation)"
+            )
     network = copy.deepcopy(scenario.network)
     own = OwnController(name, controller, network, limit)
     empty = np.zeros((network.regions,) * 2)
@@ -204,12 +211,15 @@ class OwnController:
 def checked(controls: object, network: RegionalModel, where: str) -> Controls:
     """`controls` as float64 and with rounding errors removed. InputError for another type, shape or range."""
     if not isinstance(controls, Controls):
-        raise InputError(f"{where}: expected nmfd.Controls, got {type(controls).__name__} instead; "
-                         "return nmfd.Controls(perimeter=..., splits=None)")
+        raise InputError(
+            f"{where}: expected nmfd.Controls, got {type(controls).__name__} instead; "
+            "return nmfd.Controls(perimeter=..., splits=None)"
+        )
     if not isinstance(controls.status, Status):
         raise InputError(
             f"{where}: status: expected nmfd.Status, such as nmfd.Status.FALLBACK, got {controls.status!r} instead; "
-            "what is to be said of it goes into note")
+            "what is to be said of it goes into note"
+        )
     regions = network.regions
     perimeter = _array(controls.perimeter, (regions,) * 2, f"{where}: perimeter")
     perimeter = np.where(network.adjacency, perimeter, 0.0)
@@ -217,12 +227,17 @@ def checked(controls: object, network: RegionalModel, where: str) -> Controls:
         if not network.u_min - ROUNDING <= perimeter[i, h] <= network.u_max + ROUNDING:
             raise InputError(
                 f"{where}: perimeter[{i}, {h}]: expected a number in [{network.u_min:g}, {network.u_max:g}], got "
-                f"{perimeter[i, h]:g} instead; use numpy.clip")
+                f"{perimeter[i, h]:g} instead; use numpy.clip"
+            )
     perimeter = np.where(network.adjacency, np.clip(perimeter, network.u_min, network.u_max), 0.0)
     unguided = Controls(
-        perimeter=perimeter, splits=None, status=controls.status, note=_text(controls.note),
+        perimeter=perimeter,
+        splits=None,
+        status=controls.status,
+        note=_text(controls.note),
         prices=_by_region(controls.prices, regions, MOST_PRICE, f"{where}: prices"),
-        metering=_by_region(controls.metering, regions, MOST_RATE, f"{where}: metering"))
+        metering=_by_region(controls.metering, regions, MOST_RATE, f"{where}: metering"),
+    )
     if controls.splits is None:
         return unguided
     splits = _array(controls.splits, (regions,) * 3, f"{where}: splits")
@@ -231,7 +246,8 @@ def checked(controls: object, network: RegionalModel, where: str) -> Controls:
         i, h, j = wrong[0]
         raise InputError(
             f"{where}: splits[{i}, {h}, {j}]: expected {'a share >= 0' if allowed[i, h, j] else '0 (no way)'}, got "
-            f"{splits[i, h, j]:g} instead; allowed is planning.network.split_mask")
+            f"{splits[i, h, j]:g} instead; allowed is planning.network.split_mask"
+        )
     splits = np.where(allowed, np.maximum(splits, 0.0), 0.0)
     sums = splits.sum(axis=1)
     if (wrong := np.argwhere(allowed.any(axis=1) & (abs(sums - 1.0) > 100 * ROUNDING))).size:
@@ -257,8 +273,9 @@ def _array(values: object, shape: tuple[int, ...], where: str) -> np.ndarray:
         if array.shape == shape and not kind:  # else there may be any number of them
             array = array.astype(float)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:  # RuntimeError: a tensor with a gradient
-        raise InputError(f"{where}: expected numbers of shape {shape}, got {type(values).__name__} instead"
-                         f" ({_text(error)})") from None
+        raise InputError(
+            f"{where}: expected numbers of shape {shape}, got {type(values).__name__} instead ({_text(error)})"
+        ) from None
     if kind:  # NumPy would make numbers of complex ones and of texts
         raise InputError(f"{where}: expected real numbers of shape {shape}, got {kind} ones instead")
     if array.shape != shape or not np.isfinite(array).all():
@@ -277,8 +294,10 @@ def _class(name: str, limit: float = 0.0) -> Any:
     found = getattr(module, cls, None)
     if found is None:
         there = [key for key, value in vars(module).items() if isinstance(value, type) and hasattr(value, "act")]
-        raise InputError(f"{file}: has no class {cls}; " + (
-            f"choose from {', '.join(there)}" if there else "it has none with a method act: write one"))
+        raise InputError(
+            f"{file}: has no class {cls}; "
+            + (f"choose from {', '.join(there)}" if there else "it has none with a method act: write one")
+        )
     if not callable(found):
         raise InputError(f"{name}: expected a class, got {_text(found, repr)} instead")
     return found
@@ -323,8 +342,10 @@ def _guarded(name: str, doing: str, function: Callable, *arguments: Any, limit: 
         text = _text(error)
         raise InputError(text if name in text else f"{where}: {text}") from None
     except workers.TimeUp as error:
-        raise InputError(f"{_place(name, error)}: {where}: took longer than {limit:g} s; make it faster, or allow more "
-                         "with --time-limit or own_time_limit in scenario.toml") from None
+        raise InputError(
+            f"{_place(name, error)}: {where}: took longer than {limit:g} s; make it faster, or allow more "
+            "with --time-limit or own_time_limit in scenario.toml"
+        ) from None
     except workers.Ended:
         raise
     except BaseException as error:
@@ -376,5 +397,5 @@ def _undone(where: str) -> Iterator[None]:
             torch.set_num_threads(modes[2])
     if now != folder:
         raise InputError(
-            f"{where}: left the folder {folder} for {now or 'one that is gone'}; name files by their whole path "
-            "instead")
+            f"{where}: left the folder {folder} for {now or 'one that is gone'}; name files by their whole path instead"
+        )

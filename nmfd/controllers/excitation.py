@@ -9,10 +9,10 @@ from nmfd.controllers.pi_gating import PiGating, SetPoint
 from nmfd.model.planning import PlanningModel
 from nmfd.types import Controls, Observation
 
-HOLD = (3, 9)            # control intervals between two draws, from and to
+HOLD = (3, 9)  # control intervals between two draws, from and to
 SET_POINTS = (0.5, 1.3)  # of the middle one, of every region that is held
-DISTURBED = 0.35         # share of the gateways whose u is drawn by lot
-MOST_DIVERTED = 0.6      # share of the vehicles of one kind in a region whose way is drawn by lot; more locks a city
+DISTURBED = 0.35  # share of the gateways whose u is drawn by lot
+MOST_DIVERTED = 0.6  # share of the vehicles of one kind in a region whose way is drawn by lot; more locks a city
 
 
 class Probing:

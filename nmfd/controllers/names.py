@@ -8,7 +8,9 @@ from nmfd.errors import InputError
 
 
 def chosen(
-    given: str | Sequence[str], check: Callable[[str], object], ready: Callable[[], Iterable[str]],
+    given: str | Sequence[str],
+    check: Callable[[str], object],
+    ready: Callable[[], Iterable[str]],
     where: str = "controllers",
 ) -> list[str]:
     """The controllers in `given`: names and patterns (*, ?, [...]), as a sequence or separated by commas.
@@ -40,7 +42,8 @@ def _matching(pattern: str, names: Sequence[str], where: str) -> list[str]:
     if not found:
         raise InputError(
             f"{where}: no controller here matches {pattern!r}; there are {', '.join(names)}, and others once their "
-            "policies are trained")
+            "policies are trained"
+        )
     return found
 
 

@@ -46,7 +46,8 @@ class OpenLoop:
         splits = self._plan.splits
         return Controls(
             perimeter=self._plan.perimeter[observation.step],
-            splits=None if splits is None else splits[observation.step])
+            splits=None if splits is None else splits[observation.step],
+        )
 
 
 def model_hash(scenario: Scenario) -> str:
@@ -59,9 +60,16 @@ def write(plan: Plan, scenario: Scenario, path: Path) -> None:
     splits = {} if plan.splits is None else {"splits": plan.splits}
     with atomic(path) as temporary:
         np.savez_compressed(
-            temporary, scenario=np.array(scenario.name), model=np.array(model_hash(scenario)),
-            perimeter=plan.perimeter, start=np.array(plan.start), names=np.array(list(plan.totals)),
-            totals=np.array(list(plan.totals.values())), iterations=np.array(plan.iterations), **splits)
+            temporary,
+            scenario=np.array(scenario.name),
+            model=np.array(model_hash(scenario)),
+            perimeter=plan.perimeter,
+            start=np.array(plan.start),
+            names=np.array(list(plan.totals)),
+            totals=np.array(list(plan.totals.values())),
+            iterations=np.array(plan.iterations),
+            **splits,
+        )
 
 
 def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
@@ -71,15 +79,20 @@ def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
         with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:  # NumPy leaves others open
             content = {name: file[name] for name in file.files}
         plan = Plan(
-            perimeter=content["perimeter"], splits=content.get("splits"), start=str(content["start"]),
+            perimeter=content["perimeter"],
+            splits=content.get("splits"),
+            start=str(content["start"]),
             totals=dict(zip(content["names"].tolist(), content["totals"].tolist(), strict=True)),
-            iterations=int(content["iterations"]))
+            iterations=int(content["iterations"]),
+        )
         model = str(content["model"])
     except Exception:
         raise InputError(f"{path}: is no plan; compute one with 'nmfd bound'") from None
     if model != model_hash(scenario):
-        raise InputError(f"{path}: was computed for another demand or network than {scenario.name}'s; compute it again "
-                         "with 'nmfd bound'")
+        raise InputError(
+            f"{path}: was computed for another demand or network than {scenario.name}'s; compute it again "
+            "with 'nmfd bound'"
+        )
     if (plan.splits is not None) != guidance:
         wanted, other = ("with", "without") if guidance else ("without", "with")
         raise InputError(f"{path}: is a plan {other} route guidance, expected one {wanted}; choose another file")

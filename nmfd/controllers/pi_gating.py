@@ -13,9 +13,11 @@ class SetPoint(Options):
     """Of controllers that hold the accumulation of regions."""
 
     regions: Regions | None = setting(
-        "the regions whose accumulation is held; without it, those that the scenario protects", None)
+        "the regions whose accumulation is held; without it, those that the scenario protects", None
+    )
     set_point: PositiveNumbers | None = setting(
-        "accumulation to hold, of each of these regions; without it, from the MFD", None, unit="veh")
+        "accumulation to hold, of each of these regions; without it, from the MFD", None, unit="veh"
+    )
 
     def misfit(self, planning: PlanningModel) -> Problem | None:
         """A region that there is not; another number of set points than of regions."""
@@ -39,8 +41,12 @@ class Gating(SetPoint):
 
     outflow_share: float = setting(
         "the set point is where the MFD first reaches this share of its maximum; 1 is the critical accumulation, and "
-        "less leaves a margin where control below its largest does not hold back anybody yet", 1.0, unit="-", ge=0.1,
-        le=1.0)
+        "less leaves a margin where control below its largest does not hold back anybody yet",
+        1.0,
+        unit="-",
+        ge=0.1,
+        le=1.0,
+    )
     kp: float = setting("proportional gain, per relative error", 1.0, unit="-", ge=0.0)
     ki: float = setting("integral gain, per relative error", 0.01, unit="1/s", gt=0.0)
 
@@ -66,11 +72,13 @@ class PiGating:
         if not held:
             raise InputError(
                 f"{planning.where}: protected: pi-gating needs at least one protected region, got none; "
-                f"add protected = [<region>, ...] with regions from 0 to {network.regions - 1}")
+                f"add protected = [<region>, ...] with regions from 0 to {network.regions - 1}"
+            )
         self.regions = np.array(held)
         self.critical = np.array([network.mfds[region].critical for region in self.regions])
-        self.set_point = np.array(chosen.set_point or [
-            network.mfds[region].reaching(chosen.outflow_share) for region in self.regions])
+        self.set_point = np.array(
+            chosen.set_point or [network.mfds[region].reaching(chosen.outflow_share) for region in self.regions]
+        )
         self._kp, self._ki = chosen.kp, chosen.ki * planning.step
         self._open = np.where(network.adjacency, network.u_max, 0.0)
         self._entries = network.adjacency[:, self.regions]

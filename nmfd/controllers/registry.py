@@ -73,47 +73,82 @@ class Entry:
 _ENTRIES = {
     "no-control": Entry(text="every gateway open, no guidance: what others are compared with", make=NoControl),
     "route-guidance": Entry(
-        text="drivers are guided by travel times alone, every gateway open", make=RouteGuidance, guides=True),
-    "pi-gating": Entry(
-        text="a PI gate holds the protected regions at a set point", make=PiGating, declared=Gating),
+        text="drivers are guided by travel times alone, every gateway open", make=RouteGuidance, guides=True
+    ),
+    "pi-gating": Entry(text="a PI gate holds the protected regions at a set point", make=PiGating, declared=Gating),
     "greedy": Entry(text="bang-bang: every gate closed into the more congested region of its two", make=Greedy),
     "mpc-pc": Entry(
-        text="economic MPC on the regional model, perimeter control", make=partial(mpc.EconomicMpc, guidance=False),
-        declared=mpc.Mpc),
+        text="economic MPC on the regional model, perimeter control",
+        make=partial(mpc.EconomicMpc, guidance=False),
+        declared=mpc.Mpc,
+    ),
     "mpc-pcrg": Entry(
-        text="the same with route guidance", make=partial(mpc.EconomicMpc, guidance=True), guides=True,
-        declared=mpc.Mpc),
-    **{name: Entry(
-        text=f"economic MPC, perimeter control{ALSO * training.NAMES[dpc]}, with the value of {dpc} as terminal cost",
-        make=partial(mpc.load, guidance=training.NAMES[dpc]), guides=training.NAMES[dpc], policy=name, reads=VALUE,
-        declared=mpc.Mpc)
-       for name, dpc in TERMINAL.items()},
+        text="the same with route guidance", make=partial(mpc.EconomicMpc, guidance=True), guides=True, declared=mpc.Mpc
+    ),
+    **{
+        name: Entry(
+            text=f"economic MPC, perimeter control{ALSO * training.NAMES[dpc]}, with the value of {dpc} as terminal cost",
+            make=partial(mpc.load, guidance=training.NAMES[dpc]),
+            guides=training.NAMES[dpc],
+            policy=name,
+            reads=VALUE,
+            declared=mpc.Mpc,
+        )
+        for name, dpc in TERMINAL.items()
+    },
     "probing-pc": Entry(
-        text="excitation for cosim identify, perimeter control", make=partial(Probing, guidance=False),
-        declared=SetPoint),
+        text="excitation for cosim identify, perimeter control",
+        make=partial(Probing, guidance=False),
+        declared=SetPoint,
+    ),
     "probing-pcrg": Entry(
-        text="the same with route guidance", make=partial(Probing, guidance=True), guides=True, declared=SetPoint),
-    **{name: Entry(
-        text=f"a policy trained by differentiable predictive control, perimeter control{ALSO * guides}"
-             f"{', with noise on the demand' if 'robust' in name else ''}",
-        make=partial(policy_file.load, guidance=guides), guides=guides, policy=name, declared=TRAINED[name])
-       for name, guides in training.NAMES.items()},
+        text="the same with route guidance", make=partial(Probing, guidance=True), guides=True, declared=SetPoint
+    ),
+    **{
+        name: Entry(
+            text=f"a policy trained by differentiable predictive control, perimeter control{ALSO * guides}"
+            f"{', with noise on the demand' if 'robust' in name else ''}",
+            make=partial(policy_file.load, guidance=guides),
+            guides=guides,
+            policy=name,
+            declared=TRAINED[name],
+        )
+        for name, guides in training.NAMES.items()
+    },
     "dpc-pc-guarded": Entry(
-        text="dpc-pc, watched: PI gating where it has seen no such state", make=partial(fallback.load, guidance=False),
-        policy="dpc-pc"),
+        text="dpc-pc, watched: PI gating where it has seen no such state",
+        make=partial(fallback.load, guidance=False),
+        policy="dpc-pc",
+    ),
     "dpc-pcrg-guarded": Entry(
-        text="dpc-pcrg, watched in the same way", make=partial(fallback.load, guidance=True), guides=True,
-        policy="dpc-pcrg"),
+        text="dpc-pcrg, watched in the same way",
+        make=partial(fallback.load, guidance=True),
+        guides=True,
+        policy="dpc-pcrg",
+    ),
     "dpc-pc-online": Entry(
-        text="dpc-pc, fine-tuned between control intervals", make=partial(online.load, guidance=False),
-        policy="dpc-pc", declared=Online),
+        text="dpc-pc, fine-tuned between control intervals",
+        make=partial(online.load, guidance=False),
+        policy="dpc-pc",
+        declared=Online,
+    ),
     "dpc-pcrg-online": Entry(
-        text="dpc-pcrg, fine-tuned in the same way", make=partial(online.load, guidance=True), guides=True,
-        policy="dpc-pcrg", declared=Online),
-    **{name: Entry(
-        text=f"replays the best plan found with all demand known (nmfd bound), perimeter control{ALSO * guides}",
-        make=partial(open_loop.load, guidance=guides), guides=guides, policy=name, reads=PLAN)
-       for name, guides in open_loop.NAMES.items()},
+        text="dpc-pcrg, fine-tuned in the same way",
+        make=partial(online.load, guidance=True),
+        guides=True,
+        policy="dpc-pcrg",
+        declared=Online,
+    ),
+    **{
+        name: Entry(
+            text=f"replays the best plan found with all demand known (nmfd bound), perimeter control{ALSO * guides}",
+            make=partial(open_loop.load, guidance=guides),
+            guides=guides,
+            policy=name,
+            reads=PLAN,
+        )
+        for name, guides in open_loop.NAMES.items()
+    },
 }
 
 
@@ -130,14 +165,16 @@ def policy_names() -> tuple[str, ...]:
 def check(name: str) -> None:
     """InputError unless `name` is a controller."""
     if not known(name):
-        raise InputError(f"controller {name!r} is unknown{did_you_mean(name, choice())}; choose from "
-                         f"{', '.join(choice())}, or file.py:Class")
+        raise InputError(
+            f"controller {name!r} is unknown{did_you_mean(name, choice())}; choose from "
+            f"{', '.join(choice())}, or file.py:Class"
+        )
 
 
 def split(name: str) -> tuple[str, list[str]]:
     """The controller of NAME+OPTION+..., and its options; the path of a controller in a file may hold a + too."""
     own = _OWN.match(name)
-    first, *rest = [own[0], *name[own.end():].split("+")[1:]] if own else name.split("+")
+    first, *rest = [own[0], *name[own.end() :].split("+")[1:]] if own else name.split("+")
     return first, rest
 
 
@@ -156,11 +193,15 @@ def choice() -> tuple[str, ...]:
 
 def texts() -> dict[str, str]:
     """Of every controller of `choice` what it does, in a line."""
-    return {name: _ENTRIES[name].text if name in _ENTRIES else f"installed: {custom.entry_points()[name].value}"
-            for name in choice()}
+    return {
+        name: _ENTRIES[name].text if name in _ENTRIES else f"installed: {custom.entry_points()[name].value}"
+        for name in choice()
+    }
+
 
 def ready(scenario: Scenario) -> tuple[str, ...]:
     """Those of `choice` that `make` can make for `scenario`, as far as files go: what needs a policy or plan has it."""
+
     def has_files(name: str) -> bool:
         try:
             policy_path(name, scenario)
@@ -283,9 +324,12 @@ def check_options(scenario: Scenario) -> None:
         name = split(variant)[0]
         if name not in _ENTRIES:
             raise config.error(
-                planning.where, f"controllers.{variant}", f"unknown controller{did_you_mean(name, names())}; choose "
+                planning.where,
+                f"controllers.{variant}",
+                f"unknown controller{did_you_mean(name, names())}; choose "
                 f"from {', '.join(names())}, or one of them with + and the options of a strategy; that of a controller "
-                f"of your own is controllers.{OWN}.{variant}")
+                f"of your own is controllers.{OWN}.{variant}",
+            )
         own = {**tables.get(name, {}), **table}
         model = {"model": own.pop("model")} if "model" in own else {}
         config.checked(PlanningOptions, model, planning.where, f"controllers.{variant}.")

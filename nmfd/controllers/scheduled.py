@@ -27,8 +27,11 @@ def channels(controller: Controller, planning: PlanningModel) -> tuple[str, ...]
     empty = np.zeros((regions, regions))
     controller.reset()
     controls = controller.act(Observation(step=0, time=0.0, accumulation=empty, backlog=empty.copy()))
-    used = {GATES: bool(planning.protected), PRICES: controls.prices is not None and bool(planning.protected),
-            ENTRIES: controls.metering is not None}
+    used = {
+        GATES: bool(planning.protected),
+        PRICES: controls.prices is not None and bool(planning.protected),
+        ENTRIES: controls.metering is not None,
+    }
     return tuple(channel for channel in CHANNELS if used[channel])
 
 
@@ -51,8 +54,11 @@ class Scheduled:
     def act(self, observation: Observation) -> Controls:
         step, controls = observation.step, self._controller.act(observation)
         return replace(
-            controls, perimeter=self._perimeter(controls.perimeter, step), prices=self._prices(controls.prices, step),
-            metering=None if controls.metering is None else controls.metering * np.exp(self._value(ENTRIES, step)))
+            controls,
+            perimeter=self._perimeter(controls.perimeter, step),
+            prices=self._prices(controls.prices, step),
+            metering=None if controls.metering is None else controls.metering * np.exp(self._value(ENTRIES, step)),
+        )
 
     def _value(self, channel: str, step: int) -> float:
         """Of a channel in control interval `step`."""

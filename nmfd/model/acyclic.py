@@ -77,7 +77,7 @@ def build(network: RegionalModel) -> Acyclic:
     start = np.arange(network.regions**2).reshape(network.regions, network.regions)
     queue, fallback = list(cells), {}
     moves: list[tuple[int, int, int, bool]] = []
-    for cell in queue:      # grows while it is walked
+    for cell in queue:  # grows while it is walked
         o, g, i, j = cell
         if i == j:
             continue
@@ -98,11 +98,21 @@ def build(network: RegionalModel) -> Acyclic:
     mfds = {name: np.array([getattr(m, name) for m in network.mfds]) for name in ("a", "b", "c", "jam")}
     rates = np.ones(network.adjacency.shape) if network.exit_rates is None else network.exit_rates
     return Acyclic(
-        exit_rates=rates[index[:, 2], index[:, 3]], capacity=network.open_capacity, storage=network.storage,
-        origin=index[:, 0], previous=index[:, 1], region=index[:, 2], destination=index[:, 3], start=start,
-        move_from=table[:, 0], move_to=table[:, 1], move_next=table[:, 2],
-        move_onward=table[:, 3].astype(bool), fallback=np.array([fallback.get(n, -1) for n in range(len(cells))]),
-        **mfds)
+        exit_rates=rates[index[:, 2], index[:, 3]],
+        capacity=network.open_capacity,
+        storage=network.storage,
+        origin=index[:, 0],
+        previous=index[:, 1],
+        region=index[:, 2],
+        destination=index[:, 3],
+        start=start,
+        move_from=table[:, 0],
+        move_to=table[:, 1],
+        move_next=table[:, 2],
+        move_onward=table[:, 3].astype(bool),
+        fallback=np.array([fallback.get(n, -1) for n in range(len(cells))]),
+        **mfds,
+    )
 
 
 def shares(model: Acyclic, splits: PerTurn) -> tuple[PerMove, CellMask]:
@@ -138,9 +148,7 @@ def derivative(model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, 
     return change
 
 
-def transfers(
-    model: Acyclic, x: PerCell, leaving: PerCell, perimeter: PerPair, theta: PerMove,
-) -> PerMove:
+def transfers(model: Acyclic, x: PerCell, leaving: PerCell, perimeter: PerPair, theta: PerMove) -> PerMove:
     """The flow of every move (M,) [veh/s], of those `leaving` (C,) [veh/s]; capacities as in dynamics.passing."""
     wish, here = theta * leaving[model.move_from], model.region[model.move_from]
     if model.capacity is None:
@@ -170,8 +178,15 @@ INTEGRATORS = {"euler": euler, "rk4": rk4}
 
 
 def advance(
-    model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, theta: PerMove, step: float, *,
-    integrator: str = "euler", substeps: int = 1,
+    model: Acyclic,
+    x: PerCell,
+    demand: PerPair,
+    perimeter: PerPair,
+    theta: PerMove,
+    step: float,
+    *,
+    integrator: str = "euler",
+    substeps: int = 1,
 ) -> PerCell:
     """x after one control interval of `step` [s], in `substeps` equal steps under constant controls and demand."""
     for _ in range(substeps):
@@ -180,8 +195,15 @@ def advance(
 
 
 def advance_counted(
-    model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, theta: PerMove, step: float, *,
-    integrator: str = "euler", substeps: int = 1,
+    model: Acyclic,
+    x: PerCell,
+    demand: PerPair,
+    perimeter: PerPair,
+    theta: PerMove,
+    step: float,
+    *,
+    integrator: str = "euler",
+    substeps: int = 1,
 ) -> tuple[PerCell, float]:
     """As `advance`, and the trips [veh] that ended meanwhile, by the same scheme: for the ledger."""
     step, ended, ends = step / substeps, 0.0, model.region == model.destination

@@ -44,12 +44,15 @@ class Boundaries:
     def rows(self) -> list[tuple]:
         """A row of COLUMNS per boundary and direction, and one for all."""
         parts = (self.flow, self.controlled, self.shares, self.gateways, self.controllable)
-        found: list[tuple] = [(int(i), int(h), *(_plain(part[i, h]) for part in parts))
-                              for i, h in np.argwhere(self.gateways > 0)]
+        found: list[tuple] = [
+            (int(i), int(h), *(_plain(part[i, h]) for part in parts)) for i, h in np.argwhere(self.gateways > 0)
+        ]
         flow, controlled = self.flow.sum(), self.controlled.sum()
         share = controlled / flow if flow else float("nan")
-        return [*found, ("all", "all", *map(_plain, (
-            flow, controlled, share, self.gateways.sum(), self.controllable.sum())))]
+        return [
+            *found,
+            ("all", "all", *map(_plain, (flow, controlled, share, self.gateways.sum(), self.controllable.sum()))),
+        ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,26 +70,40 @@ class Verdict:
 
     def text(self) -> str:
         """For the file: the sentences, and a table of the boundaries."""
-        rows = [dict(zip(("from", "to", "flow [veh]", "controlled [veh]", "share", "gateways", "with signals"),
-                         (*row[:4], _percent(row[4]), *row[5:]), strict=True)) for row in self.boundaries.rows()]
+        rows = [
+            dict(
+                zip(
+                    ("from", "to", "flow [veh]", "controlled [veh]", "share", "gateways", "with signals"),
+                    (*row[:4], _percent(row[4]), *row[5:]),
+                    strict=True,
+                )
+            )
+            for row in self.boundaries.rows()
+        ]
         return "\n".join([*self.sentences, "", text_table(rows)]) + "\n"
 
 
 def verdict(
-    network: RegionalModel, boundaries: Boundaries, *, most: PerRegion | None, started: PerRegion | None, where: str,
+    network: RegionalModel, boundaries: Boundaries, *, most: PerRegion | None, started: PerRegion | None, where: str
 ) -> Verdict:
     """most: (R,) [-], the highest accumulation over the critical one, in any run; started: (R,) [veh], trips that began
     in every region; both None where nothing was simulated. where: the runs, such as "in 6 loading runs"."""
     flow, controlled = float(boundaries.flow.sum()), float(boundaries.controlled.sum())
     with_signals, gateways = int(boundaries.controllable.sum()), int(boundaries.gateways.sum())
-    details = [f"Of {gateways} gateways {with_signals} have a signal that perimeter control can use"
-               + (f"; {_percent(controlled / flow)} of the {flow:,.0f} crossings {where} passed one." if flow else ".")]
+    details = [
+        f"Of {gateways} gateways {with_signals} have a signal that perimeter control can use"
+        + (f"; {_percent(controlled / flow)} of the {flow:,.0f} crossings {where} passed one." if flow else ".")
+    ]
     if most is not None:
-        details.append(f"Highest accumulation {where}, as a multiple of the critical one: " + ", ".join(
-            f"{_name(network, r)} {most[r]:.2f}" for r in range(network.regions)) + ".")
+        details.append(
+            f"Highest accumulation {where}, as a multiple of the critical one: "
+            + ", ".join(f"{_name(network, r)} {most[r]:.2f}" for r in range(network.regions))
+            + "."
+        )
     if network.placeholder:
-        details.append("The critical accumulations are guesses from lanes and speed limits until cosim identify "
-                       "measures them.")
+        details.append(
+            "The critical accumulations are guesses from lanes and speed limits until cosim identify measures them."
+        )
     elif any(network.doubts):
         doubtful = [_name(network, r) for r, doubts in enumerate(network.doubts) if doubts]
         details.append(f"The fit is doubtful, and so is this, in {', '.join(doubtful)}: see its warnings.")
@@ -95,7 +112,10 @@ def verdict(
 
 
 def _answer(
-    network: RegionalModel, boundaries: Boundaries, most: PerRegion | None, started: PerRegion | None,
+    network: RegionalModel,
+    boundaries: Boundaries,
+    most: PerRegion | None,
+    started: PerRegion | None,
     details: list[str],
 ) -> str:
     """The answer; what there is to say of critical regions goes to the details."""
@@ -108,20 +128,25 @@ def _answer(
     critical = np.flatnonzero(most >= 1.0)
     if not len(critical):
         nearest = int(np.argmax(most))
-        return (f"No: no region is ever critical, {_name(network, nearest)} comes nearest with {most[nearest]:.2f} of "
-                "its critical accumulation, so there is nothing to protect; more demand may change that.")
+        return (
+            f"No: no region is ever critical, {_name(network, nearest)} comes nearest with {most[nearest]:.2f} of "
+            "its critical accumulation, so there is nothing to protect; more demand may change that."
+        )
     came, held = boundaries.flow.sum(axis=0), boundaries.controlled.sum(axis=0)
     holdable = held / np.maximum(came + started, 1.0)
     for r in critical:
         details.append(
             f"{_name(network, r)} becomes critical: {came[r]:,.0f} vehicles came into it from other regions, "
             f"{_percent(held[r] / max(came[r], 1.0))} of them past a signal under control, and {started[r]:,.0f} "
-            f"started in it; {_percent(holdable[r])} of all that could be held.")
+            f"started in it; {_percent(holdable[r])} of all that could be held."
+        )
     best = int(critical[np.argmax(holdable[critical])])
     share = f"{_percent(holdable[best])} of what fills {_name(network, best)}"
     if holdable[best] <= NOTHING:
-        return (f"No: regions become critical, but gateways could hold no more than {share}; "
-                "other regions (cosim import --regions, --method, or your own) may have signals between them.")
+        return (
+            f"No: regions become critical, but gateways could hold no more than {share}; "
+            "other regions (cosim import --regions, --method, or your own) may have signals between them."
+        )
     if holdable[best] < ENOUGH:
         return f"Hardly: regions become critical, but gateways could hold no more than {share}."
     return f"It may: {_name(network, best)} becomes critical, and gateways could hold {share}."
@@ -129,7 +154,8 @@ def _answer(
 
 NO_GATEWAY = (
     "no gateway has a signal that perimeter control can use, so that only route guidance can do anything here; "
-    "other regions (cosim import --regions, --method, or your own) may have signals between them")
+    "other regions (cosim import --regions, --method, or your own) may have signals between them"
+)
 
 
 def _name(network: RegionalModel, region: int) -> str:
@@ -151,4 +177,6 @@ def joined(boundaries: Sequence[Boundaries]) -> Boundaries:
     return Boundaries(
         flow=np.sum([one.flow for one in boundaries], axis=0),
         controlled=np.sum([one.controlled for one in boundaries], axis=0),
-        gateways=boundaries[0].gateways, controllable=boundaries[0].controllable)
+        gateways=boundaries[0].gateways,
+        controllable=boundaries[0].controllable,
+    )

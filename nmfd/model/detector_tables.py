@@ -18,19 +18,20 @@ import pandas as pd
 from nmfd.errors import InputError, did_you_mean
 from nmfd.runs.files import check_file
 
-CHUNK = 10**6            # lines at a time: all of UTD19 has 134 million
-MOST_FLOW = 3600.0       # veh/h per lane: one a second
-SHORTEST = 30            # s: intervals that are nearer to each other are minutes or numbers
-DAY = 86400              # s
-LONGEST_LINK = 30.0      # km
-EARTH = 6371000.0        # m
-NEAR = 2                 # decimals of km: detectors of a link within 10 m of each other are beside each other
-SPEEDS = 0.5, 50.0       # m/s: a mean speed beyond is one of wrong units
+CHUNK = 10**6  # lines at a time: all of UTD19 has 134 million
+MOST_FLOW = 3600.0  # veh/h per lane: one a second
+SHORTEST = 30  # s: intervals that are nearer to each other are minutes or numbers
+DAY = 86400  # s
+LONGEST_LINK = 30.0  # km
+EARTH = 6371000.0  # m
+NEAR = 2  # decimals of km: detectors of a link within 10 m of each other are beside each other
+SPEEDS = 0.5, 50.0  # m/s: a mean speed beyond is one of wrong units
 COUNTS = ("day", "interval", "detid", "flow", "occ")
 LIMITS = {  # column -> least, most, what it is, what a value beyond may be
     "interval": (0, DAY, "seconds since midnight", "is it milliseconds?"),
     "flow": (0.0, MOST_FLOW, "vehicles per hour and lane", "is it of all lanes together, or a fault?"),
-    "occ": (0.0, 1.0, "a share of the time", "is it percent?")}
+    "occ": (0.0, 1.0, "a share of the time", "is it percent?"),
+}
 
 
 def read_counts(path: Path, *, city: str | None = None, skip_bad: bool = False) -> tuple[pd.DataFrame, dict[str, int]]:
@@ -59,29 +60,37 @@ def read_counts(path: Path, *, city: str | None = None, skip_bad: bool = False) 
         left["with a missing or impossible number"] += len(chunk) - len(good)
         parts.append(good[[*COUNTS, *(["region"] if "region" in good else [])]])
     if city is not None and city not in cities:
-        raise InputError(f"{path}: city: there is no {city!r}{did_you_mean(city, cities)}; choose from "
-                         f"{', '.join(sorted(cities)) or 'none: the file has no such column, so omit --city'}")
+        raise InputError(
+            f"{path}: city: there is no {city!r}{did_you_mean(city, cities)}; choose from "
+            f"{', '.join(sorted(cities)) or 'none: the file has no such column, so omit --city'}"
+        )
     if city is None and len(cities) > 1:
-        raise InputError(f"{path}: city: holds {len(cities)} of them; choose one with --city: "
-                         f"{', '.join(sorted(cities))}")
+        raise InputError(
+            f"{path}: city: holds {len(cities)} of them; choose one with --city: {', '.join(sorted(cities))}"
+        )
     rows = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
     if len(rows) == 0 or left["with a missing or impossible number"] > len(rows):
-        raise InputError(f"{path}: {len(rows)} good rows, and left out: {told(left)}; is flow in veh/h per lane, and "
-                         "occ a share?")
+        raise InputError(
+            f"{path}: {len(rows)} good rows, and left out: {told(left)}; is flow in veh/h per lane, and occ a share?"
+        )
     doubled = rows.duplicated(["day", "interval", "detid"])
     if doubled.any():
         day, interval, detid = rows.loc[doubled.idxmax(), ["day", "interval", "detid"]]
-        raise InputError(f"{path}: detector {detid} has two rows of {day}, {interval:g} s ({int(doubled.sum())} such "
-                         "rows); leave one of each")
+        raise InputError(
+            f"{path}: detector {detid} has two rows of {day}, {interval:g} s ({int(doubled.sum())} such "
+            "rows); leave one of each"
+        )
     times = np.unique(rows["interval"])
     if len(times) > 1 and np.diff(times).min() < SHORTEST:
-        raise InputError(f"{path}: interval: expected seconds since midnight, {SHORTEST} s apart or more, got "
-                         f"{times[0]:g}, {times[1]:g}, ... instead; is it minutes, or a number?")
+        raise InputError(
+            f"{path}: interval: expected seconds since midnight, {SHORTEST} s apart or more, got "
+            f"{times[0]:g}, {times[1]:g}, ... instead; is it minutes, or a number?"
+        )
     return rows, left
 
 
 def read_detectors(
-    path: Path | None, regions: Path | None, counts: pd.DataFrame, where: Path, city: str | None = None,
+    path: Path | None, regions: Path | None, counts: pd.DataFrame, where: Path, city: str | None = None
 ) -> pd.DataFrame:
     """Of the detectors in `counts`, the file `where`: index detid; region, lane_km that each stands for, pos_km, x_m
     and y_m, the last four NaN where unknown.
@@ -92,17 +101,28 @@ def read_detectors(
     table = counts.drop_duplicates("detid").drop(columns=["day", "interval", "flow", "occ"])
     detids, own = list(table["detid"]), "region" in table
     if path is not None:
-        more = pd.concat(_chunks(
-            path, ("detid", "length"), ("lanes", "linkid", "pos", "long", "lat", "x", "y", "citycode", "region")))
+        more = pd.concat(
+            _chunks(
+                path, ("detid", "length"), ("lanes", "linkid", "pos", "long", "lat", "x", "y", "citycode", "region")
+            )
+        )
         if city is not None and "citycode" in more:
             more = more[more["citycode"] == city]
         if own and "region" in more:
             raise InputError(f"{path}: has a column region, and so has {where}; remove one of the two")
         more = _once(more[more["detid"].isin(detids)], "detid", path)
         table = more.merge(table, how="left").set_index(more.index) if own else more
-        table, problem = _numbers(table, {
-            "length": (1e-3, LONGEST_LINK, "km of its link", "is it metres?"), **({"lanes": (
-                1, 20, "lanes that it covers", "")} if "lanes" in table and table["lanes"].notna().all() else {})})
+        table, problem = _numbers(
+            table,
+            {
+                "length": (1e-3, LONGEST_LINK, "km of its link", "is it metres?"),
+                **(
+                    {"lanes": (1, 20, "lanes that it covers", "")}
+                    if "lanes" in table and table["lanes"].notna().all()
+                    else {}
+                ),
+            },
+        )
         if problem:
             raise InputError(f"{path}: {problem}; correct it")
     if regions is not None:
@@ -110,18 +130,26 @@ def read_detectors(
             raise InputError(f"{regions}: {where if own else path} has a column region already; give one of the two")
         table = table.merge(_once(pd.concat(_chunks(regions, ("detid", "region"))), "detid", regions), how="left")
     if "region" not in table:
-        raise InputError(f"{path or where}: has no column region; give the region of every detector there, or as a "
-                         "table detid,region with --regions")
+        raise InputError(
+            f"{path or where}: has no column region; give the region of every detector there, or as a "
+            "table detid,region with --regions"
+        )
     table = table.set_index("detid")
-    for missing, what in ((set(detids) - set(table.index), "no row"), (set(detids) & set(
-            table.index[table["region"].isna() | (table["region"].str.strip() == "")]), "no region")):
+    for missing, what in (
+        (set(detids) - set(table.index), "no row"),
+        (set(detids) & set(table.index[table["region"].isna() | (table["region"].str.strip() == "")]), "no region"),
+    ):
         if missing:
             file = regions if regions and what == "no region" else path or where
-            raise InputError(f"{file}: detector {min(missing)}, which {where} counts, has {what} ({len(missing)} such "
-                             "detectors); add it")
+            raise InputError(
+                f"{file}: detector {min(missing)}, which {where} counts, has {what} ({len(missing)} such "
+                "detectors); add it"
+            )
     table = table.loc[detids]
-    number = {name: pd.to_numeric(table[name], errors="coerce") if name in table else np.nan
-              for name in ("length", "lanes", "pos", "long", "lat", "x", "y")}
+    number = {
+        name: pd.to_numeric(table[name], errors="coerce") if name in table else np.nan
+        for name in ("length", "lanes", "pos", "long", "lat", "x", "y")
+    }
     found = pd.DataFrame(number, index=table.index).assign(region=table["region"].str.strip())
     link = table["linkid"].fillna(pd.Series(table.index, table.index)) if "linkid" in table else found.index
     stations = found["pos"].round(NEAR).groupby(np.asarray(link)).transform(lambda places: max(1, places.nunique()))
@@ -131,7 +159,8 @@ def read_detectors(
         found["x"] = EARTH * np.cos(middle) * np.radians(found["long"] - found["long"].mean())
         found["y"] = EARTH * np.radians(found["lat"] - found["lat"].mean())
     return found.rename(columns={"pos": "pos_km", "x": "x_m", "y": "y_m"})[
-        ["region", "lane_km", "pos_km", "x_m", "y_m"]]
+        ["region", "lane_km", "pos_km", "x_m", "y_m"]
+    ]
 
 
 def read_about(path: Path | None, regions: Sequence[str]) -> pd.DataFrame:
@@ -142,10 +171,16 @@ def read_about(path: Path | None, regions: Sequence[str]) -> pd.DataFrame:
     table = _once(pd.concat(_chunks(path, ("region",), tuple(columns))), "region", path)
     given = [name for name in columns if name in table]
     if unknown := sorted(set(table["region"]) - set(regions)):
-        raise InputError(f"{path}: region {unknown[0]!r} has no detector{did_you_mean(unknown[0], regions)}; there are "
-                         f"{', '.join(regions)}")
-    limits = {"lane_km": (1e-3, 1e6, "km of lanes", ""), "trip_length": (10.0, 1e5, "m", "is it km?"),
-              "x": (-1e9, 1e9, "m", ""), "y": (-1e9, 1e9, "m", "")}
+        raise InputError(
+            f"{path}: region {unknown[0]!r} has no detector{did_you_mean(unknown[0], regions)}; there are "
+            f"{', '.join(regions)}"
+        )
+    limits = {
+        "lane_km": (1e-3, 1e6, "km of lanes", ""),
+        "trip_length": (10.0, 1e5, "m", "is it km?"),
+        "x": (-1e9, 1e9, "m", ""),
+        "y": (-1e9, 1e9, "m", ""),
+    }
     for name in given:
         _, problem = _numbers(table[table[name].notna()], {name: limits[name]})
         if problem:
@@ -161,8 +196,10 @@ def read_pairs(path: Path, regions: Sequence[str]) -> np.ndarray:
     for line, (i, h) in zip(table.index + 2, table[["region", "neighbour"]].itertuples(index=False), strict=True):
         for name in (i, h):
             if name not in place:
-                raise InputError(f"{path}: line {line}: region {name!r} has no detector"
-                                 f"{did_you_mean(str(name), regions)}; there are {', '.join(regions)}")
+                raise InputError(
+                    f"{path}: line {line}: region {name!r} has no detector"
+                    f"{did_you_mean(str(name), regions)}; there are {', '.join(regions)}"
+                )
         if i == h:
             raise InputError(f"{path}: line {line}: region {i!r} is no neighbour of itself; remove the line")
         adjacency[place[i], place[h]] = adjacency[place[h], place[i]] = True
@@ -179,12 +216,15 @@ def _chunks(path: Path, needed: Sequence[str], wanted: Sequence[str] = ()) -> It
     check_file(path, "give a csv file")
     try:
         reader = pd.read_csv(
-            path, dtype=str, chunksize=CHUNK, usecols=lambda name: name in (*needed, *wanted), skipinitialspace=True)
+            path, dtype=str, chunksize=CHUNK, usecols=lambda name: name in (*needed, *wanted), skipinitialspace=True
+        )
         with reader:
             header = list(pd.read_csv(path, nrows=0).columns)
             if missing := [name for name in needed if name not in header]:
-                raise InputError(f"{path}: column {missing[0]} is missing{did_you_mean(missing[0], header)}; expected "
-                                 f"{', '.join(needed)}, got {', '.join(map(str, header))[:200]} instead")
+                raise InputError(
+                    f"{path}: column {missing[0]} is missing{did_you_mean(missing[0], header)}; expected "
+                    f"{', '.join(needed)}, got {', '.join(map(str, header))[:200]} instead"
+                )
             yield from reader
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; give a csv file") from None
@@ -195,9 +235,7 @@ def _chunks(path: Path, needed: Sequence[str], wanted: Sequence[str] = ()) -> It
         raise InputError(f"{path}: cannot be read as a csv file ({text}); give one") from None
 
 
-def _numbers(
-    table: pd.DataFrame, limits: Mapping[str, tuple[float, float, str, str]],
-) -> tuple[pd.DataFrame, str]:
+def _numbers(table: pd.DataFrame, limits: Mapping[str, tuple[float, float, str, str]]) -> tuple[pd.DataFrame, str]:
     """The rows of which all these columns are numbers within their limits, and what is wrong with the first other."""
     values = {name: pd.to_numeric(table[name], errors="coerce") for name in limits}
     bad = {name: ~values[name].between(low, high) for name, (low, high, _, _) in limits.items()}
@@ -207,8 +245,10 @@ def _numbers(
             line, text = bad[name].idxmax(), table.loc[bad[name].idxmax(), name]
             got = "nothing" if pd.isna(text) else repr(text)
             hint = hint if values[name][line] > high and hint else ""
-            return good, (f"line {line + 2}: {name}: expected {what}, from {low:g} to {high:g}, got {got} instead "
-                          f"({int(bad[name].sum()):,} such rows){'; ' + hint if hint else ''}")
+            return good, (
+                f"line {line + 2}: {name}: expected {what}, from {low:g} to {high:g}, got {got} instead "
+                f"({int(bad[name].sum()):,} such rows){'; ' + hint if hint else ''}"
+            )
     return good, ""
 
 
@@ -217,6 +257,8 @@ def _once(table: pd.DataFrame, key: str, path: Path) -> pd.DataFrame:
     if table[key].isna().any():
         raise InputError(f"{path}: line {table[key].isna().idxmax() + 2}: {key} is missing; add it or remove the line")
     if (twice := table[key].duplicated()).any():
-        raise InputError(f"{path}: line {twice.idxmax() + 2}: {key} {table[key][twice].iloc[0]} is there twice; remove "
-                         "one of the lines")
+        raise InputError(
+            f"{path}: line {twice.idxmax() + 2}: {key} {table[key][twice].iloc[0]} is there twice; remove "
+            "one of the lines"
+        )
     return table

@@ -41,7 +41,7 @@ def estimated(law: Disturbance, innovations: torch.Tensor) -> PerPair:
 
 
 def ahead(
-    law: Disturbance, disturbance: PerPair, x: PerPair, critical: PerRegion, intervals: int, step: float,
+    law: Disturbance, disturbance: PerPair, x: PerPair, critical: PerRegion, intervals: int, step: float
 ) -> torch.Tensor:
     """(..., intervals, R, R) [veh/s] to be added to the demand from x (..., R, R) [veh] on.
 

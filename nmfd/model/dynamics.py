@@ -45,9 +45,10 @@ class Parameters:
 
 
 def parameters(
-    network: RegionalModel, *, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu",
+    network: RegionalModel, *, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu"
 ) -> Parameters:
     """The network as tensors of `dtype` on `device`."""
+
     def tensor(values: Any) -> Any:
         return None if values is None else torch.tensor(values, dtype=dtype, device=device)
 
@@ -55,9 +56,16 @@ def parameters(
         return tensor([getattr(m, name) for m in network.mfds])
 
     return Parameters(
-        a=row("a"), b=row("b"), c=row("c"), jam=row("jam"), adjacency=tensor(network.adjacency),
+        a=row("a"),
+        b=row("b"),
+        c=row("c"),
+        jam=row("jam"),
+        adjacency=tensor(network.adjacency),
         off_diagonal=1.0 - torch.eye(network.regions, dtype=dtype, device=device),
-        exit_rates=tensor(network.exit_rates), capacity=tensor(network.open_capacity), storage=tensor(network.storage))
+        exit_rates=tensor(network.exit_rates),
+        capacity=tensor(network.open_capacity),
+        storage=tensor(network.storage),
+    )
 
 
 def rate(p: Parameters, accumulation: PerRegion) -> PerRegion:
@@ -95,9 +103,7 @@ def passing(p: Parameters, wish: PerPair, perimeter: PerPair, accumulation: PerR
     return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
 
 
-def admitted(
-    backlog: PerPair, demand: PerPair, metering: PerRegion | None, step: float,
-) -> tuple[PerPair, PerPair]:
+def admitted(backlog: PerPair, demand: PerPair, metering: PerRegion | None, step: float) -> tuple[PerPair, PerPair]:
     """The demand (..., R, R) [veh/s] that may enter within `step` [s], and the backlog (..., R, R) [veh] after it.
 
     metering: (..., R) [veh/s], the most trips that may begin in each region, in equal shares of all who wait for the
@@ -136,8 +142,15 @@ SCHEMES = {"euler": ((1.0,), (0.0,)), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0
 
 
 def advance(
-    p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float, *,
-    integrator: str = "euler", substeps: int = 1,
+    p: Parameters,
+    x: PerPair,
+    demand: PerPair,
+    perimeter: PerPair,
+    splits: PerTurn,
+    step: float,
+    *,
+    integrator: str = "euler",
+    substeps: int = 1,
 ) -> PerPair:
     """x after one control interval of `step` [s], in `substeps` equal steps under constant controls and demand."""
     for _ in range(substeps):
@@ -146,8 +159,15 @@ def advance(
 
 
 def advance_counted(
-    p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float, *,
-    integrator: str = "euler", substeps: int = 1,
+    p: Parameters,
+    x: PerPair,
+    demand: PerPair,
+    perimeter: PerPair,
+    splits: PerTurn,
+    step: float,
+    *,
+    integrator: str = "euler",
+    substeps: int = 1,
 ) -> tuple[PerPair, PerRollout]:
     """As `advance`, and the trips (...) [veh] that ended meanwhile, by the same scheme: for the ledger."""
     step, ended = step / substeps, torch.zeros(x.shape[:-2], dtype=x.dtype)

@@ -38,6 +38,7 @@ class Parameters:
 
 def parameters(network: RegionalModel) -> Parameters:
     """The network as constants."""
+
     def column(name: str) -> ca.DM:
         return ca.DM([getattr(m, name) for m in network.mfds])
 
@@ -45,9 +46,15 @@ def parameters(network: RegionalModel) -> Parameters:
         return None if values is None else ca.DM(values)
 
     return Parameters(
-        a=column("a"), b=column("b"), c=column("c"), jam=column("jam"),
-        adjacency=ca.sparsify(ca.DM(network.adjacency.astype(float))), exit_rates=matrix(network.exit_rates),
-        capacity=matrix(network.open_capacity), storage=None if network.storage is None else ca.DM(network.storage).T)
+        a=column("a"),
+        b=column("b"),
+        c=column("c"),
+        jam=column("jam"),
+        adjacency=ca.sparsify(ca.DM(network.adjacency.astype(float))),
+        exit_rates=matrix(network.exit_rates),
+        capacity=matrix(network.open_capacity),
+        storage=None if network.storage is None else ca.DM(network.storage).T,
+    )
 
 
 def splits_list(splits: PerTurn) -> list[ca.DM]:
@@ -75,8 +82,7 @@ def flows(p: Parameters, x: Matrix, perimeter: Matrix, splits: Turns) -> tuple[M
     else:
         wish = ca.vertcat(*(ca.sum2(transfer).T for transfer in transfers))
         open_share = passing(p, wish, perimeter, accumulation) * p.adjacency
-    return completions, [
-        ca.repmat(open_share[i, :].T, 1, regions) * transfer for i, transfer in enumerate(transfers)]
+    return completions, [ca.repmat(open_share[i, :].T, 1, regions) * transfer for i, transfer in enumerate(transfers)]
 
 
 def passing(p: Parameters, wish: Matrix, perimeter: Matrix, accumulation: Matrix) -> Matrix:
@@ -112,8 +118,15 @@ INTEGRATORS = {"euler": euler, "rk4": rk4}
 
 
 def advance(
-    p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns, step: float, *,
-    integrator: str = "euler", substeps: int = 1,
+    p: Parameters,
+    x: Matrix,
+    demand: Matrix,
+    perimeter: Matrix,
+    splits: Turns,
+    step: float,
+    *,
+    integrator: str = "euler",
+    substeps: int = 1,
 ) -> Matrix:
     """x after one control interval of `step` [s], in `substeps` equal steps under constant controls and demand."""
     for _ in range(substeps):

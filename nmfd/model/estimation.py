@@ -42,9 +42,9 @@ OUTFLOW_ERROR, DEMAND_ERROR = 0.3, 0.3
 # Of every single flow, and of every way out of a cell as a share of what leaves it: drivers take other ways, and trips
 # are not exponential. As long as MEMORY too, but not worth a state each: white noise that sums up to the same.
 FLOW_ERROR, STRAY = 0.2, 0.02
-COUNT_ERROR = 0.3     # [-], of vehicles over a boundary, expanded from one counted gateway to all alike
-FLOOR = 0.01          # [veh^2], variance of a reading that would be exact
-DIFFERENCE = 1e-5     # of the Jacobian [veh], [-]
+COUNT_ERROR = 0.3  # [-], of vehicles over a boundary, expanded from one counted gateway to all alike
+FLOOR = 0.01  # [veh^2], variance of a reading that would be exact
+DIFFERENCE = 1e-5  # of the Jacobian [veh], [-]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,25 +142,34 @@ class _Model:
         self._parameters, self._probe_share = dynamics.parameters(network), instruments.probe_share
         regions = self._regions = network.regions
         cells = self._cells = regions**2
-        self._fastest = torch.tensor(
-            [m.rate(np.linspace(0.0, m.jam, 501)).max() for m in network.mfds])
+        self._fastest = torch.tensor([m.rate(np.linspace(0.0, m.jam, 501)).max() for m in network.mfds])
         if network.exit_rates is not None:
             self._fastest *= torch.from_numpy(network.exit_rates.max(axis=1))
         self._boundaries = np.argwhere(network.adjacency)
         sizes = (2 * regions, regions, cells, regions, len(self._boundaries), cells, cells)
         ends = np.cumsum(sizes)
         (self._factors, self._expansion, self._x, self._mean, self._crossings, self._probes, self._departures) = (
-            slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True))
+            slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)
+        )
         self._states, self._size = int(ends[2]), int(ends[-1])
-        self._spread = torch.from_numpy(np.concatenate([
-            np.full(regions, OUTFLOW_ERROR), np.full(regions, DEMAND_ERROR), instruments.detector_error]))
+        self._spread = torch.from_numpy(
+            np.concatenate(
+                [np.full(regions, OUTFLOW_ERROR), np.full(regions, DEMAND_ERROR), instruments.detector_error]
+            )
+        )
         memory = torch.tensor([MEMORY, MEMORY, EXPANSION_MEMORY], dtype=torch.float64)
         self._kept = torch.exp(-self._step / memory).repeat_interleave(regions)
         kept = np.exp(-self._step / MEMORY)
         self._lasting = float((1.0 + kept) / (1.0 - kept))  # variance of white noise over that of what lasts
         self._turns = np.argwhere(network.split_mask)
-        self._from = torch.from_numpy(np.concatenate([  # the cell, of every event but departures
-            self._turns[:, 0] * regions + self._turns[:, 2], np.arange(regions) * (regions + 1)]))
+        self._from = torch.from_numpy(
+            np.concatenate(
+                [  # the cell, of every event but departures
+                    self._turns[:, 0] * regions + self._turns[:, 2],
+                    np.arange(regions) * (regions + 1),
+                ]
+            )
+        )
         vehicle, probe = (torch.from_numpy(part) for part in self._effects())
         self._pairs = [_pairs(vehicle, vehicle), _pairs(vehicle, probe), _pairs(probe, probe)]
         self._half = vehicle[cells : cells + regions]
@@ -188,12 +197,14 @@ class _Model:
         """Of a city without vehicles."""
         mean, variance = np.zeros(self._states), torch.full((self._cells,), FLOOR, dtype=torch.float64)
         return Belief(
-            mean=mean, covariance=torch.diag(torch.cat([self._spread**2, variance])).numpy(),
-            probes=np.zeros((self._regions, self._regions)), surprise=np.nan)
+            mean=mean,
+            covariance=torch.diag(torch.cat([self._spread**2, variance])).numpy(),
+            probes=np.zeros((self._regions, self._regions)),
+            surprise=np.nan,
+        )
 
     def advance(
-        self, belief: Belief, demand: PerPair, perimeter: PerPair, splits: PerTurn, readings: Readings,
-        loops: PerRegion,
+        self, belief: Belief, demand: PerPair, perimeter: PerPair, splits: PerTurn, readings: Readings, loops: PerRegion
     ) -> Belief:
         """The belief one control interval later. loops: (R,) [veh], the accumulations that are to be trusted."""
         z, covariance, leaving = self._predicted(belief, demand, perimeter, splits)
@@ -222,7 +233,7 @@ class _Model:
         return Belief(mean=mean, covariance=posterior, probes=probes, surprise=surprise)
 
     def _predicted(
-        self, belief: Belief, demand: PerPair, perimeter: PerPair, splits: PerTurn,
+        self, belief: Belief, demand: PerPair, perimeter: PerPair, splits: PerTurn
     ) -> tuple[np.ndarray, torch.Tensor, np.ndarray]:
         """Z (size,), its covariance, and what leaves every cell (R^2,) [veh]."""
         mean, errors, first = torch.from_numpy(belief.mean), self._x.start, self._expansion.start
@@ -237,12 +248,13 @@ class _Model:
         covariance = jacobian @ torch.from_numpy(belief.covariance) @ jacobian.T
         covariance.diagonal()[:errors] += (1.0 - self._kept**2) * self._spread**2
         leaving = torch.zeros(self._cells, dtype=torch.float64).index_add_(
-            0, self._from, moves[: len(self._from)])  # the turns and ends of trips
+            0, self._from, moves[: len(self._from)]
+        )  # the turns and ends of trips
         covariance[errors:, errors:] += self._flow_noise(belief, moves, seen, leaving)
         return torch.cat([self._kept * mean[:errors], outputs[0]]).numpy(), covariance, leaving.numpy()
 
     def _rollout(
-        self, points: torch.Tensor, probes: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn,
+        self, points: torch.Tensor, probes: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """All of Z but the relative errors at `points` (B, 2 R + R^2); and the events of the first one, (events,)
         [veh], of all vehicles and of probes."""
@@ -281,7 +293,7 @@ class _Model:
         return outputs, every, events[1].clamp(min=0.0).minimum(every)
 
     def _flow_noise(
-        self, belief: Belief, moves: torch.Tensor, seen: torch.Tensor, leaving: torch.Tensor,
+        self, belief: Belief, moves: torch.Tensor, seen: torch.Tensor, leaving: torch.Tensor
     ) -> torch.Tensor:
         """The covariance of Z without its relative errors that comes from the flows (events,) [veh] of which `seen` are
         probes: whole vehicles, so Poisson, and other flows than modelled, for probes and others alike."""
@@ -296,7 +308,8 @@ class _Model:
         weights = moves + wrong, seen + share * wrong, seen + share**2 * wrong
         parts = [
             torch.zeros(shape, dtype=x.dtype).index_put_(index[:2], value * weight[index[2]], accumulate=True)
-            for (shape, index, value), weight in zip(self._pairs, weights, strict=True)]
+            for (shape, index, value), weight in zip(self._pairs, weights, strict=True)
+        ]
         # When in the interval an event was also moves the mean: evenly distributed, a variance of 1/12 of its effect.
         parts[0].diagonal()[self._cells : self._cells + self._regions] += self._half**2 @ moves / 3.0
         return torch.cat([torch.cat(parts[:2], dim=1), torch.cat([parts[1].T, parts[2]], dim=1)])
@@ -312,20 +325,28 @@ class _Model:
         mean, expansion, counts = z[self._mean], z[self._expansion], z[self._crossings]
         share = np.maximum(known.detector_share, 1e-6)
         boundary, gateways = (
-            np.maximum(part[here, to], low) for part, low in ((known.counted_share, 1e-6), (known.counted_gateways, 1)))
+            np.maximum(part[here, to], low) for part, low in ((known.counted_share, 1e-6), (known.counted_gateways, 1))
+        )
         cells, p = np.full(self._cells, FLOOR), self._probe_share
         there = np.maximum(z[self._x], 1.0)
         kept = np.minimum(np.exp(-leaving / there), np.exp(-self._step / MEMORY))
         thinning = p * (1.0 - p) * there * (1.0 + kept) / (1.0 - kept) + FLOOR
         parts = (
             # a share of the links sees a share of the vehicles; the lasting part of the error is a state
-            (loops, (1.0 + expansion) * mean,
-             np.maximum(mean, 1.0) * (1.0 - share) / share + (known.detector_noise * mean) ** 2 + FLOOR),
-            (readings.crossings[here, to], counts,
-             (1.0 - boundary) * (np.maximum(counts, 1.0) / boundary + COUNT_ERROR**2 * counts**2 / gateways) + FLOOR),
+            (
+                loops,
+                (1.0 + expansion) * mean,
+                np.maximum(mean, 1.0) * (1.0 - share) / share + (known.detector_noise * mean) ** 2 + FLOOR,
+            ),
+            (
+                readings.crossings[here, to],
+                counts,
+                (1.0 - boundary) * (np.maximum(counts, 1.0) / boundary + COUNT_ERROR**2 * counts**2 / gateways) + FLOOR,
+            ),
             (readings.probes.ravel(), z[self._probes], cells),
             (readings.probe_departures.ravel(), z[self._departures], cells),
-            (0.0 * readings.probes.ravel(), z[self._probes] - self._probe_share * z[self._x], thinning))
+            (0.0 * readings.probes.ravel(), z[self._probes] - self._probe_share * z[self._x], thinning),
+        )
         return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
     def _rows(self, z: np.ndarray, matrix: torch.Tensor) -> torch.Tensor:

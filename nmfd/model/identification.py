@@ -24,16 +24,16 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.tensors import PerPair, PerRegion
 from nmfd.threads import one_thread
 
-HORIZON = 10         # control intervals
+HORIZON = 10  # control intervals
 ITERATIONS = 600
-BATCH = 256          # rollouts per Adam step
+BATCH = 256  # rollouts per Adam step
 LEARNING_RATE = 0.03
-OUTLIER = 0.3        # of the scale: from here on an error counts linearly (Huber)
+OUTLIER = 0.3  # of the scale: from here on an error counts linearly (Huber)
 BY_DESTINATION = 3.0  # weight of the errors of x_ij, beside those of x_i
-LEAST_RATE = 0.01    # of the free rate, up to the jam accumulation
-EXIT_RATES = 8.0     # most and 1 / least
-FEWEST = 30.0        # vehicles that must have crossed before their split ratios count
-RIDGE = 1e-3         # of the squared logarithm of exit rates and capacities: what the data do not say stays as it was
+LEAST_RATE = 0.01  # of the free rate, up to the jam accumulation
+EXIT_RATES = 8.0  # most and 1 / least
+FEWEST = 30.0  # vehicles that must have crossed before their split ratios count
+RIDGE = 1e-3  # of the squared logarithm of exit rates and capacities: what the data do not say stays as it was
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,9 +84,16 @@ class _Model(torch.nn.Module):
         rates = EXIT_RATES ** torch.tanh(self.exit_rates)
         rates = torch.minimum(rates, 0.999 * self._fastest / c.unsqueeze(-1))
         return dynamics.Parameters(
-            a=-c * second / jam**2, b=-c * first / jam, c=c, jam=jam, adjacency=self.adjacency,
-            off_diagonal=off_diagonal, exit_rates=rates, capacity=self.capacity.exp() * self.adjacency / self._u_max,
-            storage=self.storage.exp())
+            a=-c * second / jam**2,
+            b=-c * first / jam,
+            c=c,
+            jam=jam,
+            adjacency=self.adjacency,
+            off_diagonal=off_diagonal,
+            exit_rates=rates,
+            capacity=self.capacity.exp() * self.adjacency / self._u_max,
+            storage=self.storage.exp(),
+        )
 
     def penalty(self) -> torch.Tensor:
         """What it costs to depart from where the search starts."""
@@ -95,7 +102,7 @@ class _Model(torch.nn.Module):
 
 
 def observed_split_ratios(
-    network: RegionalModel, crossings: Real[np.ndarray, "R R R"],
+    network: RegionalModel, crossings: Real[np.ndarray, "R R R"]
 ) -> dict[tuple[int, int], dict[int, float]]:
     """(i, j) -> {h: share}: by which neighbour h the vehicles in i bound for j went on in fact.
 
@@ -111,8 +118,15 @@ def observed_split_ratios(
 
 
 def fit(
-    network: RegionalModel, runs: Sequence[Observed], *, step: float, substeps: int = 1, integrator: str = "euler",
-    iterations: int = ITERATIONS, seed: int = 0, progress: Callable[[int, int, str], None] | None = None,
+    network: RegionalModel,
+    runs: Sequence[Observed],
+    *,
+    step: float,
+    substeps: int = 1,
+    integrator: str = "euler",
+    iterations: int = ITERATIONS,
+    seed: int = 0,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> RegionalModel:
     """`network` with the MFDs, exit rates, capacities and storage that predict `runs` best.
 
@@ -144,8 +158,14 @@ def fit(
 
 
 def fit_disturbance(
-    network: RegionalModel, runs: Sequence[Observed], *, step: float, substeps: int = 1, integrator: str = "euler",
-    iterations: int = ITERATIONS // 4, seed: int = 0,
+    network: RegionalModel,
+    runs: Sequence[Observed],
+    *,
+    step: float,
+    substeps: int = 1,
+    integrator: str = "euler",
+    iterations: int = ITERATIONS // 4,
+    seed: int = 0,
 ) -> RegionalModel:
     """`network` with the disturbance (nmfd.model.disturbance) that corrects its predictions of `runs` best; as it is
     where no run is long enough."""
@@ -175,12 +195,15 @@ def _law(free: torch.Tensor) -> Disturbance:
 
 
 def corrected(
-    law: Disturbance, p: dynamics.Parameters, data: Sequence[torch.Tensor], critical: PerRegion,
+    law: Disturbance,
+    p: dynamics.Parameters,
+    data: Sequence[torch.Tensor],
+    critical: PerRegion,
     scheme: Mapping[str, Any],
 ) -> list[torch.Tensor]:
     """`windows` without their first LOOK intervals, whose innovations correct the demand of the others."""
     foreseen, step = dynamics.advance(p, *(part[:, :LOOK] for part in data), **scheme), scheme["step"]
-    estimate = disturbance.estimated(law, (data[0][:, 1:LOOK + 1] - foreseen) / step)
+    estimate = disturbance.estimated(law, (data[0][:, 1 : LOOK + 1] - foreseen) / step)
     observed, demand, perimeter, splits = (part[:, LOOK:] for part in data)
     added = disturbance.ahead(law, estimate, observed[:, 0], critical, demand.shape[1], step)
     return [observed, demand + added, perimeter, splits]
@@ -188,17 +211,20 @@ def corrected(
 
 def windows(runs: Sequence[Observed], horizon: int) -> list[torch.Tensor]:
     """States (N, horizon + 1, R, R), demands, perimeters and splits (N, horizon, ...) of every `horizon` intervals."""
+
     def stack(name: str, length: int) -> torch.Tensor:
         parts = [
-            np.lib.stride_tricks.sliding_window_view(getattr(run, name), length, axis=0) for run in runs
-            if len(run.demand) >= horizon]
+            np.lib.stride_tricks.sliding_window_view(getattr(run, name), length, axis=0)
+            for run in runs
+            if len(run.demand) >= horizon
+        ]
         return torch.tensor(np.moveaxis(np.concatenate(parts), -1, 1), dtype=torch.float32)
 
     return [stack("accumulation", horizon + 1), *(stack(name, horizon) for name in ("demand", "perimeter", "splits"))]
 
 
 def _misfit(
-    p: dynamics.Parameters, data: Sequence[torch.Tensor], scale: torch.Tensor, scheme: Mapping[str, Any],
+    p: dynamics.Parameters, data: Sequence[torch.Tensor], scale: torch.Tensor, scheme: Mapping[str, Any]
 ) -> torch.Tensor:
     """The mean Huber loss of the errors of x_i and x_ij over the horizon, in units of `scale` (R,) [veh]."""
     total, horizon = torch.zeros(()), data[1].shape[1]
@@ -209,7 +235,7 @@ def _misfit(
 
 
 def _foreseen(
-    p: dynamics.Parameters, data: Sequence[torch.Tensor], scheme: Mapping[str, Any],
+    p: dynamics.Parameters, data: Sequence[torch.Tensor], scheme: Mapping[str, Any]
 ) -> Iterator[torch.Tensor]:
     """(N, R, R) [veh] after every interval of `windows`, from their first states on."""
     observed, demand, perimeter, splits = data
@@ -224,7 +250,7 @@ def _huber(error: torch.Tensor) -> torch.Tensor:
 
 
 def _network(
-    network: RegionalModel, model: _Model, runs: Sequence[Observed], off_diagonal: torch.Tensor,
+    network: RegionalModel, model: _Model, runs: Sequence[Observed], off_diagonal: torch.Tensor
 ) -> RegionalModel:
     """The fitted numbers, scaled such that the exit rates of a region are 1 on the average of its vehicles."""
     with torch.no_grad():
@@ -236,15 +262,26 @@ def _network(
     mean = (weight * rates).sum(axis=1) / weight.sum(axis=1)
     mfds = tuple(
         Mfd(a=float(a) * m, b=float(b) * m, c=float(c) * m, jam=float(jam))
-        for a, b, c, jam, m in zip(p.a, p.b, p.c, p.jam, mean, strict=True))
+        for a, b, c, jam, m in zip(p.a, p.b, p.c, p.jam, mean, strict=True)
+    )
     return replace(
-        network, mfds=mfds, exit_rates=rates / mean[:, None],
-        capacity=p.capacity.double().numpy() * network.u_max * network.adjacency, storage=p.storage.double().numpy())
+        network,
+        mfds=mfds,
+        exit_rates=rates / mean[:, None],
+        capacity=p.capacity.double().numpy() * network.u_max * network.adjacency,
+        storage=p.storage.double().numpy(),
+    )
 
 
 def prediction_errors(
-    network: RegionalModel, runs: Sequence[Observed], intervals: int, *, step: float, substeps: int = 1,
-    integrator: str = "euler", law: Disturbance | None = None,
+    network: RegionalModel,
+    runs: Sequence[Observed],
+    intervals: int,
+    *,
+    step: float,
+    substeps: int = 1,
+    integrator: str = "euler",
+    law: Disturbance | None = None,
 ) -> Float[np.ndarray, "N R"]:
     """(N, R) [veh]: predicted minus observed accumulation, `intervals` ahead of every observed state of `runs`.
 
@@ -266,14 +303,14 @@ def intervals_within(ahead: float, step: float, runs: Sequence[Observed]) -> int
 
 
 def prediction_shares(
-    network: RegionalModel, runs: Sequence[Observed], intervals: Sequence[int], **scheme: Any,
+    network: RegionalModel, runs: Sequence[Observed], intervals: Sequence[int], **scheme: Any
 ) -> Float[np.ndarray, "L R"]:
     """(len(intervals), R) [-]: RMSE of `prediction_errors`, as a share of the critical accumulation."""
     return _shares(network, [prediction_errors(network, runs, n, **scheme) for n in intervals])
 
 
 def persistence_shares(
-    network: RegionalModel, runs: Sequence[Observed], intervals: Sequence[int],
+    network: RegionalModel, runs: Sequence[Observed], intervals: Sequence[int]
 ) -> Float[np.ndarray, "L R"]:
     """(len(intervals), R) [-]: as `prediction_shares`, of the prediction that nothing changes."""
     states = [run.accumulation.sum(axis=2) for run in runs]

@@ -37,10 +37,11 @@ def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) 
         neighbours = ", ".join(str(h) for h in adjacent)
         curve = network.mfds[region]
         out.write(
-            f'\n[[regions]]\nname = {quoted(network.region_names[region])}\nposition = [{x:.6g}, {y:.6g}]\n'
+            f"\n[[regions]]\nname = {quoted(network.region_names[region])}\nposition = [{x:.6g}, {y:.6g}]\n"
             f"adjacent = [{neighbours}]\n{barred}{_options(network, region)}\n"
             f"[regions.mfd]\na = {curve.a:.6g}\nb = {curve.b:.6g}\nc = {curve.c:.6g}\n"
-            f"jam = {curve.jam:.6g}\n")
+            f"jam = {curve.jam:.6g}\n"
+        )
     for (i, j), shares in sorted(network.observed_split_ratios.items()):
         via = ", ".join(str(h) for h in shares)
         share = ", ".join(f"{value:.4f}" for value in shares.values())
@@ -56,8 +57,8 @@ def _options(network: RegionalModel, region: int) -> str:
     if network.capacity is not None and network.storage is not None:
         passing = network.capacity[region, network.adjacency[region]]
         lines += (
-            f"capacity = [{', '.join(f'{value:.4g}' for value in passing)}]\n"
-            f"storage = {network.storage[region]:.6g}\n")
+            f"capacity = [{', '.join(f'{value:.4g}' for value in passing)}]\nstorage = {network.storage[region]:.6g}\n"
+        )
     if network.controllable is not None:
         shares = network.controllable[region, network.adjacency[region]]
         lines += f"controllable = [{', '.join(f'{value:.4g}' for value in shares)}]\n"

@@ -56,16 +56,29 @@ class RegionTable(Settings):
     mfd: MfdTable | None = setting("its own MFD instead of that of [mfd]", None)
     exit_rates: config.PositiveNumbers | None = setting(
         "how fast vehicles leave it, relative to the mean of the MFD, per region that they are bound for; for every "
-        "region or for none", None, unit="-")
+        "region or for none",
+        None,
+        unit="-",
+    )
     capacity: config.PositiveNumbers | None = setting(
         "the most that passes under the largest control into each adjacent region while that is empty, in the order of "
-        "adjacent, without those of no_way_to; together with storage, for every region or for none", None, unit="veh/s")
+        "adjacent, without those of no_way_to; together with storage, for every region or for none",
+        None,
+        unit="veh/s",
+    )
     storage: float | None = setting(
-        "accumulation that leaves no room for vehicles from other regions; together with capacity", None, unit="veh",
-        gt=0.0, le=MOST)
+        "accumulation that leaves no room for vehicles from other regions; together with capacity",
+        None,
+        unit="veh",
+        gt=0.0,
+        le=MOST,
+    )
     controllable: Annotated[tuple[Share, ...], Field(strict=False)] | None = setting(
         "share of the flow into each adjacent region that passes signals under control, in the order of adjacent, "
-        "without those of no_way_to; cosim import and identify count it; for every region or for none", None, unit="-")
+        "without those of no_way_to; cosim import and identify count it; for every region or for none",
+        None,
+        unit="-",
+    )
     doubts: config.Texts = setting("what cosim identify found doubtful about the fit of this region", ())
 
     @model_validator(mode="after")
@@ -99,7 +112,8 @@ class DisturbanceTable(Settings):
     gain: float = setting("how much of it is believed", unit="-", ge=0.0, le=2.0)
     memory: Share = setting("weight of an interval beside that of the next one")
     fade_critical: float = setting(
-        "logit of how much of it is left after an interval, in a region at its critical accumulation", unit="-")
+        "logit of how much of it is left after an interval, in a region at its critical accumulation", unit="-"
+    )
     fade_slope: float = setting("how much that rises per critical accumulation", unit="-")
 
     @property
@@ -113,13 +127,15 @@ class NetworkTable(Settings):
 
     name: config.Name = setting("of the model")
     placeholder: bool = setting(
-        "whether the MFDs are a guess from lanes and speed limits: nothing is trained on them", False)
+        "whether the MFDs are a guess from lanes and speed limits: nothing is trained on them", False
+    )
     perimeter: PerimeterTable = setting("bounds of the control")
     mfd: MfdTable | None = setting("of every region without one of its own", None)
     regions: Rows[RegionTable] = setting("one table per region", min_length=1)
     observed_split_ratios: Rows[SplitsTable] = setting("one table per region and destination", ())
     disturbance: DisturbanceTable | None = setting(
-        "for predictions that are offset-free; cosim identify finds it", None)
+        "for predictions that are offset-free; cosim identify finds it", None
+    )
     sumo: dict[str, Any] = setting("the city to simulate, for cosim", {})
 
     def mfd_of(self, row: RegionTable) -> Mfd:
@@ -133,8 +149,10 @@ class NetworkTable(Settings):
         most = len(self.regions) - 1
         for number, row in enumerate(self.regions):
             if max(row.adjacent, default=0) > most:
-                raise Problem(f"regions[{number}].adjacent", got(
-                    f"a list of distinct whole numbers from 0 to {most}", list(row.adjacent)))
+                raise Problem(
+                    f"regions[{number}].adjacent",
+                    got(f"a list of distinct whole numbers from 0 to {most}", list(row.adjacent)),
+                )
         for number, row in enumerate(self.regions):
             self._check_region(number, row)
         for number, splits in enumerate(self.observed_split_ratios):
@@ -150,14 +168,14 @@ class NetworkTable(Settings):
                 raise Problem(
                     f"{where}.adjacent",
                     f"not symmetric: region {i} lists {h}, but region {h} does not list {i}; add or remove one of them "
-                    "(no_way_to lists the adjacent regions into which no road leads)")
+                    "(no_way_to lists the adjacent regions into which no road leads)",
+                )
         if row.mfd is None and self.mfd is None:
             raise Problem(f"{where}.mfd", "missing; add a table [regions.mfd], or [mfd] for all regions")
         for key in OF_ALL:
             if getattr(row, key) is None and any(getattr(other, key) is not None for other in self.regions):
                 raise Problem(f"{where}.{key}", "missing; give it for every region or for none")
-        for key, length in (("exit_rates", count), ("capacity", len(row.onward)),
-                            ("controllable", len(row.onward))):
+        for key, length in (("exit_rates", count), ("capacity", len(row.onward)), ("controllable", len(row.onward))):
             values = getattr(row, key)
             if values is not None and len(values) != length:
                 raise Problem(f"{where}.{key}", got(f"a list of {length} numbers", list(values)))

@@ -20,7 +20,7 @@ from nmfd.model.scenario import Scenario
 from nmfd.model.scenario_file import PlanningOptions
 from nmfd.runs import config
 
-GUIDED = "guided"         # in a network's folder: that of the same city's model with guided drivers
+GUIDED = "guided"  # in a network's folder: that of the same city's model with guided drivers
 GUIDING = ("mpc-pcrg", "dpc-pcrg")  # beginnings of the names of the controllers that plan with it
 
 
@@ -86,11 +86,19 @@ def planning_model(scenario: Scenario, controller: str = "") -> PlanningModel:
     else:
         network = copy.deepcopy(scenario.network)
     return PlanningModel(
-        name=scenario.name, network=network, step=scenario.step, steps=scenario.steps,
+        name=scenario.name,
+        network=network,
+        step=scenario.step,
+        steps=scenario.steps,
         forecast=scenario.forecast.copy(),
-        measurement_std=scenario.measurement_std, integrator=scenario.integrator, substeps=scenario.substeps,
-        protected=scenario.protected, initial=copy.copy(scenario.initial), folder=scenario.folder,
-        controller_options=copy.deepcopy({**tables, name: options} if name else dict(tables)))
+        measurement_std=scenario.measurement_std,
+        integrator=scenario.integrator,
+        substeps=scenario.substeps,
+        protected=scenario.protected,
+        initial=copy.copy(scenario.initial),
+        folder=scenario.folder,
+        controller_options=copy.deepcopy({**tables, name: options} if name else dict(tables)),
+    )
 
 
 def with_model(planning: PlanningModel, scenario: Scenario, folder: Path) -> PlanningModel:
@@ -107,7 +115,8 @@ def other_model(scenario: Scenario, folder: Path, where: str = "") -> RegionalMo
     if not np.array_equal(model.adjacency, scenario.network.adjacency):
         raise InputError(
             f"{where or folder / 'network.toml'}: network {model.name} has other regions or boundaries than "
-            f"{scenario.network.name}; identify one for the same city with 'cosim identify'")
+            f"{scenario.network.name}; identify one for the same city with 'cosim identify'"
+        )
     check_step(model, scenario.step / scenario.substeps, f"{model.folder}")
     return model
 

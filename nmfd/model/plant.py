@@ -13,12 +13,12 @@ from nmfd.types import Controls, Observation, State
 class NmfdPlant:
     """The regional model as a plant (nmfd.types.Plant), in float64.
 
-        >>> scenario = nmfd.load_scenario("economic_mpc")
-        >>> plant, network = nmfd.NmfdPlant(scenario), scenario.network
-        >>> state = plant.reset(0)
-        >>> state = plant.step(nmfd.Controls(perimeter=network.u_max * network.adjacency, splits=None))
-        >>> state.step, state.time
-        (1, 30.0)
+    >>> scenario = nmfd.load_scenario("economic_mpc")
+    >>> plant, network = nmfd.NmfdPlant(scenario), scenario.network
+    >>> state = plant.reset(0)
+    >>> state = plant.step(nmfd.Controls(perimeter=network.u_max * network.adjacency, splits=None))
+    >>> state.step, state.time
+    (1, 30.0)
     """
 
     def __init__(self, scenario: Scenario):
@@ -38,14 +38,26 @@ class NmfdPlant:
         demand, self._backlog = _admitted(self._backlog, self._demand[self._k], controls, self._scenario.step)
         splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
         self._x, ended = dynamics.advance_counted(
-            self._parameters, self._x, demand, torch.from_numpy(controls.perimeter), torch.from_numpy(splits),
-            self._scenario.step, integrator=self._scenario.integrator, substeps=self._scenario.substeps)
+            self._parameters,
+            self._x,
+            demand,
+            torch.from_numpy(controls.perimeter),
+            torch.from_numpy(splits),
+            self._scenario.step,
+            integrator=self._scenario.integrator,
+            substeps=self._scenario.substeps,
+        )
         self._entered += float(demand.sum()) * self._scenario.step
         self._ended += float(ended)
         self._k += 1
         ledger.check(
-            self._k, self._k * self._scenario.step, entered=self._entered, ended=self._ended,
-            inside=float(self._x.sum()), least=float(self._x.min()))
+            self._k,
+            self._k * self._scenario.step,
+            entered=self._entered,
+            ended=self._ended,
+            inside=float(self._x.sum()),
+            least=float(self._x.min()),
+        )
         return self._state()
 
     def observe(self) -> Observation | None:
@@ -57,8 +69,12 @@ class NmfdPlant:
     def _state(self) -> State:
         x = self._x.numpy()
         return State(
-            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=self._backlog.numpy().copy(),
-            completed=self._ended)
+            step=self._k,
+            time=self._k * self._scenario.step,
+            accumulation=x,
+            backlog=self._backlog.numpy().copy(),
+            completed=self._ended,
+        )
 
 
 class AcyclicPlant:
@@ -98,7 +114,8 @@ class AcyclicPlant:
         """One control interval. LedgerError if vehicles appear or vanish."""
         scenario, model = self._scenario, self._model
         entering, self._backlog = _admitted(
-            self._backlog, torch.from_numpy(scenario.demand[self._k]), controls, scenario.step)
+            self._backlog, torch.from_numpy(scenario.demand[self._k]), controls, scenario.step
+        )
         demand = entering.numpy()
         splits = scenario.network.nominal_splits if controls.splits is None else controls.splits
         theta, forced = acyclic.shares(model, splits)
@@ -107,14 +124,26 @@ class AcyclicPlant:
             passing = acyclic.transfers(model, self._x, leaving, controls.perimeter, theta)
             self._forced += scenario.step * float(passing[model.fallback[forced]].sum())
         self._x, ended = acyclic.advance_counted(
-            model, self._x, demand, controls.perimeter, theta, scenario.step, integrator=scenario.integrator,
-            substeps=scenario.substeps)
+            model,
+            self._x,
+            demand,
+            controls.perimeter,
+            theta,
+            scenario.step,
+            integrator=scenario.integrator,
+            substeps=scenario.substeps,
+        )
         self._entered += float(demand.sum()) * scenario.step
         self._ended += ended
         self._k += 1
         ledger.check(
-            self._k, self._k * scenario.step, entered=self._entered, ended=self._ended, inside=float(self._x.sum()),
-            least=float(self._x.min()))
+            self._k,
+            self._k * scenario.step,
+            entered=self._entered,
+            ended=self._ended,
+            inside=float(self._x.sum()),
+            least=float(self._x.min()),
+        )
         return self._state()
 
     def observe(self) -> Observation | None:
@@ -126,12 +155,16 @@ class AcyclicPlant:
     def _state(self) -> State:
         x = acyclic.translate(self._model, self._x)
         return State(
-            step=self._k, time=self._k * self._scenario.step, accumulation=x, backlog=self._backlog.numpy().copy(),
-            completed=self._ended)
+            step=self._k,
+            time=self._k * self._scenario.step,
+            accumulation=x,
+            backlog=self._backlog.numpy().copy(),
+            completed=self._ended,
+        )
 
 
 def _admitted(
-    backlog: tensors.PerPair, demand: tensors.PerPair, controls: Controls, step: float,
+    backlog: tensors.PerPair, demand: tensors.PerPair, controls: Controls, step: float
 ) -> tuple[tensors.PerPair, tensors.PerPair]:
     """As dynamics.admitted, by what `controls` meter."""
     metering = None if controls.metering is None else torch.from_numpy(controls.metering)

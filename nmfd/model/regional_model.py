@@ -20,8 +20,8 @@ from nmfd.runs import config, shipped
 # Of boundaries with a capacity. What passes is a smooth minimum of wish and limit, (wish^-n + limit^-n)^(-1/n), 84 % of
 # either where they are equal: demand within a control interval is not even.
 SHARPNESS = 4
-LEAST_ROOM = 0.03    # of the capacity, into a region however full: it never locks for good
-LEAST_LIMIT = 1e-6   # veh/s, against a division by zero
+LEAST_ROOM = 0.03  # of the capacity, into a region however full: it never locks for good
+LEAST_LIMIT = 1e-6  # veh/s, against a division by zero
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,8 +116,12 @@ class RegionalModel:
     def hash(self) -> str:
         """A fingerprint of all that the dynamics depend on; a policy is valid for one network only."""
         content = [
-            self.adjacency.astype(int).tolist(), [[m.a, m.b, m.c, m.jam] for m in self.mfds], self.u_min, self.u_max,
-            self.nominal_splits.round(12).tolist()]
+            self.adjacency.astype(int).tolist(),
+            [[m.a, m.b, m.c, m.jam] for m in self.mfds],
+            self.u_min,
+            self.u_max,
+            self.nominal_splits.round(12).tolist(),
+        ]
         options = {"exit_rates": self.exit_rates, "capacity": self.capacity, "storage": self.storage}
         content += [[name, option.tolist()] for name, option in options.items() if option is not None]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
@@ -161,16 +165,26 @@ def load_network(folder: Path | str) -> RegionalModel:
         adjacency[i, list(row.onward)] = True
     capacity, controllable = (_by_pair(rows, name) for name in ("capacity", "controllable"))
     network = RegionalModel(
-        name=table.name, region_names=tuple(row.name or str(number) for number, row in enumerate(rows)),
-        positions=np.array([row.position for row in rows]), adjacency=adjacency,
-        mfds=tuple(table.mfd_of(row) for row in rows), u_min=table.perimeter.min, u_max=table.perimeter.max,
-        observed_split_ratios={(row.region, row.destination): dict(zip(row.next, row.share, strict=True))
-                    for row in table.observed_split_ratios},
+        name=table.name,
+        region_names=tuple(row.name or str(number) for number, row in enumerate(rows)),
+        positions=np.array([row.position for row in rows]),
+        adjacency=adjacency,
+        mfds=tuple(table.mfd_of(row) for row in rows),
+        u_min=table.perimeter.min,
+        u_max=table.perimeter.max,
+        observed_split_ratios={
+            (row.region, row.destination): dict(zip(row.next, row.share, strict=True))
+            for row in table.observed_split_ratios
+        },
         exit_rates=None if rows[0].exit_rates is None else np.array([row.exit_rates for row in rows]),
-        capacity=capacity, storage=None if rows[0].storage is None else np.array([row.storage for row in rows]),
-        controllable=controllable, placeholder=table.placeholder, folder=folder,
+        capacity=capacity,
+        storage=None if rows[0].storage is None else np.array([row.storage for row in rows]),
+        controllable=controllable,
+        placeholder=table.placeholder,
+        folder=folder,
         disturbance=None if table.disturbance is None else table.disturbance.law,
-        doubts=tuple(row.doubts for row in rows) if any(row.doubts for row in rows) else ())
+        doubts=tuple(row.doubts for row in rows) if any(row.doubts for row in rows) else (),
+    )
     _check_ways(network, path)
     return network
 
@@ -189,14 +203,15 @@ def _check_ways(network: RegionalModel, path: Path) -> None:
     """InputError for a region that cannot be reached, or drivers whose way leads back to where they are."""
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
-        raise config.error(
-            path, "regions", f"region {j} cannot be reached from region {i}; connect them with adjacent")
+        raise config.error(path, "regions", f"region {j} cannot be reached from region {i}; connect them with adjacent")
     for (i, j), shares in network.observed_split_ratios.items():
         for h in shares:
             if not network.split_mask[i, h, j]:
                 raise config.error(
-                    path, "observed_split_ratios",
-                    f"from region {i} to {j} by way of {h} leads back into {i}; remove it")
+                    path,
+                    "observed_split_ratios",
+                    f"from region {i} to {j} by way of {h} leads back into {i}; remove it",
+                )
 
 
 def check_step(network: RegionalModel, step: float, where: str) -> None:
@@ -210,4 +225,5 @@ def check_step(network: RegionalModel, step: float, where: str) -> None:
             raise InputError(
                 f"{where}: step: an integration step of {step:g} s is too long for region {region} of network "
                 f"{network.name}, whose vehicles leave at up to {fastest:.3g} 1/s; allowed is at most "
-                f"{1.0 / fastest:.3g} s: raise substeps or shorten step")
+                f"{1.0 / fastest:.3g} s: raise substeps or shorten step"
+            )

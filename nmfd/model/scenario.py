@@ -82,8 +82,15 @@ class Scenario:
     def hash(self) -> str:
         """A fingerprint of all that a run depends on, whatever its files are called."""
         settings = [
-            self.network.hash, self.step, self.steps, self.measurement_std, self.integrator, self.substeps,
-            self.protected, self.controller_options]
+            self.network.hash,
+            self.step,
+            self.steps,
+            self.measurement_std,
+            self.integrator,
+            self.substeps,
+            self.protected,
+            self.controller_options,
+        ]
         if self.forecast_error:
             settings.append([self.forecast_error, self.forecast_seed])
         if self.faults:
@@ -115,12 +122,13 @@ def with_time_limit(scenario: Scenario, seconds: float | None) -> Scenario:
 def with_demand(scenario: Scenario, *, steps: int | None = None, factor: float = 1.0) -> Scenario:
     """The first `steps` control intervals of `scenario`, at most all of them, with `factor` times its demand."""
     steps = scenario.steps if steps is None else min(steps, scenario.steps)
-    return replace(scenario, steps=steps, demand=factor * scenario.demand[:steps],
-                   demand_factor=factor * scenario.demand_factor)
+    return replace(
+        scenario, steps=steps, demand=factor * scenario.demand[:steps], demand_factor=factor * scenario.demand_factor
+    )
 
 
 def trapezoid(
-    time: Intervals, *, start: float, peak: float, ramp_up: float, flat: float, ramp_down: float,
+    time: Intervals, *, start: float, peak: float, ramp_up: float, flat: float, ramp_down: float
 ) -> Intervals:
     """Demand [veh/s] at `time` (T,) [s]: rises from 0 at `start`, stays at `peak` for `flat` and falls to 0."""
     end = start + ramp_up + flat + ramp_down
@@ -146,11 +154,24 @@ def read_scenario(folder: Path | str) -> Scenario:
         demand += _demand_file(folder / table.demand_file, table.steps, network.regions)
     check_step(network, table.step / table.substeps, str(path))
     scenario = Scenario(
-        name=table.name, network=network, step=table.step, steps=table.steps, demand=table.demand_factor * demand,
-        measurement_std=table.noise.measurement_std, integrator=table.integrator, substeps=table.substeps,
-        protected=table.protected, controller_options=table.controllers, demand_factor=table.demand_factor,
-        forecast_error=table.forecast.error, forecast_seed=table.forecast.seed, faults=table.faults,
-        own_time_limit=table.own_time_limit, initial=_initial(table, network.regions), folder=folder)
+        name=table.name,
+        network=network,
+        step=table.step,
+        steps=table.steps,
+        demand=table.demand_factor * demand,
+        measurement_std=table.noise.measurement_std,
+        integrator=table.integrator,
+        substeps=table.substeps,
+        protected=table.protected,
+        controller_options=table.controllers,
+        demand_factor=table.demand_factor,
+        forecast_error=table.forecast.error,
+        forecast_seed=table.forecast.seed,
+        faults=table.faults,
+        own_time_limit=table.own_time_limit,
+        initial=_initial(table, network.regions),
+        folder=folder,
+    )
     _ = scenario.ordered_faults  # checked here, where the file is known
     return scenario
 
@@ -159,8 +180,9 @@ def _check_regions(table: ScenarioTable, network: RegionalModel, path: Path) -> 
     """InputError for regions that the network has not, or more intervals than there is memory for."""
     most, known = network.regions - 1, f"network {network.name} has the regions 0 to {network.regions - 1}"
     if max(table.protected, default=0) > most:
-        raise config.error(path, "protected", config.got(
-            f"a list of distinct whole numbers from 0 to {most}", list(table.protected)))
+        raise config.error(
+            path, "protected", config.got(f"a list of distinct whole numbers from 0 to {most}", list(table.protected))
+        )
     ends = [(f"demand[{n}]", (("from", row.origin), ("to", row.to))) for n, row in enumerate(table.demand or ())]
     ends += [(f"initial[{n}]", (("region", row.region), ("to", row.to))) for n, row in enumerate(table.initial)]
     for where, pair in ends:
@@ -168,8 +190,9 @@ def _check_regions(table: ScenarioTable, network: RegionalModel, path: Path) -> 
             if region > most:
                 raise config.error(path, f"{where}.{key}", f"region {region} is unknown; {known}")
     if table.steps > MOST_NUMBERS // network.regions**2:
-        raise config.error(path, "steps", config.got(
-            f"a whole number from 1 to {MOST_NUMBERS // network.regions**2}", table.steps))
+        raise config.error(
+            path, "steps", config.got(f"a whole number from 1 to {MOST_NUMBERS // network.regions**2}", table.steps)
+        )
 
 
 def _trapezoids(table: ScenarioTable, regions: int) -> PairsOverTime:
@@ -220,7 +243,8 @@ def _demand_file(path: Path, steps: int, regions: int) -> PairsOverTime:
         if not good:
             raise InputError(
                 f"{path}: line {number}: expected an interval from 0 up, two regions from 0 to {regions - 1} and "
-                f"veh/s from 0 to 1e6, got {','.join(row)} instead")
+                f"veh/s from 0 to 1e6, got {','.join(row)} instead"
+            )
         if k < steps:
             demand[k, i, j] += rate
     return demand

@@ -9,16 +9,20 @@ from nmfd.runs import config, files, shipped
 from nmfd.runs.config import Flow, Name, Problem, Region, Regions, Rows, Seconds, Settings, Text, Texts, setting, whole
 
 MOST_NUMBERS = 2 * 10**8  # of a demand table: more would not fit into memory
-LONGEST_STEP = 86_400.0   # s
-OWN_TIME_LIMIT = 600.0    # s
+LONGEST_STEP = 86_400.0  # s
+OWN_TIME_LIMIT = 600.0  # s
 
 
 class NoiseTable(Settings):
     """What a controller sees of the plant's state."""
 
     measurement_std: float = setting(
-        "standard deviation of the Gaussian noise on every accumulation that a controller sees", 0.0, unit="veh",
-        ge=0.0, le=1e6)
+        "standard deviation of the Gaussian noise on every accumulation that a controller sees",
+        0.0,
+        unit="veh",
+        ge=0.0,
+        le=1e6,
+    )
 
 
 class ForecastTable(Settings):
@@ -55,7 +59,9 @@ class PlanningOptions(Settings):
     model: Text | None = setting(
         "folder of the regional model that it plans with, or the name of a network that comes with the package; "
         "without it, that of the scenario's network or, of controllers that guide routes, the one in the folder guided "
-        "of that network", None)
+        "of that network",
+        None,
+    )
 
 
 class ScenarioTable(Settings):
@@ -64,7 +70,9 @@ class ScenarioTable(Settings):
     name: Name = setting("of the scenario")
     base: Text | None = setting(
         "folder of another scenario that says what this one does not, or the name of one that comes with the package; "
-        "tables are completed key by key", None)
+        "tables are completed key by key",
+        None,
+    )
     network: Text = setting("folder of the network, or the name of one that comes with the package")
     step: float = setting("control interval", unit="s", gt=0.0, le=LONGEST_STEP)
     steps: int = whole("control intervals", low=1, high=MOST_NUMBERS)
@@ -76,7 +84,11 @@ class ScenarioTable(Settings):
     faults: Texts = setting("injected into every run: KIND[:VALUE][@FROM-TO], as of --fault", ())
     own_time_limit: float = setting(
         "of every call of a controller of your own: its import, making, reset and every act; 0: none; --time-limit "
-        "goes before it", OWN_TIME_LIMIT, unit="s", ge=0.0)
+        "goes before it",
+        OWN_TIME_LIMIT,
+        unit="s",
+        ge=0.0,
+    )
     noise: NoiseTable = setting("of the measurements", NoiseTable())
     forecast: ForecastTable = setting("of the demand", ForecastTable())
     demand: Rows[DemandTable] | None = setting("one table per flow; may be left out beside demand_file", None)
@@ -114,6 +126,7 @@ def read_tables(folder: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
 def _name_from(own: dict, folder: Path, here: Path) -> None:
     """Files that a scenario.toml names are relative to it, or come with the package: rewrite them as seen from the
     folder `here`."""
+
     def seen(name: str, *kinds: str) -> str:
         return files.relative(shipped.found(name, *kinds, beside=folder), here)
 
@@ -133,6 +146,9 @@ def _name_from(own: dict, folder: Path, here: Path) -> None:
 
 def _completed(content: dict, base: dict) -> dict:
     """`content` with what only `base` has, in the tables of both too."""
-    both = {key: _completed(content[key], base[key]) for key in content
-            if isinstance(content[key], dict) and isinstance(base.get(key), dict)}
+    both = {
+        key: _completed(content[key], base[key])
+        for key in content
+        if isinstance(content[key], dict) and isinstance(base.get(key), dict)
+    }
     return {**base, **content, **both}

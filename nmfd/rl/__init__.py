@@ -25,8 +25,12 @@ if TYPE_CHECKING:
 __all__ = ["Interface", "NmfdVectorEnv", "RegionalEnv", "RegionsEnv", "Sb3VecEnv"]
 _SCENARIOS = {"Hexagon7": "economic_mpc"}  # of the ids: a scenario of the package; Scenario takes scenario=FOLDER
 _PLACES = {  # name -> its module, and the libraries that it needs
-    "Interface": ("interface",), "NmfdVectorEnv": ("vector", "gymnasium"), "RegionalEnv": ("env", "gymnasium"),
-    "RegionsEnv": ("agents", "gymnasium", "pettingzoo"), "Sb3VecEnv": ("sb3", "gymnasium", "stable_baselines3")}
+    "Interface": ("interface",),
+    "NmfdVectorEnv": ("vector", "gymnasium"),
+    "RegionalEnv": ("env", "gymnasium"),
+    "RegionsEnv": ("agents", "gymnasium", "pettingzoo"),
+    "Sb3VecEnv": ("sb3", "gymnasium", "stable_baselines3"),
+}
 
 
 def __getattr__(name: str) -> Any:
@@ -45,9 +49,7 @@ def register(namespace: str, entry_point: str, scenarios: dict[str, str]) -> Non
 
         gymnasium.register(id=f"{namespace}/Scenario-v0", entry_point=entry_point)
         for name, folder in scenarios.items():
-            gymnasium.register(
-                id=f"{namespace}/{name}-v0", entry_point=entry_point,
-                kwargs={"scenario": folder})
+            gymnasium.register(id=f"{namespace}/{name}-v0", entry_point=entry_point, kwargs={"scenario": folder})
 
 
 register("nmfd", "nmfd.rl.env:RegionalEnv", _SCENARIOS)

@@ -22,8 +22,13 @@ class RegionsEnv(ParallelEnv):
     metadata = {"name": "nmfd_regions_v0", "render_modes": ["rgb_array"], "render_fps": 10, "is_parallelizable": True}
 
     def __init__(
-        self, scenario: Scenario | Path | str, plant: Plant | None = None, *, guidance: bool = False,
-        cooperative: bool = True, render_mode: str | None = None,
+        self,
+        scenario: Scenario | Path | str,
+        plant: Plant | None = None,
+        *,
+        guidance: bool = False,
+        cooperative: bool = True,
+        render_mode: str | None = None,
     ):
         self._episode, self.render_mode = Episode(scenario, plant), render_mode
         loaded = self._episode.scenario
@@ -34,14 +39,17 @@ class RegionsEnv(ParallelEnv):
         self.unit = self._episode.unit
         self.interfaces = {
             agent: Interface(network, guidance=guidance, regions=[region])
-            for region, agent in enumerate(self.possible_agents)}
+            for region, agent in enumerate(self.possible_agents)
+        }
         self._whole, self._random = Interface(network, guidance=guidance), np.random.default_rng()
         self.observation_spaces = {
             agent: gymnasium.spaces.Box(*interface.bounds(loaded), dtype=np.float32)
-            for agent, interface in self.interfaces.items()}
+            for agent, interface in self.interfaces.items()
+        }
         self.action_spaces = {
             agent: gymnasium.spaces.Box(-1.0, 1.0, (interface.action_size,), np.float32)
-            for agent, interface in self.interfaces.items()}
+            for agent, interface in self.interfaces.items()
+        }
 
     def observation_space(self, agent: str) -> gymnasium.Space:
         return self.observation_spaces[agent]
@@ -59,15 +67,23 @@ class RegionsEnv(ParallelEnv):
 
     def step(self, actions: dict) -> tuple[dict, dict, dict, dict, dict]:
         """An agent without an action leaves its region open."""
-        controls = combined({
-            self.possible_agents.index(agent): self.interfaces[agent].controls(action)
-            for agent, action in actions.items()}, self._episode.scenario.network)
+        controls = combined(
+            {
+                self.possible_agents.index(agent): self.interfaces[agent].controls(action)
+                for agent, action in actions.items()
+            },
+            self._episode.scenario.network,
+        )
         self._seen, vehicles, over = self._episode.step(controls)
         amounts = np.full(len(vehicles), vehicles.sum()) if self._cooperative else vehicles
         everyone, rewards = self.agents, dict(zip(self.agents, (-amounts / self.unit).tolist(), strict=True))
         result = (
-            self._observations(), rewards, dict.fromkeys(everyone, False), dict.fromkeys(everyone, over),
-            self._infos())
+            self._observations(),
+            rewards,
+            dict.fromkeys(everyone, False),
+            dict.fromkeys(everyone, over),
+            self._infos(),
+        )
         if over:
             self.agents = []
         return result
@@ -84,8 +100,11 @@ class RegionsEnv(ParallelEnv):
         self._episode.close()
 
     def _observations(self) -> dict:
-        return {agent: np.clip(self.interfaces[agent].observed(self._seen), space.low, space.high)
-                for agent, space in self.observation_spaces.items() if agent in self.agents}
+        return {
+            agent: np.clip(self.interfaces[agent].observed(self._seen), space.low, space.high)
+            for agent, space in self.observation_spaces.items()
+            if agent in self.agents
+        }
 
     def _infos(self) -> dict:
         return {agent: {"time_s": self._seen.time} for agent in self.agents}

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from nmfd.arrays import Adjacency, PerPair, PerRegion, Positions
 
 SIZE, DPI = (6.4, 4.8), 100
-OVER = 2.0         # critical accumulations: the dark end of the scale
+OVER = 2.0  # critical accumulations: the dark end of the scale
 JAM = 1000.0 / 7.5  # veh/km and lane
 COLOURS = LinearSegmentedColormap.from_list("load", ("#c3cbd2", "#f2c14e", "#e2711d", "#a3123a", "#2d0a2e"))
-ASIDE = 0.06       # of the way between two regions: how far the arrows of the two directions are apart
+ASIDE = 0.06  # of the way between two regions: how far the arrows of the two directions are apart
 
 
 class CityDrawing:
@@ -23,7 +23,10 @@ class CityDrawing:
     beneath them streets, where there are any, coloured by density."""
 
     def __init__(
-        self, places: Positions, adjacency: Adjacency, critical: PerRegion,
+        self,
+        places: Positions,
+        adjacency: Adjacency,
+        critical: PerRegion,
         streets: Sequence[Float[np.ndarray, "_ 2"]] = (),
     ):
         """places: (R, 2), of the regions; streets: E lines, in the same coordinates"""
@@ -40,8 +43,8 @@ class CityDrawing:
         for lines in (self._streets, self._bounds):
             self._ax.add_collection(lines)
         self._discs = self._ax.scatter(
-            *places.T, s=420, c=np.zeros(len(places)), cmap=COLOURS, vmin=0.0, vmax=OVER, edgecolors="#22303c",
-            zorder=3)
+            *places.T, s=420, c=np.zeros(len(places)), cmap=COLOURS, vmin=0.0, vmax=OVER, edgecolors="#22303c", zorder=3
+        )
         for region, place in enumerate(places):
             self._ax.annotate(str(region), place, ha="center", va="center", fontweight="bold", zorder=4)
         figure.colorbar(self._discs, ax=self._ax, shrink=0.7, label="accumulation / critical [-]")
@@ -51,7 +54,7 @@ class CityDrawing:
         self._ax.set_axis_off()
 
     def draw(
-        self, title: str, accumulation: PerRegion, perimeter: PerPair, density: Float[np.ndarray, " E"] | None = None,
+        self, title: str, accumulation: PerRegion, perimeter: PerPair, density: Float[np.ndarray, " E"] | None = None
     ) -> UInt8[np.ndarray, "H W 3"]:
         """accumulation: (R,) [veh]; perimeter: u (R, R) [-]; density: (E,) [veh/km and lane]"""
         self._discs.set_array(accumulation / self._critical)

@@ -29,8 +29,13 @@ class RegionalEnv(gymnasium.Env):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
     def __init__(
-        self, scenario: Scenario | Path | str, plant: Plant | None = None, *, guidance: bool = False,
-        metering: bool = False, render_mode: str | None = None,
+        self,
+        scenario: Scenario | Path | str,
+        plant: Plant | None = None,
+        *,
+        guidance: bool = False,
+        metering: bool = False,
+        render_mode: str | None = None,
     ):
         self._episode, self.render_mode = Episode(scenario, plant), render_mode
         loaded = self._episode.scenario
@@ -46,9 +51,7 @@ class RegionalEnv(gymnasium.Env):
         self._spent = 0.0
         return self._observed(seen), self._info(seen)
 
-    def step(
-        self, action: Float[np.ndarray, " A"],
-    ) -> tuple[Float[np.ndarray, " O"], float, bool, bool, dict]:
+    def step(self, action: Float[np.ndarray, " A"]) -> tuple[Float[np.ndarray, " O"], float, bool, bool, dict]:
         """One control interval under `action`."""
         seen, vehicles, over = self._episode.step(self.interface.controls(action))
         self._spent += self._episode.scenario.step * float(vehicles.sum())

@@ -35,7 +35,11 @@ class Interface:
     """
 
     def __init__(
-        self, network: RegionalModel, *, guidance: bool = False, metering: bool = False,
+        self,
+        network: RegionalModel,
+        *,
+        guidance: bool = False,
+        metering: bool = False,
         regions: Sequence[int] | None = None,
     ):
         self._network = network
@@ -60,7 +64,8 @@ class Interface:
         batch, chosen = accumulation.shape[:-2], self._chosen
         parts = [
             (accumulation / self._critical[:, None])[..., chosen, :].reshape(*batch, -1),
-            (backlog.sum(axis=-1) / self._critical)[..., chosen]]
+            (backlog.sum(axis=-1) / self._critical)[..., chosen],
+        ]
         if not self._all:
             parts.append(accumulation.sum(axis=-1) / self._critical)
         return np.concatenate(parts, axis=-1, dtype=np.float32)
@@ -73,24 +78,24 @@ class Interface:
         """The lowest and the highest observation (observation_size,): of nobody, and of twice all vehicles of the
         scenario besides full regions at every place, give and take the noise."""
         trips = 2.0 * (scenario.step * scenario.demand.sum() + scenario.start.sum()) + sum(
-            mfd.jam for mfd in scenario.network.mfds)
+            mfd.jam for mfd in scenario.network.mfds
+        )
         off, nobody = NOISE * scenario.measurement_std, np.zeros_like(self._open)
         return self.observation(nobody - off, nobody), self.observation(nobody + trips + off, nobody + trips)
 
     def perimeter(self, action: Actions) -> Pairs:
         """(..., R, R) [-] of actions (..., action_size); u_max at the boundaries of other regions."""
         network = self._network
-        share = 0.5 * (np.clip(np.asarray(action, dtype=float)[..., :self._count], -1.0, 1.0) + 1.0)
+        share = 0.5 * (np.clip(np.asarray(action, dtype=float)[..., : self._count], -1.0, 1.0) + 1.0)
         perimeter = np.broadcast_to(self._open, (*share.shape[:-1], *self._open.shape)).copy()
-        perimeter[..., *self._boundaries] = (
-            network.u_min + (network.u_max - network.u_min) * share[..., self._gate])
+        perimeter[..., *self._boundaries] = network.u_min + (network.u_max - network.u_min) * share[..., self._gate]
         return perimeter
 
     def splits(self, action: Actions) -> Float[np.ndarray, "*B R R R"] | None:
         """(..., R, R, R) [-] of actions (..., action_size), 0 in other regions; None without guidance."""
         if self._ways is None:
             return None
-        action = np.clip(np.asarray(action, dtype=float)[..., self._count:], -1.0, 1.0)
+        action = np.clip(np.asarray(action, dtype=float)[..., self._count :], -1.0, 1.0)
         weight = np.zeros((*action.shape[:-1], *self._rest.shape))
         weight[..., *self._ways] = np.exp(LOGITS * action)
         sums = weight.sum(axis=-2, keepdims=True)
@@ -149,8 +154,11 @@ class Episode:
         state = self._state
         return self._drawing.draw(
             f"{self.scenario.name}, {state.time / 60:.0f} min: {state.accumulation.sum():,.0f} vehicles inside, "
-            f"{state.completed:,.0f} trips completed", state.accumulation.sum(axis=1), self._perimeter,
-            self._density() if self._density else None)
+            f"{state.completed:,.0f} trips completed",
+            state.accumulation.sum(axis=1),
+            self._perimeter,
+            self._density() if self._density else None,
+        )
 
     @property
     def completed(self) -> float:

@@ -37,7 +37,8 @@ class Sb3VecEnv(VecEnv):
             spent = info["final_info"]["total_time_spent_veh_s"]
             infos = [
                 {"terminal_observation": final, "TimeLimit.truncated": True, "total_time_spent_veh_s": float(total)}
-                for final, total in zip(info["final_obs"], spent, strict=True)]
+                for final, total in zip(info["final_obs"], spent, strict=True)
+            ]
         return observations, rewards.astype(np.float32), over, infos
 
     def close(self) -> None:

@@ -29,8 +29,14 @@ class NmfdVectorEnv(VectorEnv):
     """
 
     def __init__(
-        self, scenario: Scenario, num_envs: int, *, guidance: bool = False, metering: bool = False,
-        demand_spread: float = 0.0, initial_share: float = 0.0,
+        self,
+        scenario: Scenario,
+        num_envs: int,
+        *,
+        guidance: bool = False,
+        metering: bool = False,
+        demand_spread: float = 0.0,
+        initial_share: float = 0.0,
     ):
         self.num_envs, self.scenario = num_envs, scenario
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -61,18 +67,21 @@ class NmfdVectorEnv(VectorEnv):
         self._k, self._spent = 0, np.zeros(self.num_envs)
         return self._observations(), self._info()
 
-    def step(
-        self, actions: Float[np.ndarray, "N A"],
-    ) -> tuple[Observations, Float[np.ndarray, " N"], Ends, Ends, dict]:
+    def step(self, actions: Float[np.ndarray, "N A"]) -> tuple[Observations, Float[np.ndarray, " N"], Ends, Ends, dict]:
         """One control interval of all episodes; none is ever terminated, all are truncated at once."""
         scenario = self.scenario
         splits = self.interface.splits(actions)
         vehicles = self._x.sum((1, 2)).numpy()
         self._x = dynamics.advance(
-            self._rollout.parameters, self._x, self._demand[self._k],
+            self._rollout.parameters,
+            self._x,
+            self._demand[self._k],
             torch.from_numpy(self.interface.perimeter(actions)),
-            self._rollout.nominal_splits if splits is None else torch.from_numpy(splits), scenario.step,
-            integrator=scenario.integrator, substeps=scenario.substeps)
+            self._rollout.nominal_splits if splits is None else torch.from_numpy(splits),
+            scenario.step,
+            integrator=scenario.integrator,
+            substeps=scenario.substeps,
+        )
         self._k += 1
         self._spent = self._spent + scenario.step * vehicles
         observations, info = self._observations(), self._info()

@@ -16,11 +16,11 @@ from nmfd.errors import InputError, did_you_mean
 from nmfd.runs import schema
 from nmfd.runs.files import check_file
 
-MOST = 10**9        # of a whole number without a limit of its own
-LONGEST = 1000      # characters of a text
+MOST = 10**9  # of a whole number without a limit of its own
+LONGEST = 1000  # characters of a text
 LONGEST_NAME = 100  # characters: names become file names
 DEEP = re.compile(rb"(?:\s*\.\s*[\"']?[\w-]+[\"']?){100}")  # a dotted key of so many parts
-SHOWN = 60          # characters of a wrong value that a message repeats
+SHOWN = 60  # characters of a wrong value that a message repeats
 S = TypeVar("S", bound="Settings")
 
 
@@ -32,7 +32,7 @@ def setting(text: str, default: Any = ..., *, unit: str = "", **limits: Any) -> 
 
 
 def whole(
-    text: str, default: Any = ..., *, low: int = 0, high: int = MOST, unit: str = "", alias: str | None = None,
+    text: str, default: Any = ..., *, low: int = 0, high: int = MOST, unit: str = "", alias: str | None = None
 ) -> Any:
     """The same of a whole number from `low` to `high`."""
     return setting(text, default, unit=unit, ge=low, le=high, alias=alias)
@@ -147,7 +147,7 @@ def shown(value: Any) -> str:
 
 
 def _told(declaration: type[Settings], values: Any, error: ValidationError) -> str:
-    """"key: problem" of the first mistake; a misspelt key comes before the one that is missing for it."""
+    """ "key: problem" of the first mistake; a misspelt key comes before the one that is missing for it."""
     first = min(error.errors(include_url=False), key=lambda found: found["type"] != "extra_forbidden")
     root = schema.of(declaration)
     path, here, table, kind = "", root, root, first["type"]

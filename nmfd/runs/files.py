@@ -83,7 +83,8 @@ def locked(file: Path, what: Path, wait: float = 0.0) -> Iterator[None]:
         lock.acquire()
     except Timeout:
         raise InputError(
-            f"{what}: {_holder(file)} is writing to it; wait for its end, or choose another name with --out") from None
+            f"{what}: {_holder(file)} is writing to it; wait for its end, or choose another name with --out"
+        ) from None
     except OSError as error:
         if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):  # a file system without locks
             raise
@@ -120,9 +121,7 @@ def write_table(path: Path, frame: "pd.DataFrame", **options: str) -> None:
     write_text(path, frame.to_csv(index=False, **options))
 
 
-def read_table(
-    path: Path, types: Mapping[str, type], remedy: str, columns: Collection[str] = (),
-) -> "pd.DataFrame":
+def read_table(path: Path, types: Mapping[str, type], remedy: str, columns: Collection[str] = ()) -> "pd.DataFrame":
     """A table of runs as `write_table` wrote it, without its trail. types: of some columns; columns: those to be added,
     with NaN, where an older version did not write them. Raises InputError."""
     import pandas as pd  # heavy

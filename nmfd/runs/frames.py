@@ -1,8 +1,8 @@
 """Run folders as Parquet files, for pandas, DuckDB, R and the like.
 
-    summary.parquet     one row per run: summary.csv, in SUMO with sumo.csv
-    states.parquet      one row per run, time and pair of regions (Trajectory.to_frame)
-    controls.parquet    one row per run, control interval and pair of regions (Trajectory.controls_frame)
+summary.parquet     one row per run: summary.csv, in SUMO with sumo.csv
+states.parquet      one row per run, time and pair of regions (Trajectory.to_frame)
+controls.parquet    one row per run, control interval and pair of regions (Trajectory.controls_frame)
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,8 +18,10 @@ from nmfd.types import Trajectory
 def write(folder: Path, trajectories: Sequence[Trajectory], tables: Mapping[str, pd.DataFrame]) -> list[Path]:
     """Write `tables` by name, and those of the trajectories, to `folder`, atomically; the files."""
     frames = {
-        **tables, "states": pd.concat([t.to_frame() for t in trajectories], ignore_index=True),
-        "controls": pd.concat([t.controls_frame() for t in trajectories], ignore_index=True)}
+        **tables,
+        "states": pd.concat([t.to_frame() for t in trajectories], ignore_index=True),
+        "controls": pd.concat([t.controls_frame() for t in trajectories], ignore_index=True),
+    }
     return [write_parquet(folder / f"{name}.parquet", frame) for name, frame in frames.items()]
 
 

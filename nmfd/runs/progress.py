@@ -13,7 +13,7 @@ from tqdm.std import tqdm
 
 LINE = "{desc}  [{bar:24}]  {n_fmt}/{total_fmt}  {remaining} left{postfix}"
 PLAIN = "{desc}: {n_fmt}/{total_fmt} after {elapsed}, {remaining} left{postfix}"
-BEAT = 1.0    # s, between two looks of the moving line at the clock
+BEAT = 1.0  # s, between two looks of the moving line at the clock
 EVERY = 30.0  # s, between two plain lines
 SOON = 1.0  # s: what is done sooner shows nothing in a notebook
 
@@ -39,9 +39,18 @@ def progress_line(label: str, stream: TextIO | None = None) -> Iterator[Show]:
     with ExitStack() as stack:
         shown = stream if moving else stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
         # a new note is shown even if nothing more is done: miniters 0; jams change the rate, not for long: smoothing 0
-        line = stack.enter_context(tqdm(
-            desc=label, file=shown, leave=False, dynamic_ncols=True, ascii=".#", miniters=0, smoothing=0.0,
-            bar_format=LINE if moving else PLAIN))
+        line = stack.enter_context(
+            tqdm(
+                desc=label,
+                file=shown,
+                leave=False,
+                dynamic_ncols=True,
+                ascii=".#",
+                miniters=0,
+                smoothing=0.0,
+                bar_format=LINE if moving else PLAIN,
+            )
+        )
 
         def beat() -> None:
             while not over.wait(BEAT if moving else EVERY):

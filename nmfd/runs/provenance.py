@@ -17,8 +17,11 @@ def provenance() -> dict:
     """Date, versions, and the commit of the checkout that this package lies in; commit is None outside one."""
     commit, dirty = _checkout()
     return {
-        "date": datetime.now().astimezone().isoformat(timespec="seconds"), "versions": dict(_versions()),
-        "commit": commit, "dirty": dirty}
+        "date": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "versions": dict(_versions()),
+        "commit": commit,
+        "dirty": dirty,
+    }
 
 
 @cache

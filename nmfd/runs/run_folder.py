@@ -1,10 +1,10 @@
 """Run folders: trajectories, summary.csv and manifest.json, written so that an interruption costs one run at most.
 
-    <folder>/manifest.json              configuration, controllers, and seeds, versions and commit of every session
-    <folder>/summary.csv                one row per finished run (metrics.summary)
-    <folder>/<controller>-<seed>.nc     all else of it (nmfd.types.Trajectory, in SUMO cosim.plant.record.Record too)
-                                        but wall times, so that the same run gives the same bytes; a netCDF file:
-                                        xarray.open_dataset, with dimensions, units and long names
+<folder>/manifest.json              configuration, controllers, and seeds, versions and commit of every session
+<folder>/summary.csv                one row per finished run (metrics.summary)
+<folder>/<controller>-<seed>.nc     all else of it (nmfd.types.Trajectory, in SUMO cosim.plant.record.Record too)
+                                    but wall times, so that the same run gives the same bytes; a netCDF file:
+                                    xarray.open_dataset, with dimensions, units and long names
 """
 
 import json
@@ -59,7 +59,7 @@ def write_trajectory(path: Path, trajectory: Trajectory, record: Mapping[str, tu
 
 
 def _write_variable(
-    file: netCDF4.Dataset, name: str, axes: str | Sequence[str], values: np.ndarray, attributes: Mapping,
+    file: netCDF4.Dataset, name: str, axes: str | Sequence[str], values: np.ndarray, attributes: Mapping
 ) -> None:
     dimensions, text = np.atleast_1d(axes), values.dtype.kind == "U"
     if values.dtype == np.float16:  # netCDF has none; compressed it takes no more room
@@ -80,13 +80,22 @@ def read_trajectory(path: Path) -> Trajectory:
 
 def trajectory_in(file: netCDF4.Dataset) -> Trajectory:
     """That of a run's file (`opened`)."""
-    arrays = {name: file[name][...] for name in quantities(Trajectory)
-              if name != "decision_time" and (name in file.variables or name not in YOUNGER)}
+    arrays = {
+        name: file[name][...]
+        for name in quantities(Trajectory)
+        if name != "decision_time" and (name in file.variables or name not in YOUNGER)
+    }
     arrays["note"] = tuple(arrays["note"])
     return Trajectory(
-        controller=file.controller, plant=file.plant, seed=int(file.seed), step=float(file.step),
-        estimated=bool(file.estimated), decision_time=np.full(len(arrays["note"]), math.nan), wall_time=math.nan,
-        **arrays)
+        controller=file.controller,
+        plant=file.plant,
+        seed=int(file.seed),
+        step=float(file.step),
+        estimated=bool(file.estimated),
+        decision_time=np.full(len(arrays["note"]), math.nan),
+        wall_time=math.nan,
+        **arrays,
+    )
 
 
 @contextmanager
@@ -211,8 +220,12 @@ class RunFolder:
 
 @contextmanager
 def open_folder(
-    path: Path, *, configuration: Mapping, order: Sequence[tuple[str, int]],
-    controllers: Mapping[str, Mapping] | None = None, session: Mapping | None = None,
+    path: Path,
+    *,
+    configuration: Mapping,
+    order: Sequence[tuple[str, int]],
+    controllers: Mapping[str, Mapping] | None = None,
+    session: Mapping | None = None,
     renew: Callable[[str], None] | None = None,
 ) -> Iterator[RunFolder]:
     """A RunFolder at `path` for the runs `order`, as (controller, seed); made if it is not there.
@@ -233,14 +246,22 @@ def open_folder(
         rows = read_summary(summary_path) if summary_path.is_file() else []
         for name, what in changed.items():
             if kept := sum(row["controller"] == name for row in rows):
-                tell(f"{path}: {name} has changed ({what}): its {kept} kept runs do not count any more, and those "
-                      "asked for are run again")
+                tell(
+                    f"{path}: {name} has changed ({what}): its {kept} kept runs do not count any more, and those "
+                    "asked for are run again"
+                )
         if rows:
             write_summary(summary_path, [row for row in rows if row["controller"] not in changed])
 
     refuse_old(Path(path))
-    with manifest(path, configuration=configuration, controllers=controllers, session=session, results=summary_path,
-                  renew=None if renew is None else partial(drop, tell=renew)):
+    with manifest(
+        path,
+        configuration=configuration,
+        controllers=controllers,
+        session=session,
+        results=summary_path,
+        renew=None if renew is None else partial(drop, tell=renew),
+    ):
         folder = RunFolder(Path(path), order, read_summary(summary_path) if summary_path.is_file() else [])
         try:
             yield folder
@@ -254,8 +275,13 @@ def open_folder(
 
 @contextmanager
 def manifest(
-    path: Path, *, configuration: Mapping, results: Path, controllers: Mapping[str, Mapping] | None = None,
-    session: Mapping | None = None, renew: Callable[[Mapping[str, str]], None] | None = None,
+    path: Path,
+    *,
+    configuration: Mapping,
+    results: Path,
+    controllers: Mapping[str, Mapping] | None = None,
+    session: Mapping | None = None,
+    renew: Callable[[Mapping[str, str]], None] | None = None,
 ) -> Iterator[None]:
     """manifest.json in the folder `path`, which is made if it is not there; arguments as in `open_folder`.
 
@@ -270,8 +296,11 @@ def manifest(
     file, sessions = path / "manifest.json", []
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; choose another folder with --out")
-    if path.is_dir() and not file.is_file() and any(
-            found.name != LOCK and not files.TEMPORARY.fullmatch(found.name) for found in path.iterdir()):
+    if (
+        path.is_dir()
+        and not file.is_file()
+        and any(found.name != LOCK and not files.TEMPORARY.fullmatch(found.name) for found in path.iterdir())
+    ):
         raise InputError(f"{path}: is not empty and holds no manifest.json; choose another folder with --out")
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
@@ -282,7 +311,8 @@ def manifest(
             files.sweep(path)
             if file.is_file():
                 sessions, controllers, changed = _continued(
-                    file, configuration, controllers, renewable=renew is not None)
+                    file, configuration, controllers, renewable=renew is not None
+                )
                 if changed and renew is not None:
                     renew(changed)
             first = not sessions
@@ -313,7 +343,9 @@ def _continued(manifest_path: Path, configuration: Mapping, controllers: Mapping
         there = {**{name: known.get(name, controllers[name]) for name in controllers}, **manifest["configuration"]}
         changed = {
             name: ", ".join(key for key in {**known[name], **wanted} if known[name].get(key) != wanted.get(key))
-            for name, wanted in controllers.items() if name in known and known[name] != wanted}
+            for name, wanted in controllers.items()
+            if name in known and known[name] != wanted
+        }
     except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(f"{manifest_path}: is no manifest of a run; choose another folder with --out") from None
     asked = {**controllers, **configuration}
@@ -321,7 +353,8 @@ def _continued(manifest_path: Path, configuration: Mapping, controllers: Mapping
         if asked.get(key) != there.get(key) and not (renewable and key in changed):
             raise InputError(
                 f"{manifest_path.parent}: holds runs of another configuration ({key}: {json.dumps(there.get(key))} "
-                f"there, {json.dumps(asked.get(key))} asked for); choose another folder with --out")
+                f"there, {json.dumps(asked.get(key))} asked for); choose another folder with --out"
+            )
     return sessions, {**known, **controllers}, changed
 
 

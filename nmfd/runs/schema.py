@@ -43,12 +43,18 @@ def allowed(schema: Schema) -> str:
         return "true or false"
     if kind == "string":
         most = schema.get("maxLength")
-        return f"one of {', '.join(schema['enum'])}" if "enum" in schema else "text in quotes" + (
-            f" of 1 to {most} printable characters" if most else "")
+        return (
+            f"one of {', '.join(schema['enum'])}"
+            if "enum" in schema
+            else "text in quotes" + (f" of 1 to {most} printable characters" if most else "")
+        )
     if kind == "array":
         return _list(schema)
-    return f"a whole number{_range(schema)}" if kind == "integer" else (
-        f"a number{_range(schema)}" if kind == "number" else "a table")
+    return (
+        f"a whole number{_range(schema)}"
+        if kind == "integer"
+        else (f"a number{_range(schema)}" if kind == "number" else "a table")
+    )
 
 
 def _range(schema: Schema) -> str:

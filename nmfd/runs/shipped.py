@@ -46,11 +46,15 @@ def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
             return folder
     if beside is not None or not kinds or len(word.parts) != 1 or word.suffix or os.path.exists(path):
         return path
-    near = [folder.name for kind in kinds for folder in (*folders(kind), *(
-        file.parent for file in Path().glob(f"*/{kind}.toml")))]
+    near = [
+        folder.name
+        for kind in kinds
+        for folder in (*folders(kind), *(file.parent for file in Path().glob(f"*/{kind}.toml")))
+    ]
     raise InputError(
         f"{name}: no such folder here, and no {' or '.join(kinds)} of that name comes with the package"
-        f"{did_you_mean(str(name), near)}; `nmfd list` shows those that do")
+        f"{did_you_mean(str(name), near)}; `nmfd list` shows those that do"
+    )
 
 
 def installed(path: Path) -> bool:
@@ -91,5 +95,6 @@ def made(folder: Path) -> Path:
     except OSError as error:
         raise InputError(
             f"{folder}: what is built of a city cannot be kept there ({error.strerror}); name a folder that can be "
-            f"written to in the environment variable {CACHE}") from None
+            f"written to in the environment variable {CACHE}"
+        ) from None
     return folder

@@ -33,6 +33,14 @@ def markdown_table(headings: Sequence[str], lines: Iterable[Iterable[object]]) -
 
 def wrapped(caption: str) -> list[str]:
     """Lines of at most WIDTH characters; those of an indented line are indented, too."""
-    return [part for line in caption.splitlines() for part in textwrap.wrap(
-        line, WIDTH, subsequent_indent=" " * (len(line) - len(line.lstrip())), break_long_words=False,
-        break_on_hyphens=False)]
+    return [
+        part
+        for line in caption.splitlines()
+        for part in textwrap.wrap(
+            line,
+            WIDTH,
+            subsequent_indent=" " * (len(line) - len(line.lstrip())),
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+    ]

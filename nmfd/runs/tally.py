@@ -10,7 +10,12 @@ class Tally:
     """Tells `report` of the runs `todo`."""
 
     def __init__(
-        self, report: Progress | None, todo: Sequence[Any], *, steps: Callable[[Any], int], label: Callable[[Any], str],
+        self,
+        report: Progress | None,
+        todo: Sequence[Any],
+        *,
+        steps: Callable[[Any], int],
+        label: Callable[[Any], str],
         at: Callable[[Any, float], str] = lambda run, share: "",
     ):
         """steps, label: of a run; at: where it is when so much [-] of it is done, in words"""

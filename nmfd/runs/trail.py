@@ -61,8 +61,10 @@ def of_runs(folder: Path) -> dict:
             manifest = json.loads((place / "manifest.json").read_text(encoding="utf-8"))
             for one in manifest["sessions"]:
                 _add(found.setdefault("runs", []), one)
-            hashes = {**_hashes(manifest["configuration"]), **{
-                name: about for name, of in manifest["controllers"].items() if (about := _hashes(of))}}
+            hashes = {
+                **_hashes(manifest["configuration"]),
+                **{name: about for name, of in manifest["controllers"].items() if (about := _hashes(of))},
+            }
             found.setdefault("hashes", {})[place.name if place != folder else "."] = hashes
     return found
 
@@ -110,7 +112,7 @@ def metadata(file: Path) -> dict[str, str]:
 def into_gif(picture: Path, trail: str) -> None:
     """Add a comment to a finished gif, before its last byte."""
     data, content = trail.encode("ascii"), picture.read_bytes()
-    parts = [data[at:at + 255] for at in range(0, len(data), 255)]
+    parts = [data[at : at + 255] for at in range(0, len(data), 255)]
     block = b"".join([b"\x21\xfe", *(bytes([len(part)]) + part for part in parts), b"\0"])
     picture.write_bytes(content[:-1] + block + content[-1:])
 

@@ -25,10 +25,10 @@ import psutil
 
 from nmfd.errors import InputError, RunFailed
 
-GRACE = 2.0   # s, from the end of a time limit, of which a task is told, to that of its process
-LEAVE = 5.0   # s, for a process that has nothing more to do
-LOOK = 0.5    # s, between two looks at the time limits
-SAID = 300    # bytes, of what a task is at
+GRACE = 2.0  # s, from the end of a time limit, of which a task is told, to that of its process
+LEAVE = 5.0  # s, for a process that has nothing more to do
+LOOK = 0.5  # s, between two looks at the time limits
+SAID = 300  # bytes, of what a task is at
 # Where tasks are done, other than in processes here: (function, tasks) -> (task, outcome) as they finish.
 Source = Callable[[Callable, Sequence], Iterator[tuple]]
 
@@ -98,7 +98,7 @@ class Watch:
 
     def set(self, doing: str, until: float = 0.0) -> None:
         """From now on; until: 0 for no limit."""
-        self._doing.value = doing.encode(errors="replace")[:SAID - 1]
+        self._doing.value = doing.encode(errors="replace")[: SAID - 1]
         self._until.value = until
 
     @property
@@ -234,8 +234,13 @@ class Worker:
 
 
 def outcomes(
-    function: Callable, tasks: Sequence, workers: int, *, fresh: bool = False,
-    group: Callable[[Any], str] = lambda task: "", seconds: float | None = None,
+    function: Callable,
+    tasks: Sequence,
+    workers: int,
+    *,
+    fresh: bool = False,
+    group: Callable[[Any], str] = lambda task: "",
+    seconds: float | None = None,
     look: Callable[[Sequence[tuple[Any, float]]], object] | None = None,
 ) -> Iterator[tuple]:
     """(task, `attempt(function, task)`) for every task, as they finish, from `workers` processes.

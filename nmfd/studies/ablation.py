@@ -25,15 +25,32 @@ from nmfd.studies.benchmark import PLANTS, configuration, interval, results
 METHODS = {"alternating": True, "joint": False}
 VALIDATION_COLUMNS = {"method": str, "seed": int, "adam_step": int, "total_time_spent_veh_s": float}
 TRAINING_COLUMNS = {
-    "method": str, "seed": int, "adam_steps": int, "best_validation_veh_s": float, "total_time_spent_veh_s": float,
-    "final_accumulation_veh": float}
+    "method": str,
+    "seed": int,
+    "adam_steps": int,
+    "best_validation_veh_s": float,
+    "total_time_spent_veh_s": float,
+    "final_accumulation_veh": float,
+}
 HORIZON_COLUMNS = {
-    "controller": str, "horizon": int, "total_time_spent_veh_s": float, "final_accumulation_veh": float,
-    "control_step_ms_median": float, "control_step_ms_max": float, "solver_failures": int}
+    "controller": str,
+    "horizon": int,
+    "total_time_spent_veh_s": float,
+    "final_accumulation_veh": float,
+    "control_step_ms_median": float,
+    "control_step_ms_max": float,
+    "solver_failures": int,
+}
 
 
 def train_one(
-    run: tuple[str, int], *, scenario: Scenario, controller: str, plant: str, steps: int | None, compiled: bool,
+    run: tuple[str, int],
+    *,
+    scenario: Scenario,
+    controller: str,
+    plant: str,
+    steps: int | None,
+    compiled: bool,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, list[dict]]:
     """One training, `run` = (method, seed): its validations, and the closed loop of the best policy on `plant`."""
@@ -47,18 +64,34 @@ def train_one(
 
     with Scratch("nmfd-") as folder:
         policy = training.train(
-            changed, controller, seed=seed, out=folder / "policy.pt", steps=steps, log=log, compiled=compiled,
-            progress=progress and (lambda done, total, note: progress(done, total)))
+            changed,
+            controller,
+            seed=seed,
+            out=folder / "policy.pt",
+            steps=steps,
+            log=log,
+            compiled=compiled,
+            progress=progress and (lambda done, total, note: progress(done, total)),
+        )
         driver = registry.make(controller, scenario, policy=policy)
         row = summary(closed_loop.run(PLANTS[plant](scenario), driver, scenario, seed=0))
     best = min(point["total_time_spent_veh_s"] for point in curve)
-    return {"validation": curve, "training": [{
-        "method": method, "seed": seed, "adam_steps": curve[-1]["adam_step"], "best_validation_veh_s": best,
-        **{name: row[name] for name in ("total_time_spent_veh_s", "final_accumulation_veh")}}]}
+    return {
+        "validation": curve,
+        "training": [
+            {
+                "method": method,
+                "seed": seed,
+                "adam_steps": curve[-1]["adam_step"],
+                "best_validation_veh_s": best,
+                **{name: row[name] for name in ("total_time_spent_veh_s", "final_accumulation_veh")},
+            }
+        ],
+    }
 
 
 def drive_one(
-    run: tuple[str, int], *, scenario: Scenario, plant: str, progress: Callable[[int, int], None] | None = None,
+    run: tuple[str, int], *, scenario: Scenario, plant: str, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, list[dict]]:
     """The closed loop of one MPC, `run` = (controller, horizon), as a single row."""
     controller = registry.make(run[0], with_horizon(scenario, *run))
@@ -74,8 +107,15 @@ def with_horizon(scenario: Scenario, controller: str, horizon: int) -> Scenario:
 
 
 def alternating_or_joint(
-    scenario: Scenario, seeds: Sequence[int], *, plant: str, out: Path, controller: str = "dpc-pcrg",
-    steps: int | None = None, workers: int = 1, progress: Callable[[int, int, str], None] | None = None,
+    scenario: Scenario,
+    seeds: Sequence[int],
+    *,
+    plant: str,
+    out: Path,
+    controller: str = "dpc-pcrg",
+    steps: int | None = None,
+    workers: int = 1,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> dict[str, list[dict]]:
     """Train `controller` both ways with every seed and drive `plant`; validation.csv, training.csv, training.png.
 
@@ -87,18 +127,29 @@ def alternating_or_joint(
     training.check(scenario, controller)
     common, _ = configuration(scenario, [], plant, {})
     compiled = chosen.steps >= training.WORTH_COMPILING and rollout.can_compile()
-    work = partial(
-        train_one, scenario=scenario, controller=controller, plant=plant, steps=steps, compiled=compiled)
+    work = partial(train_one, scenario=scenario, controller=controller, plant=plant, steps=steps, compiled=compiled)
     todo = [(method, seed) for method in METHODS for seed in seeds]
     return _kept(
-        out, work, todo, columns={"validation": VALIDATION_COLUMNS, "training": TRAINING_COLUMNS}, workers=workers,
-        length=chosen.steps, progress=progress,
-        configuration={**common, "controller": controller, "adam_steps": chosen.steps, "compiled": compiled})
+        out,
+        work,
+        todo,
+        columns={"validation": VALIDATION_COLUMNS, "training": TRAINING_COLUMNS},
+        workers=workers,
+        length=chosen.steps,
+        progress=progress,
+        configuration={**common, "controller": controller, "adam_steps": chosen.steps, "compiled": compiled},
+    )
 
 
 def horizons(
-    scenario: Scenario, controllers: Sequence[str], lengths: Sequence[int], *, plant: str, out: Path,
-    workers: int = 1, progress: Callable[[int, int, str], None] | None = None,
+    scenario: Scenario,
+    controllers: Sequence[str],
+    lengths: Sequence[int],
+    *,
+    plant: str,
+    out: Path,
+    workers: int = 1,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> dict[str, list[dict]]:
     """Run MPC `controllers` with horizons of `lengths` control intervals; horizon.csv and horizon.png in `out`.
 
@@ -112,13 +163,27 @@ def horizons(
     for run in todo:
         registry.make(run[0], with_horizon(scenario, *run))
     return _kept(
-        out, partial(drive_one, scenario=scenario, plant=plant), todo, columns={"horizon": HORIZON_COLUMNS},
-        workers=workers, length=scenario.steps, configuration=common, progress=progress)
+        out,
+        partial(drive_one, scenario=scenario, plant=plant),
+        todo,
+        columns={"horizon": HORIZON_COLUMNS},
+        workers=workers,
+        length=scenario.steps,
+        configuration=common,
+        progress=progress,
+    )
 
 
 def _kept(
-    out: Path, work: Callable, todo: Sequence[tuple[str, int]], *, columns: Mapping[str, Mapping[str, type]],
-    workers: int, length: int, configuration: Mapping, progress: Callable[[int, int, str], None] | None,
+    out: Path,
+    work: Callable,
+    todo: Sequence[tuple[str, int]],
+    *,
+    columns: Mapping[str, Mapping[str, type]],
+    workers: int,
+    length: int,
+    configuration: Mapping,
+    progress: Callable[[int, int, str], None] | None,
 ) -> dict[str, list[dict]]:
     """All rows of `out`/<name>.csv, each of `columns`, after the runs `todo` = (what, number).
 
@@ -127,10 +192,15 @@ def _kept(
     *_, name = columns
     failures = []
     with run_folder.manifest(
-            out, configuration={**configuration, "ablation": name}, results=out / f"{name}.csv",
-            session={"workers": workers}):
-        rows = {file: files.read_rows(out / f"{file}.csv", kinds) if (out / f"{file}.csv").is_file() else []
-                for file, kinds in columns.items()}
+        out,
+        configuration={**configuration, "ablation": name},
+        results=out / f"{name}.csv",
+        session={"workers": workers},
+    ):
+        rows = {
+            file: files.read_rows(out / f"{file}.csv", kinds) if (out / f"{file}.csv").is_file() else []
+            for file, kinds in columns.items()
+        }
         done = {_run(row) for row in rows[name]}
         missing = [run for run in todo if run not in done]
         for run, outcome in results(work, missing, workers, length, progress, label=lambda r: f"{r[0]} {r[1]}"):
@@ -173,20 +243,35 @@ def ablation_table(rows: Mapping[str, Sequence[Mapping]]) -> str:
     """The result as text: one line per training and one per method, or one line per horizon."""
     if "training" in rows:
         return text_table([*map(_training_line, rows["training"]), *_method_lines(rows["training"])])
-    return text_table([{
-        "controller": row["controller"], "horizon": row["horizon"], **_totals(row),
-        "decision [ms]": f"{row['control_step_ms_median']:.0f} / {row['control_step_ms_max']:.0f}",
-        "failures": row["solver_failures"]} for row in rows["horizon"]], "decision: median / longest")
+    return text_table(
+        [
+            {
+                "controller": row["controller"],
+                "horizon": row["horizon"],
+                **_totals(row),
+                "decision [ms]": f"{row['control_step_ms_median']:.0f} / {row['control_step_ms_max']:.0f}",
+                "failures": row["solver_failures"],
+            }
+            for row in rows["horizon"]
+        ],
+        "decision: median / longest",
+    )
 
 
 def _totals(row: Mapping) -> dict:
-    return {"TTS [veh s]": f"{row['total_time_spent_veh_s']:.4e}",
-            "final [veh]": f"{row['final_accumulation_veh']:,.0f}"}
+    return {
+        "TTS [veh s]": f"{row['total_time_spent_veh_s']:.4e}",
+        "final [veh]": f"{row['final_accumulation_veh']:,.0f}",
+    }
 
 
 def _training_line(row: Mapping) -> dict:
-    return {"method": row["method"], "seed": row["seed"], **_totals(row),
-            "best validation [veh s]": f"{row['best_validation_veh_s']:.4e}"}
+    return {
+        "method": row["method"],
+        "seed": row["seed"],
+        **_totals(row),
+        "best validation [veh s]": f"{row['best_validation_veh_s']:.4e}",
+    }
 
 
 def _method_lines(rows: Sequence[Mapping]) -> list[dict]:
@@ -195,6 +280,13 @@ def _method_lines(rows: Sequence[Mapping]) -> list[dict]:
     for method in dict.fromkeys(row["method"] for row in rows):
         totals = [row["total_time_spent_veh_s"] for row in rows if row["method"] == method]
         spread = f" ± {interval(totals):.1e}" if len(totals) > 1 else ""
-        lines.append({"method": method, "seed": "mean", "TTS [veh s]": f"{statistics.fmean(totals):.4e}{spread}",
-                      "final [veh]": "", "best validation [veh s]": ""})
+        lines.append(
+            {
+                "method": method,
+                "seed": "mean",
+                "TTS [veh s]": f"{statistics.fmean(totals):.4e}{spread}",
+                "final [veh]": "",
+                "best validation [veh s]": "",
+            }
+        )
     return lines

@@ -23,19 +23,31 @@ from nmfd.runs.tables import text_table
 from nmfd.runs.workers import Failure, ended
 from nmfd.studies.benchmark import PLANTS, REFERENCE, configuration, results
 
-RAIN = 0.8      # of the outflow at every accumulation
-MORE = 1.2      # times the demand
-LATER = 600.0   # s
+RAIN = 0.8  # of the outflow at every accumulation
+MORE = 1.2  # times the demand
+LATER = 600.0  # s
 CASES = {
-    "nominal": "as planned", "more": "20 % more demand", "one-origin": "50 % more demand from the busiest origin",
-    "later": "all demand ten minutes later", "rain": "capacity minus 20 % in every region"}
+    "nominal": "as planned",
+    "more": "20 % more demand",
+    "one-origin": "50 % more demand from the busiest origin",
+    "later": "all demand ten minutes later",
+    "rain": "capacity minus 20 % in every region",
+}
 COLUMNS = {
-    "case": str, "seed": int, "controller": str, "total_time_spent_veh_s": float, "final_accumulation_veh": float,
-    "control_step_ms_median": float, "control_step_ms_max": float, "fallbacks": int}
+    "case": str,
+    "seed": int,
+    "controller": str,
+    "total_time_spent_veh_s": float,
+    "final_accumulation_veh": float,
+    "control_step_ms_median": float,
+    "control_step_ms_max": float,
+    "fallbacks": int,
+}
 CAPTION = (
     "TTS: total time spent, mean over seeds; change: against the first controller but no-control; decision: median / "
-    "longest; nothing of a case is told to a controller:\n" + "\n".join(
-        f"  {name}: {what}" for name, what in CASES.items()))
+    "longest; nothing of a case is told to a controller:\n"
+    + "\n".join(f"  {name}: {what}" for name, what in CASES.items())
+)
 
 
 class Run(NamedTuple):
@@ -57,7 +69,7 @@ def changed(scenario: Scenario, case: str) -> Scenario:
         return replace(scenario, demand=factor * demand)
     if case == "later":
         late = min(round(LATER / scenario.step), scenario.steps)
-        return replace(scenario, demand=np.concatenate([np.zeros_like(demand[:late]), demand[:len(demand) - late]]))
+        return replace(scenario, demand=np.concatenate([np.zeros_like(demand[:late]), demand[: len(demand) - late]]))
     if case == "rain":
         network = scenario.network
         wet = tuple(replace(m, a=RAIN * m.a, b=RAIN * m.b, c=RAIN * m.c) for m in network.mfds)
@@ -67,20 +79,36 @@ def changed(scenario: Scenario, case: str) -> Scenario:
 
 
 def run_one(
-    run: Run, *, scenario: Scenario, plant: str, policies: Mapping[str, Path],
+    run: Run,
+    *,
+    scenario: Scenario,
+    plant: str,
+    policies: Mapping[str, Path],
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
     """The row of `run` in adaptation.csv, on one thread."""
     actual = changed(scenario, run.case)
     controller = registry.make(run.controller, scenario, policy=policies.get(run.controller))
     row = summary(closed_loop.run(PLANTS[plant](actual), controller, actual, seed=run.seed, progress=progress))
-    return {"case": run.case, "seed": run.seed, "controller": run.controller, "fallbacks": row["fallbacks"],
-            **{name: row[name] for name in COLUMNS if name in row and name not in ("seed", "controller")}}
+    return {
+        "case": run.case,
+        "seed": run.seed,
+        "controller": run.controller,
+        "fallbacks": row["fallbacks"],
+        **{name: row[name] for name in COLUMNS if name in row and name not in ("seed", "controller")},
+    }
 
 
 def adaptation(
-    scenario: Scenario, controllers: Sequence[str], cases: Sequence[str], seeds: Sequence[int], *, out: Path,
-    plant: str = "nmfd", policies: Mapping[str, Path] | None = None, workers: int = 1,
+    scenario: Scenario,
+    controllers: Sequence[str],
+    cases: Sequence[str],
+    seeds: Sequence[int],
+    *,
+    out: Path,
+    plant: str = "nmfd",
+    policies: Mapping[str, Path] | None = None,
+    workers: int = 1,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> list[dict]:
     """Run what is not yet in `out`/adaptation.csv, and return all its rows, which are kept as they come.
@@ -97,8 +125,13 @@ def adaptation(
     common, settings = configuration(scenario, controllers, plant, policies)
     wanted = [Run(case, seed, name) for case in cases for seed in seeds for name in controllers]
     file, failures = out / "adaptation.csv", []
-    with run_folder.manifest(out, configuration=common, controllers=settings, results=file,
-                       session={"scenario_folder": str(scenario.folder), "workers": workers}):
+    with run_folder.manifest(
+        out,
+        configuration=common,
+        controllers=settings,
+        results=file,
+        session={"scenario_folder": str(scenario.folder), "workers": workers},
+    ):
         rows = {_run(row): row for row in (files.read_rows(file, COLUMNS) if file.is_file() else [])}
         todo = [run for run in wanted if run not in rows]
         work = partial(run_one, scenario=scenario, plant=plant, policies=policies)
@@ -134,10 +167,16 @@ def adaptation_table(rows: Sequence[Mapping]) -> str:
         for name in names:
             group = groups[case, name]
             change = "" if name == first or not mean[first] else f"{100 * (mean[name] / mean[first] - 1):+.1f} %"
-            lines.append({
-                "case": case, "controller": name, "seeds": len(group), "TTS [veh s]": f"{mean[name]:.4g}",
-                "change": change,
-                "final [veh]": f"{statistics.fmean(r['final_accumulation_veh'] for r in group):,.0f}",
-                "decision [ms]": f"{statistics.fmean(r['control_step_ms_median'] for r in group):.3g} / "
-                                 f"{max(r['control_step_ms_max'] for r in group):.3g}"})
+            lines.append(
+                {
+                    "case": case,
+                    "controller": name,
+                    "seeds": len(group),
+                    "TTS [veh s]": f"{mean[name]:.4g}",
+                    "change": change,
+                    "final [veh]": f"{statistics.fmean(r['final_accumulation_veh'] for r in group):,.0f}",
+                    "decision [ms]": f"{statistics.fmean(r['control_step_ms_median'] for r in group):.3g} / "
+                    f"{max(r['control_step_ms_max'] for r in group):.3g}",
+                }
+            )
     return text_table(lines, CAPTION)

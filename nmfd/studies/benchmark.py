@@ -39,7 +39,12 @@ def compared_with(controllers: Iterable[str]) -> str:
 
 
 def run_one(
-    run: tuple[str, int], *, scenario: Scenario, plant: str, policies: Mapping[str, Path], noise: Noise | None = None,
+    run: tuple[str, int],
+    *,
+    scenario: Scenario,
+    plant: str,
+    policies: Mapping[str, Path],
+    noise: Noise | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
     """The closed loop of `run` = (controller, seed), on one thread; the controller knows nothing of the `noise`."""
@@ -55,8 +60,14 @@ def happening(scenario: Scenario, noise: Noise | None, seed: int) -> Scenario:
 
 
 def run_all(
-    scenario: Scenario, controllers: Sequence[str], seeds: Sequence[int], plant: str, *, out: Path,
-    policies: Mapping[str, Path] | None = None, workers: int = 1,
+    scenario: Scenario,
+    controllers: Sequence[str],
+    seeds: Sequence[int],
+    plant: str,
+    *,
+    out: Path,
+    policies: Mapping[str, Path] | None = None,
+    workers: int = 1,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> list[dict]:
     """Run what is not yet in the run folder `out`, add the figures, and return all rows of its summary.csv.
@@ -64,7 +75,8 @@ def run_all(
     As `perform` does it; RunFailed, or an InputError, at the end if runs failed, which the message names.
     """
     rows, failures = perform(
-        scenario, controllers, seeds, plant, out=out, policies=policies, workers=workers, progress=progress)
+        scenario, controllers, seeds, plant, out=out, policies=policies, workers=workers, progress=progress
+    )
     if rows:
         kept = [run_folder.run_path(out, row["controller"], row["seed"]) for row in rows]
         draw(out, scenario, [run_folder.read_trajectory(path) for path in kept if path.is_file()])
@@ -74,10 +86,19 @@ def run_all(
 
 
 def perform(
-    scenario: Scenario, controllers: Sequence[str], seeds: Sequence[int], plant: str, *, out: Path,
-    policies: Mapping[str, Path] | None = None, noise: Noise | None = None, workers: int = 1,
-    progress: Callable[[int, int, str], None] | None = None, renew: Callable[[str], None] | None = None,
-    source: Source | None = None, omit: Collection[tuple[str, int]] = (),
+    scenario: Scenario,
+    controllers: Sequence[str],
+    seeds: Sequence[int],
+    plant: str,
+    *,
+    out: Path,
+    policies: Mapping[str, Path] | None = None,
+    noise: Noise | None = None,
+    workers: int = 1,
+    progress: Callable[[int, int, str], None] | None = None,
+    renew: Callable[[str], None] | None = None,
+    source: Source | None = None,
+    omit: Collection[tuple[str, int]] = (),
 ) -> tuple[list[dict], list[tuple[tuple[str, int], Failure]]]:
     """Run what is not yet in the run folder `out`; returns all rows of its summary.csv, and the runs that failed.
 
@@ -98,12 +119,12 @@ def perform(
     wanted = [(name, seed) for name in controllers for seed in seeds]
     session = {"scenario_folder": str(scenario.folder), "workers": workers}
     with run_folder.open_folder(
-            out, configuration=common, controllers=settings, order=wanted, session=session, renew=renew) as folder:
+        out, configuration=common, controllers=settings, order=wanted, session=session, renew=renew
+    ) as folder:
         todo = [run for run in wanted if run not in folder.finished and run not in omit]
         failures = []
         work = partial(run_one, scenario=scenario, plant=plant, policies=policies, noise=noise)
-        for run, outcome in results(
-                work, todo, workers, scenario.steps, progress, label=_label, source=source):
+        for run, outcome in results(work, todo, workers, scenario.steps, progress, label=_label, source=source):
             if isinstance(outcome, Failure):
                 failures.append((run, outcome))
             else:
@@ -112,7 +133,7 @@ def perform(
 
 
 def configuration(
-    scenario: Scenario, controllers: Sequence[str], plant: str, policies: Mapping[str, Path],
+    scenario: Scenario, controllers: Sequence[str], plant: str, policies: Mapping[str, Path]
 ) -> tuple[dict, dict]:
     """What all runs have in common, and what each controller depends on besides. InputError for a fault that the
     regional model cannot have."""
@@ -122,10 +143,15 @@ def configuration(
         policy = registry.policy_path(name, scenario, policies.get(name))
         settings[name] = registry.fingerprint(name, policy)
     common = {
-        "scenario": scenario.name, "scenario_hash": scenario.hash,
+        "scenario": scenario.name,
+        "scenario_hash": scenario.hash,
         "network": scenario.network.name,
-        "network_hash": scenario.network.hash, "plant": plant, "step_s": scenario.step, "steps": scenario.steps,
-        "measurement_std_veh": scenario.measurement_std}
+        "network_hash": scenario.network.hash,
+        "plant": plant,
+        "step_s": scenario.step,
+        "steps": scenario.steps,
+        "measurement_std_veh": scenario.measurement_std,
+    }
     return common, settings
 
 
@@ -134,8 +160,14 @@ def _label(run: tuple[str, int]) -> str:
 
 
 def results(
-    work: Callable, todo: Sequence[tuple], workers: int, steps: int,
-    progress: Callable[[int, int, str], None] | None, *, label: Callable[..., str], source: Source | None = None,
+    work: Callable,
+    todo: Sequence[tuple],
+    workers: int,
+    steps: int,
+    progress: Callable[[int, int, str], None] | None,
+    *,
+    label: Callable[..., str],
+    source: Source | None = None,
 ) -> Iterator[tuple]:
     """(run, result or Failure) of every run, in this process if there is one worker; those of controllers of the
     user's own in processes of their own.
@@ -145,8 +177,11 @@ def results(
     """
     tally = Tally(progress, todo, steps=lambda run: steps, label=label)
     if source or workers > 1:
-        found = source(work, todo) if source else outcomes(
-            work, todo, min(workers, len(todo)), group=_apart, look=tally.look)
+        found = (
+            source(work, todo)
+            if source
+            else outcomes(work, todo, min(workers, len(todo)), group=_apart, look=tally.look)
+        )
         for run, outcome in found:
             tally.end(run, failed=isinstance(outcome, Failure))
             yield run, outcome
@@ -154,6 +189,7 @@ def results(
     apart: dict[str, Worker] = {}
     try:
         for run in todo:
+
             def tick(k: int, _: int, run: tuple = run) -> None:
                 tally.look([(run, k / steps)])
 
@@ -187,8 +223,13 @@ def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -
 
 
 def draw_accumulations(
-    folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory], *, seed: int | None = None,
-    title: str | None = None, outflow: OutflowOf | None = None,
+    folder: Path,
+    scenario: Scenario,
+    trajectories: Sequence[Trajectory],
+    *,
+    seed: int | None = None,
+    title: str | None = None,
+    outflow: OutflowOf | None = None,
 ) -> None:
     """Total and regional accumulation over time, as png files in `folder`.
 

@@ -24,8 +24,8 @@ from nmfd.studies.settings import Bound
 from nmfd.threads import one_thread
 
 ITERATIONS = Bound().iterations
-LEARNING_RATE = 0.15    # of Adam, on logits; falls along a cosine
-INSIDE = 0.02           # a start is moved this far into the admissible set: on its edge there is no gradient
+LEARNING_RATE = 0.15  # of Adam, on logits; falls along a cosine
+INSIDE = 0.02  # a start is moved this far into the admissible set: on its edge there is no gradient
 
 
 def check(name: str) -> None:
@@ -35,7 +35,11 @@ def check(name: str) -> None:
 
 
 def compute(
-    scenario: Scenario, name: str, *, starts: Sequence[str] | None = None, iterations: int = ITERATIONS,
+    scenario: Scenario,
+    name: str,
+    *,
+    starts: Sequence[str] | None = None,
+    iterations: int = ITERATIONS,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Plan:
     """The bound `name` ("bound-pc" or "bound-pcrg"), from neutral starts and the closed loops of `starts`.
@@ -47,8 +51,12 @@ def compute(
     begin = neutral_starts(scenario.network, scenario.steps, guidance=guidance)
     for controller in _usual_starts(scenario, guidance) if starts is None else starts:
         trajectory = closed_loop.run(
-            NmfdPlant(scenario), registry.make(controller, scenario), scenario, seed=0,
-            progress=progress and (lambda done, total, name=controller: progress(done, total, f"closed loop {name}")))
+            NmfdPlant(scenario),
+            registry.make(controller, scenario),
+            scenario,
+            seed=0,
+            progress=progress and (lambda done, total, name=controller: progress(done, total, f"closed loop {name}")),
+        )
         if not guidance and not np.array_equal(trajectory.splits[0], scenario.network.nominal_splits):
             raise InputError(f"--from: {controller} guides routes, which {name} may not; omit it")
         begin[controller] = trajectory.perimeter, trajectory.splits
@@ -57,8 +65,11 @@ def compute(
 
 def _usual_starts(scenario: Scenario, guidance: bool) -> list[str]:
     candidates = (["pi-gating"] if scenario.protected else []) + ["dpc-pc"] + (["dpc-pcrg"] if guidance else [])
-    return [name for name in candidates if not name.startswith("dpc") or (
-        scenario.folder is not None and (scenario.folder / f"{name}.pt").is_file())]
+    return [
+        name
+        for name in candidates
+        if not name.startswith("dpc") or (scenario.folder is not None and (scenario.folder / f"{name}.pt").is_file())
+    ]
 
 
 def neutral_starts(network: RegionalModel, steps: int, *, guidance: bool) -> dict[str, tuple]:
@@ -67,17 +78,26 @@ def neutral_starts(network: RegionalModel, steps: int, *, guidance: bool) -> dic
     even = mask / np.maximum(mask.sum(axis=1, keepdims=True), 1)
 
     def constant(u: float, splits: np.ndarray) -> tuple:
-        return (np.broadcast_to(np.where(network.adjacency, u, 0.0), (steps, *network.adjacency.shape)),
-                np.broadcast_to(splits if guidance else network.nominal_splits, (steps, *splits.shape)))
+        return (
+            np.broadcast_to(np.where(network.adjacency, u, 0.0), (steps, *network.adjacency.shape)),
+            np.broadcast_to(splits if guidance else network.nominal_splits, (steps, *splits.shape)),
+        )
 
-    return {"open": constant(network.u_max, network.nominal_splits),
-            "middle": constant(0.5 * (network.u_min + network.u_max), even)}
+    return {
+        "open": constant(network.u_max, network.nominal_splits),
+        "middle": constant(0.5 * (network.u_min + network.u_max), even),
+    }
 
 
 @one_thread()
 def solve(
-    scenario: Scenario, starts: Mapping[str, tuple], *, guidance: bool, iterations: int = ITERATIONS,
-    learning_rate: float = LEARNING_RATE, progress: Callable[[int, int, str], None] | None = None,
+    scenario: Scenario,
+    starts: Mapping[str, tuple],
+    *,
+    guidance: bool,
+    iterations: int = ITERATIONS,
+    learning_rate: float = LEARNING_RATE,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> Plan:
     """The best plan found from `starts`: name -> perimeter (T, R, R) and splits (T, R, R, R).
 
@@ -116,8 +136,12 @@ def solve(
         perimeter, splits = (value[:, 0].numpy() for value in controls())
     names = list(starts)
     return Plan(
-        perimeter=perimeter, splits=splits if guidance else None, start=names[winner],
-        totals={name: float(total) for name, total in zip(names, best, strict=True)}, iterations=iteration)
+        perimeter=perimeter,
+        splits=splits if guidance else None,
+        start=names[winner],
+        totals={name: float(total) for name, total in zip(names, best, strict=True)},
+        iterations=iteration,
+    )
 
 
 class _Controls:
@@ -151,15 +175,25 @@ class _Controls:
 
 
 def _total_time_spent(
-    scenario: Scenario, parameters: dynamics.Parameters, demand: Float[torch.Tensor, "T R R"],
-    perimeter: Float[torch.Tensor, "T B R R"], splits: Float[torch.Tensor, "T b R R R"],  # b: B or 1
+    scenario: Scenario,
+    parameters: dynamics.Parameters,
+    demand: Float[torch.Tensor, "T R R"],
+    perimeter: Float[torch.Tensor, "T B R R"],
+    splits: Float[torch.Tensor, "T b R R R"],  # b: B or 1
 ) -> Float[torch.Tensor, " B"]:
     """TTS (B,) [veh s] of plans from the start of the scenario by the definition of nmfd.metrics."""
     x = torch.from_numpy(scenario.start).expand(perimeter.shape[1], -1, -1)
     states = [x]
     for k in range(scenario.steps - 1):
         x = dynamics.advance(
-            parameters, x, demand[k], perimeter[k], splits[k], scenario.step, integrator=scenario.integrator,
-            substeps=scenario.substeps)
+            parameters,
+            x,
+            demand[k],
+            perimeter[k],
+            splits[k],
+            scenario.step,
+            integrator=scenario.integrator,
+            substeps=scenario.substeps,
+        )
         states.append(x)
     return scenario.step * torch.stack(states).sum((0, -2, -1))

@@ -24,15 +24,17 @@ def delays_by_origin(scenario: Scenario, trajectory: Trajectory) -> tuple[PerReg
     spent, trips = _time_spent(scenario, trajectory.perimeter, trajectory.splits)
     free, few = _time_spent(
         replace(scenario, demand=FREE * scenario.demand, initial=FREE * scenario.start),
-        np.tile(network.u_max * network.adjacency, many), np.tile(network.nominal_splits, (*many, 1)))
-    each = [np.divide(time, begun, out=np.zeros_like(time), where=begun > 0) for time, begun in (
-        (spent, trips), (free, few))]
+        np.tile(network.u_max * network.adjacency, many),
+        np.tile(network.nominal_splits, (*many, 1)),
+    )
+    each = [
+        np.divide(time, begun, out=np.zeros_like(time), where=begun > 0)
+        for time, begun in ((spent, trips), (free, few))
+    ]
     return np.maximum(each[0] - each[1], 0.0), trips
 
 
-def _time_spent(
-    scenario: Scenario, perimeter: PairsOverTime, splits: TurnsOverTime,
-) -> tuple[PerRegion, PerRegion]:
+def _time_spent(scenario: Scenario, perimeter: PairsOverTime, splits: TurnsOverTime) -> tuple[PerRegion, PerRegion]:
     """(R,) [veh s], counted as total time spent is, and (R,) [veh], trips, both by origin."""
     plant = AcyclicPlant(scenario)
     plant.reset(0)

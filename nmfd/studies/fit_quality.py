@@ -17,23 +17,24 @@ from nmfd.runs import files
 from nmfd.runs.tables import text_table, wrapped
 
 SPILLBACK = "held up by a neighbour"  # label of samples that the region's own MFD does not explain
-SAMPLES = 10     # of a region: with fewer it is as good as empty, and keeps the MFD that it has
-BINS = 12        # of accumulation, for the hysteresis
+SAMPLES = 10  # of a region: with fewer it is as good as empty, and keeps the MFD that it has
+BINS = 12  # of accumulation, for the hysteresis
 EXPLAINED = 0.3  # R2: below, the curve says hardly more than the mean outflow
-FALL = 0.05      # of the largest outflow: if it falls less up to the jam accumulation, it does not fall
-AHEAD = 900.0    # s, of the longer prediction that is judged
+FALL = 0.05  # of the largest outflow: if it falls less up to the jam accumulation, it does not fall
+AHEAD = 900.0  # s, of the longer prediction that is judged
 CORRECTED = "corrected: by what the model got wrong in the control intervals just before"
 FEW, POOR, SHORT, ENDLESS, ALONE = "few samples", "R2", "not reached", "no falling branch", "one seed"
 MEANINGS = {  # beginning of a doubt -> what it means, and what would help
     FEW: f"fewer than {SAMPLES} samples, the MFD stays what it was before; higher --levels would load the region",
     POOR: f"below {EXPLAINED:g} the curve explains hardly anything of the outflow, and whoever plans with it is "
-          "misled; more --levels and --seeds, or other regions, may tell more",
+    "misled; more --levels and --seeds, or other regions, may tell more",
     SHORT: "no loading run reached the critical accumulation, what lies beyond is a guess; give higher --levels, or "
-           "take it that perimeter control has nothing to protect there",
+    "take it that perimeter control has nothing to protect there",
     ENDLESS: "the fitted outflow hardly falls up to the jam accumulation, so nothing tells where congestion begins; "
-             "give higher --levels",
+    "give higher --levels",
     ALONE: "there is no held-out error, and what the model is worth in runs that it has not seen is unknown; give "
-           "--seeds 2 or more"}
+    "--seeds 2 or more",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,13 +62,18 @@ class RegionFit:
 
 
 def region_fits(
-    network: RegionalModel, samples: Sequence[dict[str, Points]], accumulations: Sequence[StatesOverTime] = (),
+    network: RegionalModel,
+    samples: Sequence[dict[str, Points]],
+    accumulations: Sequence[StatesOverTime] = (),
     seeds: int = 2,
 ) -> list[RegionFit]:
     """One per region. samples: by region (model_validation.outflow_samples); accumulations: of the runs, (T+1, R, R)
     [veh] each; seeds: of the loading runs"""
-    most = np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0) if len(accumulations) else (
-        np.array([cloud_most(cloud) for cloud in samples]))
+    most = (
+        np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
+        if len(accumulations)
+        else (np.array([cloud_most(cloud) for cloud in samples]))
+    )
     found = []
     for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
         points = own_points(cloud)
@@ -86,12 +92,22 @@ def region_fits(
             doubts.append(f"{ENDLESS} (jam {curve.jam:.0f}, critical {curve.critical:.0f} veh)")
         if seeds < 2:
             doubts.append(ALONE)
-        found.append(RegionFit(
-            region=region, name=network.region_names[region], critical_veh=curve.critical, jam_veh=curve.jam,
-            storage_veh=float("inf") if network.storage is None else float(network.storage[region]),
-            max_outflow_veh_s=curve.capacity, samples=len(points), r2=explained,
-            spread=float(np.sqrt((residuals**2).mean()) / curve.capacity) if len(points) else float("nan"),
-            hysteresis=hysteresis(cloud), most_share=share, doubts=tuple(doubts)))
+        found.append(
+            RegionFit(
+                region=region,
+                name=network.region_names[region],
+                critical_veh=curve.critical,
+                jam_veh=curve.jam,
+                storage_veh=float("inf") if network.storage is None else float(network.storage[region]),
+                max_outflow_veh_s=curve.capacity,
+                samples=len(points),
+                r2=explained,
+                spread=float(np.sqrt((residuals**2).mean()) / curve.capacity) if len(points) else float("nan"),
+                hysteresis=hysteresis(cloud),
+                most_share=share,
+                doubts=tuple(doubts),
+            )
+        )
     return found
 
 
@@ -128,20 +144,32 @@ def hysteresis(cloud: Mapping[str, Points]) -> float:
 
 
 def fit_table(
-    network: RegionalModel, samples: Sequence[dict], fits: Sequence[RegionFit] | None = None,
+    network: RegionalModel,
+    samples: Sequence[dict],
+    fits: Sequence[RegionFit] | None = None,
     known: Mapping[str, str] = MEANINGS,
 ) -> str:
     """Per region: the curve of the MFD, how well it explains the samples, their hysteresis, and what is doubtful; then
     what the doubts mean, as far as `known`."""
     fits = region_fits(network, samples) if fits is None else fits
-    table = text_table([{
-        "region": f"{fit.region} {fit.name}", "critical [veh]": f"{fit.critical_veh:.0f}",
-        "jam [veh]": f"{fit.jam_veh:.0f}",
-        **({} if network.storage is None else {"storage [veh]": f"{fit.storage_veh:.0f}"}),
-        "max outflow [veh/s]": f"{fit.max_outflow_veh_s:.3f}", "samples": fit.samples, "R2": f"{fit.r2:.2f}",
-        "spread": f"{100 * fit.spread:.0f} %",
-        "hysteresis": "-" if np.isnan(fit.hysteresis) else f"{100 * fit.hysteresis:.0f} %",
-        "most / critical": f"{fit.most_share:.2f}", "WARNINGS": "; ".join(fit.doubts) or "none"} for fit in fits])
+    table = text_table(
+        [
+            {
+                "region": f"{fit.region} {fit.name}",
+                "critical [veh]": f"{fit.critical_veh:.0f}",
+                "jam [veh]": f"{fit.jam_veh:.0f}",
+                **({} if network.storage is None else {"storage [veh]": f"{fit.storage_veh:.0f}"}),
+                "max outflow [veh/s]": f"{fit.max_outflow_veh_s:.3f}",
+                "samples": fit.samples,
+                "R2": f"{fit.r2:.2f}",
+                "spread": f"{100 * fit.spread:.0f} %",
+                "hysteresis": "-" if np.isnan(fit.hysteresis) else f"{100 * fit.hysteresis:.0f} %",
+                "most / critical": f"{fit.most_share:.2f}",
+                "WARNINGS": "; ".join(fit.doubts) or "none",
+            }
+            for fit in fits
+        ]
+    )
     lines = [table, *wrapped("\n".join(meanings([doubt for fit in fits for doubt in fit.doubts], known)))]
     if empty := nearly_empty(samples):
         left = ", ".join(f"{region} {network.region_names[region]}" for region in empty)
@@ -151,8 +179,9 @@ def fit_table(
 
 def meanings(doubts: Sequence[str], known: Mapping[str, str] = MEANINGS) -> list[str]:
     """What these doubts mean, each kind once."""
-    return [f"WARNING, {kind}: {what}" for kind, what in known.items()
-            if any(doubt.startswith(kind) for doubt in doubts)]
+    return [
+        f"WARNING, {kind}: {what}" for kind, what in known.items() if any(doubt.startswith(kind) for doubt in doubts)
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,10 +203,14 @@ def predictions(network: RegionalModel, runs: Sequence[Observed], scheme: dict) 
     model, law = identification.prediction_shares(network, runs, (1, intervals), **scheme), network.disturbance
     long_enough = law is not None and max(len(run.demand) for run in runs) >= intervals + LOOK
     return Predictions(
-        step=scheme["step"], ahead=intervals * scheme["step"], model=model,
+        step=scheme["step"],
+        ahead=intervals * scheme["step"],
+        model=model,
         corrected=identification.prediction_shares(network, runs, (1, intervals), law=law, **scheme)
-        if long_enough else np.full_like(model, np.nan),
-        persistence=identification.persistence_shares(network, runs, (1, intervals)))
+        if long_enough
+        else np.full_like(model, np.nan),
+        persistence=identification.persistence_shares(network, runs, (1, intervals)),
+    )
 
 
 def prediction_table(network: RegionalModel, held_out: Sequence[Observed], scheme: dict) -> str:
@@ -187,11 +220,27 @@ def prediction_table(network: RegionalModel, held_out: Sequence[Observed], schem
     columns = np.stack([part[n] for n in (0, 1) for part in (found.model, found.corrected, found.persistence)], axis=1)
     names = [f"{region} {name}" for region, name in enumerate(network.region_names)]
     return text_table(
-        [dict(zip(("region", heads[0], "corrected", "if nothing changed", heads[1], "corrected ",
-                   "if nothing changed "), (name, *map(percent, row)), strict=True))
-         for name, row in zip([*names, "mean"], [*columns, columns.mean(axis=0)], strict=True)],
+        [
+            dict(
+                zip(
+                    (
+                        "region",
+                        heads[0],
+                        "corrected",
+                        "if nothing changed",
+                        heads[1],
+                        "corrected ",
+                        "if nothing changed ",
+                    ),
+                    (name, *map(percent, row)),
+                    strict=True,
+                )
+            )
+            for name, row in zip([*names, "mean"], [*columns, columns.mean(axis=0)], strict=True)
+        ],
         "RMSE of the accumulation in percent of the critical one, in the runs of the last seed, by a fit without them; "
-        f"{CORRECTED}; if nothing changed: of the prediction that every region keeps what it holds")
+        f"{CORRECTED}; if nothing changed: of the prediction that every region keeps what it holds",
+    )
 
 
 def percent(share: float) -> str:
@@ -207,6 +256,7 @@ def write_fits(path: Path, fits: Sequence[RegionFit], found: Predictions | None)
         for part in ("model", "corrected", "persistence"):
             for n, when in enumerate(("next_interval", "ahead")):
                 row[f"held_out_{when}_{part}_rmse_share"] = (
-                    float("nan") if found is None else float(getattr(found, part)[n, fit.region]))
+                    float("nan") if found is None else float(getattr(found, part)[n, fit.region])
+                )
         rows.append(row | {"ahead_s": float("nan") if found is None else found.ahead})
     files.write_table(path, pd.DataFrame(rows), float_format="%.6g")

@@ -30,33 +30,40 @@ from nmfd.runs.tables import wrapped
 from nmfd.studies import fit_quality, mfd_bands
 from nmfd.studies.settings import Measured
 
-U_MIN, U_MAX = 0.1, 0.9   # bounds of the control, as in all networks here
-STOP_LINE = 0.03          # km before a junction: a loop here sees queues first
-FAR = 3.0                 # times the median distance between neighbouring detectors: no boundary lies between
+U_MIN, U_MAX = 0.1, 0.9  # bounds of the control, as in all networks here
+STOP_LINE = 0.03  # km before a junction: a loop here sees queues first
+FAR = 3.0  # times the median distance between neighbouring detectors: no boundary lies between
 COVERAGE, BIASED, DAYS = 0.3, 0.5, 3  # shares of lane-kilometres; days: below, or above, it is doubtful
 UNKNOWN, SMALL, LOOPS, ASSUMED, SINGLE = (
-    "coverage unknown", "low coverage", "loops at stop lines", "trip length assumed", "days")
+    "coverage unknown",
+    "low coverage",
+    "loops at stop lines",
+    "trip length assumed",
+    "days",
+)
 MEANINGS = {
     fit_quality.FEW: f"fewer than {fit_quality.SAMPLES} intervals were measured",
     fit_quality.POOR: f"below {fit_quality.EXPLAINED:g} the curve explains hardly anything of the outflow: streets "
-                      "that are not alike, too few detectors, or no MFD; other regions may have one",
+    "that are not alike, too few detectors, or no MFD; other regions may have one",
     fit_quality.SHORT: "the critical accumulation was never reached: it and what lies beyond are extrapolated",
     fit_quality.ENDLESS: "no falling branch was measured, so where congestion begins is unknown: the accumulation "
-                         "called critical is hardly more than the largest that was seen",
+    "called critical is hardly more than the largest that was seen",
     UNKNOWN: "all streets are taken to be those with detectors: accumulation and outflow are those of the monitored "
-             "part; give lane_km with --about",
+    "part; give lane_km with --about",
     SMALL: f"detectors stand for less than {100 * COVERAGE:g} % of the lane-kilometres, usually the main roads, and "
-           "are taken for all",
+    "are taken for all",
     LOOPS: f"most loops lie within {1000 * STOP_LINE:g} m of a junction, where queues stand: the density comes out too "
-           "high where a vehicle stands on them, too low between two",
+    "high where a vehicle stands on them, too low between two",
     ASSUMED: "two thirds of the side of a square as large as the region: the outflow is as uncertain as that; give it "
-             "with --trip-length or --about",
-    SINGLE: f"fewer than {DAYS} days: how much the curve differs from day to day is unknown"}
+    "with --trip-length or --about",
+    SINGLE: f"fewer than {DAYS} days: how much the curve differs from day to day is unknown",
+}
 UNSAID = (
     "What such data do not say: which trips end in a region and which pass through (one trip length stands for all); "
     "vehicles on streets without detectors; the shares of drivers by destination and route (they cross the fewest "
     "boundaries); capacities of boundaries; which signals can be controlled; anything beyond the largest accumulation "
-    "seen, where the outflow is kept constant. Demand and its pairs of regions belong into a scenario.toml.")
+    "seen, where the outflow is kept constant. Demand and its pairs of regions belong into a scenario.toml."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,12 +106,23 @@ class Identified:
         """The fit, for notebooks."""
         return html_table(
             ["region", "critical [veh]", "max outflow [veh/s]", "R2", "spread", "doubts"],
-            [[fit.name, f"{fit.critical_veh:,.0f}", f"{fit.max_outflow_veh_s:.3g}", f"{fit.r2:.2f}",
-              f"{100 * fit.spread:.0f} %", "; ".join(fit.doubts)] for fit in self.fits], UNSAID)
+            [
+                [
+                    fit.name,
+                    f"{fit.critical_veh:,.0f}",
+                    f"{fit.max_outflow_veh_s:.3g}",
+                    f"{fit.r2:.2f}",
+                    f"{100 * fit.spread:.0f} %",
+                    "; ".join(fit.doubts),
+                ]
+                for fit in self.fits
+            ],
+            UNSAID,
+        )
 
 
 def identify(
-    sources: Sources, measured: Measured, *, out: Path, name: str | None = None, force: bool = False,
+    sources: Sources, measured: Measured, *, out: Path, name: str | None = None, force: bool = False
 ) -> Identified:
     """Fit an MFD to every region; write network.toml, mfd.png, samples.csv, fit.csv and identify.txt to `out`.
 
@@ -115,7 +133,8 @@ def identify(
         raise InputError(f"{out / 'network.toml'}: is there already; choose another --out, or replace it with --force")
     rows, left = detector_tables.read_counts(sources.counts, city=sources.city, skip_bad=sources.skip_bad)
     detectors = detector_tables.read_detectors(
-        sources.detectors, sources.regions, rows, sources.counts, city=sources.city)
+        sources.detectors, sources.regions, rows, sources.counts, city=sources.city
+    )
     base = _given_network(sources.adjacency, detectors)
     regions = _ordered(set(detectors["region"])) if base is None else list(base.region_names)
     about = detector_tables.read_about(sources.about, regions)
@@ -123,7 +142,8 @@ def identify(
     lane_km, coverage = _lane_km(detectors, about, regions, sources)
     trip_km, assumed = _trip_lengths(detectors, about, regions, measured)
     intervals = _intervals(rows, detectors, regions, measured).merge(
-        pd.DataFrame({"region": regions, "lane_km": lane_km, "trip_km": trip_km}), on="region")
+        pd.DataFrame({"region": regions, "lane_km": lane_km, "trip_km": trip_km}), on="region"
+    )
     intervals["accumulation_veh"] = intervals["density_veh_km"] * intervals["lane_km"]
     intervals["production_veh_km_h"] = intervals["flow_veh_h"] * intervals["lane_km"]
     intervals["outflow_veh_s"] = intervals["production_veh_km_h"] / intervals.pop("trip_km") / 3600.0
@@ -135,29 +155,55 @@ def identify(
             raise InputError(
                 f"{sources.counts}: region {region} was measured in fewer than {fit_quality.SAMPLES} intervals with "
                 f"{100 * measured.least_share:g} % of its detectors reporting; give more data, a lower --least-share, "
-                "or join it to another region")
+                "or join it to another region"
+            )
     samples = tuple(
-        {label: np.concatenate([day[label] for day in days]) for label in ("loading", "unloading")} for days in clouds)
+        {label: np.concatenate([day[label] for day in days]) for label in ("loading", "unloading")} for days in clouds
+    )
     network = base or RegionalModel(
-        name="", region_names=tuple(regions), positions=places, u_min=U_MIN, u_max=U_MAX, mfds=(),
-        adjacency=_adjacency(sources.adjacency, detectors, regions))
+        name="",
+        region_names=tuple(regions),
+        positions=places,
+        u_min=U_MIN,
+        u_max=U_MAX,
+        mfds=(),
+        adjacency=_adjacency(sources.adjacency, detectors, regions),
+    )
     network = replace(
-        network, name=name or out.absolute().name, exit_rates=None, capacity=None, storage=None, placeholder=False,
-        mfds=tuple(mfd.fit(*fit_quality.own_points(cloud).T) for cloud in samples))
+        network,
+        name=name or out.absolute().name,
+        exit_rates=None,
+        capacity=None,
+        storage=None,
+        placeholder=False,
+        mfds=tuple(mfd.fit(*fit_quality.own_points(cloud).T) for cloud in samples),
+    )
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
-        raise InputError(f"{sources.adjacency or sources.counts}: region {regions[j]} cannot be reached from "
-                         f"{regions[i]}; give all pairs of neighbours, region,neighbour, with --adjacency")
+        raise InputError(
+            f"{sources.adjacency or sources.counts}: region {regions[j]} cannot be reached from "
+            f"{regions[i]}; give all pairs of neighbours, region,neighbour, with --adjacency"
+        )
     days = rows["day"].nunique()
     fits = tuple(
         replace(fit, doubts=(*fit.doubts, *_doubts(part, share, length if assume else None, days)))
         for fit, part, share, length, assume in zip(
-            fit_quality.region_fits(network, samples), (detectors[detectors["region"] == r] for r in regions), coverage,
-            trip_km, assumed, strict=True))
+            fit_quality.region_fits(network, samples),
+            (detectors[detectors["region"] == r] for r in regions),
+            coverage,
+            trip_km,
+            assumed,
+            strict=True,
+        )
+    )
     network = replace(network, doubts=tuple(fit.doubts for fit in fits))
-    text = "\n".join([
-        fit_quality.fit_table(network, samples, fits, MEANINGS), *_told(rows, left, coverage, trip_km),
-        *wrapped(UNSAID)])
+    text = "\n".join(
+        [
+            fit_quality.fit_table(network, samples, fits, MEANINGS),
+            *_told(rows, left, coverage, trip_km),
+            *wrapped(UNSAID),
+        ]
+    )
     found = Identified(network=network, samples=samples, fits=fits, intervals=intervals, text=text)
     _write(out, found, clouds, sources)
     return found
@@ -184,7 +230,8 @@ def _check_units(intervals: pd.DataFrame, path: Path, measured: Measured) -> Non
     if not SPEEDS[0] <= speed <= SPEEDS[1]:
         raise InputError(
             f"{path}: flow and occ give a mean speed of {speed:.3g} m/s, with {measured.vehicle_length:g} m for a "
-            "vehicle over a loop; expected flow in veh/h per lane, not per interval, and occ as a share, not percent")
+            "vehicle over a loop; expected flow in veh/h per lane, not per interval, and occ as a share, not percent"
+        )
 
 
 def _clouds(part: pd.DataFrame) -> list[dict[str, Points]]:
@@ -210,12 +257,16 @@ def _given_network(path: Path | None, detectors: pd.DataFrame) -> RegionalModel 
         return None
     network = load_network(path.parent)
     names = {str(number): name for number, name in enumerate(network.region_names)}
-    detectors["region"] = detectors["region"].map(lambda name: name if name in network.region_names else names.get(
-        name, name))
+    detectors["region"] = detectors["region"].map(
+        lambda name: name if name in network.region_names else names.get(name, name)
+    )
     there, own = set(detectors["region"]), set(network.region_names)
     if there != own:
-        odd, other = (min(there - own), "the network has no such region") if there - own else (
-            min(own - there), "no detector lies there")
+        odd, other = (
+            (min(there - own), "the network has no such region")
+            if there - own
+            else (min(own - there), "no detector lies there")
+        )
         raise InputError(f"{path}: region {odd!r}: {other}; the regions must be the same, {', '.join(names.values())}")
     return network
 
@@ -229,24 +280,28 @@ def _places(detectors: pd.DataFrame, about: pd.DataFrame, regions: Sequence[str]
 
 
 def _lane_km(
-    detectors: pd.DataFrame, about: pd.DataFrame, regions: Sequence[str], sources: Sources,
+    detectors: pd.DataFrame, about: pd.DataFrame, regions: Sequence[str], sources: Sources
 ) -> tuple[np.ndarray, np.ndarray]:
     """(R,) lane-kilometres [km], and the share of them that detectors stand for, NaN where unknown."""
     seen = detectors["lane_km"].groupby(detectors["region"]).sum(min_count=1).reindex(list(regions)).to_numpy()
     given = about["lane_km"].to_numpy()
     if (unknown := np.isnan(seen) & np.isnan(given)).any():
         region = regions[int(unknown.argmax())]
-        raise InputError(f"{sources.counts}: how long the streets of region {region} are is unknown; give the length "
-                         "of the detectors' links with --detectors, or lane_km of every region with --about")
+        raise InputError(
+            f"{sources.counts}: how long the streets of region {region} are is unknown; give the length "
+            "of the detectors' links with --detectors, or lane_km of every region with --about"
+        )
     if (seen > 1.05 * given).any():
         n = int(np.nanargmax(seen / given))
-        raise InputError(f"{sources.about}: region {regions[n]}: lane_km: {given[n]:g} is less than the {seen[n]:.4g} "
-                         "km that its detectors stand for; correct it, or length and lanes in the detectors' table")
+        raise InputError(
+            f"{sources.about}: region {regions[n]}: lane_km: {given[n]:g} is less than the {seen[n]:.4g} "
+            "km that its detectors stand for; correct it, or length and lanes in the detectors' table"
+        )
     return np.where(np.isnan(given), seen, given), seen / given
 
 
 def _trip_lengths(
-    detectors: pd.DataFrame, about: pd.DataFrame, regions: Sequence[str], measured: Measured,
+    detectors: pd.DataFrame, about: pd.DataFrame, regions: Sequence[str], measured: Measured
 ) -> tuple[np.ndarray, np.ndarray]:
     """(R,) mean trip lengths within the regions [km], and whether they were assumed."""
     given = about["trip_length"].fillna(np.nan if measured.trip_length is None else measured.trip_length)
@@ -258,7 +313,8 @@ def _trip_lengths(
         except (QhullError, ValueError):
             raise InputError(
                 f"the mean trip length in region {regions[n]} is unknown, and its detectors' positions do not tell its "
-                "size; give --trip-length METRES, or a column trip_length with --about") from None
+                "size; give --trip-length METRES, or a column trip_length with --about"
+            ) from None
     return lengths, given.isna().to_numpy()
 
 
@@ -274,8 +330,10 @@ def _adjacency(path: Path | None, detectors: pd.DataFrame, regions: Sequence[str
     try:
         corners = Delaunay(points).simplices
     except (QhullError, ValueError):
-        raise InputError("which regions are adjacent is unknown, and the detectors have no positions (long, lat or x, "
-                         "y) that tell it; give a table region,neighbour with --adjacency") from None
+        raise InputError(
+            "which regions are adjacent is unknown, and the detectors have no positions (long, lat or x, "
+            "y) that tell it; give a table region,neighbour with --adjacency"
+        ) from None
     edges = np.unique(np.sort([pair for corner in corners for pair in combinations(corner, 2)], axis=1), axis=0)
     distance = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     for i, h in own[edges[distance <= FAR * np.median(distance)]]:
@@ -286,25 +344,36 @@ def _adjacency(path: Path | None, detectors: pd.DataFrame, regions: Sequence[str
 def _doubts(detectors: pd.DataFrame, coverage: float, assumed_km: float | None, days: int) -> list[str]:
     """What is doubtful about a region beside its fit."""
     near = (detectors["pos_km"] <= STOP_LINE).mean()
-    return [text for text, there in (
-        (UNKNOWN, np.isnan(coverage)), (f"{SMALL} {100 * coverage:.0f} %", coverage < COVERAGE),
-        (f"{LOOPS} ({100 * near:.0f} %)", near > BIASED),
-        (f"{ASSUMED} ({1000 * (assumed_km or 0.0):,.0f} m)", assumed_km is not None),
-        (f"{SINGLE}: {days}", days < DAYS)) if there]
+    return [
+        text
+        for text, there in (
+            (UNKNOWN, np.isnan(coverage)),
+            (f"{SMALL} {100 * coverage:.0f} %", coverage < COVERAGE),
+            (f"{LOOPS} ({100 * near:.0f} %)", near > BIASED),
+            (f"{ASSUMED} ({1000 * (assumed_km or 0.0):,.0f} m)", assumed_km is not None),
+            (f"{SINGLE}: {days}", days < DAYS),
+        )
+        if there
+    ]
 
 
 def _told(rows: pd.DataFrame, left: Mapping[str, int], coverage: np.ndarray, trip_km: np.ndarray) -> list[str]:
-    share = "unknown" if np.isnan(coverage).all() else (
-        f"{100 * np.nanmin(coverage):.0f} to {100 * np.nanmax(coverage):.0f} %")
+    share = (
+        "unknown"
+        if np.isnan(coverage).all()
+        else (f"{100 * np.nanmin(coverage):.0f} to {100 * np.nanmax(coverage):.0f} %")
+    )
     return wrapped(
         f"{len(rows):,} rows of {rows['detid'].nunique()} detectors on {rows['day'].nunique()} days; left out: "
         f"{detector_tables.told(left)}; share of the lane-km with detectors: {share}; trip length within a region: "
-        f"{1000 * trip_km.min():,.0f} to {1000 * trip_km.max():,.0f} m")
+        f"{1000 * trip_km.min():,.0f} to {1000 * trip_km.max():,.0f} m"
+    )
 
 
 def _write(out: Path, found: Identified, clouds: Sequence[Sequence[dict[str, Points]]], sources: Sources) -> None:
     text = network_toml(
-        found.network, {}, f"Regional model: written by nmfd identify from {sources.counts.name}; see identify.txt.")
+        found.network, {}, f"Regional model: written by nmfd identify from {sources.counts.name}; see identify.txt."
+    )
     config.checked(NetworkTable, tomllib.loads(text), out / "network.toml")  # names, say, may be none
     out.mkdir(parents=True, exist_ok=True)
     bands = [mfd_bands.band([fit_quality.own_points(day) for day in days]) for days in clouds]

@@ -12,8 +12,8 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.studies import plots
 from nmfd.studies.benchmark import interval
 
-BINS = 12    # of accumulation
-FEWEST = 3   # runs in a bin
+BINS = 12  # of accumulation
+FEWEST = 3  # runs in a bin
 Band = Float[np.ndarray, "_ 3"]  # bins of accumulation
 
 
@@ -38,8 +38,16 @@ def band(runs: Sequence[Points]) -> Band:
 def draw_band(ax: Axes, found: Band, over: str = "runs") -> Axes:
     """A shaded band and its middle; found: (n, 3) as `band` gives it, over runs or days."""
     x, mean, half = found.T
-    ax.fill_between(x, mean - half, mean + half, color="tab:blue", alpha=0.25, linewidth=0, zorder=3,
-                    label=f"mean over {over}, 95 % interval")
+    ax.fill_between(
+        x,
+        mean - half,
+        mean + half,
+        color="tab:blue",
+        alpha=0.25,
+        linewidth=0,
+        zorder=3,
+        label=f"mean over {over}, 95 % interval",
+    )
     ax.plot(x, mean, color="tab:blue", linewidth=1.2, zorder=3)
     return ax
 
@@ -72,8 +80,11 @@ def draw_production(path: Path, network: RegionalModel, records: Sequence[Mappin
 
 
 def draw_mfds(
-    path: Path, network: RegionalModel, samples: Sequence[Mapping[str, Points]],
-    found: Sequence[Band] = (), over: str = "runs",
+    path: Path,
+    network: RegionalModel,
+    samples: Sequence[Mapping[str, Points]],
+    found: Sequence[Band] = (),
+    over: str = "runs",
 ) -> None:
     """The MFD of every region over its outflow samples, as one picture. found: by region, a `band` to draw, over runs
     or days."""

@@ -29,15 +29,32 @@ from nmfd.types import Trajectory
 
 # Colours that stay apart for colour-blind readers and on coloured zones.
 CONTROLLER_COLOURS = {
-    "no-control": "#333333", "pi-gating": "#e69f00", "mpc-pc": "#56b4e9", "mpc-pcrg": "#0059a8",
-    "dpc-pc": "#e377c2", "dpc-pcrg": "#882255", "dpc-pc-robust": "#b07aa1", "dpc-pcrg-robust": "#d62d20",
-    "route-guidance": "#8c6d31", "probing-pc": "#bcbd22", "probing-pcrg": "#637939",
-    "dpc-pc-guarded": "#c9a0dc", "dpc-pcrg-guarded": "#6a3d9a", "bound-pc": "#9aa33c", "bound-pcrg": "#4d6600",
-    "dpc-pc-online": "#f4a3c8", "dpc-pcrg-online": "#c2407e", "greedy": "#2e8b57",
-    "mpc-pc-terminal": "#7fd1c7", "mpc-pcrg-terminal": "#00695c",
+    "no-control": "#333333",
+    "pi-gating": "#e69f00",
+    "mpc-pc": "#56b4e9",
+    "mpc-pcrg": "#0059a8",
+    "dpc-pc": "#e377c2",
+    "dpc-pcrg": "#882255",
+    "dpc-pc-robust": "#b07aa1",
+    "dpc-pcrg-robust": "#d62d20",
+    "route-guidance": "#8c6d31",
+    "probing-pc": "#bcbd22",
+    "probing-pcrg": "#637939",
+    "dpc-pc-guarded": "#c9a0dc",
+    "dpc-pcrg-guarded": "#6a3d9a",
+    "bound-pc": "#9aa33c",
+    "bound-pcrg": "#4d6600",
+    "dpc-pc-online": "#f4a3c8",
+    "dpc-pcrg-online": "#c2407e",
+    "greedy": "#2e8b57",
+    "mpc-pc-terminal": "#7fd1c7",
+    "mpc-pcrg-terminal": "#00695c",
 }
 CITY_COLOURS = {  # what a city may do without a regional controller
-    "webster": "#00838f", "actuated": "#7e57c2", "max-pressure": "#009e73", "rerouting-30": "#7f7f7f",
+    "webster": "#00838f",
+    "actuated": "#7e57c2",
+    "max-pressure": "#009e73",
+    "rerouting-30": "#7f7f7f",
     "rerouting-100": "#b5a642",
 }
 OTHER_COLOURS = ("#17becf", "#5254a3", "#843c39", "#66c2a5", "#bc80bd", "#1b5e20", "#fb8072", "#556b2f")
@@ -98,7 +115,8 @@ def legend_below(drawing: Figure, axes: Sequence[Axes], columns: int = 4) -> Non
     entries |= {label: entries.pop(label) for label in LAST if label in entries}
     for number in range(min(columns, len(entries)), 0, -1):
         legend = drawing.legend(
-            entries.values(), entries.keys(), loc="outside lower center", ncols=number, frameon=False)
+            entries.values(), entries.keys(), loc="outside lower center", ncols=number, frameon=False
+        )
         if number == 1 or legend.get_window_extent(drawing.canvas.get_renderer()).width <= drawing.bbox.width:
             return
         legend.remove()
@@ -120,7 +138,11 @@ def total_accumulation(ax: Axes, trajectories: Sequence[Trajectory], seed: int |
 
 
 def region_accumulation(
-    ax: Axes, network: RegionalModel, region: int, trajectories: Sequence[Trajectory], seed: int | None = None,
+    ax: Axes,
+    network: RegionalModel,
+    region: int,
+    trajectories: Sequence[Trajectory],
+    seed: int | None = None,
     outflow: OutflowOf | None = None,
 ) -> Axes:
     """Accumulation of one region over time, and the critical one of the model; above, a strip per curve in the colours
@@ -133,8 +155,17 @@ def region_accumulation(
     """
     mfd = network.mfds[region]
     highest = max((t.accumulation[:, region].sum(axis=1).max() for t in trajectories), default=0.0)
-    ax.hlines(mfd.critical, 0.0, 1.0, transform=ax.get_yaxis_transform(), color="0.35", linewidth=1.0, linestyle=":",
-              label=CRITICAL, zorder=1)
+    ax.hlines(
+        mfd.critical,
+        0.0,
+        1.0,
+        transform=ax.get_yaxis_transform(),
+        color="0.35",
+        linewidth=1.0,
+        linestyle=":",
+        label=CRITICAL,
+        zorder=1,
+    )
     _curves(ax, trajectories, lambda t: t.accumulation[:, region].sum(axis=1), seed)
     left = _strips(ax, mfd, region, trajectories, seed, outflow)
     ax.set_ylabel("accumulation [veh]")
@@ -146,7 +177,7 @@ def region_accumulation(
 
 
 def _strips(
-    ax: Axes, mfd: Mfd, region: int, trajectories: Sequence[Trajectory], seed: int | None, outflow: OutflowOf | None,
+    ax: Axes, mfd: Mfd, region: int, trajectories: Sequence[Trajectory], seed: int | None, outflow: OutflowOf | None
 ) -> float:
     """The strips of a region; returns the share of `ax` below them."""
     chosen: dict[tuple[str, str], Trajectory] = {}
@@ -156,22 +187,31 @@ def _strips(
     shown = [chosen[key] for key in known]
     if not shown:
         return 1.0
-    found = states(mfd, shown[0].step, [t.accumulation[:, region].sum(axis=1) for t in shown],
-                   [out[:, region] for out in known.values()])
+    found = states(
+        mfd,
+        shown[0].step,
+        [t.accumulation[:, region].sum(axis=1) for t in shown],
+        [out[:, region] for out in known.values()],
+    )
     tones = colours([t.controller for t in trajectories])
     time = [time_axis(ax, t.step * np.arange(len(t.accumulation))) for t in shown]
     return draw_strips(
-        ax, time, found, [tones[t.controller] for t in shown], [t.plant != trajectories[0].plant for t in shown])
+        ax, time, found, [tones[t.controller] for t in shown], [t.plant != trajectories[0].plant for t in shown]
+    )
 
 
 def region_estimate(
-    ax: Axes, network: RegionalModel, region: int, trajectory: Trajectory, outflow: OutflowOf | None = None,
+    ax: Axes, network: RegionalModel, region: int, trajectory: Trajectory, outflow: OutflowOf | None = None
 ) -> Axes:
     """Accumulation of one region over time, and the estimate of it that the controller saw."""
     estimate = replace(trajectory, accumulation=trajectory.observed, plant="estimate")
     return region_accumulation(
-        ax, network, region, [trajectory, estimate],
-        outflow=lambda t: None if outflow is None or t.plant == "estimate" else outflow(t))
+        ax,
+        network,
+        region,
+        [trajectory, estimate],
+        outflow=lambda t: None if outflow is None or t.plant == "estimate" else outflow(t),
+    )
 
 
 def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> Axes:
@@ -189,8 +229,17 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> 
     if clouds:  # which tell what flows themselves
         seen = max(cloud[:, 0].max() for cloud in clouds.values())
         ax.axvspan(seen, max(right, seen), facecolor="none", edgecolor="0.75", hatch="///", linewidth=0, label=UNSEEN)
-        ax.vlines(mfd.critical, 0.0, 1.0, transform=ax.get_xaxis_transform(), color="0.35", linewidth=1.0,
-                  linestyle=":", label=CRITICAL, zorder=1)
+        ax.vlines(
+            mfd.critical,
+            0.0,
+            1.0,
+            transform=ax.get_xaxis_transform(),
+            color="0.35",
+            linewidth=1.0,
+            linestyle=":",
+            label=CRITICAL,
+            zorder=1,
+        )
     else:
         _zones(ax, mfd, right)
     for (label, cloud), tone in zip(clouds.items(), _tones(len(clouds)), strict=True):
@@ -200,8 +249,14 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> 
     ax.plot(grid, mfd.outflow(grid), color="black", linewidth=1.8, label="MFD")
     ax.plot([mfd.critical], [mfd.capacity], "o", color="black", markersize=4)
     if not clouds:
-        ax.annotate(f"{mfd.critical:,.0f} veh, {mfd.capacity:.3g} veh/s", (mfd.critical, mfd.capacity), xytext=(0, 6),
-                    textcoords="offset points", ha="center", fontsize="small")
+        ax.annotate(
+            f"{mfd.critical:,.0f} veh, {mfd.capacity:.3g} veh/s",
+            (mfd.critical, mfd.capacity),
+            xytext=(0, 6),
+            textcoords="offset points",
+            ha="center",
+            fontsize="small",
+        )
     ax.set_xlim(0.0, right)
     ax.set_ylim(0.0, 1.12 * max([mfd.capacity, *(cloud[:, 1].max() for cloud in clouds.values())]))
     ax.set_xlabel("accumulation [veh]")
@@ -242,8 +297,15 @@ def spawn_matrix(ax: Axes, scenario: Scenario) -> Axes:
     image = ax.imshow(np.where(trips > 0, trips, np.nan), cmap="Blues", vmin=0.0)
     for (i, j), value in np.ndenumerate(trips):
         if value > 0 and regions <= 12:
-            ax.text(j, i, f"{value:,.0f}", ha="center", va="center", fontsize="x-small",
-                    color="white" if value > 0.5 * trips.max() else "black")
+            ax.text(
+                j,
+                i,
+                f"{value:,.0f}",
+                ha="center",
+                va="center",
+                fontsize="x-small",
+                color="white" if value > 0.5 * trips.max() else "black",
+            )
     ax.set_xticks(range(regions))
     ax.set_yticks(range(regions))
     ax.set_xticks(np.arange(regions - 1) + 0.5, minor=True)
@@ -266,10 +328,15 @@ def demand(ax: Axes, scenario: Scenario) -> Axes:
     end = min(scenario.steps, 1 + steps[-1] + max(1, scenario.steps // 20)) if len(steps) else scenario.steps
     time = time_axis(ax, scenario.step * np.arange(end + 1))
     if len(used):
-        rates = np.concatenate([arriving[used, :end], arriving[used, end - 1:end]], axis=1)
+        rates = np.concatenate([arriving[used, :end], arriving[used, end - 1 : end]], axis=1)
         ax.stackplot(
-            time, rates, step="post", labels=[f"to {region_title(scenario.network, j)}" for j in used],
-            colors=_tones(len(used)), linewidth=0)
+            time,
+            rates,
+            step="post",
+            labels=[f"to {region_title(scenario.network, j)}" for j in used],
+            colors=_tones(len(used)),
+            linewidth=0,
+        )
     ax.set_ylabel("demand [veh/s]")
     ax.set_ylim(bottom=0.0)
     ax.spines[["top", "right"]].set_visible(False)
@@ -277,8 +344,7 @@ def demand(ax: Axes, scenario: Scenario) -> Axes:
 
 
 def _curves(
-    ax: Axes, trajectories: Sequence[Trajectory], quantity: Callable[[Trajectory], np.ndarray],
-    seed: int | None = None,
+    ax: Axes, trajectories: Sequence[Trajectory], quantity: Callable[[Trajectory], np.ndarray], seed: int | None = None
 ) -> None:
     """One curve per controller and plant: the mean over its seeds, or one `seed`, and their range as a shade."""
     groups: dict[tuple[str, str], list[Trajectory]] = {}
@@ -293,11 +359,23 @@ def _curves(
         parts = [controller] * (len(groups) > len(plants) or len(plants) == 1)
         parts += [PLANT_LABELS.get(plant, plant)] * (len(plants) > 1)
         shown = [n for n, member in enumerate(members) if member.seed == seed]
-        ax.plot(time, values[shown[0]] if shown else values.mean(axis=0), color=tones[controller], linewidth=1.6,
-                label=", ".join(parts), linestyle=LINE_STYLES[plants.index(plant) % len(LINE_STYLES)])
+        ax.plot(
+            time,
+            values[shown[0]] if shown else values.mean(axis=0),
+            color=tones[controller],
+            linewidth=1.6,
+            label=", ".join(parts),
+            linestyle=LINE_STYLES[plants.index(plant) % len(LINE_STYLES)],
+        )
         if len(members) > 1:
-            ax.fill_between(time, values.min(axis=0), values.max(axis=0), color=tones[controller],
-                            alpha=0.2 if len(groups) < 4 else 0.1, linewidth=0)
+            ax.fill_between(
+                time,
+                values.min(axis=0),
+                values.max(axis=0),
+                color=tones[controller],
+                alpha=0.2 if len(groups) < 4 else 0.1,
+                linewidth=0,
+            )
     _thousands(ax.yaxis)
     ax.spines[["top", "right"]].set_visible(False)
 

@@ -21,16 +21,32 @@ def decision_times(ax: Axes, rows: Sequence[Mapping], *, interval: float, publis
     _curves(ax, rows, "median_decision_s", "-")
     _curves(ax, rows, "first_decision_s", ":")
     ax.axhline(interval, color=plots.RED, linewidth=1.2)
-    ax.annotate(f"control interval, {interval:g} s", (0.02, interval), xycoords=("axes fraction", "data"),
-                xytext=(0, 3), textcoords="offset points", fontsize="small", color=plots.RED)
+    ax.annotate(
+        f"control interval, {interval:g} s",
+        (0.02, interval),
+        xycoords=("axes fraction", "data"),
+        xytext=(0, 3),
+        textcoords="offset points",
+        fontsize="small",
+        color=plots.RED,
+    )
     ax.plot([], [], linestyle=":", color="#555555", label="first decision")
     if published:
         for name, most in PUBLISHED_LIMITS.items():
             if any(row["controller"] == name and row["regions"] >= most for row in rows):
                 ax.axvline(most, color=plots.colour(name), linewidth=1.0, linestyle="--", alpha=0.8)
-                ax.annotate(f"published {name} fails beyond {most}", (most, 0.9), xycoords=("data", "axes fraction"),
-                            xytext=(-3, 0), textcoords="offset points", fontsize="small", rotation=90, ha="right",
-                            va="top", color="#444444")
+                ax.annotate(
+                    f"published {name} fails beyond {most}",
+                    (most, 0.9),
+                    xycoords=("data", "axes fraction"),
+                    xytext=(-3, 0),
+                    textcoords="offset points",
+                    fontsize="small",
+                    rotation=90,
+                    ha="right",
+                    va="top",
+                    color="#444444",
+                )
     ax.set_ylabel("time of a decision [s]")
     return ax
 
@@ -50,8 +66,15 @@ def _curves(ax: Axes, rows: Sequence[Mapping], quantity: str, style: str) -> Non
         points = [point for point in points if not math.isnan(point[1])]
         if points:  # matplotlib cannot do without, on a logarithmic axis
             ax.set_yscale("log")
-        ax.plot(*zip(*points, strict=True) if points else ([], []), style, color=plots.colour(name), linewidth=1.6,
-                marker=MARKERS[name] if style == "-" else None, markersize=4, label=name if style == "-" else None)
+        ax.plot(
+            *zip(*points, strict=True) if points else ([], []),
+            style,
+            color=plots.colour(name),
+            linewidth=1.6,
+            marker=MARKERS[name] if style == "-" else None,
+            markersize=4,
+            label=name if style == "-" else None,
+        )
     ax.set_xscale("log")
     ax.set_xlim(0.9 * counts[0], 1.1 * counts[-1])
     ax.set_xticks(counts)

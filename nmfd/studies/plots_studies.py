@@ -19,8 +19,17 @@ def improvement(ax: Axes, gains: Mapping[str, Mapping[float, tuple[float, float]
     ax.axhline(0.0, color=plots.CONTROLLER_COLOURS["no-control"], linewidth=1.0)
     for number, (controller, points) in enumerate(gains.items()):
         mean, half = np.array(list(points.values())).reshape(-1, 2).T
-        ax.errorbar(list(points), mean, np.nan_to_num(half), color=plots.colour(controller), linewidth=1.6, capsize=3,
-                    marker="o^sDv"[number % 5], markersize=4, label=controller)
+        ax.errorbar(
+            list(points),
+            mean,
+            np.nan_to_num(half),
+            color=plots.colour(controller),
+            linewidth=1.6,
+            capsize=3,
+            marker="o^sDv"[number % 5],
+            markersize=4,
+            label=controller,
+        )
     ax.set_ylabel("total time spent saved\nagainst no-control [%]")
     ax.spines[["top", "right"]].set_visible(False)
     return ax
@@ -49,8 +58,13 @@ def training_curves(ax: Axes, rows: Sequence[Mapping]) -> Axes:
                 seeds.setdefault(row["seed"], {})[row["adam_step"]] = row["total_time_spent_veh_s"]
         steps = list(next(iter(seeds.values())))
         best = np.stack([np.minimum.accumulate(list(values.values())) for values in seeds.values()])
-        ax.plot(steps, best.mean(axis=0), color=METHOD_COLOURS[method], linewidth=1.6,
-                label=f"{method}, mean and range of {len(best)} seed{'s' * (len(best) > 1)}")
+        ax.plot(
+            steps,
+            best.mean(axis=0),
+            color=METHOD_COLOURS[method],
+            linewidth=1.6,
+            label=f"{method}, mean and range of {len(best)} seed{'s' * (len(best) > 1)}",
+        )
         ax.fill_between(steps, best.min(axis=0), best.max(axis=0), color=METHOD_COLOURS[method], alpha=0.2, linewidth=0)
     ax.set_xscale("log")  # most is gained early
     if any(row["total_time_spent_veh_s"] > 0 for row in rows):
@@ -74,8 +88,15 @@ def learning_curve(ax: Axes, controller: str, rows: Sequence[tuple[int, float, f
     colour, best = plots.colour(controller), int(np.nanargmin(validated))
     ax.plot(steps, trained, color=colour, alpha=0.4, linewidth=1.2, label="training: random starts and demand")
     ax.plot(steps, validated, color=colour, linewidth=1.8, marker=".", label="validation: the scenario itself")
-    ax.plot(steps[best], validated[best], "o", color=colour, markersize=9, fillstyle="none",
-            label=f"kept: {validated[best]:.4g} veh s after {steps[best]:.0f} steps")
+    ax.plot(
+        steps[best],
+        validated[best],
+        "o",
+        color=colour,
+        markersize=9,
+        fillstyle="none",
+        label=f"kept: {validated[best]:.4g} veh s after {steps[best]:.0f} steps",
+    )
     if (np.concatenate([trained, validated]) > 0.0).all():
         ax.set_yscale("log")
         ax.yaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(2.0, 0.5)))
@@ -109,8 +130,14 @@ def over_horizon(ax: Axes, rows: Sequence[Mapping], column: str, label: str) -> 
     """`column` of horizon.csv (nmfd.studies.ablation) against the horizon of MPC, one curve per controller."""
     for controller in dict.fromkeys(row["controller"] for row in rows):
         points = [(row["horizon"], row[column]) for row in rows if row["controller"] == controller]
-        ax.plot(*zip(*points, strict=True), color=plots.colour(controller), marker="o", markersize=4, linewidth=1.6,
-                label=controller)
+        ax.plot(
+            *zip(*points, strict=True),
+            color=plots.colour(controller),
+            marker="o",
+            markersize=4,
+            linewidth=1.6,
+            label=controller,
+        )
     ax.set_xlabel("horizon [control intervals]")
     ax.set_ylabel(label)
     ax.spines[["top", "right"]].set_visible(False)

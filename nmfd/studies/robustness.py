@@ -21,11 +21,18 @@ from nmfd.studies import benchmark, plots, plots_studies
 from nmfd.studies.benchmark import REFERENCE, configuration, interval, results
 
 COLUMNS = {
-    "sigma_veh_per_s": float, "scenario": int, "controller": str, "trips_veh": float,
-    "total_time_spent_veh_s": float, "final_accumulation_veh": float, "fallbacks": int}
+    "sigma_veh_per_s": float,
+    "scenario": int,
+    "controller": str,
+    "trips_veh": float,
+    "total_time_spent_veh_s": float,
+    "final_accumulation_veh": float,
+    "fallbacks": int,
+}
 CAPTION = (
     "improvement of total time spent over no-control in the same perturbed scenario [%], mean ± 95 % interval; "
-    "trips: mean of all perturbed scenarios [veh]; sigma of the noise on the demand in veh/s")
+    "trips: mean of all perturbed scenarios [veh]; sigma of the noise on the demand in veh/s"
+)
 
 
 class Run(NamedTuple):
@@ -37,25 +44,49 @@ class Run(NamedTuple):
 
 
 def run_one(
-    run: Run, *, scenario: Scenario, plant: str, where: str, policies: Mapping[str, Path],
+    run: Run,
+    *,
+    scenario: Scenario,
+    plant: str,
+    where: str,
+    policies: Mapping[str, Path],
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
     """The row of `run` in robustness.csv, on one thread."""
     noise = benchmark.Noise(run.sigma, where)
-    row = summary(benchmark.run_one(
-        (run.controller, run.scenario), scenario=scenario, plant=plant, policies=policies, noise=noise,
-        progress=progress))
+    row = summary(
+        benchmark.run_one(
+            (run.controller, run.scenario),
+            scenario=scenario,
+            plant=plant,
+            policies=policies,
+            noise=noise,
+            progress=progress,
+        )
+    )
     actual = benchmark.happening(scenario, noise, run.scenario)
     return {
-        "sigma_veh_per_s": run.sigma, "scenario": run.scenario, "controller": run.controller,
+        "sigma_veh_per_s": run.sigma,
+        "scenario": run.scenario,
+        "controller": run.controller,
         "trips_veh": float(actual.step * actual.demand.sum()),
         "total_time_spent_veh_s": row["total_time_spent_veh_s"],
-        "final_accumulation_veh": row["final_accumulation_veh"], "fallbacks": row["fallbacks"]}
+        "final_accumulation_veh": row["final_accumulation_veh"],
+        "fallbacks": row["fallbacks"],
+    }
 
 
 def robustness(
-    scenario: Scenario, controllers: Sequence[str], sigmas: Sequence[float], scenarios: int, *, where: str, out: Path,
-    plant: str = "acyclic", policies: Mapping[str, Path] | None = None, workers: int = 1,
+    scenario: Scenario,
+    controllers: Sequence[str],
+    sigmas: Sequence[float],
+    scenarios: int,
+    *,
+    where: str,
+    out: Path,
+    plant: str = "acyclic",
+    policies: Mapping[str, Path] | None = None,
+    workers: int = 1,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> list[dict]:
     """Run what is not yet in `out`/robustness.csv, draw robustness.png, and return all rows.
@@ -70,9 +101,17 @@ def robustness(
     wanted = [Run(sigma, number, name) for sigma in sigmas for number in range(scenarios) for name in names]
     file, failures = out / "robustness.csv", []
     with run_folder.manifest(
-            out, configuration={**common, "where": where}, controllers=settings, results=file,
-            session={"scenario_folder": str(scenario.folder), "workers": workers, "sigmas": list(sigmas),
-                     "scenarios": scenarios}):
+        out,
+        configuration={**common, "where": where},
+        controllers=settings,
+        results=file,
+        session={
+            "scenario_folder": str(scenario.folder),
+            "workers": workers,
+            "sigmas": list(sigmas),
+            "scenarios": scenarios,
+        },
+    ):
         rows = {_run(row): row for row in (read(file) if file.is_file() else [])}
         todo = [run for run in wanted if run not in rows]
         work = partial(run_one, scenario=scenario, plant=plant, where=where, policies=policies)

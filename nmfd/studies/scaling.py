@@ -34,21 +34,36 @@ from nmfd.threads import one_thread
 from nmfd.types import Controller, Observation, Status
 
 BENCHMARK_MFD = Mfd(a=4.133e-11, b=-8.282e-7, c=0.0042, jam=10_000.0)
-SPREAD = 0.2            # every region's speed and size is drawn from 1 +- SPREAD times the benchmark's
+SPREAD = 0.2  # every region's speed and size is drawn from 1 +- SPREAD times the benchmark's
 INTERVAL, INTERVALS = 30.0, 10  # s, and control intervals
 REGIONS = {"complete": (2, 4, 8, 16, 32, 64), "hexagonal": (2, 4, 8, 16, 32, 64, 128, 256)}
 LOADS = ("published", "congested")
 LOCAL = "dpc-pc-local"  # dpc-pc with the option local, and as few units as do
 CONTROLLERS = {  # name -> with route guidance
-    "dpc-pc": False, "dpc-pcrg": True, "mpc-pc": False, "mpc-pcrg": True, LOCAL: False}
+    "dpc-pc": False,
+    "dpc-pcrg": True,
+    "mpc-pc": False,
+    "mpc-pcrg": True,
+    LOCAL: False,
+}
 COLUMNS = {
-    "family": str, "load": str, "regions": int, "controller": str, "status": str, "set_up_s": float,
-    "first_decision_s": float, "median_decision_s": float, "longest_decision_s": float, "unsolved_decisions": int,
-    "peak_memory_mib": float}
+    "family": str,
+    "load": str,
+    "regions": int,
+    "controller": str,
+    "status": str,
+    "set_up_s": float,
+    "first_decision_s": float,
+    "median_decision_s": float,
+    "longest_decision_s": float,
+    "unsolved_decisions": int,
+    "peak_memory_mib": float,
+}
 CAPTION = (
     "time per decision: median / longest of the decisions after the first; set-up: network, controller and policy; "
     "memory: peak of the whole process, Python and its libraries included; unsolved: decisions that were a "
-    "failure or a fallback")
+    "failure or a fallback"
+)
 
 
 class Case(NamedTuple):
@@ -82,8 +97,14 @@ def network(family: str, regions: int, seed: int = 0) -> RegionalModel:
         base = BENCHMARK_MFD
         mfds.append(Mfd(a=base.a * speed / size**2, b=base.b * speed / size, c=base.c * speed, jam=base.jam * size))
     return RegionalModel(
-        name=f"{family}-{regions}", region_names=tuple(map(str, range(regions))), positions=where,
-        adjacency=near & ~np.eye(regions, dtype=bool), mfds=tuple(mfds), u_min=0.1, u_max=0.9)
+        name=f"{family}-{regions}",
+        region_names=tuple(map(str, range(regions))),
+        positions=where,
+        adjacency=near & ~np.eye(regions, dtype=bool),
+        mfds=tuple(mfds),
+        u_min=0.1,
+        u_max=0.9,
+    )
 
 
 def initial_state(network: RegionalModel, load: str, seed: int = 0) -> np.ndarray:
@@ -102,7 +123,8 @@ def made(name: str, planning: PlanningModel) -> Controller:
         return EconomicMpc(planning, guidance=CONTROLLERS[name])
     torch.manual_seed(0)
     architecture = (
-        Architecture(width=32, local=True) if name == LOCAL else Architecture(guidance=CONTROLLERS[name], sparse=True))
+        Architecture(width=32, local=True) if name == LOCAL else Architecture(guidance=CONTROLLERS[name], sparse=True)
+    )
     return DpcController(Policy(planning.network, architecture))
 
 
@@ -123,9 +145,16 @@ def run_one(case: Case, *, memory_gib: float) -> dict:
         mine.rlimit(psutil.RLIMIT_DATA, (int(memory_gib * 2**30), mine.rlimit(psutil.RLIMIT_DATA)[1]))
     begin = time.perf_counter()
     city = network(case.family, case.regions)
-    chosen = made(case.controller, PlanningModel(
-        name=city.name, network=city, step=INTERVAL, steps=INTERVALS,
-        forecast=np.zeros((INTERVALS, case.regions, case.regions))))
+    chosen = made(
+        case.controller,
+        PlanningModel(
+            name=city.name,
+            network=city,
+            step=INTERVAL,
+            steps=INTERVALS,
+            forecast=np.zeros((INTERVALS, case.regions, case.regions)),
+        ),
+    )
     set_up = time.perf_counter() - begin
     # The model by its turns: with its dense splits a trajectory of 256 regions would take gigabytes.
     model = edge_model.build(city, np.arange(case.regions), guidance=True)
@@ -140,13 +169,23 @@ def run_one(case: Case, *, memory_gib: float) -> dict:
         unsolved += controls.status != Status.OK
         splits = city.nominal_splits if controls.splits is None else controls.splits
         x = edge_model.advance(
-            model, x.ravel(), np.zeros(x.size), controls.perimeter[tuple(model.edges.T)],
-            splits[tuple(model.turns.T)], INTERVAL)[0].reshape(x.shape)
+            model,
+            x.ravel(),
+            np.zeros(x.size),
+            controls.perimeter[tuple(model.edges.T)],
+            splits[tuple(model.turns.T)],
+            INTERVAL,
+        )[0].reshape(x.shape)
     return {
-        **case._asdict(), "status": "ok" if not unsolved else controls.note, "set_up_s": set_up,
-        "first_decision_s": times[0], "median_decision_s": statistics.median(times[1:]),
-        "longest_decision_s": max(times[1:]), "unsolved_decisions": unsolved,
-        "peak_memory_mib": _peak_memory() / 2**20}
+        **case._asdict(),
+        "status": "ok" if not unsolved else controls.note,
+        "set_up_s": set_up,
+        "first_decision_s": times[0],
+        "median_decision_s": statistics.median(times[1:]),
+        "longest_decision_s": max(times[1:]),
+        "unsolved_decisions": unsolved,
+        "peak_memory_mib": _peak_memory() / 2**20,
+    }
 
 
 def _peak_memory() -> int:
@@ -159,8 +198,15 @@ def _peak_memory() -> int:
 
 
 def scaling(
-    controllers: Sequence[str], *, out: Path, family: str = "complete", load: str = "published",
-    regions: Sequence[int] = (), workers: int = 1, memory_gib: float = 16.0, time_limit: float = 600.0,
+    controllers: Sequence[str],
+    *,
+    out: Path,
+    family: str = "complete",
+    load: str = "published",
+    regions: Sequence[int] = (),
+    workers: int = 1,
+    memory_gib: float = 16.0,
+    time_limit: float = 600.0,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> list[dict]:
     """Run what is not yet in `out`/scaling.csv, each case in a process of its own, and return the rows asked for.
@@ -177,14 +223,17 @@ def scaling(
     _check(controllers, family, load, regions)
     file = out / "scaling.csv"
     configuration = {
-        "experiment": "scaling", "step_s": INTERVAL, "steps": INTERVALS, "memory_gib": memory_gib,
-        "time_limit_s": time_limit}
+        "experiment": "scaling",
+        "step_s": INTERVAL,
+        "steps": INTERVALS,
+        "memory_gib": memory_gib,
+        "time_limit_s": time_limit,
+    }
     with run_folder.manifest(out, configuration=configuration, results=file, session={"workers": workers}):
         rows = {_case(row): row for row in (files.read_rows(file, COLUMNS) if file.is_file() else [])}
         todo = [case for case in cases if case not in rows]
         work = partial(run_one, memory_gib=memory_gib)
-        for done, (case, outcome) in enumerate(
-                outcomes(work, todo, workers, fresh=True, seconds=time_limit), start=1):
+        for done, (case, outcome) in enumerate(outcomes(work, todo, workers, fresh=True, seconds=time_limit), start=1):
             rows[case] = failed(case, outcome.reason) if isinstance(outcome, Failure) else outcome
             files.write_rows(file, COLUMNS, ordered(rows))
             if progress:
@@ -201,9 +250,18 @@ def failed(case: Case, reason: str) -> dict:
 
 def ordered(rows: Mapping[Case, dict]) -> list[dict]:
     """The rows by family, load, controller and regions."""
-    return [rows[case] for case in sorted(rows, key=lambda case: (
-        list(REGIONS).index(case.family), LOADS.index(case.load), list(CONTROLLERS).index(case.controller),
-        case.regions))]
+    return [
+        rows[case]
+        for case in sorted(
+            rows,
+            key=lambda case: (
+                list(REGIONS).index(case.family),
+                LOADS.index(case.load),
+                list(CONTROLLERS).index(case.controller),
+                case.regions,
+            ),
+        )
+    ]
 
 
 def _case(row: Mapping) -> Case:
@@ -213,8 +271,10 @@ def _case(row: Mapping) -> Case:
 def _check(controllers: Sequence[str], family: str, load: str, regions: Sequence[int]) -> None:
     for name in controllers:
         if name not in CONTROLLERS:
-            raise InputError(f"--controllers: {name!r} is not measured{did_you_mean(name, CONTROLLERS)}; choose from "
-                             f"{', '.join(CONTROLLERS)}")
+            raise InputError(
+                f"--controllers: {name!r} is not measured{did_you_mean(name, CONTROLLERS)}; choose from "
+                f"{', '.join(CONTROLLERS)}"
+            )
     if family not in REGIONS:
         raise InputError(f"--family: expected one of {', '.join(REGIONS)}, got {family!r} instead")
     if load not in LOADS:
@@ -232,7 +292,8 @@ def draw(folder: Path, rows: Sequence[Mapping]) -> Path:
     for column, (family, load) in enumerate(kinds):
         members = [row for row in rows if (row["family"], row["load"]) == (family, load)]
         plots_scaling.decision_times(
-            axes[0, column], members, interval=INTERVAL, published=(family, load) == ("complete", "published"))
+            axes[0, column], members, interval=INTERVAL, published=(family, load) == ("complete", "published")
+        )
         plots_scaling.memory(axes[1, column], members)
         axes[0, column].set_title(f"{family} networks, {load} load", fontsize="medium")
     for ax in axes[:, 1:].ravel():
@@ -243,9 +304,21 @@ def draw(folder: Path, rows: Sequence[Mapping]) -> Path:
 
 def scaling_table(rows: Sequence[Mapping]) -> str:
     """The rows as text."""
-    return text_table([{
-        "family": row["family"], "load": row["load"], "controller": row["controller"], "regions": row["regions"],
-        "set-up [s]": f"{row['set_up_s']:.3g}", "first [s]": f"{row['first_decision_s']:.3g}",
-        "decision [ms]": f"{1e3 * row['median_decision_s']:.3g} / {1e3 * row['longest_decision_s']:.3g}",
-        "memory [MiB]": f"{row['peak_memory_mib']:.0f}", "unsolved": row["unsolved_decisions"],
-        "status": row["status"]} for row in rows], CAPTION)
+    return text_table(
+        [
+            {
+                "family": row["family"],
+                "load": row["load"],
+                "controller": row["controller"],
+                "regions": row["regions"],
+                "set-up [s]": f"{row['set_up_s']:.3g}",
+                "first [s]": f"{row['first_decision_s']:.3g}",
+                "decision [ms]": f"{1e3 * row['median_decision_s']:.3g} / {1e3 * row['longest_decision_s']:.3g}",
+                "memory [MiB]": f"{row['peak_memory_mib']:.0f}",
+                "unsolved": row["unsolved_decisions"],
+                "status": row["status"],
+            }
+            for row in rows
+        ],
+        CAPTION,
+    )

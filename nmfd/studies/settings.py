@@ -21,11 +21,14 @@ class Robustness(Study):
     """Of controllers against perturbed demand."""
 
     sigmas: Annotated[tuple[Annotated[float, Field(ge=0.0)], ...], *DISTINCT] = setting(
-        "standard deviations of the noise", (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0), unit="veh/s")
+        "standard deviations of the noise", (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0), unit="veh/s"
+    )
     scenarios: int = whole("draws of the noise for every sigma", 20, low=1, high=MOST)
     where: Literal["planned", "pairs", "all"] = setting(
         "what is perturbed: planned demand while it lasts, its pairs of regions all the time, or all pairs; clipping "
-        "at zero makes the last two add many trips", "pairs")
+        "at zero makes the last two add many trips",
+        "pairs",
+    )
     plant: Literal["nmfd", "acyclic"] = setting("the model that the controllers act on", "acyclic")
 
 
@@ -34,7 +37,8 @@ class Adaptation(Study):
 
     cases: Annotated[tuple[Text, ...], Field(strict=False)] = setting(
         "what comes differently: more demand, more from one origin, all of it later, capacity minus 20 %",
-        ("nominal", "more", "one-origin", "later", "rain"))
+        ("nominal", "more", "one-origin", "later", "rain"),
+    )
 
 
 class Ablation(Study):
@@ -42,7 +46,8 @@ class Ablation(Study):
 
     seeds: int = whole("training: seeds 0 to N - 1 with each method", 3, low=1, high=MOST)
     horizons: Annotated[tuple[Annotated[int, Field(ge=2, le=MOST)], ...], *DISTINCT] = setting(
-        "horizon: control intervals that MPC looks ahead", (2, 3, 4, 6, 8, 10, 12, 16, 20, 25, 30))
+        "horizon: control intervals that MPC looks ahead", (2, 3, 4, 6, 8, 10, 12, 16, 20, 25, 30)
+    )
     plant: Literal["nmfd", "acyclic"] = setting("the model that MPC and the trained policies act on", "acyclic")
 
 
@@ -51,11 +56,14 @@ class Scaling(Study):
 
     regions: Annotated[tuple[Annotated[int, Field(ge=2, le=MOST)], ...], *DISTINCT] = setting("numbers of regions", ())
     family: Literal["complete", "hexagonal"] = setting(
-        "every region adjacent to every other, as published, or a plane city", "complete")
+        "every region adjacent to every other, as published, or a plane city", "complete"
+    )
     load: Literal["published", "congested"] = setting(
-        "initial states: 0 to 100 vehicles bound for every region, or regions up to beyond their jam", "published")
+        "initial states: 0 to 100 vehicles bound for every region, or regions up to beyond their jam", "published"
+    )
     workers: int = whole(
-        "cases at a time, each in a process on one core; timings are cleanest with 1", 1, low=1, high=MOST)
+        "cases at a time, each in a process on one core; timings are cleanest with 1", 1, low=1, high=MOST
+    )
     memory: float = setting("that a case may take", 16.0, unit="GiB", gt=0.0, le=1e6)
     time_limit: float = setting("that a case may take", 600.0, unit="s", gt=0.0, le=1e6)
 
@@ -64,12 +72,18 @@ class Measured(Settings):
     """Of MFDs from real detectors."""
 
     vehicle_length: float = setting(
-        "of a vehicle and a loop together: the density is the occupancy over it", 6.5, unit="m", gt=1.0, le=50.0)
+        "of a vehicle and a loop together: the density is the occupancy over it", 6.5, unit="m", gt=1.0, le=50.0
+    )
     trip_length: float | None = setting(
-        "mean length of trips within a region: the outflow is the production over it", None, unit="m", ge=10.0, le=1e5)
+        "mean length of trips within a region: the outflow is the production over it", None, unit="m", ge=10.0, le=1e5
+    )
     least_share: float = setting(
-        "of a region's detectors, by lane-kilometres, that must report for an interval to count", 0.5, unit="-", ge=0.0,
-        le=1.0)
+        "of a region's detectors, by lane-kilometres, that must report for an interval to count",
+        0.5,
+        unit="-",
+        ge=0.0,
+        le=1.0,
+    )
 
 
 class Value(Settings):

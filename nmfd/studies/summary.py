@@ -17,10 +17,12 @@ if TYPE_CHECKING:
 UNITS = {"veh_s": "veh s", "veh": "veh", "s": "s", "ms_median": "ms", "ms_max": "ms"}  # by the end of a column's name
 CAPTION = (
     "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against {against}; control: time of all "
-    "decisions of a run; step: median / longest decision; decisions of all seeds: " + "; ".join(
-        f"{heading}: {what}" for heading, what in COUNTED.values()))
+    "decisions of a run; step: median / longest decision; decisions of all seeds: "
+    + "; ".join(f"{heading}: {what}" for heading, what in COUNTED.values())
+)
 BOUND_CAPTION = (
-    "; above bound: TTS against the bound with the same controls, perimeter alone (PC) or with routes (PCRG)")
+    "; above bound: TTS against the bound with the same controls, perimeter alone (PC) or with routes (PCRG)"
+)
 
 
 class Summary(list[dict]):
@@ -68,6 +70,7 @@ def _lines(rows: Sequence[Mapping]) -> tuple[list[dict], str]:
     with_bound = any(name in tts for name in ("bound-pc", "bound-pcrg"))
     lines = []
     for name, group in groups.items():
+
         def mean(column: str, group: Sequence[Mapping] = group) -> float:
             return statistics.fmean(row[column] for row in group)
 
@@ -75,17 +78,23 @@ def _lines(rows: Sequence[Mapping]) -> tuple[list[dict], str]:
         change = _percent(tts[name], tts[against]) if name != against else ""
         bound = "bound-pcrg" if "-pcrg" in name else "bound-pc"
         above = _percent(tts[name], tts[bound]) if bound in tts and name != bound else ""
-        lines.append({
-            "controller": name, "seeds": len(group),
-            "TTS [veh s]": _scientific(statistics.fmean(tts[name])) + (
-                "" if math.isnan(spread) else f" ± {_scientific(spread, 1)}"),
-            "change": change, **({"above bound": above} if with_bound else {}),
-            "final [veh]": f"{mean('final_accumulation_veh'):,.0f}",
-            "max [veh]": f"{mean('max_accumulation_veh'):,.0f}",
-            "completed [veh]": f"{mean('completed_veh'):,.0f}", "control [s]": f"{mean('evaluation_time_s'):.3g}",
-            "step [ms]": f"{mean('control_step_ms_median'):.3g} / "
-                         f"{max(row['control_step_ms_max'] for row in group):.3g}",
-            **{heading: sum(row[column] for row in group) for column, (heading, _) in COUNTED.items()}})
+        lines.append(
+            {
+                "controller": name,
+                "seeds": len(group),
+                "TTS [veh s]": _scientific(statistics.fmean(tts[name]))
+                + ("" if math.isnan(spread) else f" ± {_scientific(spread, 1)}"),
+                "change": change,
+                **({"above bound": above} if with_bound else {}),
+                "final [veh]": f"{mean('final_accumulation_veh'):,.0f}",
+                "max [veh]": f"{mean('max_accumulation_veh'):,.0f}",
+                "completed [veh]": f"{mean('completed_veh'):,.0f}",
+                "control [s]": f"{mean('evaluation_time_s'):.3g}",
+                "step [ms]": f"{mean('control_step_ms_median'):.3g} / "
+                f"{max(row['control_step_ms_max'] for row in group):.3g}",
+                **{heading: sum(row[column] for row in group) for column, (heading, _) in COUNTED.items()},
+            }
+        )
     return lines, CAPTION.format(against=against) + BOUND_CAPTION * with_bound
 
 

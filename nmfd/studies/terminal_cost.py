@@ -33,19 +33,26 @@ from nmfd.model.scenario import Scenario
 from nmfd.threads import one_thread
 from nmfd.types import Controller
 
-ROLLOUTS = 128        # at a time
-MOST_SCATTER = 0.25   # of the logarithm of every x_ij
-WIDTH = 128           # of both hidden layers
-BATCH = 256           # states per Adam step
+ROLLOUTS = 128  # at a time
+MOST_SCATTER = 0.25  # of the logarithm of every x_ij
+WIDTH = 128  # of both hidden layers
+BATCH = 256  # states per Adam step
 RATE, LAST = 2e-3, 0.02  # learning rate of Adam; what is left of it at the end
-VALUES = 0.3          # weight of the squared error of values, beside the Huber loss of derivatives
+VALUES = 0.3  # weight of the squared error of values, beside the Huber loss of derivatives
 
 Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]  # x (N, R, J), step (N,), value (N,), slope
 
 
 def learn(
-    scenario: Scenario, controller: str, *, seed: int, samples: int, rounds: int, steps: int,
-    policy: Path | None = None, progress: Callable[[int, int, str], None] | None = None,
+    scenario: Scenario,
+    controller: str,
+    *,
+    seed: int,
+    samples: int,
+    rounds: int,
+    steps: int,
+    policy: Path | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> Terminal:
     """The terminal cost of `controller`, one of registry.TERMINAL.
 
@@ -111,14 +118,20 @@ def _sampled(rollout: Rollout, policy: Policy, visited: Demands, generator: torc
     for k in range(steps - int(step.min()) - 1):
         x = rollout.step(policy, x, demand[step + k], exact)
         value = value + (step + k + 1 < steps) * x.sum((-2, -1))
-    slope, = torch.autograd.grad(value.sum(), begin)
+    (slope,) = torch.autograd.grad(value.sum(), begin)
     used = rollout.bound.bool()
     return begin.detach()[:, :, used], step, value.detach(), slope[:, :, used]
 
 
 def _fitted(
-    planning: PlanningModel, rollout: Rollout, found: list[Batch], controller: str, steps: int,
-    generator: torch.Generator, tell: Callable[[int, str], object], before: int,
+    planning: PlanningModel,
+    rollout: Rollout,
+    found: list[Batch],
+    controller: str,
+    steps: int,
+    generator: torch.Generator,
+    tell: Callable[[int, str], object],
+    before: int,
 ) -> Terminal:
     """V, learned from all samples so far. before: what was done of this round, for `tell`"""
     x, step, value, slope = (torch.cat(parts) for parts in zip(*found, strict=True))
@@ -127,8 +140,12 @@ def _fitted(
     scale = critical.expand(x.shape[1:]).flatten()
     times = torch.tensor(np.stack([clock(k / horizon) for k in range(horizon)]), dtype=x.dtype)
     network = torch.nn.Sequential(
-        torch.nn.Linear(cells + times.shape[1], WIDTH), torch.nn.GELU(), torch.nn.Linear(WIDTH, WIDTH),
-        torch.nn.GELU(), torch.nn.Linear(WIDTH, cells + 1))
+        torch.nn.Linear(cells + times.shape[1], WIDTH),
+        torch.nn.GELU(),
+        torch.nn.Linear(WIDTH, WIDTH),
+        torch.nn.GELU(),
+        torch.nn.Linear(WIDTH, cells + 1),
+    )
 
     def valued(x: Float[torch.Tensor, "B C"], step: torch.Tensor) -> Float[torch.Tensor, " B"]:
         out, left = network(torch.cat([x / scale, times[step]], dim=1)), 1.0 - step / horizon
@@ -143,7 +160,7 @@ def _fitted(
         chosen = torch.randint(len(x), (BATCH,), generator=generator)
         at = x[chosen].flatten(1).requires_grad_(True)
         foreseen = valued(at, step[chosen])
-        rises, = torch.autograd.grad(foreseen.sum(), at, create_graph=True)
+        (rises,) = torch.autograd.grad(foreseen.sum(), at, create_graph=True)
         missed = torch.nn.functional.smooth_l1_loss(rises / of_slopes, slope[chosen].flatten(1) / of_slopes)
         loss = missed + VALUES * ((foreseen - value[chosen]) / of_values).square().mean()
         optimizer.zero_grad()
@@ -152,7 +169,11 @@ def _fitted(
         tell(before + done + 1, f"misfit {loss.item():.4f}")
     layers = [layer for layer in network if isinstance(layer, torch.nn.Linear)]
     return Terminal(
-        steps=horizon, used=planning.destinations, scale=scale.double().numpy(),
+        steps=horizon,
+        used=planning.destinations,
+        scale=scale.double().numpy(),
         weights=tuple(layer.weight.detach().double().numpy() for layer in layers),
         biases=tuple(layer.bias.detach().double().numpy() for layer in layers),
-        network_hash=planning.network.hash, controller=controller)
+        network_hash=planning.network.hash,
+        controller=controller,
+    )

@@ -18,14 +18,14 @@ from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
 from nmfd.types import Trajectory
 
-WINDOW = 3        # control intervals over which accumulation and outflow are averaged: single ones are noisy
-NEAR = 0.9        # of the largest outflow: near capacity
-COLLAPSED = 0.7   # of the largest outflow in the runs, with more vehicles than then: congested, whatever the curve says
-SLOW = 1 / 3      # of what could leave: congested, or held back
-STANDING = 0.1    # of what could leave: the free outflow of so many vehicles, or the largest
-FEWEST = 5.0      # vehicles, for an outflow per vehicle that means something
-EXPECTED = 10.0   # vehicles that would have left if they had been free: with fewer, none may be chance
-COUNTED = 30.0    # vehicles that left at the largest outflow: with fewer, less may be chance
+WINDOW = 3  # control intervals over which accumulation and outflow are averaged: single ones are noisy
+NEAR = 0.9  # of the largest outflow: near capacity
+COLLAPSED = 0.7  # of the largest outflow in the runs, with more vehicles than then: congested, whatever the curve says
+SLOW = 1 / 3  # of what could leave: congested, or held back
+STANDING = 0.1  # of what could leave: the free outflow of so many vehicles, or the largest
+FEWEST = 5.0  # vehicles, for an outflow per vehicle that means something
+EXPECTED = 10.0  # vehicles that would have left if they had been free: with fewer, none may be chance
+COUNTED = 30.0  # vehicles that left at the largest outflow: with fewer, less may be chance
 STRIP, STRIPS = 0.045, 0.3  # height of a strip, and of all together at most, as shares of the axes
 
 RegionalOutflow = Float[np.ndarray, "T R"]
@@ -51,7 +51,7 @@ LOOKS = {
 
 
 def states(
-    mfd: Mfd, step: float, accumulation: Sequence[Float[np.ndarray, " S"]], outflow: Sequence[Float[np.ndarray, " T"]],
+    mfd: Mfd, step: float, accumulation: Sequence[Float[np.ndarray, " S"]], outflow: Sequence[Float[np.ndarray, " T"]]
 ) -> list[Int[np.ndarray, " T"]]:
     """The TrafficState of one region in every interval of some runs, accumulations [veh] and outflows [veh/s] each.
 
@@ -100,8 +100,10 @@ def model_outflow(network: RegionalModel) -> OutflowOf:
     def outflow(trajectory: Trajectory) -> RegionalOutflow | None:
         if trajectory.plant not in ("nmfd", "acyclic"):
             return None
-        x, u, theta = (torch.from_numpy(np.asarray(part, dtype=float)) for part in (
-            trajectory.accumulation[:-1], trajectory.perimeter, trajectory.splits))
+        x, u, theta = (
+            torch.from_numpy(np.asarray(part, dtype=float))
+            for part in (trajectory.accumulation[:-1], trajectory.perimeter, trajectory.splits)
+        )
         completions, transfers = dynamics.flows(p, x, u, theta)
         return (completions + transfers.sum(dim=(-1, -2))).numpy()
 
@@ -122,7 +124,10 @@ def remembered(outflow: OutflowOf) -> OutflowOf:
 
 
 def draw_strips(
-    ax: Axes, time: Sequence[Float[np.ndarray, " S"]], found: Sequence[Int[np.ndarray, " T"]], tones: Sequence[str],
+    ax: Axes,
+    time: Sequence[Float[np.ndarray, " S"]],
+    found: Sequence[Int[np.ndarray, " T"]],
+    tones: Sequence[str],
     hollow: Sequence[bool],
 ) -> float:
     """A strip per run at the top of `ax` in the colours of its states, a mark in the run's own colour before it, or a
@@ -135,10 +140,27 @@ def draw_strips(
             end = begin + len(list(members))
             label, fill, hatch = LOOKS[TrafficState(kind)]
             ax.broken_barh(
-                [(edges[begin], edges[end] - edges[begin])], (y + 0.1 * height, 0.8 * height), facecolor=fill,
-                edgecolor="#ffffff" if hatch else fill, hatch=hatch, linewidth=0.0, label=label,
-                transform=ax.get_xaxis_transform(), zorder=4)
+                [(edges[begin], edges[end] - edges[begin])],
+                (y + 0.1 * height, 0.8 * height),
+                facecolor=fill,
+                edgecolor="#ffffff" if hatch else fill,
+                hatch=hatch,
+                linewidth=0.0,
+                label=label,
+                transform=ax.get_xaxis_transform(),
+                zorder=4,
+            )
             begin = end
-        ax.scatter([-0.025], [y + 0.5 * height], s=9, marker="s", facecolor="none" if empty else tone,
-                   edgecolor=tone, transform=ax.transAxes, clip_on=False, linewidths=0.8, zorder=5)
+        ax.scatter(
+            [-0.025],
+            [y + 0.5 * height],
+            s=9,
+            marker="s",
+            facecolor="none" if empty else tone,
+            edgecolor=tone,
+            transform=ax.transAxes,
+            clip_on=False,
+            linewidths=0.8,
+            zorder=5,
+        )
     return 1.0 - len(found) * height

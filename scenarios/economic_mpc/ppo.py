@@ -82,8 +82,10 @@ class Best(BaseCallback):
         if spent < self._best:
             self._best = spent
             torch.save(self.model.policy.state_dict(), self._out)
-        print(f"round {self._round}: {spent:.4g} veh s, best {self._best:.4g}, exploring {self._exploring:.4g}",
-              flush=True)
+        print(
+            f"round {self._round}: {spent:.4g} veh s, best {self._best:.4g}, exploring {self._exploring:.4g}",
+            flush=True,
+        )
 
 
 def train(rounds: int, seed: int, out: Path = WEIGHTS) -> None:
@@ -94,11 +96,22 @@ def train(rounds: int, seed: int, out: Path = WEIGHTS) -> None:
     # Returns of a hundred and more would leave the gradient to the critic: rewards are scaled by their spread.
     env = VecNormalize(env, norm_obs=False, gamma=0.99)
     model = PPO(
-        "MlpPolicy", env, n_steps=scenario.steps, batch_size=1024, n_epochs=6, gamma=0.99, gae_lambda=0.95,
-        learning_rate=lambda left: 1e-3 * (0.1 + 0.9 * left), target_kl=0.05,
+        "MlpPolicy",
+        env,
+        n_steps=scenario.steps,
+        batch_size=1024,
+        n_epochs=6,
+        gamma=0.99,
+        gae_lambda=0.95,
+        learning_rate=lambda left: 1e-3 * (0.1 + 0.9 * left),
+        target_kl=0.05,
         # Exploration that keeps its direction for half an hour: noise that is new every interval averages out.
-        use_sde=True, sde_sample_freq=60, policy_kwargs=NETWORK,
-        seed=seed, device="cpu")
+        use_sde=True,
+        sde_sample_freq=60,
+        policy_kwargs=NETWORK,
+        seed=seed,
+        device="cpu",
+    )
     best = Best(scenario, every=5, out=out)
     model.learn(rounds * ENVS * scenario.steps, callback=best)
     best.validate()

@@ -1,6 +1,6 @@
 """No control as Sirmatel and Geroliminis (2018) have it: every gate open, and drivers who look at travel times.
 
-    nmfd benchmark seven_region_2018 --controllers no-control,scenarios/seven_region_2018/logit.py:LogitDrivers
+nmfd benchmark seven_region_2018 --controllers no-control,scenarios/seven_region_2018/logit.py:LogitDrivers
 """
 
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ import numpy as np
 
 from nmfd import Controls, Observation, PlanningModel
 
-CHOICES = 3            # published: the shortest sequences of regions that a driver chooses from
+CHOICES = 3  # published: the shortest sequences of regions that a driver chooses from
 PER_SECOND = 1 / 60.0  # of travel time: ours, the paper does not say how much drivers care
 
 
@@ -37,8 +37,10 @@ class LogitDrivers:
         self._open = np.where(network.adjacency, network.u_max, 0.0)
         pairs = [(i, j) for i in range(network.regions) for j in range(network.regions) if i != j]
         self._ways = {pair: list(sequences(network.adjacency, *pair)) for pair in pairs}
-        self._visits = {pair: np.array([np.isin(np.arange(network.regions), way) for way in ways], dtype=float)
-                        for pair, ways in self._ways.items()}
+        self._visits = {
+            pair: np.array([np.isin(np.arange(network.regions), way) for way in ways], dtype=float)
+            for pair, ways in self._ways.items()
+        }
 
     def reset(self, seed: int = 0) -> None:
         """Nothing is remembered."""

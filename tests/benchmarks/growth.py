@@ -33,7 +33,7 @@ from nmfd.runs import command
 from nmfd.runs.files import write_table
 from nmfd.studies import plots
 
-BLOCK, REACH = 150.0, 3000.0   # m
+BLOCK, REACH = 150.0, 3000.0  # m
 VEHICLES_PER_EDGE, HOUR = 12.0, 3600.0
 REGIONS = 6
 CONTROLLERS = ("no-control", "route-guidance")
@@ -41,13 +41,31 @@ CONTROLLERS = ("no-control", "route-guidance")
 
 def streets(side: int, file: Path) -> None:
     """A grid of side x side junctions."""
-    _sumo("netgenerate", "--grid", "--grid.number", str(side), "--grid.length", str(BLOCK), "--default.lanenumber", "2",
-          "--tls.guess", "--tls.guess.threshold", "100", "--no-turnarounds", "-o", file)
+    _sumo(
+        "netgenerate",
+        "--grid",
+        "--grid.number",
+        str(side),
+        "--grid.length",
+        str(BLOCK),
+        "--default.lanenumber",
+        "2",
+        "--tls.guess",
+        "--tls.guess.threshold",
+        "100",
+        "--no-turnarounds",
+        "-o",
+        file,
+    )
 
 
 def _sumo(program: str, *arguments: str | Path) -> None:
-    subprocess.run([Path(sumo.SUMO_HOME) / "bin" / program, *arguments], check=True, stdout=subprocess.DEVNULL,
-                   stderr=subprocess.DEVNULL)
+    subprocess.run(
+        [Path(sumo.SUMO_HOME) / "bin" / program, *arguments],
+        check=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
 
 
 def vehicles(net: Path, count: int, file: Path, seed: int = 0) -> None:
@@ -63,18 +81,32 @@ def vehicles(net: Path, count: int, file: Path, seed: int = 0) -> None:
     _, destination = cKDTree(middle).query(np.clip(there, middle.min(axis=0), middle.max(axis=0)))
     departs = np.sort(random.uniform(0.0, HOUR, count))
     trips = file.with_name("trips.xml")
-    trips.write_text("<routes>\n" + "".join(
-        f'<trip id="{n}" depart="{depart:.1f}" from="{names[a]}" to="{names[b]}"/>\n'
-        for n, (depart, a, b) in enumerate(zip(departs, origin, destination, strict=True)) if a != b) + "</routes>\n")
+    trips.write_text(
+        "<routes>\n"
+        + "".join(
+            f'<trip id="{n}" depart="{depart:.1f}" from="{names[a]}" to="{names[b]}"/>\n'
+            for n, (depart, a, b) in enumerate(zip(departs, origin, destination, strict=True))
+            if a != b
+        )
+        + "</routes>\n"
+    )
     _sumo("duarouter", "-n", net, "-r", trips, "--routing-algorithm", "astar", "-o", file)
 
 
 def _import(folder: str) -> None:
     """In a process of its own."""
     at = Path(folder)
-    import_city(ImportOptions(
-        source=at / "net.net.xml", routes=(at / "city.rou.xml",), out=at / "networks" / "grid", run=False,
-        scenario=at / "scenarios" / "grid", mesoscopic=True, cut=Clustered(method="geometric", regions=REGIONS)))
+    import_city(
+        ImportOptions(
+            source=at / "net.net.xml",
+            routes=(at / "city.rou.xml",),
+            out=at / "networks" / "grid",
+            run=False,
+            scenario=at / "scenarios" / "grid",
+            mesoscopic=True,
+            cut=Clustered(method="geometric", regions=REGIONS),
+        )
+    )
 
 
 def _run(folder: str, controller: str) -> dict:
@@ -82,9 +114,15 @@ def _run(folder: str, controller: str) -> dict:
     begin = time.process_time()
     facts = simulate(Task(scenario=Path(folder) / "scenarios" / "grid", controller=controller, seed=0)).facts
     return {
-        "cpu_s": time.process_time() - begin, "memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
-        "wall_s": facts["wall_time_s"], "setup_s": facts["setup_time_s"], "outside_sumo_share": facts["overhead_share"],
-        "trips": facts["trips"], "mean_trip_time_s": facts["mean_trip_time_s"], "teleports": facts["teleports"]}
+        "cpu_s": time.process_time() - begin,
+        "memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+        "wall_s": facts["wall_time_s"],
+        "setup_s": facts["setup_time_s"],
+        "outside_sumo_share": facts["overhead_share"],
+        "trips": facts["trips"],
+        "mean_trip_time_s": facts["mean_trip_time_s"],
+        "teleports": facts["teleports"],
+    }
 
 
 def measured(count: int) -> list[dict]:
@@ -103,8 +141,15 @@ def measured(count: int) -> list[dict]:
             imported = time.perf_counter() - begin
             for controller in CONTROLLERS:
                 found = pool.apply(_run, (folder, controller))
-                rows.append({"vehicles": count, "edges": 4 * side * (side - 1), "controller": controller, **found,
-                             "import_wall_s": imported})
+                rows.append(
+                    {
+                        "vehicles": count,
+                        "edges": 4 * side * (side - 1),
+                        "controller": controller,
+                        **found,
+                        "import_wall_s": imported,
+                    }
+                )
                 print(rows[-1], flush=True)
     return rows
 

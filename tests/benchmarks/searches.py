@@ -42,8 +42,11 @@ def with_networkit(costs: csr_array) -> Callable[[], Search]:
 
     def ready() -> Search:
         graph = networkit.GraphFromCoo(
-            (moves.data, (moves.row.astype(np.uint64), moves.col.astype(np.uint64))), costs.shape[0], weighted=True,
-            directed=True)
+            (moves.data, (moves.row.astype(np.uint64), moves.col.astype(np.uint64))),
+            costs.shape[0],
+            weighted=True,
+            directed=True,
+        )
 
         def search(node: int) -> object:
             found = networkit.distance.Dijkstra(graph, node, True, False)
@@ -87,8 +90,7 @@ def with_contraction(costs: csr_array, middle: np.ndarray) -> Callable[[], Searc
     routingkit = importlib.import_module("routingkit_cch")
     moves = costs.tocoo()
     tail, head = moves.row.tolist(), moves.col.tolist()
-    order = routingkit.compute_order_inertial(
-        costs.shape[0], tail, head, middle[:, 1].tolist(), middle[:, 0].tolist())
+    order = routingkit.compute_order_inertial(costs.shape[0], tail, head, middle[:, 1].tolist(), middle[:, 0].tolist())
     hierarchy = routingkit.CCH(order, tail, head, False)
     gateways = np.random.default_rng(0).choice(costs.shape[0], GATEWAYS, replace=False).tolist()
 
@@ -130,8 +132,10 @@ def main() -> None:
     print(f"{asked.scenario}: {costs.shape[0]} edges, {costs.nnz} moves; {within:.0%} of them within {LIMIT:.0f} s\n")
     print("| library | getting ready [ms] | a search [ms] |\n|---|---|---|")
     for name, library in (
-        (f"scipy, {LIMIT:.0f} s", lambda: with_scipy(costs, LIMIT)), ("scipy", lambda: with_scipy(costs)),
-        ("networkit", lambda: with_networkit(costs)), ("igraph", lambda: with_igraph(costs)),
+        (f"scipy, {LIMIT:.0f} s", lambda: with_scipy(costs, LIMIT)),
+        ("scipy", lambda: with_scipy(costs)),
+        ("networkit", lambda: with_networkit(costs)),
+        ("igraph", lambda: with_igraph(costs)),
         ("rustworkx", lambda: with_rustworkx(costs)),
         (f"contraction hierarchies, to {GATEWAYS} edges", lambda: with_contraction(costs, middle)),
     ):

@@ -79,8 +79,7 @@ def closed(scenario: Scenario, controller: str, seed: int, folder: Path) -> tupl
     additional = folder / f"{controller}.add.xml"
     additional.write_text(_programmes(shown, end))
     command[command.index("--tripinfo-output") + 1] = str(folder / "bare.xml")
-    return Timed(wall=wall, cpu=cpu, trips=trips), [
-        *command, "--additional-files", str(additional), "--end", str(end)]
+    return Timed(wall=wall, cpu=cpu, trips=trips), [*command, "--additional-files", str(additional), "--end", str(end)]
 
 
 def bare(command: list[str]) -> Timed:
@@ -129,11 +128,16 @@ def main() -> None:
                 loop, command = closed(scenario, controller, 1, Path(folder))
                 pairs.append((loop, bare(command)))
         same = all(loop.trips == alone.trips for loop, alone in pairs)
-        wall, cpu = ([min(getattr(side, kind) for side in sides) for sides in zip(*pairs, strict=True)]
-                     for kind in ("wall", "cpu"))
-        print(f"{controller}, {chosen.intervals} intervals, best of {chosen.repeats}: closed loop / bare binary: "
-              f"wall {wall[0]:.2f} / {wall[1]:.2f} s = {wall[0] / wall[1]:.3f}, CPU {cpu[0]:.2f} / {cpu[1]:.2f} s = "
-              f"{cpu[0] / cpu[1]:.3f}; trips {'the same' if same else 'DIFFERENT'}", flush=True)
+        wall, cpu = (
+            [min(getattr(side, kind) for side in sides) for sides in zip(*pairs, strict=True)]
+            for kind in ("wall", "cpu")
+        )
+        print(
+            f"{controller}, {chosen.intervals} intervals, best of {chosen.repeats}: closed loop / bare binary: "
+            f"wall {wall[0]:.2f} / {wall[1]:.2f} s = {wall[0] / wall[1]:.3f}, CPU {cpu[0]:.2f} / {cpu[1]:.2f} s = "
+            f"{cpu[0] / cpu[1]:.3f}; trips {'the same' if same else 'DIFFERENT'}",
+            flush=True,
+        )
         if chosen.profile:
             profile = cProfile.Profile()
             with tempfile.TemporaryDirectory() as folder:

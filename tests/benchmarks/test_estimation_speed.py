@@ -26,17 +26,27 @@ def one_thread():
 def test_estimator_step(benchmark):
     network, plant = SCENARIO.network, NmfdPlant(SCENARIO)
     inner = network.adjacency
-    estimator = Estimator(planning_model(SCENARIO), Instruments(
-        detector_share=np.full(7, 0.3), detector_error=np.full(7, 0.3), detector_noise=np.full(7, 0.3),
-        counted_share=np.where(inner, 0.3, 0.0),
-        counted_gateways=np.where(inner, 2, 0), probe_share=0.1))
+    estimator = Estimator(
+        planning_model(SCENARIO),
+        Instruments(
+            detector_share=np.full(7, 0.3),
+            detector_error=np.full(7, 0.3),
+            detector_noise=np.full(7, 0.3),
+            counted_share=np.where(inner, 0.3, 0.0),
+            counted_gateways=np.where(inner, 2, 0),
+            probe_share=0.1,
+        ),
+    )
     controls = Controls(perimeter=np.where(inner, network.u_max, 0.0), splits=None)
     plant.reset(0)
     for k in range(20):
         x = plant.step(controls).accumulation
         observation = Readings(
-            accumulation=0.9 * x.sum(axis=1), crossings=np.full((7, 7), np.nan), probes=np.round(0.1 * x),
-            probe_departures=np.round(0.1 * SCENARIO.step * SCENARIO.demand[k]))
+            accumulation=0.9 * x.sum(axis=1),
+            crossings=np.full((7, 7), np.nan),
+            probes=np.round(0.1 * x),
+            probe_departures=np.round(0.1 * SCENARIO.step * SCENARIO.demand[k]),
+        )
         estimator.step(controls, observation)
     benchmark(estimator.step, controls, observation)
     assert np.isfinite(estimator.accumulation).all()

@@ -53,8 +53,8 @@ def measurement(x, k=0):
 def forecast(scenario, k):
     """(HORIZON, R, R) [veh/s]."""
     ahead = np.zeros((HORIZON, *scenario.demand.shape[1:]))
-    known = scenario.demand[k:k + HORIZON]
-    ahead[:len(known)] = known
+    known = scenario.demand[k : k + HORIZON]
+    ahead[: len(known)] = known
     return ahead
 
 
@@ -82,9 +82,15 @@ def test_mpc_has_the_optimum_of_plain_ipopt(seen, guidance):
     assert ours <= plain_ipopt * (1.0 + 1e-5) and (not solved or ours == pytest.approx(plain_ipopt, rel=1e-4))
 
 
-@pytest.mark.parametrize("family, regions, guidance", [
-    ("complete", 5, True), ("complete", 8, False), ("hexagonal", 9, False),
-    pytest.param("hexagonal", 7, True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "family, regions, guidance",
+    [
+        ("complete", 5, True),
+        ("complete", 8, False),
+        ("hexagonal", 9, False),
+        pytest.param("hexagonal", 7, True, marks=pytest.mark.slow),
+    ],
+)
 def test_mpc_has_the_optimum_of_plain_ipopt_in_random_cities(family, regions, guidance):
     ours, plain_ipopt, solved = compare(*random_city(family, regions), guidance)
     assert ours <= plain_ipopt * (1.0 + 1e-5) and (not solved or ours == pytest.approx(plain_ipopt, rel=1e-4))

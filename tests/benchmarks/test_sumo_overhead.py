@@ -14,5 +14,5 @@ def test_bare_sumo_under_the_recorded_signals_runs_the_same_trips(tmp_path):
     programmes = (tmp_path / "pi-gating.add.xml").read_text()
     assert programmes.count("<tlLogic") > 20 and len(loop.trips) > 400
     assert sumo_overhead.bare(command).trips == loop.trips
-    unchanged = command[: command.index("--additional-files")] + command[command.index("--end"):]
+    unchanged = command[: command.index("--additional-files")] + command[command.index("--end") :]
     assert sumo_overhead.bare(unchanged).trips != loop.trips

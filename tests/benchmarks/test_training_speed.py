@@ -1,6 +1,6 @@
 """One Adam step's rollout and gradient, 240 control intervals and 16 rollouts, plain and compiled:
 
-    pytest -n0 tests/benchmarks/test_training_speed.py --benchmark-only
+pytest -n0 tests/benchmarks/test_training_speed.py --benchmark-only
 """
 
 from pathlib import Path

@@ -26,28 +26,60 @@ def city():
         end = begin + 150.0 * np.eye(2)[n % 2]
         shapes.append(np.linspace(begin, end, 6) + random.normal(0.0, 8.0, (6, 2)))
     middles = np.array([shape.mean(axis=0) for shape in shapes])
-    columns, rows = (np.minimum(middles[:, a] / (np.ptp(middles[:, a]) / n), n - 1).astype(int).clip(0)
-                     for a, n in ((0, 4), (1, 3)))
+    columns, rows = (
+        np.minimum(middles[:, a] / (np.ptp(middles[:, a]) / n), n - 1).astype(int).clip(0) for a, n in ((0, 4), (1, 3))
+    )
     region = columns + 4 * rows
     gates = tuple(
-        Gate(source=int(region[e]), target=int(region[e] + 1) % REGIONS, place=(float(middles[e][0]), float(
-            middles[e][1])), gateways=(n,), signal=True)
-        for n, e in enumerate(random.choice(EDGES, GATES, replace=False)))
+        Gate(
+            source=int(region[e]),
+            target=int(region[e] + 1) % REGIONS,
+            place=(float(middles[e][0]), float(middles[e][1])),
+            gateways=(n,),
+            signal=True,
+        )
+        for n, e in enumerate(random.choice(EDGES, GATES, replace=False))
+    )
     return CityPicture(
-        name="large", region_names=tuple(map(str, range(REGIONS))), edges=tuple(f"e{n}" for n in range(EDGES)),
-        shapes=shapes, lane_km=np.full(EDGES, 0.15), limit=np.full(EDGES, 14.0), lanes=random.integers(1, 4, EDGES),
-        region=region, outlines=rings_round(shapes, np.ones(EDGES, dtype=bool), region, 0.06),
-        places=np.stack([middles[region == r].mean(axis=0) for r in range(REGIONS)]), gates=gates,
-        critical=np.full(REGIONS, 500.0), curves=[np.ones((60, 2))] * REGIONS, step=60.0, steps=60, low=0.1, high=0.9)
+        name="large",
+        region_names=tuple(map(str, range(REGIONS))),
+        edges=tuple(f"e{n}" for n in range(EDGES)),
+        shapes=shapes,
+        lane_km=np.full(EDGES, 0.15),
+        limit=np.full(EDGES, 14.0),
+        lanes=random.integers(1, 4, EDGES),
+        region=region,
+        outlines=rings_round(shapes, np.ones(EDGES, dtype=bool), region, 0.06),
+        places=np.stack([middles[region == r].mean(axis=0) for r in range(REGIONS)]),
+        gates=gates,
+        critical=np.full(REGIONS, 500.0),
+        curves=[np.ones((60, 2))] * REGIONS,
+        step=60.0,
+        steps=60,
+        low=0.1,
+        high=0.9,
+    )
 
 
 @pytest.fixture(scope="module")
 def frame():
     return Frame(
-        time=0.0, intervals=0, whole=True, density=np.zeros(EDGES, np.float16), speed=np.zeros(EDGES, np.float16),
-        accumulation=np.zeros(REGIONS), outflow=np.zeros(REGIONS), waiting=0.0, completed=0.0, removed=0.0,
-        time_spent=0.0, perimeter=np.ones((REGIONS, REGIONS)), green=np.ones(GATES), queue=np.zeros(GATES),
-        guided=np.zeros((REGIONS, REGIONS)))
+        time=0.0,
+        intervals=0,
+        whole=True,
+        density=np.zeros(EDGES, np.float16),
+        speed=np.zeros(EDGES, np.float16),
+        accumulation=np.zeros(REGIONS),
+        outflow=np.zeros(REGIONS),
+        waiting=0.0,
+        completed=0.0,
+        removed=0.0,
+        time_spent=0.0,
+        perimeter=np.ones((REGIONS, REGIONS)),
+        green=np.ones(GATES),
+        queue=np.zeros(GATES),
+        guided=np.zeros((REGIONS, REGIONS)),
+    )
 
 
 def test_a_frame_in_the_run(benchmark, city, frame):
@@ -68,6 +100,7 @@ def test_a_picture_in_the_server(benchmark, city, frame):
 
 def test_a_page_for_one_more_viewer(benchmark, city):
     """Of which forty must not hold up a run: 1.1 s before the streets were encoded once for all."""
+
     def made():
         page, document = Page(city, ["one", "other"]), Document()
         page.place(document, "", [], [], streets=True)
@@ -82,17 +115,30 @@ def test_the_size_of_the_page(benchmark, city):
     page, document = Page(city, ["one", "other"]), Document()
     page.place(document, "", [], [])
     html = benchmark.pedantic(
-        file_html, (document, INLINE), {"template": document.template, "template_variables": (
-            document.template_variables)}, rounds=1)
+        file_html,
+        (document, INLINE),
+        {"template": document.template, "template_variables": (document.template_variables)},
+        rounds=1,
+    )
     assert len(html) < 15e6
 
 
 def test_the_size_of_a_report(benchmark, city, frame):
     """One hour of two runs, an interval a minute, on the map with a slider; pictures and tables take 1 to 2 MB more."""
     random = np.random.default_rng(1)
-    runs = {name: [
-        replace(frame, time=60.0 * k, intervals=k, density=random.uniform(0.0, 133.0, EDGES).astype(np.float16),
-                green=random.uniform(size=GATES), queue=random.uniform(0.0, 30.0, GATES))
-        for k in range(61)] for name in ("one", "other")}
+    runs = {
+        name: [
+            replace(
+                frame,
+                time=60.0 * k,
+                intervals=k,
+                density=random.uniform(0.0, 133.0, EDGES).astype(np.float16),
+                green=random.uniform(size=GATES),
+                queue=random.uniform(0.0, 30.0, GATES),
+            )
+            for k in range(61)
+        ]
+        for name in ("one", "other")
+    }
     made = benchmark.pedantic(replay.embedded, (city, runs), rounds=1)
     assert sum(map(len, (*made.scripts, *made.roots.values()))) < 13e6

@@ -46,8 +46,13 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=2)
     parser.add_argument("--controller", default="no-control")
     chosen = parser.parse_args()
-    kinds = {"nobody": None, "one elsewhere": elsewhere, "forty, slow, garbage": crowd, "one in Chromium": browser,
-             "nobody, a busy core": busy}
+    kinds = {
+        "nobody": None,
+        "one elsewhere": elsewhere,
+        "forty, slow, garbage": crowd,
+        "one in Chromium": browser,
+        "nobody, a busy core": busy,
+    }
     rows: dict[str, list[dict]] = {kind: [] for kind in kinds}
     for _ in range(chosen.pairs):
         for kind, visitors in kinds.items():
@@ -62,8 +67,23 @@ def main() -> None:
 def watched(chosen: argparse.Namespace, visitors) -> dict:
     """Wall time and processor time of the run's process, the server's processor time, and what the visitors found."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "cosim", "watch", str(chosen.scenario), "--controller", chosen.controller, "--seed", "1",
-         "--steps", str(chosen.steps), "--no-open"], stdout=subprocess.PIPE, text=True)
+        [
+            sys.executable,
+            "-m",
+            "cosim",
+            "watch",
+            str(chosen.scenario),
+            "--controller",
+            chosen.controller,
+            "--seed",
+            "1",
+            "--steps",
+            str(chosen.steps),
+            "--no-open",
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     address = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())[0]
     begin, server = time.perf_counter(), psutil.Process(process.pid)
     run = max(server.children(), key=lambda child: sum(child.cpu_times()[:2]))
@@ -84,8 +104,12 @@ def watched(chosen: argparse.Namespace, visitors) -> dict:
                     seen |= told.get()
                 if there is None and "map_s" in seen:
                     there = end, cpu
-    found = {"wall_s": round(end - begin, 2), "cpu_s": round(cpu - before, 2),
-             "server_cpu_s": round(spent - made, 2), **seen}
+    found = {
+        "wall_s": round(end - begin, 2),
+        "cpu_s": round(cpu - before, 2),
+        "server_cpu_s": round(spent - made, 2),
+        **seen,
+    }
     if there and end - there[0] > IDLE:  # the share of its time that the run was kept waiting, for a core or the page
         found["waiting"] = round(1.0 - (cpu - there[1]) / (end - there[0]), 3)
     if other:
@@ -115,16 +139,25 @@ def browser(address: str, told) -> None:
         begin = time.perf_counter()
         page.goto(address)
         page.wait_for_function(THERE, timeout=300e3)
-        told.put({"first_paint_s": round(page.evaluate(PAINTED) / 1000, 2),
-                  "map_s": round(time.perf_counter() - begin, 2), **sizes})
+        told.put(
+            {
+                "first_paint_s": round(page.evaluate(PAINTED) / 1000, 2),
+                "map_s": round(time.perf_counter() - begin, 2),
+                **sizes,
+            }
+        )
         page.evaluate(COUNT)
         sizes["websocket_bytes"] = 0
         begin = time.perf_counter()
         while True:
             page.wait_for_timeout(2000)
             seconds = time.perf_counter() - begin
-            told.put({"pictures_per_s": round(page.evaluate("() => window.pictures") / seconds, 2),
-                      "kB_per_s": round(sizes["websocket_bytes"] / 1000 / seconds, 1)})
+            told.put(
+                {
+                    "pictures_per_s": round(page.evaluate("() => window.pictures") / seconds, 2),
+                    "kB_per_s": round(sizes["websocket_bytes"] / 1000 / seconds, 1),
+                }
+            )
 
 
 def busy(_: str, __) -> None:
@@ -153,9 +186,13 @@ def crowd(address: str, told, clients: int = CLIENTS + 1, harmful: bool = True) 
                 count["waited"] += error.code == 503
                 await asyncio.sleep(5.0)
         token = re.search(r'"token":"([^"]+)"', page)[1]
-        socket = await websocket_connect(HTTPRequest(f"ws://127.0.0.1:{port}/ws", headers={
-            "Sec-WebSocket-Protocol": f"bokeh, {token}", "Origin": f"http://127.0.0.1:{port}"}),
-            max_message_size=100_000_000)
+        socket = await websocket_connect(
+            HTTPRequest(
+                f"ws://127.0.0.1:{port}/ws",
+                headers={"Sec-WebSocket-Protocol": f"bokeh, {token}", "Origin": f"http://127.0.0.1:{port}"},
+            ),
+            max_message_size=100_000_000,
+        )
         count["in"] += 1
         for part in PULL:
             socket.write_message(part)
@@ -183,7 +220,8 @@ def crowd(address: str, told, clients: int = CLIENTS + 1, harmful: bool = True) 
     async def all_of_them() -> None:
         harm = [garbage()] if harmful else []
         await asyncio.gather(
-            *(client(harmful and n == 0) for n in range(clients)), *harm, tell(), return_exceptions=True)
+            *(client(harmful and n == 0) for n in range(clients)), *harm, tell(), return_exceptions=True
+        )
 
     asyncio.run(all_of_them())
 

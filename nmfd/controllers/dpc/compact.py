@@ -48,9 +48,9 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.tensors import PerPair, PerRegion, PerTurn
 
 DISPERSION = 60.0  # s: how differently drivers see the same ways; assumed, nobody has measured it
-HELD = 90.0        # s, a cycle of the signals: how fast a region may fill
-OLDEST = 8         # numbers of the policies that had the fewest: up to metering
-LONGEST = 20.0     # times as long as in free flow: the most that it takes in the model to leave a region
+HELD = 90.0  # s, a cycle of the signals: how fast a region may fill
+OLDEST = 8  # numbers of the policies that had the fewest: up to metering
+LONGEST = 20.0  # times as long as in free flow: the most that it takes in the model to leave a region
 
 
 class Numbers(NamedTuple):
@@ -116,8 +116,10 @@ class CompactPolicy(Policy):
             return None
         numbers, full = self._read(), self._full(x)
         return torch.where(
-            self.held, numbers.price * (full - numbers.price_from).clamp(min=0.0),
-            numbers.elsewhere * (full - numbers.elsewhere_from).clamp(min=0.0))
+            self.held,
+            numbers.price * (full - numbers.price_from).clamp(min=0.0),
+            numbers.elsewhere * (full - numbers.elsewhere_from).clamp(min=0.0),
+        )
 
     def metering(self, x: PerPair) -> PerRegion | None:
         """(..., R) [veh/s], the most trips that may begin in each region in the states x; None where nobody waits."""

@@ -27,14 +27,14 @@ from nmfd.types import Controls, Observation, Status
 # Added to the variance of every normalised state: 2 % of the critical accumulation is no departure, even in an entry
 # that was always empty in training.
 TOLERANCE = 0.02
-QUANTILE = 0.999    # of the training states that count as inside
-PATIENCE = 4        # control intervals in a row inside before the policy is trusted again
-MOST_ERROR = 0.25   # of the critical accumulations: of predictions for the next interval, root mean square of regions
-MEMORY = 0.5        # of the squared errors before
-LOOK_AHEAD = 40     # control intervals; gating costs something at first, and pays later
-MOST_LOSS = 0.05    # of the total time spent without control, in that time
-JUDGED = 10         # control intervals after which split ratios are judged by what came of them
-TOLERATED = 0.01    # of the time spent in them: errors of the model that are no fault of the split ratios
+QUANTILE = 0.999  # of the training states that count as inside
+PATIENCE = 4  # control intervals in a row inside before the policy is trusted again
+MOST_ERROR = 0.25  # of the critical accumulations: of predictions for the next interval, root mean square of regions
+MEMORY = 0.5  # of the squared errors before
+LOOK_AHEAD = 40  # control intervals; gating costs something at first, and pays later
+MOST_LOSS = 0.05  # of the total time spent without control, in that time
+JUDGED = 10  # control intervals after which split ratios are judged by what came of them
+TOLERATED = 0.01  # of the time spent in them: errors of the model that are no fault of the split ratios
 
 
 def statistics(states: Float[np.ndarray, "N C"]) -> dict[str, torch.Tensor]:
@@ -46,8 +46,11 @@ def statistics(states: Float[np.ndarray, "N C"]) -> dict[str, torch.Tensor]:
     precision = np.linalg.inv(np.cov(states, rowvar=False) + TOLERANCE**2 * np.eye(states.shape[1]))
     far = states - mean
     squares = ((far @ precision) * far).sum(axis=1)
-    return {"mean": torch.from_numpy(mean), "precision": torch.from_numpy(precision),
-            "limit": torch.tensor(float(np.sqrt(np.quantile(squares, QUANTILE))), dtype=torch.float64)}
+    return {
+        "mean": torch.from_numpy(mean),
+        "precision": torch.from_numpy(precision),
+        "limit": torch.tensor(float(np.sqrt(np.quantile(squares, QUANTILE))), dtype=torch.float64),
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,9 +85,9 @@ class Judge:
     """
 
     def __init__(self) -> None:
-        self.commanded = False                          # in this interval
-        self._missed: dict[bool, float] = {}            # as shares of what was foreseen [-], by whether commanded
-        self._claimed = 0.0                             # for the intervals that were judged [-]
+        self.commanded = False  # in this interval
+        self._missed: dict[bool, float] = {}  # as shares of what was foreseen [-], by whether commanded
+        self._claimed = 0.0  # for the intervals that were judged [-]
         self._open: deque[list[float]] = deque(maxlen=JUDGED)  # foreseen, claimed, and measured so far [veh]
 
     def see(self, observation: Observation) -> None:
@@ -166,9 +169,9 @@ class Guarded:
 
     def reset(self, seed: int = 0) -> None:
         self._policy.reset(seed)
-        self._left = 0          # intervals that PI gating keeps the control for
+        self._left = 0  # intervals that PI gating keeps the control for
         self._judge = Judge()
-        self._error = 0.0       # squared, of the predictions so far
+        self._error = 0.0  # squared, of the predictions so far
         self._predicted: np.ndarray | None = None  # accumulations (R,) at the end of this interval
 
     def distance(self, accumulation: PerPair) -> float:
@@ -191,8 +194,11 @@ class Guarded:
         else:
             reason = problem or f"inside again for {PATIENCE - self._left} of {PATIENCE} intervals"
             controls = replace(
-                self._fallback.act(observation), splits=self._drivers, status=Status.FALLBACK,
-                note=f"guard: {reason}, pi-gating in control")
+                self._fallback.act(observation),
+                splits=self._drivers,
+                status=Status.FALLBACK,
+                note=f"guard: {reason}, pi-gating in control",
+            )
         self._predict(observation, controls)
         return controls
 
@@ -205,8 +211,12 @@ class Guarded:
         if not problem:
             return controls
         return replace(
-            controls, splits=self._drivers, prices=None, status=controls.status | Status.FALLBACK,
-            note=f"guard: {problem}, the drivers' own instead")
+            controls,
+            splits=self._drivers,
+            prices=None,
+            status=controls.status | Status.FALLBACK,
+            note=f"guard: {problem}, the drivers' own instead",
+        )
 
     def _problem(self, observation: Observation, foreseen: Foreseen) -> str | None:
         """Why the policy is not to be trusted now."""
@@ -232,11 +242,17 @@ class Guarded:
                 (perimeter, splits), metering = self._network(x[:2]), self._network.metering(x[:2])
                 own = self._own.expand(3, -1, -1, -1)
                 entering, waiting = dynamics.admitted(
-                    waiting, demand.expand_as(x), None if metering is None else torch.cat([metering, unlimited]),
-                    self._planning.step)
+                    waiting,
+                    demand.expand_as(x),
+                    None if metering is None else torch.cat([metering, unlimited]),
+                    self._planning.step,
+                )
                 x = self._advance(
-                    x, entering, torch.cat([perimeter, self._open[None]]),
-                    own if splits is None else torch.cat([splits[:1], own[1:]]))
+                    x,
+                    entering,
+                    torch.cat([perimeter, self._open[None]]),
+                    own if splits is None else torch.cat([splits[:1], own[1:]]),
+                )
                 totals.append((x + waiting).sum((1, 2)))
         policy, gates, none = torch.stack(totals, dim=-1).numpy().astype(float)
         return Foreseen(policy=policy, gates=gates, none=none)
@@ -247,20 +263,33 @@ class Guarded:
         with torch.inference_mode():
             if controls.metering is not None:
                 demand, _ = dynamics.admitted(
-                    torch.from_numpy(observation.backlog).float(), demand, torch.from_numpy(controls.metering).float(),
-                    self._planning.step)
+                    torch.from_numpy(observation.backlog).float(),
+                    demand,
+                    torch.from_numpy(controls.metering).float(),
+                    self._planning.step,
+                )
             x = self._advance(
-                torch.from_numpy(observation.accumulation).float(), demand,
-                torch.from_numpy(controls.perimeter).float(), splits)
+                torch.from_numpy(observation.accumulation).float(),
+                demand,
+                torch.from_numpy(controls.perimeter).float(),
+                splits,
+            )
         self._predicted = x.sum(-1).numpy().astype(float)
 
     def _advance(
-        self, x: tensors.PerPair, demand: tensors.PerPair, perimeter: tensors.PerPair, splits: tensors.PerTurn,
+        self, x: tensors.PerPair, demand: tensors.PerPair, perimeter: tensors.PerPair, splits: tensors.PerTurn
     ) -> tensors.PerPair:
         planning = self._planning
         return dynamics.advance(
-            self._model, x, demand, perimeter, splits, planning.step, integrator=planning.integrator,
-            substeps=planning.substeps)
+            self._model,
+            x,
+            demand,
+            perimeter,
+            splits,
+            planning.step,
+            integrator=planning.integrator,
+            substeps=planning.substeps,
+        )
 
 
 def load(path: Path, planning: PlanningModel, *, guidance: bool) -> Guarded:
@@ -273,4 +302,5 @@ def load(path: Path, planning: PlanningModel, *, guidance: bool) -> Guarded:
         return Guarded(policy, content["states"], planning)
     except (KeyError, TypeError, AttributeError, RuntimeError):
         raise InputError(
-            f"{path}: states: are damaged or of another version; train it again with 'nmfd train'") from None
+            f"{path}: states: are damaged or of another version; train it again with 'nmfd train'"
+        ) from None

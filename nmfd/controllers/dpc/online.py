@@ -24,7 +24,7 @@ from nmfd.model.planning import PlanningModel
 from nmfd.types import Controls, Observation
 
 MEMORY = 0.97  # of what was seen, per control interval: half is forgotten after 23
-TRUST = 1.0    # how much the nominal model weighs: as one interval with 1 % of the critical accumulations flowing
+TRUST = 1.0  # how much the nominal model weighs: as one interval with 1 % of the critical accumulations flowing
 LIMITS = (0.5, 2.0)  # of demand and outflow, times their nominal values
 
 
@@ -67,8 +67,9 @@ class ModelEstimate:
         step, regions = self._planning.step, self._regions
         x = torch.from_numpy(np.maximum(before, 0.0))
         splits = self._splits if controls.splits is None else torch.from_numpy(controls.splits)
-        completions, transfers = (flow.numpy() for flow in dynamics.flows(
-            self._parameters, x, torch.from_numpy(controls.perimeter), splits))
+        completions, transfers = (
+            flow.numpy() for flow in dynamics.flows(self._parameters, x, torch.from_numpy(controls.perimeter), splits)
+        )
         parts = np.zeros((2 * regions, regions, regions))
         for i in range(regions):
             parts[i, i] = step * planned[i]
@@ -131,8 +132,10 @@ class OnlineDpc:
             self._tune(seen, demand)
         with torch.no_grad():
             start = torch.from_numpy(np.maximum(seen, 0.0)).float().unsqueeze(0)
-            spent = [float(self._rollout.total_time_spent(policy, start, demand[:, :1], self._generator))
-                     for policy in (self._tuned, self._frozen)]
+            spent = [
+                float(self._rollout.total_time_spent(policy, start, demand[:, :1], self._generator))
+                for policy in (self._tuned, self._frozen)
+            ]
         controls = self._controllers[0 if spent[0] <= spent[1] else 1].act(observation)
         self._last = seen, controls, k
         return controls

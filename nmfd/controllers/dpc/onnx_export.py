@@ -25,7 +25,7 @@ from nmfd.tensors import PerPair, PerTurn
 
 OPSET = 18
 TOLERANCE = 1e-5  # [-], of every output against torch: float32, summed in another order
-SAMPLES = 64      # states of the check
+SAMPLES = 64  # states of the check
 MODULES = ("onnx", "onnxscript", "onnxruntime")
 
 
@@ -45,7 +45,8 @@ def export(policy_file: Path, out: Path, scenario_folder: Path | None = None) ->
     if policy.architecture.compact:
         raise InputError(
             f"{policy_file}: is a compact policy, whose few numbers need no graph: 'nmfd list policies' shows them, "
-            "and nmfd/controllers/dpc/compact.py what they mean; choose a policy that is a network")
+            "and nmfd/controllers/dpc/compact.py what they mean; choose a policy that is a network"
+        )
     policy.eval()
     with atomic(out) as temporary:
         _write(policy, temporary)
@@ -54,8 +55,11 @@ def export(policy_file: Path, out: Path, scenario_folder: Path | None = None) ->
         if not difference <= TOLERANCE:
             raise RunFailed(f"{out}: the graph differs from the policy by {difference:.2g}, more than {TOLERANCE:g}")
     return {
-        "controller": content["configuration"].get("controller", "dpc"), "regions": policy.regions,
-        "samples": SAMPLES, "difference": difference}
+        "controller": content["configuration"].get("controller", "dpc"),
+        "regions": policy.regions,
+        "samples": SAMPLES,
+        "difference": difference,
+    }
 
 
 def _planning(policy_file: Path, folder: Path | None) -> tuple[PlanningModel, dict]:
@@ -80,8 +84,17 @@ def _write(policy: Policy, path: Path) -> None:
     with warnings.catch_warnings(), contextlib.redirect_stdout(talk), contextlib.redirect_stderr(talk):
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            _Outputs(policy), (example,), path, input_names=["accumulation"], output_names=outputs, dynamo=True,
-            dynamic_shapes=({0: torch.export.Dim("batch")},), opset_version=OPSET, external_data=False, verbose=False)
+            _Outputs(policy),
+            (example,),
+            path,
+            input_names=["accumulation"],
+            output_names=outputs,
+            dynamo=True,
+            dynamic_shapes=({0: torch.export.Dim("batch")},),
+            opset_version=OPSET,
+            external_data=False,
+            verbose=False,
+        )
 
 
 class _Outputs(torch.nn.Module):
@@ -103,10 +116,19 @@ def _describe(path: Path, planning: PlanningModel, controller: str) -> None:
 
     model = onnx.load(path)
     network = planning.network
-    onnx.helper.set_model_props(model, {
-        "controller": controller, "network": network.name, "network_hash": network.hash, "u_min": f"{network.u_min:g}",
-        "u_max": f"{network.u_max:g}", "control_interval_s": f"{planning.step:g}", "units": "accumulation [veh], "
-        "[i, j] = in region i bound for j; perimeter [-], [i, h] = u_ih; splits [-], [i, h, j] = theta_ihj"})
+    onnx.helper.set_model_props(
+        model,
+        {
+            "controller": controller,
+            "network": network.name,
+            "network_hash": network.hash,
+            "u_min": f"{network.u_min:g}",
+            "u_max": f"{network.u_max:g}",
+            "control_interval_s": f"{planning.step:g}",
+            "units": "accumulation [veh], "
+            "[i, j] = in region i bound for j; perimeter [-], [i, h] = u_ih; splits [-], [i, h, j] = theta_ihj",
+        },
+    )
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, path)
 

@@ -50,8 +50,11 @@ class SoftExponential(nn.Module):
 
 
 ACTIVATIONS: dict[Activation, Callable[[int], nn.Module]] = {
-    "gelu": lambda width: nn.GELU(), "relu": lambda width: nn.ReLU(), "tanh": lambda width: nn.Tanh(),
-    "soft-exponential": SoftExponential}
+    "gelu": lambda width: nn.GELU(),
+    "relu": lambda width: nn.ReLU(),
+    "tanh": lambda width: nn.Tanh(),
+    "soft-exponential": SoftExponential,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,8 +94,10 @@ class Policy(nn.Module):
         self.architecture, self.regions = architecture, regions
         self.u_min, self.u_max = network.u_min, network.u_max
         self.register_buffer(
-            "scale", torch.tensor([[m.critical] for m in network.mfds], dtype=torch.float32),
-            persistent=not architecture.local)
+            "scale",
+            torch.tensor([[m.critical] for m in network.mfds], dtype=torch.float32),
+            persistent=not architecture.local,
+        )
         onward = _neighbours(network.adjacency) if architecture.listed else np.tile(np.arange(regions), (regions, 1))
         here = np.arange(regions)[:, None]
         allowed = torch.tensor(network.adjacency[here, onward] & (np.diff(onward, prepend=-1) != 0))
@@ -107,8 +112,7 @@ class Policy(nn.Module):
         layers: list[nn.Module] = []
         for layer in range(architecture.layers):
             inputs = FEATURES if architecture.local else regions**2
-            layers += [nn.Linear(inputs if layer == 0 else width, width),
-                       ACTIVATIONS[architecture.activation](width)]
+            layers += [nn.Linear(inputs if layer == 0 else width, width), ACTIVATIONS[architecture.activation](width)]
         self.backbone = nn.Sequential(*layers)
         self.perimeter_decoder = nn.Linear(width, 1 if architecture.local else onward.size)
         if architecture.guidance:
@@ -129,11 +133,12 @@ class Policy(nn.Module):
         perimeter = perimeter.new_zeros(*x.shape[:-2], *shape).scatter_add(-1, onward.expand_as(perimeter), perimeter)
         if splits is not None:
             splits = splits.new_zeros(*x.shape[:-2], self.regions, *shape).scatter_add(
-                -2, onward.unsqueeze(-1).expand_as(splits), splits)
+                -2, onward.unsqueeze(-1).expand_as(splits), splits
+            )
         return perimeter, splits
 
     def listed(
-        self, x: PerPair, memory: Memory | None = None,
+        self, x: PerPair, memory: Memory | None = None
     ) -> tuple[Float[torch.Tensor, "*#B R D"], Float[torch.Tensor, "*#B R D R"] | None]:
         """Perimeter (..., R, D) and splits (..., R, D, R) towards the regions `onward` (R, D); all D = R if dense.
 
@@ -164,8 +169,7 @@ class Policy(nn.Module):
         """Of every boundary (i, h): how full i and h are, their neighbours on average, and how many of those in i and h
         end there, in critical accumulations."""
         critical = self.scale.squeeze(-1)
-        full, ending = (
-            n.to(critical.dtype) / critical for n in (x.sum(-1), torch.diagonal(x, dim1=-2, dim2=-1)))
+        full, ending = (n.to(critical.dtype) / critical for n in (x.sum(-1), torch.diagonal(x, dim1=-2, dim2=-1)))
         beside = (full[..., self.onward] * self.adjacency).sum(-1) / self.adjacency.sum(-1).clamp(min=1.0)
         regions = torch.stack([full, beside, ending], dim=-1)
         here = regions.unsqueeze(-2).expand(*regions.shape[:-1], self.onward.shape[1], -1)
@@ -201,7 +205,8 @@ class DpcController:
             perimeter, splits = self._policy.listed(x, self._memory)
             prices, metering = (
                 None if asked is None else asked.numpy().astype(float)
-                for asked in (self._policy.prices(x), self._policy.metering(x)))
+                for asked in (self._policy.prices(x), self._policy.metering(x))
+            )
         perimeter = perimeter.numpy()
         if self.fault == "policy-nan":
             perimeter = np.full_like(perimeter, np.nan)
@@ -211,13 +216,19 @@ class DpcController:
         # The sum is finite if every number is: they are bounded unless they are NaN.
         if not math.isfinite(perimeter.sum()) or (splits is not None and not math.isfinite(sums.sum())):
             return Controls(
-                perimeter=self._u_max, splits=None, status=Status.SOLVER_FAILURE | Status.FALLBACK,
-                note="dpc: policy returned NaN, perimeter opened")
+                perimeter=self._u_max,
+                splits=None,
+                status=Status.SOLVER_FAILURE | Status.FALLBACK,
+                note="dpc: policy returned NaN, perimeter opened",
+            )
         if splits is not None:
             splits /= np.maximum(sums, 1e-9)  # float32 sums miss 1 by 1e-7; those of j = i are 0
         return Controls(
-            perimeter=self._full(perimeter), splits=None if splits is None else self._full(splits),
-            prices=prices, metering=metering)
+            perimeter=self._full(perimeter),
+            splits=None if splits is None else self._full(splits),
+            prices=prices,
+            metering=metering,
+        )
 
     def _full(self, listed: np.ndarray) -> np.ndarray:
         """(R, R) or (R, R, R) of (R, D) or (R, D, R): the second axis, over the policy's neighbours, over all regions.

@@ -30,9 +30,13 @@ def checkpoint(policy: Policy, network: RegionalModel, configuration: Mapping, s
     """
     return {
         **({} if states is None else {"states": dict(states)}),
-        "format": FORMAT, "architecture": asdict(policy.architecture), "network": network.name,
-        "network_hash": network.hash, "configuration": dict(configuration),
-        "weights": {key: value.detach().cpu().clone() for key, value in policy.state_dict().items()}}
+        "format": FORMAT,
+        "architecture": asdict(policy.architecture),
+        "network": network.name,
+        "network_hash": network.hash,
+        "configuration": dict(configuration),
+        "weights": {key: value.detach().cpu().clone() for key, value in policy.state_dict().items()},
+    }
 
 
 def read_file(path: Path, missing: str, damaged: str) -> Any:
@@ -49,7 +53,8 @@ def read_file(path: Path, missing: str, damaged: str) -> Any:
 def read_policy_file(path: Path) -> Any:
     """The checkpoint in `path`, unchecked. InputError if there is none."""
     return read_file(
-        path, "no such policy; train one with 'nmfd train'", "is not a policy file; train one with 'nmfd train'")
+        path, "no such policy; train one with 'nmfd train'", "is not a policy file; train one with 'nmfd train'"
+    )
 
 
 def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
@@ -62,9 +67,12 @@ def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
         if content["network_hash"] != network.hash and architecture.local is not True:
             raise InputError(
                 f"{path}: network_hash: the policy was trained for network {content['network']!r} "
-                f"({content['network_hash']}), not for {network.name!r} ({network.hash}); train one with 'nmfd train'")
-        flags = {type(flag) for flag in (
-            architecture.guidance, architecture.sparse, architecture.local, architecture.metering)}
+                f"({content['network_hash']}), not for {network.name!r} ({network.hash}); train one with 'nmfd train'"
+            )
+        flags = {
+            type(flag)
+            for flag in (architecture.guidance, architecture.sparse, architecture.local, architecture.metering)
+        }
         if not all(type(region) is int and 0 <= region < network.regions for region in architecture.compact):
             raise KeyError("architecture")
         if not (0 < architecture.width <= WIDEST and 0 < architecture.layers <= DEEPEST and flags == {bool}):

@@ -39,6 +39,7 @@ class Replays:
 
     def __init__(self, rollout: Rollout, policy: Policy, runs: Sequence[Run]):
         """policy: under which they were"""
+
         def stacked(arrays: Sequence[np.ndarray]) -> Demands:
             return torch.tensor(np.stack(arrays, axis=1), dtype=rollout.dtype, device=rollout.device)
 
@@ -68,7 +69,11 @@ class Replays:
 
 
 def descend(
-    policy: Policy, replays: Replays, *, steps: int, learning_rate: float,
+    policy: Policy,
+    replays: Replays,
+    *,
+    steps: int,
+    learning_rate: float,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> list[float]:
     """Take `steps` Adam steps down the mean logarithm of the TTS of `replays`, in place; returns its geometric mean

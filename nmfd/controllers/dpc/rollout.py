@@ -28,11 +28,16 @@ class Rollout:
     """
 
     def __init__(
-        self, planning: PlanningModel, dtype: torch.dtype = torch.float32, device: str | torch.device = "cpu",
-        detour_cost: float = 0.0, swing_cost: float = 0.0,
+        self,
+        planning: PlanningModel,
+        dtype: torch.dtype = torch.float32,
+        device: str | torch.device = "cpu",
+        detour_cost: float = 0.0,
+        swing_cost: float = 0.0,
     ):
         """detour_cost: what a vehicle loses that is guided off the drivers' own split ratios [s]
         swing_cost: of opening or closing the gates between two regions, whole and in one interval [veh s]"""
+
         def tensor(values: Any) -> torch.Tensor:
             return torch.tensor(values, dtype=dtype, device=device)
 
@@ -47,7 +52,11 @@ class Rollout:
         self.start = torch.zeros_like(self.demand[0]) if planning.initial is None else tensor(planning.initial)
 
     def random_start(
-        self, batch: int, spread: float, share: float, generator: torch.Generator,
+        self,
+        batch: int,
+        spread: float,
+        share: float,
+        generator: torch.Generator,
         levels: tuple[float, float] = (1.0, 1.0),
     ) -> tuple[States, Demands]:
         """Initial states (B, R, R) [veh] and demands (T, B, R, R) [veh/s].
@@ -57,6 +66,7 @@ class Rollout:
         up to between nothing and 80 % of their jam accumulation with vehicles for the destinations in use; the others
         start as the scenario does.
         """
+
         def uniform(*shape: int) -> torch.Tensor:
             return torch.rand(*shape, generator=generator, dtype=self.dtype).to(self.device)
 
@@ -83,6 +93,7 @@ class Rollout:
         """
         p, regions = self._nominal, len(self.jam)
         if spread or scale != 1.0:
+
             def factor(*shape: int, share: float = 1.0) -> torch.Tensor:
                 normal = torch.randn(batch, *shape, generator=generator, dtype=self.dtype).to(self.device)
                 return torch.exp(share * spread * normal.clamp(-2.0, 2.0))
@@ -91,9 +102,14 @@ class Rollout:
             # The integration step stays short enough: no rate rises above the largest that the network was checked for.
             high = high.clamp(max=1.0 / (self._fastest() * self.planning.step / self.planning.substeps))
             p = replace(
-                p, a=high * p.a / wide**2, b=high * p.b / wide, c=high * p.c, jam=wide * p.jam,
+                p,
+                a=high * p.a / wide**2,
+                b=high * p.b / wide,
+                c=high * p.c,
+                jam=wide * p.jam,
                 capacity=None if p.capacity is None else p.capacity * factor(regions, regions, share=0.5),
-                storage=None if p.storage is None else p.storage * wide)
+                storage=None if p.storage is None else p.storage * wide,
+            )
         self.parameters = p
 
     def _fastest(self) -> torch.Tensor:
@@ -102,7 +118,7 @@ class Rollout:
         return p.c if p.exit_rates is None else p.c * p.exit_rates.amax(-1)
 
     def perturb(
-        self, demand: Demands, level: Levels, noise: float, noise_all: float, generator: torch.Generator,
+        self, demand: Demands, level: Levels, noise: float, noise_all: float, generator: torch.Generator
     ) -> Demands:
         """`demand` (T, B, R, R) [veh/s] with Gaussian noise, clipped at zero.
 
@@ -122,8 +138,15 @@ class Rollout:
         """The state (B, R, R) [veh] one control interval after x, which `policy` saw with `noise` (B, R, R) [veh]."""
         perimeter, splits = policy(x + noise)
         return dynamics.advance(
-            self.parameters, x, demand, perimeter, self.nominal_splits if splits is None else splits,
-            self.planning.step, integrator=self.planning.integrator, substeps=self.planning.substeps)
+            self.parameters,
+            x,
+            demand,
+            perimeter,
+            self.nominal_splits if splits is None else splits,
+            self.planning.step,
+            integrator=self.planning.integrator,
+            substeps=self.planning.substeps,
+        )
 
     def entering(self, policy: Policy, seen: States, demand: States, backlog: States) -> tuple[States, States]:
         """The demand (B, R, R) [veh/s] that a policy lets enter where it has `seen` the states, and the backlog
@@ -133,7 +156,7 @@ class Rollout:
         return dynamics.admitted(backlog, demand, policy.metering(seen), self.planning.step)
 
     def states(
-        self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None,
+        self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None
     ) -> tuple[Demands, Demands, Float[torch.Tensor, "T B"]]:
         """The states (T, B, R, R) [veh] under `policy` from x (B, R, R), what it saw of them through the noise, and how
         many (T, B) [veh] waited to enter, because it did not let them.
@@ -151,10 +174,9 @@ class Rollout:
         return exact, exact + noise, torch.stack(waiting)
 
     def total_time_spent(
-        self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None,
+        self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None
     ) -> Levels:
-        """TTS (B,) [veh s] of rollouts from x (B, R, R) under `policy`, with detours and swings; arguments as `states`.
-        """
+        """TTS (B,) [veh s] of rollouts from x (B, R, R) under `policy`, with detours and swings; arguments as `states`."""
         return self.cost(policy, *self.states(policy, x, demand, generator, step))
 
     def cost(self, policy: Policy, exact: Demands, seen: Demands, waiting: Float[torch.Tensor, "T B"]) -> Levels:

@@ -38,7 +38,7 @@ WORTH_COMPILING = 200  # Adam steps
 # as a share of the set point; share of u where there is no gate.
 GATE_STEPS, GATE_BATCH, GATE_RATE, GATE_WIDTH, GATE_FULLEST, OPENED = 1000, 256, 2e-3, 0.05, 2.5, 0.95
 WEAK, OPEN, RARE = 0.1, 3.0, 1e-3  # of the first policy from no control: factor of weights, logit of u, least theta
-VALIDATIONS = 16       # perturbed scenarios in a validation, if training perturbs the demand
+VALIDATIONS = 16  # perturbed scenarios in a validation, if training perturbs the demand
 NAMES = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
 
 
@@ -52,17 +52,20 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
         raise InputError(f"--controller: {controller!r} cannot be trained; choose one of {', '.join(NAMES)}")
     if variant and controller not in scenario.controller_options:
         raise InputError(
-            f"--controller: {controller!r} needs a table [controllers.\"{controller}\"] in {scenario.folder}/"
-            f"scenario.toml that says what is different from {name}; add one, or train {name}")
+            f'--controller: {controller!r} needs a table [controllers."{controller}"] in {scenario.folder}/'
+            f"scenario.toml that says what is different from {name}; add one, or train {name}"
+        )
     chosen = options(TRAINED[name], planning_model(scenario, controller), name, controller)
     if chosen.local and NAMES[name]:
         raise InputError(
             f"{scenario.folder}/scenario.toml: controllers.{controller}.local: a local policy guides no routes; train "
-            f"{name.replace('pcrg', 'pc')}, or omit it")
+            f"{name.replace('pcrg', 'pc')}, or omit it"
+        )
     if not chosen.descend and steps is not None:
         raise InputError(
             f"--steps: {controller} stays as it begins (descend = false in {scenario.folder}/scenario.toml); omit one "
-            "of them")
+            "of them"
+        )
     return chosen if steps is None else chosen.changed(steps=steps)
 
 
@@ -73,12 +76,14 @@ def check(scenario: Scenario, controller: str) -> RegionalModel:
     if city.controllable is not None and not city.controllable.any():
         raise InputError(
             f"{_file(city)}: controllable: is 0 at every boundary: {NO_GATEWAY}; --anyway trains {controller} all the "
-            "same")
+            "same"
+        )
     if believed.placeholder:
         raise InputError(
             f"{_file(believed)}: placeholder: is true: its MFDs are guesses from lanes and speed limits, and a policy "
             f"would learn these; run 'cosim identify {os.path.dirname(_file(city)) or 'NETWORK'}' first, or set it to "
-            f"false once you have put in MFDs of your own; --anyway trains {controller} all the same")
+            f"false once you have put in MFDs of your own; --anyway trains {controller} all the same"
+        )
     return believed
 
 
@@ -87,16 +92,25 @@ def _file(network: RegionalModel) -> str:
 
 
 def available(device: str) -> str:
-    """"cpu" or "cuda", with "auto" the GPU where there is one. InputError for a GPU that is not there."""
+    """ "cpu" or "cuda", with "auto" the GPU where there is one. InputError for a GPU that is not there."""
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device: cuda asked for, but PyTorch finds no GPU here; choose cpu or auto")
     return "cuda" if device == "auto" and torch.cuda.is_available() else device.replace("auto", "cpu")
 
 
 def train(
-    scenario: Scenario, controller: str, *, seed: int, out: Path, steps: int | None = None, resume: bool = False,
-    device: str = "cpu", compiled: bool = False, anyway: bool = False,
-    progress: Callable[[int, int, str], None] | None = None, log: Callable[[int, float, float], object] | None = None,
+    scenario: Scenario,
+    controller: str,
+    *,
+    seed: int,
+    out: Path,
+    steps: int | None = None,
+    resume: bool = False,
+    device: str = "cpu",
+    compiled: bool = False,
+    anyway: bool = False,
+    progress: Callable[[int, int, str], None] | None = None,
+    log: Callable[[int, float, float], object] | None = None,
 ) -> Path:
     """Train `controller`, one that `settings` knows, on the regional model and write the policy to `out`.
 
@@ -113,14 +127,25 @@ def train(
         planning = planning_model(scenario, controller)
         steps = chosen.steps if chosen.descend else 0
         configuration = {
-            "controller": controller, "scenario": planning.name, "seed": seed, "compiled": compiled, **vars(chosen),
-            "steps": steps}
+            "controller": controller,
+            "scenario": planning.name,
+            "seed": seed,
+            "compiled": compiled,
+            **vars(chosen),
+            "steps": steps,
+        }
         torch.manual_seed(seed)
         generator = torch.Generator().manual_seed(seed)
         guidance = NAMES[controller.partition("+")[0]]
         architecture = Architecture(
-            width=chosen.width, layers=chosen.layers, activation=chosen.activation, guidance=guidance,
-            local=chosen.local, compact=planning.protected if chosen.compact else (), metering=chosen.metering)
+            width=chosen.width,
+            layers=chosen.layers,
+            activation=chosen.activation,
+            guidance=guidance,
+            local=chosen.local,
+            compact=planning.protected if chosen.compact else (),
+            metering=chosen.metering,
+        )
         policy = new_policy(planning.network, architecture)
         if chosen.numbers and isinstance(policy, CompactPolicy):
             policy.begin_with(chosen.numbers)
@@ -128,8 +153,7 @@ def train(
             begin_as_no_control(policy, planning.network)
         device = "cpu" if chosen.compact else device
         policy = policy.to(device)
-        rollout = Rollout(
-            planning, device=device, detour_cost=chosen.detour_cost, swing_cost=chosen.swing_cost)
+        rollout = Rollout(planning, device=device, detour_cost=chosen.detour_cost, swing_cost=chosen.swing_cost)
         if chosen.from_gating and not resume:
             begin_as_gate(policy, rollout, generator)
         advance = compiled_step(rollout.step) if compiled else rollout.step
@@ -149,9 +173,11 @@ def train(
                     group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
                 rollout.draw_model(chosen.batch, chosen.mfd_spread, generator, chosen.mfd_scale)
                 x, demand = rollout.random_start(
-                    chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
+                    chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels
+                )
                 demand = rollout.perturb(
-                    demand, torch.rand(chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
+                    demand, torch.rand(chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator
+                )
                 # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
                 loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
                 optimizer.zero_grad()
@@ -186,8 +212,7 @@ def train(
                     progress(1, 1, f"as it begins {best:.4g} veh s")
                 _keep(policy, rollout, chosen, configuration, best, out)
             if not math.isfinite(best):
-                raise RunFailed(
-                    f"{controller}: every validation of {steps} steps diverged; lower the learning rate")
+                raise RunFailed(f"{controller}: every validation of {steps} steps diverged; lower the learning rate")
             state_file.unlink(missing_ok=True)
         return out
 
@@ -237,8 +262,9 @@ def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> f
     demand = rollout.perturb(nominal, level, chosen.noise, chosen.noise_all, generator)
     if chosen.demand_low < chosen.demand_high:
         low, high = chosen.levels
-        demand = demand * (low + (high - low) * level[torch.randperm(count, generator=generator)]).to(
-            demand)[:, None, None]
+        demand = (
+            demand * (low + (high - low) * level[torch.randperm(count, generator=generator)]).to(demand)[:, None, None]
+        )
     with torch.no_grad():
         total = rollout.total_time_spent(policy, rollout.start.expand_as(demand[0]), demand, generator)
     return torch.log(total).mean().exp().item()
@@ -249,16 +275,18 @@ def visited(policy: Policy, rollout: Rollout, chosen: Training, seed: int) -> Fl
     generator = torch.Generator().manual_seed(seed)
     rollout.draw_model(4 * chosen.batch, chosen.mfd_spread, generator, chosen.mfd_scale)
     x, demand = rollout.random_start(
-        4 * chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels)
+        4 * chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels
+    )
     demand = rollout.perturb(
-        demand, torch.rand(4 * chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator)
+        demand, torch.rand(4 * chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator
+    )
     with torch.no_grad():
         _, seen, _ = rollout.states(policy, x, demand, generator)
         return (seen / policy.scale).flatten(0, 1).flatten(-2).double().cpu().numpy()
 
 
 def _keep(
-    policy: Policy, rollout: Rollout, chosen: Training, configuration: Mapping[str, Any], score: float, out: Path,
+    policy: Policy, rollout: Rollout, chosen: Training, configuration: Mapping[str, Any], score: float, out: Path
 ) -> None:
     """Write the policy to `out`, with its `score` in validation [veh s] and statistics of the states that it sees."""
     states = fallback.statistics(visited(policy, rollout, chosen, configuration["seed"]))
@@ -266,27 +294,43 @@ def _keep(
 
 
 def _state(
-    configuration: Mapping[str, Any], step: int, best: float, history: list[list[float]], policy: Policy,
-    optimizer: torch.optim.Optimizer, generator: torch.Generator,
+    configuration: Mapping[str, Any],
+    step: int,
+    best: float,
+    history: list[list[float]],
+    policy: Policy,
+    optimizer: torch.optim.Optimizer,
+    generator: torch.Generator,
 ) -> dict[str, Any]:
     return {
-        "configuration": configuration, "step": step, "best": best, "history": history,
-        "policy": policy.state_dict(), "optimizer": optimizer.state_dict(), "generator": generator.get_state()}
+        "configuration": configuration,
+        "step": step,
+        "best": best,
+        "history": history,
+        "policy": policy.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "generator": generator.get_state(),
+    }
 
 
 def _restore(
-    state_file: Path, configuration: Mapping[str, Any], policy: Policy, optimizer: torch.optim.Optimizer,
+    state_file: Path,
+    configuration: Mapping[str, Any],
+    policy: Policy,
+    optimizer: torch.optim.Optimizer,
     generator: torch.Generator,
 ) -> tuple[int, float, list[list[float]]]:
     state = read_file(
-        state_file, "nothing to resume; train without --resume", "is damaged; remove it and train without --resume")
+        state_file, "nothing to resume; train without --resume", "is damaged; remove it and train without --resume"
+    )
     try:
         there = dict(state["configuration"])
         for key, value in configuration.items():
             if there.get(key) != value:
                 raise InputError(
                     f"{state_file}: {key}: was {there.get(key)!r}, now {value!r}; resume with the same settings or "
-                    "train without --resume")
+                    "train without --resume"
+                )
         policy.load_state_dict(state["policy"])
         optimizer.load_state_dict(state["optimizer"])
         generator.set_state(state["generator"])

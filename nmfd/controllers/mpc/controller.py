@@ -33,7 +33,7 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.config import Problem, setting, whole
 from nmfd.types import Controls, Observation, Status
 
-ROUNDING = 0.005    # of the smallest jam accumulation: over which the solver sees the kink of the MFD there rounded off
+ROUNDING = 0.005  # of the smallest jam accumulation: over which the solver sees the kink of the MFD there rounded off
 # The solver stops when, to first order, no admissible plan can save more than this share of the total time spent. A
 # tenth changes the benchmark's total time spent by less than 1 %, either way. At its limits it may stop at ACCEPTABLE.
 TOLERANCE = 1e-6
@@ -43,8 +43,8 @@ FAILED = Status.SOLVER_FAILURE | Status.FALLBACK
 # hundredth of it changes the benchmark's total time spent by 0.1 %, and takes ten times as long.
 COARSE = 1e-4
 TERMINAL = "-terminal"  # behind the name
-IN_TIME = 0.9       # share of the deadline that the solver has; the rest is for what becomes of its plan
-FEW = 5.0           # veh: added to the vehicles that a control decides on, where these scale the solver's steps
+IN_TIME = 0.9  # share of the deadline that the solver has; the rest is for what becomes of its plan
+FEW = 5.0  # veh: added to the vehicles that a control decides on, where these scale the solver's steps
 
 
 class Mpc(Options):
@@ -53,17 +53,28 @@ class Mpc(Options):
     horizon: int = whole("control intervals that the plan looks ahead", 8, low=2, high=1000)
     control_horizon: int | None = whole(
         "control intervals with controls of their own, the last of which stay in force over the rest of the horizon; "
-        "without it, all of them", None, low=1, high=1000)
+        "without it, all of them",
+        None,
+        low=1,
+        high=1000,
+    )
     solver: Literal["projected-gradient", "ipopt"] = setting(
         "ipopt: the published formulation by CasADi and IPOPT, two orders of magnitude slower: the reference",
-        "projected-gradient")
+        "projected-gradient",
+    )
     offset_free: bool = setting(
         "what the model got wrong in the last intervals is added to the demand that is forecast, fading; the network "
-        "says how, in its table [disturbance]", False)
+        "says how, in its table [disturbance]",
+        False,
+    )
     max_iterations: int = whole("of the solver, per decision", 1000)
     time_limit: float | None = setting(
         "deadline of a decision; without one, the control interval: a later answer is of no use. What is later all the "
-        "same is late in the books", None, unit="s", gt=0.0)
+        "same is late in the books",
+        None,
+        unit="s",
+        gt=0.0,
+    )
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Mpc":
@@ -90,10 +101,10 @@ class Admissible:
 
     def project(self, plan: Plan) -> Plan:
         """The nearest admissible plan."""
-        perimeter = np.clip(plan[:, :self._edges], self._network.u_min, self._network.u_max)
+        perimeter = np.clip(plan[:, : self._edges], self._network.u_min, self._network.u_max)
         if not self._guidance:
-            return np.concatenate([perimeter, np.broadcast_to(self._model.own, plan[:, self._edges:].shape)], axis=1)
-        return np.concatenate([perimeter, self._simplices(plan[:, self._edges:])], axis=1)
+            return np.concatenate([perimeter, np.broadcast_to(self._model.own, plan[:, self._edges :].shape)], axis=1)
+        return np.concatenate([perimeter, self._simplices(plan[:, self._edges :])], axis=1)
 
     def _simplices(self, splits: np.ndarray) -> np.ndarray:
         """The nearest shares (K, V) >= 0 whose sum is 1 over the turns of every cell (Michelot, 1986)."""
@@ -110,11 +121,11 @@ class Admissible:
 
     def gap(self, plan: Plan, gradient: Plan) -> float:
         """What the best admissible plan would save if the objective were linear [its unit]."""
-        u, of_u = plan[:, :self._edges], gradient[:, :self._edges]
+        u, of_u = plan[:, : self._edges], gradient[:, : self._edges]
         saved = float((of_u * (u - np.where(of_u > 0, self._network.u_min, self._network.u_max))).sum())
         if not self._guidance or not len(self._model.turns):
             return saved
-        splits, of_splits = plan[:, self._edges:], gradient[:, self._edges:]
+        splits, of_splits = plan[:, self._edges :], gradient[:, self._edges :]
         groups = self._groups(len(plan))
         least = np.full(groups.max() + 1, np.inf)
         np.minimum.at(least, groups, of_splits.ravel())
@@ -128,12 +139,12 @@ class Admissible:
     def controls(self, decision: Decision) -> tuple[PerPair, PerTurn | None]:
         """Perimeter (R, R) and splits (R, R, R), or None without guidance, of one interval (E + V,) of a plan."""
         perimeter = np.where(self._network.adjacency, self._network.u_max, 0.0)
-        perimeter[tuple(self._model.edges.T)] = decision[:self._edges]
+        perimeter[tuple(self._model.edges.T)] = decision[: self._edges]
         if not self._guidance:
             return perimeter, None
         splits = np.zeros((self._network.regions,) * 3)
         splits[self._unused] = self._network.nominal_splits[self._unused]
-        splits[tuple(self._model.turns.T)] = decision[self._edges:]
+        splits[tuple(self._model.turns.T)] = decision[self._edges :]
         return perimeter, splits
 
     def decision(self, perimeter: PerPair, splits: PerTurn) -> Decision:
@@ -180,13 +191,21 @@ class EconomicMpc:
         if terminal is not None and self.options.solver == "ipopt":
             raise InputError(
                 f"{planning.where}: controllers.{self.name}.solver: ipopt knows no terminal cost; omit it, or use "
-                f"{self.name.removesuffix(TERMINAL)}")
+                f"{self.name.removesuffix(TERMINAL)}"
+            )
         if self.options.solver == "ipopt":
             self._ipopt = Ipopt(
-                planning, guidance=guidance, horizon=horizon, iterations=self.options.max_iterations,
-                seconds=IN_TIME * self.deadline)
-        self._offset_free = OffsetFree(planning, f"{planning.where}: controllers.{self.name}.offset_free") if (
-            self.options.offset_free) else None
+                planning,
+                guidance=guidance,
+                horizon=horizon,
+                iterations=self.options.max_iterations,
+                seconds=IN_TIME * self.deadline,
+            )
+        self._offset_free = (
+            OffsetFree(planning, f"{planning.where}: controllers.{self.name}.offset_free")
+            if (self.options.offset_free)
+            else None
+        )
         self.fault: str | None = None  # injected (nmfd.faults)
         self.reset()
 
@@ -222,13 +241,16 @@ class EconomicMpc:
         if reason is not None and (found.point is last or not known) and reason != AT_REST:
             return self._without(observation, last, reason)
         self._plan, self._left, self._gates = found.point, self._moves - 1, False
-        return self._first() if reason is None else self._first(
-            Status.SOLVER_FAILURE, f"{reason}: best plan so far used")
+        return (
+            self._first() if reason is None else self._first(Status.SOLVER_FAILURE, f"{reason}: best plan so far used")
+        )
 
     def _cheaper(self, plan: Plan, than: Plan, start: PerCell, demand: Demands, deadline: float) -> bool:
         """Whether `plan` costs less, by the exact model. Raises Late."""
-        return self._exact(start, demand, plan, deadline=deadline, beyond=self._beyond)[0] < self._exact(
-            start, demand, than, deadline=deadline, beyond=self._beyond)[0]
+        return (
+            self._exact(start, demand, plan, deadline=deadline, beyond=self._beyond)[0]
+            < self._exact(start, demand, than, deadline=deadline, beyond=self._beyond)[0]
+        )
 
     def _look_beyond(self, step: int) -> None:
         """The horizon ends at the beginning of interval `step`."""
@@ -248,7 +270,8 @@ class EconomicMpc:
         self._gates = True
         _, splits = self.admissible.controls(self._open[0])
         return replace(
-            self._gating.act(observation), splits=splits, status=FAILED, note=f"{reason}: pi-gating in control")
+            self._gating.act(observation), splits=splits, status=FAILED, note=f"{reason}: pi-gating in control"
+        )
 
     def _first(self, status: Status = Status.OK, note: str = "") -> Controls:
         """The first interval of the plan."""
@@ -262,9 +285,9 @@ class EconomicMpc:
     def forecast(self, observation: Observation) -> tuple[PerCell, Demands]:
         """The cells (C,) [veh] now and the demand (horizon, C) [veh/s] of them, as edge_model numbers them."""
         first, horizon = min(observation.step, self._steps), self.options.horizon
-        known = self._demand[first:first + horizon]
+        known = self._demand[first : first + horizon]
         demand = np.zeros((horizon, *known.shape[1:]))
-        demand[:len(known)] = known
+        demand[: len(known)] = known
         demand[0] += observation.backlog / self._step
         held = np.maximum(observation.accumulation, 0.0)
         if self._offset_free is not None:
@@ -281,14 +304,23 @@ class EconomicMpc:
             raise FloatingPointError("ordered")
         if self.fault == "solver-late":
             return Minimum(point=plan, value=np.inf, gap=np.inf, evaluations=0, reason=TIME_LIMIT)
-        objective = _diverging if self.fault == "solver-diverges" else partial(
-            self._rounded, start, demand, deadline=deadline, beyond=self._beyond)
+        objective = (
+            _diverging
+            if self.fault == "solver-diverges"
+            else partial(self._rounded, start, demand, deadline=deadline, beyond=self._beyond)
+        )
         if self._ipopt is not None and self.fault is None:
             return self._by_ipopt(self._ipopt, start, demand)
         return minimise(
-            objective, self.admissible.project, self.admissible.gap, plan,
-            metric=(self._affected(start, demand, plan, deadline=deadline) + FEW) ** 2, tolerance=self._tolerance,
-            iterations=self.options.max_iterations, seconds=deadline - time.perf_counter())
+            objective,
+            self.admissible.project,
+            self.admissible.gap,
+            plan,
+            metric=(self._affected(start, demand, plan, deadline=deadline) + FEW) ** 2,
+            tolerance=self._tolerance,
+            iterations=self.options.max_iterations,
+            seconds=deadline - time.perf_counter(),
+        )
 
     def _by_ipopt(self, solver: Ipopt, start: PerCell, demand: Demands) -> Minimum:
         """The plan of IPOPT, made admissible: it keeps to bounds and sums up to its tolerance only."""
@@ -298,10 +330,9 @@ class EconomicMpc:
         forecast[:, :, self._used] = demand.reshape(len(demand), regions, -1)
         perimeter, splits, reason = solver.solve(state, forecast)
         rows = [self.admissible.decision(u, theta) for u, theta in zip(perimeter, splits, strict=True)]
-        plan = self.admissible.project(np.stack(rows[:self._moves]))
+        plan = self.admissible.project(np.stack(rows[: self._moves]))
         value, gradient = self._rounded(start, demand, plan)
-        return Minimum(
-            point=plan, value=value, gap=self.admissible.gap(plan, gradient), evaluations=1, reason=reason)
+        return Minimum(point=plan, value=value, gap=self.admissible.gap(plan, gradient), evaluations=1, reason=reason)
 
 
 def _diverging(plan: Plan) -> tuple[float, Plan]:

@@ -76,14 +76,21 @@ def build(network: RegionalModel, destinations: Int[np.ndarray, " J"], *, guidan
     rates = np.ones(network.adjacency.shape) if network.exit_rates is None else network.exit_rates
     capacity = network.open_capacity
     return Turns(
-        exit_rates=rates[:, destinations].ravel(), storage=network.storage,
+        exit_rates=rates[:, destinations].ravel(),
+        storage=network.storage,
         capacity=None if capacity is None else capacity[tuple(edges.T)],
-        destinations=destinations, edges=edges, turns=turns, edge=edge,
-        source=here * count + number[bound], target=onward * count + number[bound],
-        own=network.nominal_splits[here, onward, bound], region=cells // count,
+        destinations=destinations,
+        edges=edges,
+        turns=turns,
+        edge=edge,
+        source=here * count + number[bound],
+        target=onward * count + number[bound],
+        own=network.nominal_splits[here, onward, bound],
+        region=cells // count,
         ends=cells // count == np.asarray(destinations)[cells % count],
         **{name: np.array([getattr(m, name) for m in network.mfds]) for name in ("a", "b", "c", "jam")},
-        rounding=0.0)
+        rounding=0.0,
+    )
 
 
 def rate(model: Turns, accumulation: PerRegion) -> tuple[PerRegion, PerRegion]:
@@ -101,9 +108,7 @@ def rate(model: Turns, accumulation: PerRegion) -> tuple[PerRegion, PerRegion]:
     return q, ((2.0 * model.a * body + model.b) * share * model.jam - q * (1.0 - share)) / top
 
 
-def derivative(
-    model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, splits: PerTurn,
-) -> tuple[PerCell, tuple]:
+def derivative(model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, splits: PerTurn) -> tuple[PerCell, tuple]:
     """dx/dt (C,) [veh/s] of x (C,) [veh] under demand (C,) [veh/s], perimeter (E,) [-] and splits (V,) [-].
 
     Also what `pull_derivative` needs.
@@ -127,7 +132,7 @@ def derivative(
 
 
 def _boundary(
-    model: Turns, wish: PerEdge, perimeter: PerEdge, accumulation: PerRegion,
+    model: Turns, wish: PerEdge, perimeter: PerEdge, accumulation: PerRegion
 ) -> tuple[PerEdge, PerEdge, PerEdge, PerEdge]:
     """The share of `wish` (E,) [veh/s] that passes (dynamics.passing) [-], and how it changes (E,) with the wish
     [s/veh], with u [-] and with the accumulation of the region ahead [1/veh]."""
@@ -146,7 +151,7 @@ def _boundary(
 
 
 def pull_derivative(
-    model: Turns, adjoint: PerCell, perimeter: PerEdge, splits: PerTurn, record: tuple,
+    model: Turns, adjoint: PerCell, perimeter: PerEdge, splits: PerTurn, record: tuple
 ) -> tuple[PerCell, PerEdge, PerTurn]:
     """The gradient of x (C,), of the perimeter (E,) and the splits (V,), where one of dx/dt has `adjoint` (C,)."""
     x, leaving, q, change_of_q, wish, share, boundary = record
@@ -166,7 +171,12 @@ def pull_derivative(
 
 
 def advance(
-    model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, splits: PerTurn, step: float,
+    model: Turns,
+    x: PerCell,
+    demand: PerCell,
+    perimeter: PerEdge,
+    splits: PerTurn,
+    step: float,
     integrator: str = "euler",
 ) -> tuple[PerCell, list]:
     """x (C,) after `step` [s] by one step of the integrator, and what `pull_advance` needs."""
@@ -182,7 +192,12 @@ def advance(
 
 
 def pull_advance(
-    model: Turns, adjoint: PerCell, perimeter: PerEdge, splits: PerTurn, records: list, step: float,
+    model: Turns,
+    adjoint: PerCell,
+    perimeter: PerEdge,
+    splits: PerTurn,
+    records: list,
+    step: float,
     integrator: str = "euler",
 ) -> tuple[PerCell, Decision]:
     """The gradient of x (C,) and of the decision (E + V,) before a step, where x after it has `adjoint` (C,)."""
@@ -198,8 +213,16 @@ def pull_advance(
 
 
 def vehicle_steps(
-    model: Turns, start: PerCell, demand: Demands, plan: Plan, step: float, *, substeps: int = 1,
-    integrator: str = "euler", gradient: bool = False, deadline: float = math.inf,
+    model: Turns,
+    start: PerCell,
+    demand: Demands,
+    plan: Plan,
+    step: float,
+    *,
+    substeps: int = 1,
+    integrator: str = "euler",
+    gradient: bool = False,
+    deadline: float = math.inf,
     beyond: Callable[[PerCell], tuple[float, PerCell]] | None = None,
 ) -> tuple[float, Plan | None]:
     """Vehicles in the network, summed over the ends of H control intervals of `step` [s], and its gradient.
@@ -215,7 +238,8 @@ def vehicle_steps(
     for node, k in enumerate(interval):
         _look(deadline)
         x, records = advance(
-            model, x, demand[node // substeps], plan[k, :edges], plan[k, edges:], step / substeps, integrator)
+            model, x, demand[node // substeps], plan[k, :edges], plan[k, edges:], step / substeps, integrator
+        )
         if gradient:
             tape.append(records)
         if (node + 1) % substeps == 0:
@@ -230,14 +254,22 @@ def vehicle_steps(
         if (node + 1) % substeps == 0:
             adjoint = adjoint + 1.0
         adjoint, of_decision = pull_advance(
-            model, adjoint, plan[k, :edges], plan[k, edges:], tape.pop(), step / substeps, integrator)
+            model, adjoint, plan[k, :edges], plan[k, edges:], tape.pop(), step / substeps, integrator
+        )
         of_plan[k] += of_decision
     return total, of_plan
 
 
 def affected_vehicles(
-    model: Turns, start: PerCell, demand: Demands, plan: Plan, step: float, *, substeps: int = 1,
-    integrator: str = "euler", deadline: float = math.inf,
+    model: Turns,
+    start: PerCell,
+    demand: Demands,
+    plan: Plan,
+    step: float,
+    *,
+    substeps: int = 1,
+    integrator: str = "euler",
+    deadline: float = math.inf,
 ) -> Plan:
     """How many vehicles every number of the plan decides on (K, E + V) [veh]; arguments as in `vehicle_steps`.
 
@@ -249,7 +281,8 @@ def affected_vehicles(
     for node, k in enumerate(_intervals(plan, len(demand), substeps)):
         _look(deadline)
         x, records = advance(
-            model, x, demand[node // substeps], plan[k, :edges], plan[k, edges:], step / substeps, integrator)
+            model, x, demand[node // substeps], plan[k, :edges], plan[k, edges:], step / substeps, integrator
+        )
         now = step / substeps * records[0][1][model.source]
         leaving[k] += now
         wish[k] += np.bincount(model.edge, plan[k, edges:] * now, edges)

@@ -19,7 +19,12 @@ class Ipopt:
     """Minimises the vehicles in the network, summed over the ends of `horizon` intervals."""
 
     def __init__(
-        self, planning: PlanningModel, *, guidance: bool, horizon: int, iterations: int = 200,
+        self,
+        planning: PlanningModel,
+        *,
+        guidance: bool,
+        horizon: int,
+        iterations: int = 200,
         seconds: float | None = None,
     ):
         """iterations: at most; seconds: deadline of a decision [s], none if None"""
@@ -34,8 +39,15 @@ class Ipopt:
             splits, sums = self._splits(theta)
             after = ca.SX.sym(f"x{k}", regions, regions)
             moved = model.advance(
-                p, UNIT * x, demand[:, k * regions:(k + 1) * regions], self._perimeter(u), splits, planning.step,
-                integrator=planning.integrator, substeps=planning.substeps)
+                p,
+                UNIT * x,
+                demand[:, k * regions : (k + 1) * regions],
+                self._perimeter(u),
+                splits,
+                planning.step,
+                integrator=planning.integrator,
+                substeps=planning.substeps,
+            )
             constraints += [*sums, ca.vec(ca.densify(moved) / UNIT - after)]
             total, x = total + ca.sum1(ca.vec(after)), after
             variables += [u, theta, ca.vec(after)]
@@ -43,10 +55,17 @@ class Ipopt:
         self._lower = np.tile([network.u_min] * edges + [0.0] * (turns + cells), horizon)
         self._upper = np.tile([network.u_max] * edges + [1.0] * turns + [np.inf] * cells, horizon)
         limits = {"max_iter": iterations} | ({} if seconds is None else {"max_wall_time": seconds})
-        self._solver = ca.nlpsol("mpc", "ipopt", {
-            "x": ca.vertcat(*variables), "p": ca.vertcat(ca.vec(start), ca.vec(demand)), "f": total,
-            "g": ca.vertcat(*constraints)},
-            {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", **limits}})
+        self._solver = ca.nlpsol(
+            "mpc",
+            "ipopt",
+            {
+                "x": ca.vertcat(*variables),
+                "p": ca.vertcat(ca.vec(start), ca.vec(demand)),
+                "f": total,
+                "g": ca.vertcat(*constraints),
+            },
+            {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", **limits}},
+        )
 
     def solve(self, state: PerPair, demand: PairsOverTime) -> tuple[PairsOverTime, TurnsOverTime, str | None]:
         """u (H, R, R) [-], theta (H, R, R, R) [-], and why IPOPT stopped short of convergence, or None.
@@ -54,16 +73,29 @@ class Ipopt:
         state: (R, R) [veh]; demand: (H, R, R) [veh/s]
         """
         network, regions, horizon = self._network, self._network.regions, self._horizon
-        guess = np.concatenate([
-            np.full(len(self._edges), network.u_max), network.nominal_splits[tuple(self._turns.T)],
-            state.T.ravel() / UNIT])
-        answer = self._solver(
-            x0=np.tile(guess, horizon), p=np.concatenate([state.T.ravel() / UNIT, *(d.T.ravel() for d in demand)]),
-            lbx=self._lower, ubx=self._upper, lbg=0.0, ubg=0.0)["x"].full().reshape(horizon, -1)
+        guess = np.concatenate(
+            [
+                np.full(len(self._edges), network.u_max),
+                network.nominal_splits[tuple(self._turns.T)],
+                state.T.ravel() / UNIT,
+            ]
+        )
+        answer = (
+            self._solver(
+                x0=np.tile(guess, horizon),
+                p=np.concatenate([state.T.ravel() / UNIT, *(d.T.ravel() for d in demand)]),
+                lbx=self._lower,
+                ubx=self._upper,
+                lbg=0.0,
+                ubg=0.0,
+            )["x"]
+            .full()
+            .reshape(horizon, -1)
+        )
         stats, edges, turns = self._solver.stats(), self._edges, self._turns
         perimeter, splits = np.zeros((horizon, regions, regions)), np.tile(network.nominal_splits, (horizon, 1, 1, 1))
-        perimeter[:, edges[:, 0], edges[:, 1]] = answer[:, :len(edges)]
-        splits[:, turns[:, 0], turns[:, 1], turns[:, 2]] = answer[:, len(edges):len(edges) + len(turns)]
+        perimeter[:, edges[:, 0], edges[:, 1]] = answer[:, : len(edges)]
+        splits[:, turns[:, 0], turns[:, 1], turns[:, 2]] = answer[:, len(edges) : len(edges) + len(turns)]
         return perimeter, splits, None if stats["success"] else f"IPOPT: {stats['return_status']}"
 
     def _perimeter(self, u: ca.SX) -> ca.SX:
@@ -80,5 +112,4 @@ class Ipopt:
         splits = [ca.SX(regions, regions) for _ in range(regions)]
         for n, (i, h, j) in enumerate(self._turns.tolist()):
             splits[i][h, j] = theta[n]
-        return splits, [
-            ca.sum1(splits[i][:, j]) - 1.0 for i in range(regions) for j in range(regions) if i != j]
+        return splits, [ca.sum1(splits[i][:, j]) - 1.0 for i in range(regions) for j in range(regions) if i != j]

@@ -26,7 +26,8 @@ class OffsetFree:
         if network.disturbance is None:
             raise InputError(
                 f"{where}: the network {network.name} has no table [disturbance]; cosim identify finds it, or omit the "
-                "key")
+                "key"
+            )
         self._law, self._model = network.disturbance, dynamics.parameters(network)
         self._critical = torch.tensor(network.critical)
         self._nominal, self._demand, self._step = network.nominal_splits, planning.forecast, planning.step
@@ -48,7 +49,8 @@ class OffsetFree:
         entered = self._demand[then.step] + (then.backlog - observation.backlog) / self._step
         x, demand, u, theta = map(torch.as_tensor, (then.accumulation, entered, perimeter, splits))
         foreseen = dynamics.advance(
-            self._model, x, demand, u, theta, self._step, substeps=self._substeps, integrator=self._integrator)
+            self._model, x, demand, u, theta, self._step, substeps=self._substeps, integrator=self._integrator
+        )
         self._innovations.append((torch.as_tensor(observation.accumulation) - foreseen) / self._step)
 
     def decided(self, observation: Observation, controls: Controls) -> None:
@@ -63,4 +65,5 @@ class OffsetFree:
             return np.zeros((intervals, *accumulation.shape))
         estimate = disturbance.estimated(self._law, torch.stack(tuple(self._innovations)))
         return disturbance.ahead(
-            self._law, estimate, torch.as_tensor(accumulation), self._critical, intervals, self._step).numpy()
+            self._law, estimate, torch.as_tensor(accumulation), self._critical, intervals, self._step
+        ).numpy()

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MEMORY = 20             # values that a step is compared with: some may rise
-SUFFICIENT = 1e-4       # of the decrease that the slope promises
-SHORTEST = 1e-10        # of a step, below which the line search gives up
-LONGEST = 1e10          # spectral step length
+MEMORY = 20  # values that a step is compared with: some may rise
+SUFFICIENT = 1e-4  # of the decrease that the slope promises
+SHORTEST = 1e-10  # of a step, below which the line search gives up
+LONGEST = 1e10  # spectral step length
 AT_REST = "no further descent"
 TIME_LIMIT = "time limit"
 
@@ -39,9 +39,15 @@ class Minimum:
 
 
 def minimise(
-    function: Callable[[np.ndarray], tuple[float, np.ndarray]], project: Callable[[np.ndarray], np.ndarray],
-    gap: Callable[[np.ndarray, np.ndarray], float], start: np.ndarray, *, metric: np.ndarray | float = 1.0,
-    tolerance: float, iterations: int, seconds: float,
+    function: Callable[[np.ndarray], tuple[float, np.ndarray]],
+    project: Callable[[np.ndarray], np.ndarray],
+    gap: Callable[[np.ndarray, np.ndarray], float],
+    start: np.ndarray,
+    *,
+    metric: np.ndarray | float = 1.0,
+    tolerance: float,
+    iterations: int,
+    seconds: float,
 ) -> Minimum:
     """Descend from the admissible `start` until gap <= tolerance * |value|.
 

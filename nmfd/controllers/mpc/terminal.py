@@ -21,9 +21,9 @@ from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
 from nmfd.runs.files import atomic, check_file
 
-WAVES = 8       # sines and cosines of the time
-OFFSET = 1e4    # veh intervals
-LATE = 2.5      # of s: vehicles are first thought to be gone soon
+WAVES = 8  # sines and cosines of the time
+OFFSET = 1e4  # veh intervals
+LATE = 2.5  # of s: vehicles are first thought to be gone soon
 MAKE = "make one with 'nmfd value'"
 WEIGHTS = ("first", "second", "last")
 
@@ -56,7 +56,7 @@ class Terminal:
         of_out = np.append(left * x * stays * (1.0 - stays), OFFSET * (1.0 - share))
         of_x = first.T @ (slope * (second.T @ (steeper * (last.T @ of_out))))
         value = left * float(stays @ x) + OFFSET * (1.0 - share) * float(out[-1])
-        return value, left * stays + of_x[:len(x)] / self.scale
+        return value, left * stays + of_x[: len(x)] / self.scale
 
 
 def clock(share: float) -> Float[np.ndarray, " F"]:
@@ -75,10 +75,15 @@ def write(terminal: Terminal, path: Path) -> None:
     """As an .npz file without pickles; atomically."""
     with atomic(path) as temporary:
         np.savez_compressed(
-            temporary, steps=np.array(terminal.steps), used=terminal.used, scale=terminal.scale,
-            network_hash=np.array(terminal.network_hash), controller=np.array(terminal.controller),
+            temporary,
+            steps=np.array(terminal.steps),
+            used=terminal.used,
+            scale=terminal.scale,
+            network_hash=np.array(terminal.network_hash),
+            controller=np.array(terminal.controller),
             **{f"{name}_weight": w.astype(np.float32) for name, w in zip(WEIGHTS, terminal.weights, strict=True)},
-            **{f"{name}_bias": b.astype(np.float32) for name, b in zip(WEIGHTS, terminal.biases, strict=True)})
+            **{f"{name}_bias": b.astype(np.float32) for name, b in zip(WEIGHTS, terminal.biases, strict=True)},
+        )
 
 
 def read(path: Path, planning: PlanningModel, controller: str) -> Terminal:
@@ -88,10 +93,14 @@ def read(path: Path, planning: PlanningModel, controller: str) -> Terminal:
         with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             content = {name: file[name] for name in file.files}
         found = Terminal(
-            steps=int(content["steps"]), used=content["used"], scale=content["scale"],
+            steps=int(content["steps"]),
+            used=content["used"],
+            scale=content["scale"],
             weights=tuple(content[f"{name}_weight"].astype(float) for name in WEIGHTS),
             biases=tuple(content[f"{name}_bias"].astype(float) for name in WEIGHTS),
-            network_hash=str(content["network_hash"]), controller=str(content["controller"]))
+            network_hash=str(content["network_hash"]),
+            controller=str(content["controller"]),
+        )
         cells = planning.network.regions * int(planning.destinations.sum())
         shapes = [w.shape for w in found.weights]
         fits = found.scale.shape == (cells,) and shapes[0][1] == cells + 1 + 2 * WAVES and shapes[2][0] == cells + 1
@@ -100,7 +109,8 @@ def read(path: Path, planning: PlanningModel, controller: str) -> Terminal:
     if found.network_hash != planning.network.hash or not fits or (found.used != planning.destinations).any():
         raise InputError(
             f"{path}: network_hash: was learned for another regional model or other destinations than those of "
-            f"{planning.network.name!r}; {MAKE}")
+            f"{planning.network.name!r}; {MAKE}"
+        )
     if found.controller != controller:
         raise InputError(f"{path}: is the value function of {found.controller}, not of {controller}; {MAKE}")
     return found
