@@ -593,7 +593,6 @@ LINES = {
         train {none} --controller dpc-pc
         train
         show {none}
-        show
         show {s} --out {s}/scenario.toml|/dev/null/x
         robustness {s} --controllers no-control --sigmas a|-1|nan|inf|1,1|,|1;2
         robustness {s} --controllers no-control --scenarios 0|x
@@ -603,25 +602,9 @@ LINES = {
         bound {s} --controller bound-pc --from nobody|,
         bound {s} --controller bound-pc --iterations 0|x
         bound {s} --controller bound-pc --out {none}/x.npz
-        ablation horizon {s} --horizons 1|a|2,2|-3|"""
-    + "9" * 5000
-    + """
-        ablation horizon {s} --controllers dpc-pc|pi-gating
-        ablation sideways {s}
-        ablation training {s} --controller dpc-pc|pi-gating
-        ablation training {s} --seeds 0
-        scaling --regions 1|a|2,2|2.5
-        scaling --controllers pi-gating|x --out {none}
-        scaling --family square --out {none}
-        scaling --memory 0|nan|-1|x --out {none}
-        scaling --time-limit 0|nan|x --out {none}
-        export {none} --out {out}
-        export {s}/scenario.toml --out {out}
-        export {s}/scenario.toml
         new-controller {s}/scenario.toml|{none}/x.py|/dev/null/x.py
         new-controller
         benchmark {s} --controllers {none}.py:Mine|{s}/scenario.toml:Mine|mine.py
-        benchmark {s} --controllers no-control --fault x|frozen:1|closed:a
         nonsense
         --nonsense
     """,
@@ -643,7 +626,6 @@ LINES = {
         evaluate {g} --controllers no-control --seeds 0|x
         evaluate {g} --controllers no-control --first-seed -1|x
         evaluate {g} --controllers no-control --demand 0|-1|nan|inf|x|1,1|99
-        evaluate {g} --controllers no-control --reference x
         evaluate {g} --controllers no-control --workers 0|x
         evaluate {g} --controllers dpc-pc --policy x|dpc-pc={none}
         evaluate {none} --controllers no-control
@@ -653,25 +635,12 @@ LINES = {
         compare
         report {none}|{g}
         report
-        report {none} --reference x
-        sweep {g} --controllers x|no-control,no-control|,
-        sweep {g} --controllers no-control --seeds 0|x|99999999999
-        sweep {g} --controllers no-control --first-seed -1|9999999999
-        sweep {g} --controllers no-control --demand 0|nan|x|1,1
-        sweep {g} --controllers no-control --compliance -1|101|nan|x|1,1
-        sweep {g} --controllers dpc-pc --policy x|dpc-pc={none}
-        sweep {g} --controllers no-control --scheduler nowhere
-        sweep {none} --controllers no-control
-        video {none}|{g}
-        video {g} --rate 0|x
-        video {g} --demand nan|0|11
         watch {none} --controller no-control
         watch {g} --controller x
         watch {g} --controller no-control --delay nan|-1|x
         watch {g} --controller no-control --demand nan|0|11
         watch {g} --controller no-control --seed -1
         watch {g} --controller no-control --steps 0
-        run {g} --controller no-control --fault x|closed:nowhere|signal:nobody|missing:7
         run {g} --controller {none}.py:Mine
         identify {none}
         identify {g} --levels 0|x|nan|1,1
@@ -729,7 +698,7 @@ def test_command_lines(tmp_path, program, words, city, monkeypatch):
     }
     before = sorted(tmp_path.rglob("*"))
     filled = [word.format(**places) for word in words]
-    if program == "nmfd" and filled[0] in ("benchmark", "show", "robustness", "ablation") and "--out" not in filled:
+    if program == "nmfd" and filled[0] in ("benchmark", "show", "robustness") and "--out" not in filled:
         filled += ["--out", str(places["out"])]
     check(program, *filled, out=places["out"])
     assert sorted(tmp_path.rglob("*")) == before

@@ -110,7 +110,7 @@ def test_a_new_user(installed):
     data = Path(run("python", "-c", "from nmfd.runs import shipped; print(shipped.root())").strip())
     assert data.is_relative_to(installed.parent) and data.name == "data"
     before = hashes(data)
-    assert "grid7_peak" in run("cosim", "list")
+    assert "grid7_peak" in run("nmfd", "show")
     assert "no-control" in run("nmfd", "benchmark", "economic_mpc", "--controllers", "no-control", "--seeds", "1")
     assert "pi-gating" in run("cosim", "run", "grid7_peak", "--controller", "pi-gating", "--steps", "3", "--out", "out")
     run("cosim", "run", "grid7_peak", "--controller", "webster", "--steps", "1", "--out", "webster")

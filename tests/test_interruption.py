@@ -123,10 +123,10 @@ def test_an_interrupt_that_a_compiled_library_made_an_error_of_its_own_of(monkey
             signal.raise_signal(number)
         raise ValueError("Invalid bounding box")
 
-    monkeypatch.setattr(MAINS["nmfd"].commands["list"], "callback", draw)
+    monkeypatch.setattr(MAINS["nmfd"].commands["show"], "callback", draw)
     for number in (signal.SIGINT, signal.SIGTERM):
         with pytest.raises(SystemExit) as end:
-            MAINS["nmfd"](["list"])
+            MAINS["nmfd"](["show"])
         assert end.value.code == 128 + number and capsys.readouterr().err == "nmfd: interrupted\n"
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 

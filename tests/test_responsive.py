@@ -169,7 +169,7 @@ def places(tmp_path_factory):
     "command, name, city, said",
     [
         ("run", "max-pressure", "queues", "max-pressure counts vehicles lane by lane"),
-        ("sweep", "pi-gating+max-pressure-cyclic", "queues", "max-pressure-cyclic counts vehicles lane by lane"),
+        ("evaluate", "pi-gating+max-pressure-cyclic", "queues", "max-pressure-cyclic counts vehicles lane by lane"),
         ("evaluate", "route-guidance+estimate", "queues", "needs loop detectors on lanes"),
         ("evaluate", "mine.py:Mine+max-pressure", "queues", "counts vehicles lane by lane"),
         ("run", "webster", "bare", "webster needs fixed-time signals"),

@@ -11,7 +11,6 @@ from commands import cosim, error_line, good, nmfd
 
 from cosim.api import run as cosim_run
 from cosim.evaluation import results
-from cosim.plant import strategy
 from cosim.sumo import build
 from cosim.sumo.build import ensure_built
 from nmfd import __version__
@@ -143,14 +142,11 @@ def test_runs_find_their_scenario_again_by_its_name(installed, tmp_path):
     assert results.scenario_folder(tmp_path, manifest) == installed / "scenarios" / "grid7_peak"
 
 
-@pytest.mark.parametrize("program", [nmfd, cosim], ids=["nmfd", "cosim"])
-def test_what_is_listed(installed, program):
-    text = good(program("list"))
+def test_what_is_listed(installed):
+    text = good(nmfd("show"))
     lines = {line.split()[0] for line in text.splitlines() if line.startswith("  ")}
     assert {"economic_mpc", "grid7_peak", "hexagon7", "grid7_guided", "economic_mpc/dpc-pc.pt"} <= lines
     assert {*registry.names()} <= lines and "none" not in lines
-    assert ("+max-pressure" in lines) == (program is cosim)
     assert all(len(line) < 170 for line in text.splitlines())
-    assert [option for option, _ in strategy.options()] == [f"+{name}" for name in strategy.OPTIONS]
-    assert good(program("--version")).endswith(f"version {__version__}\n")
-    assert good(program("--cite")).startswith("cff-version: 1.2.0\n")
+    assert good(nmfd("--version")).endswith(f"version {__version__}\n")
+    assert good(nmfd("--cite")).startswith("cff-version: 1.2.0\n")

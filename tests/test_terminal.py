@@ -1,11 +1,9 @@
 """MPC's terminal cost: its derivatives, what MPC gains by it, its file."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import error_line, good, nmfd
 
 from nmfd import closed_loop
 from nmfd.api import load_scenario
@@ -113,59 +111,6 @@ def test_the_same_seed_learns_the_same_and_the_file_keeps_it(scenario, learned, 
     (tmp_path / "value.npz").write_bytes(b"PK nothing")
     with pytest.raises(InputError, match="is no value function; make one with 'nmfd value'"):
         terminal.read(tmp_path / "value.npz", planning, NAME)
-
-
-def test_the_command_writes_what_the_benchmark_reads(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    said = good(
-        nmfd(
-            "value",
-            "economic_mpc",
-            "--controller",
-            NAME,
-            "--samples",
-            "128",
-            "--rounds",
-            "2",
-            "--steps",
-            "2",
-            "--out",
-            "value.npz",
-        )
-    )
-    assert "Written to value.npz" in said
-    said = good(
-        nmfd(
-            "benchmark",
-            "economic_mpc",
-            "--controllers",
-            NAME,
-            "--seeds",
-            "1",
-            "--policy",
-            f"{NAME}=value.npz",
-            "--out",
-            "out",
-        )
-    )
-    assert NAME in said
-
-
-@pytest.mark.parametrize(
-    "arguments, expected",
-    [
-        (["value", "economic_mpc", "--controller", "dpc-pc"], "has no terminal cost; choose mpc-pc-terminal or"),
-        (["value", "economic_mpc", "--controller", NAME, "--policy", "none.pt"], "none.pt: no such policy"),
-        (
-            ["value", "economic_mpc", "--controller", NAME, "--out", "no/value.npz"],
-            "no such folder for the value function",
-        ),
-        (["benchmark", "economic_mpc_figure4", "--controllers", NAME], "learn one with: nmfd value"),
-    ],
-)
-def test_one_line_for_what_cannot_be(tmp_path, monkeypatch, arguments, expected):
-    monkeypatch.chdir(tmp_path)
-    assert expected in error_line(nmfd(*arguments), "nmfd") and not list(Path().glob("**/*.npz"))
 
 
 def test_ipopt_knows_none(scenario, learned):

@@ -50,9 +50,6 @@ def identify(
     seeds: int,
     workers: int | None,
     scheduler: str | None,
-    scheduler_ca: Path | None,
-    scheduler_cert: Path | None,
-    scheduler_key: Path | None,
     guided: bool | None,
     options: str | None,
     target: Path | None,
@@ -81,7 +78,7 @@ def identify(
     """
     if runs and guided is None and not options:
         raise InputError("--runs: fits one model; say which, by --guided, --own or --with")
-    cluster = chosen_scheduler(workers, scheduler, scheduler_ca, scheduler_cert, scheduler_key)
+    cluster = chosen_scheduler(workers, scheduler)
 
     from cosim.evaluation import identify  # heavy
     from cosim.importing import find

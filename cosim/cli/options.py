@@ -3,7 +3,6 @@
 import os
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -33,63 +32,24 @@ RUNS = click.option(
     help="Finished runs of the same city that the model is fitted to besides, a folder of cosim run or evaluate: at a "
     "demand at which the loading runs lock, those under a gate say more. May be repeated.",
 )
-EARLIER = click.option(
-    "--earlier",
-    type=FILE,
-    multiple=True,
-    metavar="FILE",
-    help="The runs.csv of an earlier evaluation or frontier of the same city whose runs are not kept any more: its "
-    "rows are in the tables too. May be repeated: of a run in several, the first one counts.",
-)
-REFERENCE = click.option(
-    "--reference",
-    metavar="NAME",
-    help="Pair all controllers with this one too, besides no-control, or the first one if that is not there.",
-)
 
 
 def scheduler_options(command: Callable) -> Callable:
-    """--scheduler, and the certificates of its connection; the command makes `chosen_scheduler` of them."""
-    for option in reversed(
-        (
-            click.option(
-                "--scheduler",
-                metavar="ADDRESS",
-                help="Of a Dask cluster that does the runs, such as tls://host:8786 (extra dask). Its workers need "
-                "this package, and the same files under the same paths. Whoever reaches a tcp:// scheduler runs "
-                "code on the cluster and here.",
-            ),
-            click.option(
-                "--scheduler-ca", type=FILE, metavar="PEM", help="Authority that a tls:// scheduler is trusted by."
-            ),
-            click.option("--scheduler-cert", type=FILE, metavar="PEM", help="Certificate that this side shows to it."),
-            click.option(
-                "--scheduler-key",
-                type=FILE,
-                metavar="PEM",
-                help="The key of that certificate. [default, of all three: Dask's own configuration, "
-                "distributed.comm.tls]",
-            ),
-        )
-    ):
-        command = option(command)
-    return command
+    """Add --scheduler to a command."""
+    return click.option(
+        "--scheduler", metavar="ADDRESS", help="Dask scheduler that runs them, such as tls://host:8786 (extra dask)."
+    )(command)
 
 
-def chosen_scheduler(
-    workers: int | None, address: str | None, ca: Path | None, cert: Path | None, key: Path | None
-) -> "Scheduler | None":
-    """What the runs are done by instead of `workers` processes here, None for these. InputError for both at once, and
-    for certificates of nothing."""
-    if address is not None and workers is not None:
-        raise InputError("--workers: is for processes here, and --scheduler has workers of its own; omit one")
+def chosen_scheduler(workers: int | None, address: str | None) -> "Scheduler | None":
+    """Return the Dask scheduler, None for processes here. Raise InputError if both are given."""
     if address is None:
-        if any((ca, cert, key)):
-            raise InputError("--scheduler: missing; the certificates are those of its connection")
         return None
+    if workers is not None:
+        raise InputError("--workers: is for processes here, and --scheduler has workers of its own; omit one")
     from cosim.evaluation.dask_cluster import Scheduler  # heavy
 
-    return Scheduler(address=address, ca=ca, cert=cert, key=key)
+    return Scheduler(address=address)
 
 
 def parsed_level(text: str, no_run: bool) -> float | None:

@@ -1,4 +1,4 @@
-"""The commands report, video and watch of `cosim`.
+"""The commands report and watch of `cosim`.
 
 What brings numpy, pandas, torch or libsumo is imported inside the commands, so that the help answers at once: in 0.1 s
 instead of 3 s.
@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cosim.cli.options import CONTROLLER, POLICY, REFERENCE, has_screen
+from cosim.cli.options import CONTROLLER, POLICY, has_screen
 from nmfd.cli.declared import declared
 from nmfd.cli.options import FILE, FOLDER, SCENARIO, SEED, STEPS
 from nmfd.cli.progress import progress_line
-from nmfd.errors import InputError, did_you_mean
+from nmfd.errors import InputError
 
 if TYPE_CHECKING:
     from cosim.evaluation.simulate import Task
@@ -23,12 +23,9 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("folders", type=FOLDER, metavar="RUN...", nargs=-1, required=True)
 @click.option("--out", type=FILE, metavar="FILE", help="The page. [default: report.html in the first RUN]")
-@REFERENCE
 @click.option("--scenario", type=FOLDER, metavar="DIR", help="The runs' scenario, if it is no longer where it was.")
 @click.option("--seed", type=SEED, help="Of the runs on the map. [default: the first that both have]")
-def report(
-    folders: tuple[Path, ...], out: Path | None, reference: str | None, scenario: Path | None, seed: int | None
-) -> None:
+def report(folders: tuple[Path, ...], out: Path | None, scenario: Path | None, seed: int | None) -> None:
     """Write one self-contained HTML page about finished runs: what came of them, in four figures, on a map, in pictures
     and tables.
 
@@ -45,60 +42,9 @@ def report(
     from cosim.report import html
 
     found = [results.read(folder, scenario) for folder in folders]
-    known = {name for run in found for name in run.rows["controller"]}
-    if reference is not None and reference not in known:
-        raise InputError(
-            f"--reference: {reference!r} is not in these runs{did_you_mean(reference, known)}; choose "
-            f"from {', '.join(sorted(known))}"
-        )
     with progress_line("report") as progress:
-        path = html.write_page(out or folders[0] / "report.html", found, reference, progress, seed=seed)
+        path = html.write_page(out or folders[0] / "report.html", found, None, progress, seed=seed)
     click.echo(f"Written to {path}: open it in a browser")
-
-
-@click.command()
-@click.argument("folder", type=FOLDER, metavar="RUN")
-@click.option("--controller", metavar="NAME", help="Whose run. [default: the best one]")
-@click.option("--against", metavar="NAME", help="A second run, shown beside it.")
-@click.option("--seed", type=SEED, help="[default: the first one there]")
-@click.option("--demand", type=float, metavar="X", help="Level of an evaluation. [default: the one nearest to 1]")
-@declared("cosim.evaluation.settings:Window", "rate")
-@click.option("--scenario", type=FOLDER, metavar="DIR", help="The run's scenario, if it is no longer where it was.")
-@click.option(
-    "--out",
-    type=FILE,
-    metavar="FILE",
-    help="A name that ends in .gif, or .mp4 where ffmpeg is installed. [default: a gif in RUN]",
-)
-def video(
-    folder: Path,
-    controller: str | None,
-    against: str | None,
-    seed: int | None,
-    demand: float | None,
-    rate: int,
-    scenario: Path | None,
-    out: Path | None,
-) -> None:
-    """Make a film of the link densities of a finished run, from its record; nothing is simulated.
-
-    RUN is a folder of `cosim run` or `cosim evaluate`.
-
-    \b
-    Examples:
-      cosim video runs/gating --controller pi-gating --against no-control
-      cosim video runs/grid7_peak-evaluate --controller max-pressure --seed 2001 --out film.mp4
-    """
-    from cosim.evaluation import results  # heavy
-    from cosim.report import video
-
-    run = results.read(folder, scenario)
-    level = run.level(demand)
-    names, seed = video.choose(run, level, controller, against, seed)
-    path = video.default_path(level, names, seed) if out is None else out
-    with progress_line("video") as progress:
-        video.film(path, run, level, names, seed, rate=rate, progress=progress)
-    click.echo(f"Written to {path}: {' and '.join(names)}, seed {seed}, {path.stat().st_size / 1e6:.1f} MB")
 
 
 @click.command()

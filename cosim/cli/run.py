@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from cosim.cli.options import CONTROLLER, CONTROLLER_HELP, POLICY, tell
-from nmfd.cli.options import FOLDER, PARQUET, SCENARIO, SEED, STEPS, TIME_LIMIT, fault_option, out_option
+from nmfd.cli.options import FOLDER, SCENARIO, SEED, STEPS, out_option
 from nmfd.cli.progress import resumable
 from nmfd.errors import InputError
 
@@ -32,9 +32,6 @@ from nmfd.errors import InputError
     help="SUMO's own outputs in the run folder too: tripinfo, summary, edgedata (per control interval), "
     "emission (of every vehicle in every step, large).",
 )
-@PARQUET
-@fault_option("closed:EDGE, signal:NAME, gate:I-H=SHARE, sumo-exits")
-@TIME_LIMIT
 @out_option()
 def run(
     scenario: Path,
@@ -44,9 +41,6 @@ def run(
     steps: int | None,
     policy: Path | None,
     sumo_output: str | None,
-    parquet: bool,
-    faults: tuple[str, ...],
-    own_time_limit: float | None,
     out: Path | None,
 ) -> None:
     """Run a controller in the microsimulation; print a table and write a run folder.
@@ -61,8 +55,7 @@ def run(
       cosim run grid7_peak --controller dpc-pcrg --against no-control
       cosim run grid7_peak --controller pi-gating --seed 3 --out runs/gating
       cosim run grid7_peak --controller dpc-pc+rerouting-30 --against rerouting-30
-      cosim run grid7_peak --controller pi-gating --sumo-output tripinfo,edgedata --parquet
-      cosim run grid7_peak --controller dpc-pc --fault missing:3@20-30 --fault closed:c33-c34@10-40
+      cosim run grid7_peak --controller pi-gating --sumo-output tripinfo,edgedata
     """
     from cosim.plant import strategy  # heavy
     from cosim.sumo import outputs
@@ -84,17 +77,11 @@ def run(
             seed=seed,
             policy=policy if name == controller else None,
             steps=steps,
-            faults=faults,
-            time_limit=own_time_limit,
         )
         for name in names
     ]
     out, rows = _experiment(tasks, out, kinds)
     click.echo(experiment.overview_table(rows))
-    if parquet:
-        from nmfd.runs import frames, run_folder  # heavy
-
-        frames.write(out, run_folder.trajectories(out), {"summary": rows})
     if (out / "estimation.csv").is_file():
         import pandas as pd
 

@@ -33,30 +33,10 @@ def about(name: str) -> Callable[[Callable], Callable]:
     return decorate
 
 
-def listing(*more: str) -> click.Command:
-    """The command list. more: "module:function" of further kinds, each named like its function."""
-    where = {kind: "nmfd.cli.catalogue" for kind in KINDS} | {
-        kind: module for module, _, kind in (place.partition(":") for place in more)
-    }
-
-    @click.command(name="list")
-    @click.argument("kinds", nargs=-1, type=click.Choice(list(where)), metavar=f"[{'|'.join(where)}]...")
-    def command(kinds: tuple[str, ...]) -> None:
-        """List what comes with the package, scenarios and networks, policies and controllers, with a line each.
-
-        Scenarios and networks are named without a path, from any folder: nmfd benchmark economic_mpc, cosim run
-        grid7_peak. A scenario of your own in a folder of that name goes before it. A policy is found by the name of the
-        controller; where a file is asked for, it is called as it is here.
-
-        \b
-        Examples:
-          nmfd list
-          cosim list scenarios policies
-        """
-        for kind in kinds or where:
-            click.echo(f"{kind}\n{_lines(getattr(import_module(where[kind]), kind)())}\n")  # heavy
-
-    return command
+def overview() -> str:
+    """List the shipped scenarios, networks, policies and controllers, one line each."""
+    catalogue = import_module("nmfd.cli.catalogue")  # heavy
+    return "\n\n".join(f"{kind}\n{_lines(getattr(catalogue, kind)())}" for kind in KINDS)
 
 
 def _lines(rows: Iterable[tuple[str, str]]) -> str:

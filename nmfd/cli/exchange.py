@@ -38,37 +38,6 @@ def new_controller(file: Path) -> None:
 
 
 @click.command()
-@click.argument("policy", type=FILE)
-@click.option("--out", type=FILE, required=True, metavar="FILE", help="The ONNX file.")
-@click.option(
-    "--scenario",
-    type=FOLDER,
-    metavar="DIR",
-    help="For which the policy was trained. [default: the folder that it lies in]",
-)
-def export(policy: Path, out: Path, scenario: Path | None) -> None:
-    """Export a policy with its constraint layers to ONNX, and check it against torch. Needs the extra onnx.
-
-    Its input is the accumulation (B, R, R) [veh] in float32; its outputs are perimeter (B, R, R) and, with route
-    guidance, splits (B, R, R, R), within their bounds and with sum 1 as those of the policy.
-
-    \b
-    Example:
-      nmfd export economic_mpc/dpc-pcrg.pt --out dpc-pcrg.onnx
-    """
-    from nmfd.controllers.dpc import onnx_export  # heavy
-
-    if not out.parent.is_dir():
-        raise InputError(f"{out.parent}: no such folder; make it first or choose another --out")
-    done = onnx_export.export(policy, out, scenario)
-    click.echo(
-        f"{done['controller']}, {done['regions']} regions: differs from torch by at most "
-        f"{done['difference']:.1e} over {done['samples']} random states"
-    )
-    click.echo(f"Written to {out}")
-
-
-@click.command()
 @click.argument("counts", type=FILE)
 @click.option(
     "--detectors",

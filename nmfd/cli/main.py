@@ -4,27 +4,25 @@ from pathlib import Path
 
 import click
 
-from nmfd.cli.about import about, listing
+from nmfd.cli.about import about, overview
 from nmfd.cli.declared import declared
 from nmfd.cli.errors import Commands, Interrupted
-from nmfd.cli.exchange import export, identify, new_controller
+from nmfd.cli.exchange import identify, new_controller
 from nmfd.cli.options import (
     ADAM_STEPS,
     FILE,
-    PARQUET,
+    FOLDER,
     POLICIES,
     SCENARIO,
     SEED,
-    TIME_LIMIT,
     controller_names,
     controllers_option,
-    fault_option,
     out_option,
     policy_files,
     quoted,
 )
 from nmfd.cli.progress import progress_line, resumable
-from nmfd.cli.studies import ablation, adaptation, bound, robustness, scaling, value
+from nmfd.cli.studies import bound, robustness
 from nmfd.errors import InputError
 
 
@@ -50,9 +48,6 @@ def main() -> None:
 )
 @declared("nmfd.studies.settings:Study", "seeds", "plant", "workers")
 @POLICIES
-@PARQUET
-@fault_option()
-@TIME_LIMIT
 @out_option()
 def benchmark(
     scenario: Path,
@@ -61,9 +56,6 @@ def benchmark(
     plant: str,
     workers: int,
     policies: tuple[str, ...],
-    parquet: bool,
-    faults: tuple[str, ...],
-    own_time_limit: float | None,
     out: Path | None,
 ) -> None:
     """Run controllers on a regional model; print a table and write a run folder.
@@ -82,21 +74,14 @@ def benchmark(
     files = policy_files(policies, names)
 
     from nmfd.api import load_scenario  # heavy
-    from nmfd.model.scenario import with_faults, with_time_limit
     from nmfd.runs import run_folder
     from nmfd.studies.benchmark import run_all
     from nmfd.studies.summary import summary_table
 
-    loaded = with_time_limit(with_faults(load_scenario(scenario), faults), own_time_limit)
+    loaded = load_scenario(scenario)
     out = run_folder.default_folder(loaded.name) if out is None else out
     with resumable("benchmark", out, "summary.csv") as progress:
         rows = run_all(loaded, names, range(seeds), plant, out=out, policies=files, workers=workers, progress=progress)
-    if parquet:
-        import pandas as pd  # heavy
-
-        from nmfd.runs import frames
-
-        frames.write(out, run_folder.trajectories(out), {"summary": pd.DataFrame(rows)})
     click.echo(f"{loaded.name}, {plant} plant, {loaded.steps} control intervals of {loaded.step:g} s")
     click.echo(summary_table(rows))
     click.echo(f"Written to {out}")
@@ -231,15 +216,18 @@ def train(
 
 
 @main.command()
-@SCENARIO
+@click.argument("scenario", type=FOLDER, required=False)
 @out_option("show", "Where the figures go.")
-def show(scenario: Path, out: Path | None) -> None:
-    """Draw a scenario: its demand, region map and MFDs.
+def show(scenario: Path | None, out: Path | None) -> None:
+    """Draw a scenario: its demand, region map and MFDs; without SCENARIO, list what comes with the package.
 
     \b
     Example:
       nmfd show economic_mpc --out figures
     """
+    if scenario is None:
+        click.echo(overview())
+        return
     from nmfd.api import load_scenario  # heavy
     from nmfd.runs.files import file_name
     from nmfd.studies.benchmark import draw_scenario
@@ -263,5 +251,5 @@ def _stamp(path: Path) -> int | None:
     return path.stat().st_mtime_ns if path.exists() else None
 
 
-for command in (listing(), bound, value, robustness, adaptation, ablation, scaling, new_controller, export, identify):
+for command in (bound, robustness, new_controller, identify):
     main.add_command(command)

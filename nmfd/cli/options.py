@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from nmfd.cli.declared import Declared, declared
+from nmfd.cli.declared import declared
 from nmfd.errors import InputError, did_you_mean
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
@@ -15,14 +15,6 @@ SEED = click.IntRange(0, 2**31 - 1)  # SUMO's are 32 bits long
 
 SCENARIO = click.argument("scenario", type=FOLDER)
 STEPS = declared("nmfd.model.scenario_file:ScenarioTable", "steps", instead="the scenario's")
-TIME_LIMIT = click.option(
-    "--time-limit",
-    "own_time_limit",
-    cls=Declared,
-    declaration="nmfd.model.scenario_file:ScenarioTable",
-    instead="the scenario's, else {}",
-    metavar="SECONDS",
-)
 ADAM_STEPS = declared("nmfd.controllers.dpc.options:Training", "steps", instead="what scenario.toml says, else {}")
 POLICIES = click.option(
     "--policy",
@@ -31,7 +23,6 @@ POLICIES = click.option(
     metavar="NAME=FILE",
     help="The file of a policy (dpc-) or plan (bound-), if not SCENARIO/NAME.pt or .npz. May be repeated.",
 )
-PARQUET = click.option("--parquet", is_flag=True, help="Write the tables as Parquet files too (nmfd.runs.frames).")
 
 
 def controllers_option(text: str, default: str | None = None) -> Callable[[Callable], Callable]:
@@ -43,21 +34,6 @@ def controllers_option(text: str, default: str | None = None) -> Callable[[Calla
 def out_option(kind: str = "<time>", text: str = "The run folder.") -> Callable[[Callable], Callable]:
     """--out, a folder."""
     return click.option("--out", type=FOLDER, metavar="DIR", help=f"{text} [default: runs/<scenario>-{kind}]")
-
-
-def fault_option(more: str = "") -> Callable[[Callable], Callable]:
-    """--fault, which may be repeated. more: kinds besides those of every plant"""
-    kinds = (
-        "frozen, delayed:N, missing:REGION, detectors:SHARE, off:FACTOR, solver-fails, solver-diverges, solver-late, "
-    )
-    return click.option(
-        "--fault",
-        "faults",
-        multiple=True,
-        metavar="KIND[:VALUE][@FROM-TO]",
-        help=f"Inject a fault, in the control intervals FROM to TO - 1: {kinds}policy-nan{', ' if more else ''}{more}. "
-        "May be repeated; what is done instead is in the status of every decision.",
-    )
 
 
 def controller_names(
