@@ -8,11 +8,11 @@ import pytest
 import tiny
 import torch
 from commands import good, nmfd
+from nmfd.controllers.dpc.fallback import Guarded, statistics
 
 from nmfd import closed_loop
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc.compact import HELD, CompactPolicy, Numbers
-from nmfd.controllers.dpc.fallback import Guarded, statistics
 from nmfd.controllers.dpc.policy import Architecture, DpcController
 from nmfd.controllers.dpc.policy_file import checkpoint, load_policy
 from nmfd.controllers.pi_gating import PiGating

@@ -8,10 +8,7 @@ import torch
 
 from nmfd import closed_loop
 from nmfd.api import load_scenario
-from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.controllers.no_control import NoControl
-from nmfd.errors import InputError
-from nmfd.metrics import total_time_spent
 from nmfd.model import disturbance, identification
 from nmfd.model.disturbance import LOOK, Disturbance
 from nmfd.model.identification import Observed
@@ -19,7 +16,6 @@ from nmfd.model.model_file import network_toml
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import load_network
-from nmfd.types import Observation
 
 LAW = Disturbance(gain=0.8, memory=0.5, fade_critical=2.0, fade_slope=1.5)
 
@@ -108,50 +104,6 @@ def test_a_model_that_is_right_needs_no_correction(slow, run):
 def test_runs_too_short_tell_nothing(believed, run):
     short = Observed(**{name: values[: LOOK + (name == "accumulation")] for name, values in vars(run).items()})
     assert identification.fit_disturbance(believed.network, [short], step=believed.step) is believed.network
-
-
-def mpc(scenario, **options):
-    loaded = replace(scenario, controller_options={"mpc-pc": {"horizon": 8, **options}})
-    return EconomicMpc(planning_model(loaded), guidance=False)
-
-
-def test_mpc_foresees_what_it_did_not_know(believed, slow):
-    """The demand that its plans reckon with has what the slow city keeps; without offset_free it has not."""
-    controllers = [mpc(believed, offset_free=on) for on in (False, True)]
-    totals = []
-    for controller in controllers:
-        trajectory = closed_loop.run(NmfdPlant(slow), controller, slow, seed=0)
-        totals.append(total_time_spent(trajectory))
-        assert not trajectory.status.any()
-    assert totals[0] != totals[1]
-    k = 60
-    seen = Observation(step=k, time=30.0 * k, accumulation=trajectory.accumulation[k], backlog=np.zeros((7, 7)))
-    plain, free = (controller.forecast(seen)[1].sum(axis=1) for controller in controllers)
-    assert (free[:3] > plain[:3] + 0.01).all() and (np.diff(free - plain) < 1e-9).all()
-
-
-def test_where_the_model_is_right_nothing_changes(believed):
-    plain, free = (
-        closed_loop.run(NmfdPlant(believed), mpc(believed, offset_free=on), replace(believed, steps=20), seed=0)
-        for on in (False, True)
-    )
-    np.testing.assert_allclose(free.accumulation, plain.accumulation, atol=0.5)
-
-
-def test_a_measurement_that_fails_is_no_innovation(believed):
-    controller = mpc(believed, offset_free=True)
-    x = np.full((7, 7), 20.0)
-    for k, seen in enumerate((x, np.full_like(x, np.nan), x + 5.0, x + 6.0)):
-        controller.act(Observation(step=k, time=30.0 * k, accumulation=seen, backlog=np.zeros((7, 7))))
-        assert len(controller._offset_free._innovations) == max(k - 2, 0)
-    controller.reset()
-    assert not controller._offset_free._innovations
-
-
-def test_a_network_that_knows_of_none(believed):
-    unknown = replace(believed, network=replace(believed.network, disturbance=None))
-    with pytest.raises(InputError, match=r"offset_free: the network .* has no table \[disturbance\]"):
-        mpc(unknown, offset_free=True)
 
 
 def test_it_is_written_and_read(believed, tmp_path):

@@ -197,7 +197,6 @@ def shared_configuration(tasks: Sequence[Task]) -> tuple[dict, dict]:
     scenario = scenario_of(first)
     controllers = {
         task.controller: dependencies(task.controller, scenario_of(task), task.policy)
-        | ({"schedule": [list(channel) for channel in task.schedule]} if task.schedule else {})
         for task in {task.controller: task for task in tasks}.values()
     }
     chosen = settings(scenario)

@@ -22,9 +22,8 @@ from cosim.sumo.outputs import check_whole
 from nmfd import closed_loop, metrics
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
-from nmfd.controllers.scheduled import Scheduled
 from nmfd.html import html_table
-from nmfd.model.planning import PlanningModel, planning_model
+from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import Scenario, with_demand, with_faults, with_time_limit
 from nmfd.quantities import variables
 from nmfd.runs import run_folder
@@ -89,8 +88,7 @@ class Task:
     scenario's own; steps: control intervals, all if None; demand_factor: multiplies all flows;
     options: of the controller, instead of those of the scenario; sumo_output: kind (cosim.sumo.outputs) and file of
     SUMO's own outputs; faults: besides those of the scenario; time_limit: of a controller of the user's own
-    [s], instead of that of the scenario; schedule: added to what the controller commands, channel and numbers
-    (nmfd.controllers.scheduled)."""
+    [s], instead of that of the scenario."""
 
     scenario: Path
     controller: str
@@ -102,7 +100,6 @@ class Task:
     sumo_output: tuple[tuple[str, Path], ...] = ()
     faults: tuple[str, ...] = ()
     time_limit: float | None = None
-    schedule: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
     def __post_init__(self) -> None:
         """A text will do for the scenario's folder."""
@@ -164,8 +161,6 @@ def simulate(
     scenario, strategy = scenario_of(task), parse(task.controller)
     variant = configured(task.controller, scenario.controller_options)
     controller = registry.make(variant, scenario, policy=task.policy)
-    if task.schedule:
-        controller = Scheduled(controller, dict(task.schedule), planning_model(scenario, variant))
     result = drive(
         scenario,
         strategy,

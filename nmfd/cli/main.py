@@ -42,8 +42,7 @@ def main() -> None:
 @controllers_option(
     "Which to run: no-control, route-guidance, pi-gating, greedy, mpc-pc, mpc-pcrg, "
     "mpc-pc-terminal, mpc-pcrg-terminal, probing-pc, "
-    "probing-pcrg, dpc-pc, dpc-pcrg, dpc-pc-robust, dpc-pcrg-robust, dpc-pc-guarded, "
-    "dpc-pcrg-guarded, dpc-pc-online, dpc-pcrg-online, bound-pc, bound-pcrg, or file.py:Class "
+    "probing-pcrg, dpc-pc, dpc-pcrg, bound-pc, bound-pcrg, or file.py:Class "
     "(see nmfd new-controller)."
 )
 @declared("nmfd.studies.settings:Study", "seeds", "plant", "workers")
@@ -89,7 +88,7 @@ def benchmark(
 
 @main.command()
 @SCENARIO
-@click.option("--controller", required=True, metavar="NAME", help="dpc-pc, dpc-pcrg, dpc-pc-robust or dpc-pcrg-robust.")
+@click.option("--controller", required=True, metavar="NAME", help="dpc-pc or dpc-pcrg.")
 @click.option(
     "--seed", type=SEED, default=0, show_default=True, help="Of the initial weights and the training scenarios."
 )
@@ -126,7 +125,7 @@ def train(
     compiled: bool | None,
     logged: str | None,
 ) -> None:
-    """Train a DPC policy on a scenario. The -robust ones are trained with noise on the demand.
+    """Train a DPC policy on a scenario.
 
     Of an imported city, identify it first: on placeholder MFDs, and for a city of which no gateway can be controlled,
     nothing is trained.

@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 
 from nmfd.controllers import custom, open_loop
-from nmfd.controllers.dpc import fallback, online, policy_file, training
-from nmfd.controllers.dpc.options import TRAINED, Online
+from nmfd.controllers.dpc import policy_file, training
+from nmfd.controllers.dpc.options import Training
 from nmfd.controllers.excitation import Probing
 from nmfd.controllers.greedy import Greedy
 from nmfd.controllers.mpc import controller as mpc
@@ -106,39 +106,14 @@ _ENTRIES = {
     ),
     **{
         name: Entry(
-            text=f"a policy trained by differentiable predictive control, perimeter control{ALSO * guides}"
-            f"{', with noise on the demand' if 'robust' in name else ''}",
+            text=f"a policy trained by differentiable predictive control, perimeter control{ALSO * guides}",
             make=partial(policy_file.load, guidance=guides),
             guides=guides,
             policy=name,
-            declared=TRAINED[name],
+            declared=Training,
         )
         for name, guides in training.NAMES.items()
     },
-    "dpc-pc-guarded": Entry(
-        text="dpc-pc, watched: PI gating where it has seen no such state",
-        make=partial(fallback.load, guidance=False),
-        policy="dpc-pc",
-    ),
-    "dpc-pcrg-guarded": Entry(
-        text="dpc-pcrg, watched in the same way",
-        make=partial(fallback.load, guidance=True),
-        guides=True,
-        policy="dpc-pcrg",
-    ),
-    "dpc-pc-online": Entry(
-        text="dpc-pc, fine-tuned between control intervals",
-        make=partial(online.load, guidance=False),
-        policy="dpc-pc",
-        declared=Online,
-    ),
-    "dpc-pcrg-online": Entry(
-        text="dpc-pcrg, fine-tuned in the same way",
-        make=partial(online.load, guidance=True),
-        guides=True,
-        policy="dpc-pcrg",
-        declared=Online,
-    ),
     **{
         name: Entry(
             text=f"replays the best plan found with all demand known (nmfd bound), perimeter control{ALSO * guides}",

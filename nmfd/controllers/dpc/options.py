@@ -1,6 +1,6 @@
 """The options of DPC policies, declared: how they are trained, and how one goes on learning while it drives."""
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -13,15 +13,6 @@ if TYPE_CHECKING:
 MOST_STEPS = 10**7
 WIDEST, DEEPEST = 10_000, 100  # units per layer, layers: of a policy that fits into memory
 Activation = Literal["gelu", "relu", "tanh", "soft-exponential"]
-ROBUST_NOISE = 3.0  # veh/s
-
-
-def _noise(default: float) -> Any:
-    return setting(
-        "largest standard deviation of the Gaussian noise on the demand of the pairs that have any, at every step; "
-        "every rollout has its own, evenly from 0 to this",
-        default,
-    )
 
 
 class Training(Options):
@@ -73,9 +64,10 @@ class Training(Options):
     initial_share: Share = setting(
         "share of the rollouts that start from a random state, at a random time of the scenario", 0.5
     )
-    noise: Flow = _noise(0.0)
-    noise_all: Flow = setting(
-        "the same of noise on every pair of regions, in every other rollout, instead of noise", 0.0
+    noise: Flow = setting(
+        "largest standard deviation of the Gaussian noise on the demand of the pairs that have any, at every step; "
+        "every rollout has its own, evenly from 0 to this",
+        0.0,
     )
     mfd_spread: Share = setting(
         "how far the regional model that every rollout has for itself is from the scenario's", 0.0
@@ -141,21 +133,3 @@ class Training(Options):
     def levels(self) -> tuple[float, float]:
         """Between which the demand is scaled."""
         return self.demand_low, self.demand_high
-
-
-class RobustTraining(Training):
-    """The same of the policies whose name ends in -robust."""
-
-    noise: Flow = _noise(ROBUST_NOISE)
-
-
-TRAINED = {"dpc-pc": Training, "dpc-pcrg": Training, "dpc-pc-robust": RobustTraining, "dpc-pcrg-robust": RobustTraining}
-
-
-class Online(Options):
-    """Of a policy that goes on learning while it drives."""
-
-    look_ahead: int = whole("control intervals of the rollouts", 80, low=1)
-    iterations: int = whole("Adam steps per control interval", 2)
-    learning_rate: float = setting("of Adam", 3e-4, unit="-", gt=0.0)
-    rollouts: int = whole("per Adam step, each from the measured state with some noise", 4, low=1)

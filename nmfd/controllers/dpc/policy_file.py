@@ -23,13 +23,9 @@ def new_policy(network: RegionalModel, architecture: Architecture) -> Policy:
     return (CompactPolicy if architecture.compact else Policy)(network, architecture)
 
 
-def checkpoint(policy: Policy, network: RegionalModel, configuration: Mapping, states: Mapping | None = None) -> dict:
-    """What a policy file holds: weights with the normalisation, architecture, network hash, configuration.
-
-    states: of nmfd.controllers.dpc.fallback.statistics, where the policy is to be guarded
-    """
+def checkpoint(policy: Policy, network: RegionalModel, configuration: Mapping) -> dict:
+    """What a policy file holds: weights with the normalisation, architecture, network hash, configuration."""
     return {
-        **({} if states is None else {"states": dict(states)}),
         "format": FORMAT,
         "architecture": asdict(policy.architecture),
         "network": network.name,

@@ -117,20 +117,14 @@ class Rollout:
         p = self._nominal
         return p.c if p.exit_rates is None else p.c * p.exit_rates.amax(-1)
 
-    def perturb(
-        self, demand: Demands, level: Levels, noise: float, noise_all: float, generator: torch.Generator
-    ) -> Demands:
-        """`demand` (T, B, R, R) [veh/s] with Gaussian noise, clipped at zero.
+    def perturb(self, demand: Demands, level: Levels, noise: float, generator: torch.Generator) -> Demands:
+        """Add Gaussian noise of sigma `level` (B,) times `noise` to the pairs with demand, clipped at zero.
 
-        sigma is `level` (B,) times `noise`, on the pairs with demand (demand_noise.WHERE, "pairs"); in every other
-        rollout times `noise_all` and on every pair ("all"), unless `noise_all` is 0.
+        demand: (T, B, R, R) [veh/s]
         """
-        if not noise and not noise_all:
+        if not noise:
             return demand
-        everywhere = (torch.arange(demand.shape[1]) % 2 == 1) & (noise_all > 0)
-        sigma = level * torch.where(everywhere, noise_all, noise)
-        pairs, every = (torch.tensor(entries(self.planning.forecast, where)[0]) for where in ("pairs", "all"))
-        sigma = sigma[:, None, None] * torch.where(everywhere[:, None, None], every, pairs)
+        sigma = level[:, None, None] * noise * torch.tensor(entries(self.planning.forecast, "pairs")[0])
         normal = torch.randn(demand.shape, generator=generator, dtype=self.dtype)
         return (demand + (normal * sigma).to(self.device)).clamp(min=0.0)
 

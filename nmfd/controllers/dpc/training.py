@@ -13,11 +13,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
-from nmfd.controllers.dpc import fallback
 from nmfd.controllers.dpc.compact import CompactPolicy
-from nmfd.controllers.dpc.options import TRAINED, Training
+from nmfd.controllers.dpc.options import Training
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint, new_policy, read_file
 from nmfd.controllers.dpc.rollout import Rollout, compiled_step
@@ -39,7 +37,7 @@ WORTH_COMPILING = 200  # Adam steps
 GATE_STEPS, GATE_BATCH, GATE_RATE, GATE_WIDTH, GATE_FULLEST, OPENED = 1000, 256, 2e-3, 0.05, 2.5, 0.95
 WEAK, OPEN, RARE = 0.1, 3.0, 1e-3  # of the first policy from no control: factor of weights, logit of u, least theta
 VALIDATIONS = 16  # perturbed scenarios in a validation, if training perturbs the demand
-NAMES = {"dpc-pc": False, "dpc-pcrg": True, "dpc-pc-robust": False, "dpc-pcrg-robust": True}
+NAMES = {"dpc-pc": False, "dpc-pcrg": True}
 
 
 def settings(scenario: Scenario, controller: str, steps: int | None = None) -> Training:
@@ -55,7 +53,7 @@ def settings(scenario: Scenario, controller: str, steps: int | None = None) -> T
             f'--controller: {controller!r} needs a table [controllers."{controller}"] in {scenario.folder}/'
             f"scenario.toml that says what is different from {name}; add one, or train {name}"
         )
-    chosen = options(TRAINED[name], planning_model(scenario, controller), name, controller)
+    chosen = options(Training, planning_model(scenario, controller), name, controller)
     if chosen.local and NAMES[name]:
         raise InputError(
             f"{scenario.folder}/scenario.toml: controllers.{controller}.local: a local policy guides no routes; train "
@@ -175,9 +173,7 @@ def train(
                 x, demand = rollout.random_start(
                     chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels
                 )
-                demand = rollout.perturb(
-                    demand, torch.rand(chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator
-                )
+                demand = rollout.perturb(demand, torch.rand(chosen.batch, generator=generator), chosen.noise, generator)
                 # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
                 loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
                 optimizer.zero_grad()
@@ -198,7 +194,7 @@ def train(
                         log(step + 1, history[-1][1], score)
                     if score < best:
                         best = score
-                        _keep(policy, rollout, chosen, configuration, best, out)
+                        _keep(policy, rollout, configuration, best, out)
                     if not last:
                         write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
                 reached((step + 1) / steps)
@@ -210,7 +206,7 @@ def train(
                     log(0, best, best)
                 if progress:
                     progress(1, 1, f"as it begins {best:.4g} veh s")
-                _keep(policy, rollout, chosen, configuration, best, out)
+                _keep(policy, rollout, configuration, best, out)
             if not math.isfinite(best):
                 raise RunFailed(f"{controller}: every validation of {steps} steps diverged; lower the learning rate")
             state_file.unlink(missing_ok=True)
@@ -254,12 +250,12 @@ def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> f
     If training perturbs demand or model: also of VALIDATIONS perturbed ones, whose sigma rises to that of `chosen`.
     """
     generator = torch.Generator().manual_seed(seed)
-    perturbed = chosen.noise or chosen.noise_all or chosen.mfd_spread or chosen.demand_low < chosen.demand_high
+    perturbed = chosen.noise or chosen.mfd_spread or chosen.demand_low < chosen.demand_high
     count = 2 + (VALIDATIONS if perturbed else 0)
     rollout.draw_model(count, chosen.mfd_spread, generator, chosen.mfd_scale)
     level = torch.linspace(0.0, 1.0, count // 2).repeat_interleave(2)  # in twos: one of each kind of noise
     nominal = rollout.demand.unsqueeze(1).expand(-1, count, -1, -1)
-    demand = rollout.perturb(nominal, level, chosen.noise, chosen.noise_all, generator)
+    demand = rollout.perturb(nominal, level, chosen.noise, generator)
     if chosen.demand_low < chosen.demand_high:
         low, high = chosen.levels
         demand = (
@@ -270,27 +266,9 @@ def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> f
     return torch.log(total).mean().exp().item()
 
 
-def visited(policy: Policy, rollout: Rollout, chosen: Training, seed: int) -> Float[np.ndarray, "N C"]:
-    """States (N, R*R) [-], as a share of the policy's scale, that `policy` sees in rollouts like those in training."""
-    generator = torch.Generator().manual_seed(seed)
-    rollout.draw_model(4 * chosen.batch, chosen.mfd_spread, generator, chosen.mfd_scale)
-    x, demand = rollout.random_start(
-        4 * chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels
-    )
-    demand = rollout.perturb(
-        demand, torch.rand(4 * chosen.batch, generator=generator), chosen.noise, chosen.noise_all, generator
-    )
-    with torch.no_grad():
-        _, seen, _ = rollout.states(policy, x, demand, generator)
-        return (seen / policy.scale).flatten(0, 1).flatten(-2).double().cpu().numpy()
-
-
-def _keep(
-    policy: Policy, rollout: Rollout, chosen: Training, configuration: Mapping[str, Any], score: float, out: Path
-) -> None:
-    """Write the policy to `out`, with its `score` in validation [veh s] and statistics of the states that it sees."""
-    states = fallback.statistics(visited(policy, rollout, chosen, configuration["seed"]))
-    write(checkpoint(policy, rollout.planning.network, {**configuration, "validation_veh_s": score}, states), out)
+def _keep(policy: Policy, rollout: Rollout, configuration: Mapping[str, Any], score: float, out: Path) -> None:
+    """Write the policy to `out`, with its `score` in validation [veh s]."""
+    write(checkpoint(policy, rollout.planning.network, {**configuration, "validation_veh_s": score}), out)
 
 
 def _state(

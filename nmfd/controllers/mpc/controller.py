@@ -22,7 +22,6 @@ from nmfd.arrays import PerPair, PerTurn
 from nmfd.controllers.mpc import edge_model
 from nmfd.controllers.mpc.edge_model import Decision, Demands, PerCell, Plan, Turns
 from nmfd.controllers.mpc.ipopt import Ipopt
-from nmfd.controllers.mpc.offset_free import OffsetFree
 from nmfd.controllers.mpc.projected_gradient import AT_REST, TIME_LIMIT, Late, Minimum, minimise
 from nmfd.controllers.mpc.terminal import Terminal, read
 from nmfd.controllers.options import Options, options
@@ -61,11 +60,6 @@ class Mpc(Options):
     solver: Literal["projected-gradient", "ipopt"] = setting(
         "ipopt: the published formulation by CasADi and IPOPT, two orders of magnitude slower: the reference",
         "projected-gradient",
-    )
-    offset_free: bool = setting(
-        "what the model got wrong in the last intervals is added to the demand that is forecast, fading; the network "
-        "says how, in its table [disturbance]",
-        False,
     )
     max_iterations: int = whole("of the solver, per decision", 1000)
     time_limit: float | None = setting(
@@ -160,7 +154,7 @@ class EconomicMpc:
     one that it started from, is used. Where it finds none (it fails, diverges, or meets its deadline first), the last
     plan is used, moved on, for as long as it reaches, and then PI gating takes over, or without a protected region the
     open perimeter, until the solver is back. The backlog counts as demand of the first interval; negative measurements
-    count as 0. With `offset_free` what the model got wrong lately counts as demand, too (offset_free.py).
+    count as 0.
     """
 
     def __init__(self, planning: PlanningModel, *, guidance: bool, terminal: Terminal | None = None):
@@ -201,29 +195,14 @@ class EconomicMpc:
                 iterations=self.options.max_iterations,
                 seconds=IN_TIME * self.deadline,
             )
-        self._offset_free = (
-            OffsetFree(planning, f"{planning.where}: controllers.{self.name}.offset_free")
-            if (self.options.offset_free)
-            else None
-        )
         self.fault: str | None = None  # injected (nmfd.faults)
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
         self._plan, self._left = self._open, 0  # left: intervals of the plan that are still to come
         self._gates = False  # PI gating is in control
-        if self._offset_free is not None:
-            self._offset_free.reset()
 
     def act(self, observation: Observation) -> Controls:
-        if self._offset_free is None:
-            return self._decide(observation)
-        self._offset_free.saw(observation)
-        controls = self._decide(observation)
-        self._offset_free.decided(observation, controls)
-        return controls
-
-    def _decide(self, observation: Observation) -> Controls:
         deadline = time.perf_counter() + IN_TIME * self.deadline
         start, demand = self.forecast(observation)
         self._look_beyond(observation.step + self.options.horizon)
@@ -290,8 +269,6 @@ class EconomicMpc:
         demand[: len(known)] = known
         demand[0] += observation.backlog / self._step
         held = np.maximum(observation.accumulation, 0.0)
-        if self._offset_free is not None:
-            demand += self._offset_free.ahead(held, horizon)
         start = held[:, self._used].ravel()
         return start, demand[:, :, self._used].reshape(horizon, -1)
 
