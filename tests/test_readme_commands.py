@@ -27,7 +27,6 @@ REDUCED = {  # what is added; of an option that is there already the last counts
 }
 NOT_RUN = {  # what takes long or needs more, and where it is tested
     "cosim watch": "test_watch.py",
-    "cosim video": "test_video.py",
     "cosim tune": "test_tuning.py",
     "cosim improve": "test_improve.py",
     "cosim frontier": "test_tuning.py",

@@ -145,17 +145,20 @@ def watch(
 
 
 def _window(task: "Task", delay: float | None) -> None:
-    """In sumo-gui."""
-    from cosim.evaluation.settings import Window
-    from cosim.report import watch
+    """Run a task in sumo-gui and print its outcome."""
+    from cosim.evaluation.simulate import simulate
+    from cosim.sumo.session import LOST, Window
 
+    window = Window(
+        options=("--start", "true", "--quit-on-end", "true", "--delay", f"{20.0 if delay is None else delay}")
+    )
     try:
         with progress_line("watch") as progress:
-            trajectory = watch.watch(task, delay=Window().delay if delay is None else delay, progress=progress)
-    except watch.WindowClosed:
+            result = simulate(task, progress, window=window)
+    except LOST:
         click.echo("The window was closed before the end.")
         return
-    _tell(task.controller, task.seed, trajectory)
+    _tell(task.controller, task.seed, result.trajectory)
 
 
 def _tell(controller: str, seed: int, trajectory: "Trajectory") -> None:

@@ -19,6 +19,7 @@ from cosim.plant.record import Record, settled
 from cosim.plant.settings import settings
 from cosim.plant.strategy import Strategy, configured, parse, planning_of
 from cosim.sumo.outputs import check_whole
+from cosim.sumo.session import Window
 from nmfd import closed_loop, metrics
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
@@ -151,7 +152,10 @@ def scenario_of(task: Task) -> Scenario:
 
 
 def simulate(
-    task: Task, progress: Callable[[int, int], None] | None = None, observer: Observer | None = None
+    task: Task,
+    progress: Callable[[int, int], None] | None = None,
+    observer: Observer | None = None,
+    window: Window | None = None,
 ) -> Result:
     """Run `task` in this process, which must hold no other SUMO session. Raises InputError.
 
@@ -171,6 +175,7 @@ def simulate(
         outputs=dict(task.sumo_output),
         planning=planning_of(scenario, task.controller),
         observer=observer,
+        window=window,
     )
     outside = registry.outside_training(variant, scenario, task.demand_factor, file=task.policy)
     return replace(result, facts={**result.facts, "outside_training": outside})
@@ -187,6 +192,7 @@ def drive(
     outputs: Mapping[str, Path] | None = None,
     planning: PlanningModel | None = None,
     observer: Observer | None = None,
+    window: Window | None = None,
 ) -> Result:
     """The closed loop of `controller` in SUMO, filed under `strategy.name`, whose options the city takes.
 
@@ -204,6 +210,7 @@ def drive(
             outputs=files,
             planning=planning,
             observer=observer,
+            window=window,
         )
         stack.callback(plant.close)
         trajectory = run_folder.labelled(
