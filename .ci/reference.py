@@ -1,6 +1,6 @@
 """The reference of the Python interface as HTML: python .ci/reference.py [FOLDER] (default: runs/reference).
 
-Of the public names of nmfd and cosim, the environments of nmfd.rl and cosim.plant.env, and a controller as it is
+Of the public names of nmfd and cosim, the environments of nmfd.rl, and a controller as it is
 written; by pdoc, for which the names that are imported when they are first used are imported first. What pdoc warns of
 is an error. Needs the extras test and rl.
 """
@@ -15,7 +15,7 @@ import jinja2
 import pdoc
 from pdoc.render import env
 
-MODULES = ("nmfd", "nmfd.rl", "nmfd.controllers.template", "cosim", "cosim.plant.env")
+MODULES = ("nmfd", "nmfd.rl", "nmfd.controllers.template", "cosim")
 
 
 def build(folder: Path) -> None:

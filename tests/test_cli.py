@@ -15,7 +15,7 @@ from commands import nmfd
 from PIL import Image
 
 from cosim.cli.main import main
-from nmfd import closed_loop, extras
+from nmfd import closed_loop
 from nmfd.cli.declared import Declared, shown
 from nmfd.controllers import registry
 from nmfd.controllers.dpc import rollout, training
@@ -214,7 +214,7 @@ def test_training_can_be_interrupted_and_resumed(scenario, tmp_path, monkeypatch
     assert nmfd("benchmark", scenario, "--controllers", "dpc-pc", "--out", tmp_path / "early").exit_code == 0
     result = nmfd(*again.split()[1:])
     assert result.exit_code == 0 and "best" in result.stdout and len(calls) == 5
-    assert {path.name for path in scenario.iterdir()} == {"scenario.toml", "dpc-pc.pt", "dpc-pc-training.png"}
+    assert {path.name for path in scenario.iterdir()} == {"scenario.toml", "dpc-pc.pt"}
     assert nmfd("benchmark", scenario, "--controllers", "dpc-pc", "--out", tmp_path / "late").exit_code == 0
 
 
@@ -228,31 +228,6 @@ def test_training_interrupted_at_once_keeps_nothing(scenario, monkeypatch):
         130,
         "nmfd: interrupted before the first validation; nothing is kept\n",
     )
-    assert [path.name for path in scenario.iterdir()] == ["scenario.toml"]
-
-
-def test_learning_curves_for_tensorboard(scenario, monkeypatch):
-    pytest.importorskip("tensorboard", reason="the extra tensorboard is not installed")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    monkeypatch.setattr(training, "VALIDATE_EVERY", 1)
-    monkeypatch.chdir(scenario)
-    result = nmfd("train", scenario, "--controller", "dpc-pc", "--steps", 3, "--log", "tensorboard", "--no-compile")
-    assert result.exit_code == 0 and "tensorboard --logdir runs" in result.stdout
-    (folder,) = (scenario / "runs" / "tensorboard").iterdir()
-    told = EventAccumulator(str(folder)).Reload()
-    for name in ("training", "validation"):
-        points = told.Scalars(f"total_time_spent_veh_s/{name}")
-        assert [point.step for point in points] == [1, 2, 3] and all(point.value > 0 for point in points)
-    best = torch.load(scenario / "dpc-pc.pt", weights_only=True)["configuration"]["validation_veh_s"]
-    assert best == pytest.approx(min(point.value for point in points))
-
-
-def test_without_tensorboard_one_line_says_what_to_install(scenario, monkeypatch):
-    found = extras.find_spec
-    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "tensorboard" else found(name))
-    result = nmfd("train", scenario, "--controller", "dpc-pc", "--steps", 2, "--log", "tensorboard")
-    assert result.exit_code == 2 and result.stderr.count("\n") == 1 and "install the extra tensorboard" in result.stderr
     assert [path.name for path in scenario.iterdir()] == ["scenario.toml"]
 
 

@@ -191,8 +191,6 @@ def test_training_killed_and_resumed_is_the_uninterrupted_one(tmp_path, monkeypa
         "scenario",
         "whole.pt",
         "mine.pt",
-        "whole-training.png",
-        "mine-training.png",
     }
 
 

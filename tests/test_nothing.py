@@ -33,7 +33,6 @@ def rows() -> pd.DataFrame:
     [
         "benchmark scenario --controllers no-control,pi-gating,mpc-pcrg --seeds 2 --out out",
         "robustness scenario --controllers pi-gating --scenarios 2 --out out",
-        "ablation horizon scenario --horizons 2,3 --out out",
         "show scenario --out out",
         "bound scenario --controller bound-pc --iterations 1 --out plan.npz",
     ],

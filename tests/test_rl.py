@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import tiny
 
+from cosim import SumoPlant
 from nmfd import api
 from nmfd.api import load_scenario
-from nmfd.controllers import custom
 from nmfd.metrics import total_time_spent
 from nmfd.model.plant import AcyclicPlant
+from nmfd.model.scenario import with_demand
 
 ROOT = Path(__file__).parents[1]
 gymnasium = pytest.importorskip("gymnasium", reason="the extra rl is not installed")
@@ -41,18 +42,9 @@ def gymnasium_check(env):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", ".*not within.*|.*recommend.*")
-        check_env(env, skip_render_check=True)  # which wants to make another one beside it
+        check_env(env, skip_render_check=True, skip_close_check=True)
     assert np.isfinite(env.observation_space.low).all() and np.isfinite(env.observation_space.high).all()
-    assert drawn(env).shape == drawn(env).shape
     env.close()
-
-
-def drawn(env):
-    """What it renders, which is a picture of something."""
-    picture = env.render()
-    assert picture.dtype == np.uint8 and picture.shape[2] == 3 and min(picture.shape[:2]) > 300
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
-    return picture
 
 
 def pettingzoo_check(env, cycles):
@@ -64,60 +56,41 @@ def pettingzoo_check(env, cycles):
 
 @pytest.mark.parametrize("guidance", [False, True])
 def test_gymnasium_and_pettingzoo_accept_the_regional_plants(scenario, hexagon, guidance):
-    gymnasium_check(rl.RegionalEnv(scenario, guidance=guidance, render_mode="rgb_array"))
-    gymnasium_check(rl.RegionalEnv(hexagon, AcyclicPlant(hexagon), guidance=guidance, render_mode="rgb_array"))
+    gymnasium_check(rl.RegionalEnv(scenario, guidance=guidance))
+    gymnasium_check(rl.RegionalEnv(hexagon, AcyclicPlant(hexagon), guidance=guidance))
     pettingzoo_check(rl.RegionsEnv(scenario, guidance=guidance), 50)
     pettingzoo_check(rl.RegionsEnv(hexagon, guidance=guidance, cooperative=False), 10)
 
 
 def test_gymnasium_and_pettingzoo_accept_sumo(peak):
-    from cosim.plant.env import gymnasium_env, pettingzoo_env
+    short = with_demand(load_scenario(peak), steps=2)
+    gymnasium_check(rl.RegionalEnv(short, SumoPlant(short), guidance=True))
+    pettingzoo_check(rl.RegionsEnv(short, SumoPlant(short)), 3)
 
-    gymnasium_check(gymnasium_env(peak, steps=2, guidance=True, render_mode="rgb_array"))
-    pettingzoo_check(pettingzoo_env(peak, steps=2, city="actuated"), 3)
 
-
-def test_environments_have_names(scenario, tmp_path):
-    env = gymnasium.make("nmfd/Hexagon7-v0", guidance=True, render_mode="rgb_array")
+def test_environments_have_names(scenario):
+    env = gymnasium.make("nmfd/Hexagon7-v0", guidance=True)
     assert env.reset(seed=1)[0] in env.observation_space and env.unwrapped.interface.action_size > 24
-    empty = drawn(env)
     for _ in range(30):
         seen, *_ = env.step(env.action_space.sample())
         assert seen in env.observation_space
-    assert (drawn(env) != empty).any()
-    env.close()
     own = gymnasium.make("nmfd/Scenario-v0", scenario=str(scenario.folder))
-    assert own.reset(seed=0)[0] in own.observation_space and own.render() is None
-    other = rl.RegionsEnv(scenario.folder, render_mode="rgb_array")
-    other.reset(seed=0)
-    drawn(other)
-
-
-def test_the_city_has_a_name(peak):
-    import cosim.plant.env as city
-
-    assert city.gymnasium_env.__name__ in gymnasium.spec("cosim/Grid7-v0").entry_point
-    env = gymnasium.make("cosim/Scenario-v0", scenario=peak, steps=2, render_mode="rgb_array")
-    env.reset(seed=1)
-    empty = drawn(env)
-    env.step(env.action_space.sample())
-    assert (drawn(env) != empty).any()
-    env.close()
+    assert own.reset(seed=0)[0] in own.observation_space
 
 
 @pytest.mark.parametrize("guidance", [False, True])
 def test_every_action_is_admissible_and_reaches_the_bounds(hexagon, guidance):
     interface, network = rl.Interface(hexagon.network, guidance=guidance), hexagon.network
     random = np.random.default_rng(0)
-    for action in (random.uniform(-1.3, 1.3, (4, interface.action_size)), np.ones((1, interface.action_size))):
+    for action in (random.uniform(-1.3, 1.3, interface.action_size), np.ones(interface.action_size)):
         perimeter, splits = interface.perimeter(action), interface.splits(action)
-        assert (perimeter[:, ~network.adjacency] == 0).all()
-        assert perimeter[:, network.adjacency].min() >= network.u_min
-        assert perimeter[:, network.adjacency].max() <= network.u_max
+        assert (perimeter[~network.adjacency] == 0).all()
+        assert perimeter[network.adjacency].min() >= network.u_min
+        assert perimeter[network.adjacency].max() <= network.u_max
         if guidance:
-            assert (splits[:, ~network.split_mask] == 0).all()
-            np.testing.assert_allclose(splits.sum(axis=2)[:, network.split_mask.any(axis=1)], 1.0)
-    assert (perimeter[:, network.adjacency] == network.u_max).all()
+            assert (splits[~network.split_mask] == 0).all()
+            np.testing.assert_allclose(splits.sum(axis=1)[network.split_mask.any(axis=1)], 1.0)
+    assert (perimeter[network.adjacency] == network.u_max).all()
     assert guidance or splits is None
 
 
@@ -178,52 +151,8 @@ def test_agents_together_do_what_one_agent_does(hexagon):
         assert list(rewards.values()) == pytest.approx([reward] * 7)
 
 
-def test_vectorised_equals_single_ones_and_begins_anew(scenario):
-    many = rl.NmfdVectorEnv(scenario, 3, guidance=True)
-    singles = [rl.RegionalEnv(scenario, guidance=True) for _ in range(3)]
-    seen, _ = many.reset(seed=4)
-    for n, env in enumerate(singles):
-        np.testing.assert_allclose(seen[n], env.reset(seed=4 + n)[0])
-    many.action_space.seed(0)
-    for k in range(scenario.steps):
-        actions = many.action_space.sample()
-        seen, rewards, terminated, truncated, info = many.step(actions)
-        alone = [env.step(action) for env, action in zip(singles, actions, strict=True)]
-        last = k + 1 == scenario.steps
-        assert truncated.tolist() == [last] * 3 and not terminated.any() and many.observation_space.contains(seen)
-        shown = np.stack(list(info["final_obs"])) if last else seen
-        np.testing.assert_allclose(shown, np.stack([step[0] for step in alone]), atol=1e-6)
-        np.testing.assert_allclose(rewards, [step[1] for step in alone], atol=1e-9)
-    assert abs(seen).max() < 0.1 and many.step(actions)[1].max() == 0.0  # empty again
-
-
-def test_random_starts_follow_the_seed(scenario):
-    def first():
-        env = rl.NmfdVectorEnv(scenario, 4, demand_spread=0.3, initial_share=0.5)
-        return env.reset(seed=1)[0], env.step(env.action_space.sample() * 0)[0]
-
-    np.testing.assert_array_equal(first(), first())
-    assert first()[0][0].sum() > 0.05 > first()[0][3].sum()
-
-
-def test_ppo_learns_with_the_adapter(scenario):
+def test_ppo_of_stable_baselines3_learns_on_it(scenario):
     sb3 = pytest.importorskip("stable_baselines3")
-    env = rl.Sb3VecEnv(rl.NmfdVectorEnv(scenario, 4))
-    model = sb3.PPO("MlpPolicy", env, n_steps=20, batch_size=40, n_epochs=1, seed=0, device="cpu")
-    model.learn(160)
-    action, _ = model.predict(env.reset(), deterministic=True)
-    assert action.shape == (4, env.env.interface.action_size)
-
-
-def test_the_ppo_example_is_a_controller_like_any_other_and_can_be_trained(hexagon, tmp_path, monkeypatch):
-    pytest.importorskip("stable_baselines3")
-    name = f"{ROOT}/scenarios/economic_mpc/ppo.py:Ppo"
-    totals = {each: total_time_spent(api.run(hexagon, each, seed=7)) for each in (name, "no-control")}
-    assert totals[name] < 0.9 * totals["no-control"]
-    example = custom._module(Path(name.removesuffix(":Ppo")), name)
-    monkeypatch.setattr(example, "ENVS", 2)
-    with pytest.warns(UserWarning, match="mini-batch"):  # two scenarios at once are fewer than it is made for
-        example.train(1, 0, tmp_path / "weights.pt")
-    monkeypatch.setattr(example, "WEIGHTS", tmp_path / "weights.pt")
-    perimeter = api.run(hexagon, name, steps=3).perimeter
-    assert ((perimeter >= 0.0) & (perimeter <= hexagon.network.u_max)).all()
+    env = rl.RegionalEnv(scenario)
+    model = sb3.PPO("MlpPolicy", env, n_steps=20, batch_size=20, n_epochs=1, seed=0, device="cpu").learn(40)
+    assert model.predict(env.reset(seed=0)[0], deterministic=True)[0] in env.action_space

@@ -8,9 +8,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from nmfd.metrics import COUNTED, gini
+from nmfd.metrics import COUNTED
 from nmfd.model.scenario import Scenario
-from nmfd.studies.delays import delays_by_origin
 from nmfd.types import Trajectory
 
 TTS = "total_time_spent_veh_s"
@@ -112,12 +111,6 @@ def of_region(row: Mapping, scenario: Scenario, trajectory: Trajectory, acyclic:
         "backlog_veh": 0.0,
         "removed_veh": 0.0,
     }
-    if acyclic:
-        delays, begun = delays_by_origin(scenario, trajectory)
-        found |= {
-            "mean_delay_s": float(delays @ begun) / trips if trips else None,
-            "delay_gini": _known(gini(delays, begun)),
-        }
     return {name: found.get(name) for name in METRICS}
 
 

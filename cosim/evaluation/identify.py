@@ -31,7 +31,7 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
 from nmfd.runs.tables import wrapped
 from nmfd.runs.workers import Source, ended
-from nmfd.studies import mfd_bands
+from nmfd.studies import plots
 from nmfd.studies.fit_quality import (
     fit_table,
     nearly_empty,
@@ -99,7 +99,7 @@ def identify(
 ) -> str:
     """Load the city of `scenario`, fit its regional model, and write the network.toml of `loading`.
 
-    Samples, pictures, fit.csv and the loading runs go to `out`, one run folder per level. Returns the fit as a table,
+    Samples, mfd.png, fit.csv and the loading runs go to `out`, one run folder per level. Returns the fit as a table,
     with what is doubtful about it, and whether perimeter control can help (verdict.txt beside network.toml). Raises
     InputError for a network that does not come from a folder, RunFailed if a loading run failed. Loading runs are kept:
     the same call goes on where it was interrupted, and gives the same model. scheduler: a Dask scheduler or its
@@ -156,9 +156,7 @@ def identify(
     model = replace(model, controllable=judged.boundaries.shares)
     text = "\n".join([text, *wrapped("\n".join(judged.sentences))])
     _write_samples(out / "samples.csv", samples)
-    by_run = [[own_points(cloud) for cloud in samples_of(network, [result])] for result in found]
-    mfd_bands.draw_mfds(out / "mfd.png", model, samples, [mfd_bands.band(runs) for runs in zip(*by_run, strict=True)])
-    mfd_bands.draw_production(out / "production.png", model, [result.record for result in found])
+    plots.draw_mfds(out / "mfd.png", model, samples)
     levels, seeds = ", ".join(f"{level:g}" for level in loading.levels), f"{min(loading.seeds)} to {max(loading.seeds)}"
     target.mkdir(parents=True, exist_ok=True)
     files.write_text(

@@ -19,7 +19,7 @@ from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_columns
-from nmfd.studies import mfd_bands, plots
+from nmfd.studies import plots
 from nmfd.studies.fit_quality import SPILLBACK
 from nmfd.studies.traffic_states import model_outflow, remembered
 from nmfd.types import Controls, Observation, Trajectory
@@ -246,5 +246,5 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
         )
         for region in range(scenario.network.regions)
     ]
-    mfd_bands.draw_mfds(folder / f"compare-{name}-mfd.png", scenario.network, samples)
+    plots.draw_mfds(folder / f"compare-{name}-mfd.png", scenario.network, samples)
     return rows

@@ -13,7 +13,7 @@ from cosim.sumo.net import City, city_of
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
-from nmfd.studies import mfd_bands, plots
+from nmfd.studies import plots
 from nmfd.studies.benchmark import draw_accumulations
 from nmfd.types import Trajectory
 
@@ -249,4 +249,4 @@ def outflows(path: Path, network: RegionalModel, results: dict[str, Result]) -> 
             for name, result in results.items()
         }
         samples.append({name: np.concatenate(list(parts.values())) for name, parts in clouds.items()})
-    mfd_bands.draw_mfds(path, network, samples)
+    plots.draw_mfds(path, network, samples)

@@ -110,9 +110,6 @@ def benchmark(
     help="Compile the rollout: a minute or two first, then about twice as fast. [default: from 200 Adam "
     "steps up, where there is a C++ compiler]",
 )
-@click.option(
-    "--log", "logged", type=click.Choice(["tensorboard"]), help="Also write logs for TensorBoard, to runs/tensorboard."
-)
 def train(
     scenario: Path,
     controller: str,
@@ -123,7 +120,6 @@ def train(
     anyway: bool,
     device: str,
     compiled: bool | None,
-    logged: str | None,
 ) -> None:
     """Train a DPC policy on a scenario.
 
@@ -131,7 +127,6 @@ def train(
     nothing is trained.
 
     The policy that does best in validation is in the policy file at any time; Ctrl-C keeps it, and --resume goes on.
-    Beside it a picture shows how the training went.
 
     \b
     Examples:
@@ -142,7 +137,6 @@ def train(
     from nmfd.controllers.dpc import rollout, training
     from nmfd.runs import shipped
     from nmfd.runs.files import file_name
-    from nmfd.studies import learning
 
     loaded = load_scenario(scenario)
     device = training.available(device)
@@ -174,9 +168,8 @@ def train(
     state = file.with_name(file.name + ".resume")
     before = _stamp(state)
     notes = ["no validation yet"]
-    board = Path("runs", "tensorboard", file_name(f"{loaded.name}-{controller}-{seed}")) if logged else None
     try:
-        with learning.Curve(board) as curve, progress_line(controller) as line:
+        with progress_line(controller) as line:
 
             def progress(done: int, total: int, note: str) -> None:
                 notes.append(note)
@@ -193,7 +186,6 @@ def train(
                 compiled=compiled,
                 anyway=anyway,
                 progress=progress,
-                log=curve.log,
             )
     except KeyboardInterrupt:
         if not resume and _stamp(state) == before:
@@ -205,13 +197,9 @@ def train(
         again += " --anyway" if anyway else ""
         again += f" --device {device}" if device != "cpu" else ""
         again += "" if default else f" --{'' if compiled else 'no-'}compile"
-        again += f" --log {logged}" if logged else ""
         raise Interrupted(f"interrupted; the best policy so far is {file}; go on with: {again} --resume") from None
-    picture = curve.draw(file.with_name(f"{file.stem}-training.png"), controller)
     click.echo(f"{controller}: {notes[-1]} in validation")
-    click.echo(f"Written to {file}; how it went: {picture}")
-    if board:
-        click.echo(f"Logs for TensorBoard in {board}: tensorboard --logdir {board.parent}")
+    click.echo(f"Written to {file}")
 
 
 @main.command()

@@ -1,32 +1,158 @@
-"""A scenario as a gymnasium environment: one agent for all regions."""
+"""A scenario as a Gymnasium environment, and with one agent per region as a PettingZoo environment."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-from jaxtyping import Float, UInt8
+from gymnasium.spaces import Box
+from jaxtyping import Float
+from pettingzoo import ParallelEnv
 
-from nmfd.model.scenario import Scenario
-from nmfd.rl.interface import Episode, Interface
-from nmfd.types import Observation, Plant
+from nmfd.arrays import PerPair, PerRegion, PerTurn
+from nmfd.closed_loop import noise_of, noisy
+from nmfd.model.plant import NmfdPlant
+from nmfd.model.regional_model import RegionalModel
+from nmfd.model.scenario import Scenario, read_scenario
+from nmfd.types import Controls, Observation, Plant
+
+Vector = Float[np.ndarray, " N"]
+
+NOISE_RANGE = 10.0  # standard deviations of the measurement noise within the observation space
+LOGIT_SCALE = 5.0  # times an action in [-1, 1]: logits of split ratios, up to a factor e^10 between two next regions
+
+
+class Interface:
+    """Observations and actions of an agent for some regions of a network, by default for all.
+
+    Observation (float32): x_ij and the backlog of these regions and, unless they are all, the accumulation of every
+    region; each divided by the region's critical accumulation.
+
+    Action in [-1, 1]: u_ih of each boundary out of these regions, from u_min to u_max, or with `metering` one value for
+    all entries of a region h; with `guidance` also a logit for each next region h of theta_ihj where there is a choice.
+    Every action is admissible.
+    """
+
+    def __init__(
+        self,
+        network: RegionalModel,
+        *,
+        guidance: bool = False,
+        metering: bool = False,
+        regions: Sequence[int] | None = None,
+    ):
+        self._network, self._all = network, regions is None
+        self._own = np.arange(network.regions) if regions is None else np.array(regions)
+        own = np.isin(np.arange(network.regions), self._own)
+        self._boundaries = np.nonzero(network.adjacency & own[:, None])
+        choice = network.split_mask & (network.split_mask.sum(axis=1, keepdims=True) > 1) & own[:, None, None]
+        self._turns = np.nonzero(choice) if guidance else None
+        entered, gate = np.unique(self._boundaries[1], return_inverse=True)
+        self._gate = gate if metering else np.arange(len(gate))  # index into the action of each boundary
+        self._gates = len(entered) if metering else len(gate)
+        self.action_size = self._gates + (0 if self._turns is None else len(self._turns[0]))
+        self.observation_size = len(self._own) * (network.regions + 1) + (0 if self._all else network.regions)
+        self._open = np.where(network.adjacency, network.u_max, 0.0)
+        # Split ratios of these regions without a choice.
+        self._fixed = np.where(network.split_mask & ~choice & own[:, None, None], network.nominal_splits, 0.0)
+
+    def vector(self, accumulation: PerPair, backlog: PerPair) -> Vector:
+        """Return the observation (observation_size,) of accumulation and backlog (R, R) [veh]."""
+        critical = self._network.critical
+        parts = [
+            (accumulation / critical[:, None])[self._own].ravel(),
+            (backlog.sum(axis=1) / critical)[self._own],
+        ]
+        if not self._all:
+            parts.append(accumulation.sum(axis=1) / critical)
+        return np.concatenate(parts, dtype=np.float32)
+
+    def observed(self, observation: Observation) -> Vector:
+        """Return the observation (observation_size,) of what a controller receives."""
+        return self.vector(observation.accumulation, observation.backlog)
+
+    def observation_space(self, scenario: Scenario) -> Box:
+        """Return bounds: an empty city, and in each cell twice all trips plus full regions; both with noise."""
+        trips = scenario.step * scenario.demand.sum() + scenario.start.sum()
+        most = 2.0 * trips + sum(mfd.jam for mfd in scenario.network.mfds)
+        noise, none = NOISE_RANGE * scenario.measurement_std, np.zeros_like(self._open)
+        return Box(self.vector(none - noise, none), self.vector(none + most + noise, none + most), dtype=np.float32)
+
+    @property
+    def action_space(self) -> Box:
+        """Vectors (action_size,) in [-1, 1]."""
+        return Box(-1.0, 1.0, (self.action_size,), np.float32)
+
+    def perimeter(self, action: Vector) -> PerPair:
+        """Return u (R, R) [-] of an action; u_max at the boundaries of other regions."""
+        low, high = self._network.u_min, self._network.u_max
+        share = 0.5 * (np.clip(np.asarray(action, dtype=float)[: self._gates], -1.0, 1.0) + 1.0)
+        perimeter = self._open.copy()
+        perimeter[self._boundaries] = low + (high - low) * share[self._gate]
+        return perimeter
+
+    def splits(self, action: Vector) -> PerTurn | None:
+        """Return theta (R, R, R) [-] of an action, 0 in other regions; None without guidance."""
+        if self._turns is None:
+            return None
+        weight = np.zeros_like(self._fixed)
+        weight[self._turns] = np.exp(LOGIT_SCALE * np.clip(np.asarray(action, dtype=float)[self._gates :], -1.0, 1.0))
+        sums = weight.sum(axis=1, keepdims=True)
+        return self._fixed + weight / np.where(sums > 0, sums, 1.0)
+
+    def controls(self, action: Vector) -> Controls:
+        """Return the controls of an action."""
+        return Controls(perimeter=self.perimeter(action), splits=self.splits(action))
+
+
+class Episode:
+    """A closed loop stepped from outside, with the noise and states of nmfd.closed_loop.run of the same seed."""
+
+    def __init__(self, scenario: Scenario | Path | str, plant: Plant | None):
+        self.scenario = scenario if isinstance(scenario, Scenario) else read_scenario(scenario)
+        self._plant = NmfdPlant(self.scenario) if plant is None else plant
+        self.unit = sum(mfd.critical for mfd in self.scenario.network.mfds)
+        self.close = self._plant.close
+
+    def reset(self, seed: int) -> Observation:
+        """Return the first observation."""
+        self._random, self._k = noise_of(seed), 0
+        self._state = self._plant.reset(seed)
+        return self._observation()
+
+    def step(self, controls: Controls) -> tuple[Observation, PerRegion, bool]:
+        """Return the observation, unfinished trips (R,) [veh] before the interval by region, and whether it ends."""
+        unfinished, self._k = self._state.unfinished.sum(axis=1), self._k + 1
+        self._state = self._plant.step(controls)
+        return self._observation(), unfinished, self._k >= self.scenario.steps
+
+    @property
+    def completed(self) -> float:
+        """Completed trips [veh]."""
+        return self._state.completed
+
+    def _observation(self) -> Observation:
+        noise = self.scenario.measurement_std * self._random.standard_normal(self._state.accumulation.shape)
+        own = self._plant.observe()
+        return noisy(self._state, noise) if own is None else own
 
 
 class RegionalEnv(gymnasium.Env):
-    """One episode is the whole scenario; it ends by truncation after its T control intervals.
+    """One agent for all regions; an episode is the whole scenario and ends by truncation.
 
         env = RegionalEnv("economic_mpc", guidance=True)
-        env = gymnasium.make("nmfd/Hexagon7-v0", guidance=True)   # the same, after import nmfd.rl
+        env = RegionalEnv(scenario, cosim.SumoPlant(scenario))        # in SUMO; one simulation per process
+        env = gymnasium.make("nmfd/Hexagon7-v0", guidance=True)       # after import nmfd.rl
 
-    Observations and actions: nmfd.rl.Interface. The reward of an interval is minus the vehicles in and before the city
-    when it begins, in `unit` (the sum of the critical accumulations): TTS = - sum of rewards * unit * scenario.step, as
-    in the benchmark table. `info` holds time_s, total_time_spent_veh_s and completed_veh so far.
+    The reward of an interval is minus the unfinished trips when it begins, in `unit` (the sum of the critical
+    accumulations): total time spent = - sum of rewards * unit * scenario.step. `info` holds time_s,
+    total_time_spent_veh_s and completed_veh. A seed gives the closed loop of nmfd.run with the same seed.
 
-    scenario: or its folder; plant: what is controlled, the NMFD if None; closed with the environment. One seed gives
-    the closed loop of nmfd.run with it. render_mode: "rgb_array" for the map.
+    scenario: or its folder; plant: the NMFD if None, closed with the environment; guidance, metering: see Interface
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    metadata: dict[str, Any] = {"render_modes": []}
 
     def __init__(
         self,
@@ -35,38 +161,117 @@ class RegionalEnv(gymnasium.Env):
         *,
         guidance: bool = False,
         metering: bool = False,
-        render_mode: str | None = None,
     ):
-        self._episode, self.render_mode = Episode(scenario, plant), render_mode
-        loaded = self._episode.scenario
-        self.interface = Interface(loaded.network, guidance=guidance, metering=metering)
+        self._episode = Episode(scenario, plant)
+        self.interface = Interface(self._episode.scenario.network, guidance=guidance, metering=metering)
         self.unit = self._episode.unit
-        self.observation_space = gymnasium.spaces.Box(*self.interface.bounds(loaded), dtype=np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.interface.action_size,), np.float32)
+        self.observation_space = self.interface.observation_space(self._episode.scenario)
+        self.action_space = self.interface.action_space
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Float[np.ndarray, " O"], dict]:
-        """Without a seed, the next one of the sequence that the last seed began."""
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Vector, dict]:
+        """Begin an episode; without a seed, the next one of the sequence begun by the last seed."""
         super().reset(seed=seed)
-        seen = self._episode.reset(int(self.np_random.integers(2**31)) if seed is None else seed)
+        observation = self._episode.reset(int(self.np_random.integers(2**31)) if seed is None else seed)
         self._spent = 0.0
-        return self._observed(seen), self._info(seen)
+        return self._observed(observation), self._info(observation)
 
-    def step(self, action: Float[np.ndarray, " A"]) -> tuple[Float[np.ndarray, " O"], float, bool, bool, dict]:
-        """One control interval under `action`."""
-        seen, vehicles, over = self._episode.step(self.interface.controls(action))
+    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict]:
+        """Advance by one control interval."""
+        observation, vehicles, over = self._episode.step(self.interface.controls(action))
         self._spent += self._episode.scenario.step * float(vehicles.sum())
-        return self._observed(seen), -float(vehicles.sum()) / self.unit, False, over, self._info(seen)
-
-    def render(self) -> UInt8[np.ndarray, "H W 3"] | None:
-        """The map, where rgb_array was asked for."""
-        return self._episode.picture() if self.render_mode == "rgb_array" else None
+        return self._observed(observation), -float(vehicles.sum()) / self.unit, False, over, self._info(observation)
 
     def close(self) -> None:
         """Close the plant."""
         self._episode.close()
 
-    def _observed(self, seen: Observation) -> Float[np.ndarray, " O"]:
-        return np.clip(self.interface.observed(seen), self.observation_space.low, self.observation_space.high)
+    def _observed(self, observation: Observation) -> Vector:
+        return np.clip(self.interface.observed(observation), self.observation_space.low, self.observation_space.high)
 
     def _info(self, seen: Observation) -> dict:
         return {"time_s": seen.time, "total_time_spent_veh_s": self._spent, "completed_veh": self._episode.completed}
+
+
+class RegionsEnv(ParallelEnv):
+    """One agent per region, which controls what leaves it; otherwise as RegionalEnv.
+
+    Each agent sees its own region by destination and the accumulation of every region. With `cooperative` all get the
+    reward of RegionalEnv, otherwise that of their own region.
+    """
+
+    metadata = {"name": "nmfd_regions_v0", "render_modes": [], "is_parallelizable": True}
+
+    def __init__(
+        self,
+        scenario: Scenario | Path | str,
+        plant: Plant | None = None,
+        *,
+        guidance: bool = False,
+        cooperative: bool = True,
+    ):
+        self._episode, self._cooperative = Episode(scenario, plant), cooperative
+        loaded = self._episode.scenario
+        self.possible_agents = [f"region_{region}" for region in range(loaded.network.regions)]
+        self.agents: list[str] = []
+        self.interfaces = {
+            agent: Interface(loaded.network, guidance=guidance, regions=[region])
+            for region, agent in enumerate(self.possible_agents)
+        }
+        self._whole, self._random = Interface(loaded.network), np.random.default_rng()
+        self.observation_spaces = {agent: part.observation_space(loaded) for agent, part in self.interfaces.items()}
+        self.action_spaces = {agent: part.action_space for agent, part in self.interfaces.items()}
+        self.observation_space, self.action_space = self.observation_spaces.get, self.action_spaces.get
+
+    def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
+        """Begin an episode; without a seed, the next one of the sequence begun by the last seed."""
+        if seed is not None:
+            self._random = np.random.default_rng(seed)
+        self.agents = list(self.possible_agents)
+        self._seen = self._episode.reset(int(self._random.integers(2**31)) if seed is None else seed)
+        return self._observations(), self._infos()
+
+    def step(self, actions: dict) -> tuple[dict, dict, dict, dict, dict]:
+        """Advance by one control interval; the region of an agent without an action is open."""
+        network = self._episode.scenario.network
+        perimeter, splits, guided = (
+            np.where(network.adjacency, network.u_max, 0.0),
+            network.nominal_splits.copy(),
+            False,
+        )
+        for agent, action in actions.items():
+            region, controls = self.possible_agents.index(agent), self.interfaces[agent].controls(action)
+            perimeter[region] = controls.perimeter[region]
+            if controls.splits is not None:
+                splits[region], guided = controls.splits[region], True
+        self._seen, vehicles, over = self._episode.step(
+            Controls(perimeter=perimeter, splits=splits if guided else None)
+        )
+        amounts = np.full(len(vehicles), vehicles.sum()) if self._cooperative else vehicles
+        agents, rewards = self.agents, (-amounts / self._episode.unit).tolist()
+        result = (
+            self._observations(),
+            dict(zip(agents, rewards, strict=True)),
+            dict.fromkeys(agents, False),
+            dict.fromkeys(agents, over),
+            self._infos(),
+        )
+        self.agents = [] if over else agents
+        return result
+
+    def state(self) -> Vector:
+        """Return the observation of all regions together."""
+        return self._whole.observed(self._seen)
+
+    def close(self) -> None:
+        """Close the plant."""
+        self._episode.close()
+
+    def _observations(self) -> dict:
+        return {
+            agent: np.clip(self.interfaces[agent].observed(self._seen), space.low, space.high)
+            for agent, space in self.observation_spaces.items()
+            if agent in self.agents
+        }
+
+    def _infos(self) -> dict:
+        return {agent: {"time_s": self._seen.time} for agent in self.agents}

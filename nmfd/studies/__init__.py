@@ -1,1 +1,1 @@
-"""Studies on the regional model: benchmark, robustness, scaling, ablations, bounds, and their pictures."""
+"""Studies on the regional model: benchmark, robustness, bound, measured MFDs, and their pictures."""

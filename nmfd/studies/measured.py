@@ -27,7 +27,7 @@ from nmfd.model.network_file import NetworkTable
 from nmfd.model.regional_model import RegionalModel, load_network
 from nmfd.runs import config, files
 from nmfd.runs.tables import wrapped
-from nmfd.studies import fit_quality, mfd_bands
+from nmfd.studies import fit_quality, plots
 from nmfd.studies.settings import Measured
 
 U_MIN, U_MAX = 0.1, 0.9  # bounds of the control, as in all networks here
@@ -205,7 +205,7 @@ def identify(
         ]
     )
     found = Identified(network=network, samples=samples, fits=fits, intervals=intervals, text=text)
-    _write(out, found, clouds, sources)
+    _write(out, found, sources)
     return found
 
 
@@ -370,14 +370,13 @@ def _told(rows: pd.DataFrame, left: Mapping[str, int], coverage: np.ndarray, tri
     )
 
 
-def _write(out: Path, found: Identified, clouds: Sequence[Sequence[dict[str, Points]]], sources: Sources) -> None:
+def _write(out: Path, found: Identified, sources: Sources) -> None:
     text = network_toml(
         found.network, {}, f"Regional model: written by nmfd identify from {sources.counts.name}; see identify.txt."
     )
     config.checked(NetworkTable, tomllib.loads(text), out / "network.toml")  # names, say, may be none
     out.mkdir(parents=True, exist_ok=True)
-    bands = [mfd_bands.band([fit_quality.own_points(day) for day in days]) for days in clouds]
-    mfd_bands.draw_mfds(out / "mfd.png", found.network, found.samples, bands, "days")
+    plots.draw_mfds(out / "mfd.png", found.network, found.samples)
     files.write_table(out / "samples.csv", found.intervals, float_format="%.6g")
     fit_quality.write_fits(out / "fit.csv", found.fits, None)
     files.write_text(out / "identify.txt", found.text + "\n")

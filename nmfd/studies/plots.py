@@ -261,6 +261,51 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> 
     return ax
 
 
+def draw_mfds(path: Path, network: RegionalModel, samples: Sequence[Mapping[str, np.ndarray]]) -> None:
+    """Draw the MFD of each region over its outflow samples, as one file."""
+    drawing, axes = panels(network.regions)
+    for region, ax in enumerate(axes):
+        mfd(ax, network.mfds[region], samples[region])
+        ax.set_title(region_title(network, region), fontsize="medium")
+    legend_below(drawing, axes)
+    save(drawing, path)
+
+
+def improvement(ax: Axes, gains: Mapping[str, Mapping[float, tuple[float, float]]]) -> Axes:
+    """Improvement over no control [%] against sigma of the demand noise [veh/s], with 95 % intervals.
+
+    gains: controller -> sigma -> mean and half interval (nmfd.studies.robustness.improvements)
+    """
+    ax.axhline(0.0, color=CONTROLLER_COLOURS["no-control"], linewidth=1.0)
+    for number, (controller, points) in enumerate(gains.items()):
+        mean, half = np.array(list(points.values())).reshape(-1, 2).T
+        ax.errorbar(
+            list(points),
+            mean,
+            np.nan_to_num(half),
+            color=colour(controller),
+            linewidth=1.6,
+            capsize=3,
+            marker="o^sDv"[number % 5],
+            markersize=4,
+            label=controller,
+        )
+    ax.set_ylabel("total time spent saved\nagainst no-control [%]")
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
+def trips(ax: Axes, counts: Mapping[float, float]) -> Axes:
+    """Vehicles of the whole scenario against sigma of the demand noise [veh/s]."""
+    ax.plot(list(counts), list(counts.values()), color=CONTROLLER_COLOURS["no-control"], marker="o", markersize=4)
+    ax.set_ylim(bottom=0.0)
+    ax.set_xlabel("standard deviation of the noise on the demand [veh/s]")
+    ax.set_ylabel("trips [veh]")
+    ax.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
 def region_map(ax: Axes, network: RegionalModel) -> Axes:
     """Regions as discs at their positions, with the boundaries that vehicles may cross."""
     positions = network.positions

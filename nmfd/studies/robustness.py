@@ -17,7 +17,7 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_columns
 from nmfd.runs.workers import Failure, ended
-from nmfd.studies import benchmark, plots, plots_studies
+from nmfd.studies import benchmark, plots
 from nmfd.studies.benchmark import REFERENCE, configuration, interval, results
 
 COLUMNS = {
@@ -172,8 +172,8 @@ def draw(folder: Path, rows: Sequence[Mapping]) -> Path:
     """Improvement and trips over sigma, as robustness.png in `folder`."""
     drawing = plots.figure(8.0, 6.4)
     upper, lower = drawing.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    plots_studies.improvement(upper, {name: improvements(rows, name) for name in compared(rows)})
-    plots_studies.trips(lower, trips(rows))
+    plots.improvement(upper, {name: improvements(rows, name) for name in compared(rows)})
+    plots.trips(lower, trips(rows))
     drawing.align_ylabels()
     plots.legend_below(drawing, [upper], columns=4)
     return plots.save(drawing, folder / "robustness.png")

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from nmfd.runs.config import DISTINCT, Settings, Text, setting, whole
+from nmfd.runs.config import DISTINCT, Settings, setting, whole
 
 MOST = 10**6  # runs
 
@@ -32,42 +32,6 @@ class Robustness(Study):
     plant: Literal["nmfd", "acyclic"] = setting("the model that the controllers act on", "acyclic")
 
 
-class Adaptation(Study):
-    """Of controllers where demand or capacity is not what they were made for."""
-
-    cases: Annotated[tuple[Text, ...], Field(strict=False)] = setting(
-        "what comes differently: more demand, more from one origin, all of it later, capacity minus 20 %",
-        ("nominal", "more", "one-origin", "later", "rain"),
-    )
-
-
-class Ablation(Study):
-    """Of one thing varied."""
-
-    seeds: int = whole("training: seeds 0 to N - 1 with each method", 3, low=1, high=MOST)
-    horizons: Annotated[tuple[Annotated[int, Field(ge=2, le=MOST)], ...], *DISTINCT] = setting(
-        "horizon: control intervals that MPC looks ahead", (2, 3, 4, 6, 8, 10, 12, 16, 20, 25, 30)
-    )
-    plant: Literal["nmfd", "acyclic"] = setting("the model that MPC and the trained policies act on", "acyclic")
-
-
-class Scaling(Study):
-    """Of the time of a decision against the number of regions."""
-
-    regions: Annotated[tuple[Annotated[int, Field(ge=2, le=MOST)], ...], *DISTINCT] = setting("numbers of regions", ())
-    family: Literal["complete", "hexagonal"] = setting(
-        "every region adjacent to every other, as published, or a plane city", "complete"
-    )
-    load: Literal["published", "congested"] = setting(
-        "initial states: 0 to 100 vehicles bound for every region, or regions up to beyond their jam", "published"
-    )
-    workers: int = whole(
-        "cases at a time, each in a process on one core; timings are cleanest with 1", 1, low=1, high=MOST
-    )
-    memory: float = setting("that a case may take", 16.0, unit="GiB", gt=0.0, le=1e6)
-    time_limit: float = setting("that a case may take", 600.0, unit="s", gt=0.0, le=1e6)
-
-
 class Measured(Settings):
     """Of MFDs from real detectors."""
 
@@ -84,15 +48,6 @@ class Measured(Settings):
         ge=0.0,
         le=1.0,
     )
-
-
-class Value(Settings):
-    """Of MPC's terminal cost."""
-
-    seed: int = whole("of what is drawn", 0, high=2**31 - 1)
-    samples: int = whole("states per round, from each of which the policy is rolled out", 12_000, low=1, high=MOST)
-    rounds: int = whole("from the second on MPC has driven with what was learned before", 2, low=1, high=100)
-    steps: int = whole("Adam steps per round", 4000, low=1, high=MOST)
 
 
 class Bound(Settings):

@@ -3,6 +3,7 @@
 What is compared must agree; that part runs with the other tests.
 """
 
+import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,9 +22,9 @@ from nmfd.controllers.no_control import NoControl
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
-from nmfd.studies import scaling
 from nmfd.types import Observation, Status
 
+SCALING = runpy.run_path(str(Path(__file__).parents[2] / "scenarios" / "large_grids" / "scaling.py"))
 SCENARIO = load_scenario(Path(__file__).parents[2] / "scenarios" / "economic_mpc")
 KINDS = pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
 WHEN = (10, 20, 30, 40)  # control intervals: from free flow to gridlock in the centre
@@ -59,9 +60,9 @@ def forecast(scenario, k):
 
 
 def random_city(family, regions):
-    city = scaling.network(family, regions)
+    city = SCALING["network"](family, regions)
     scenario = Scenario(name="city", network=city, step=30.0, steps=10, demand=np.zeros((10, regions, regions)))
-    return scenario, measurement(scaling.initial_state(city, "congested"))
+    return scenario, measurement(SCALING["initial_state"](city, "congested"))
 
 
 def compare(scenario, measured, guidance):

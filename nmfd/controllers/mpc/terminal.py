@@ -24,7 +24,7 @@ from nmfd.runs.files import atomic, check_file
 WAVES = 8  # sines and cosines of the time
 OFFSET = 1e4  # veh intervals
 LATE = 2.5  # of s: vehicles are first thought to be gone soon
-MAKE = "make one with 'nmfd value'"
+MAKE = "make one with scenarios/economic_mpc/terminal_cost.py"
 WEIGHTS = ("first", "second", "last")
 
 

@@ -1,4 +1,6 @@
-"""The value function of a DPC policy, learned from rollouts of the regional model: MPC's terminal cost.
+"""The terminal cost of MPC: the value function of a DPC policy, learned from rollouts of the regional model.
+
+    python scenarios/economic_mpc/terminal_cost.py mpc-pcrg-terminal
 
 States are those that the scenario goes through under several controllers, mixed in pairs and scattered. From each of
 them the policy is rolled out until the scenario ends, with automatic differentiation: the sum of the vehicles, and how
@@ -7,6 +9,7 @@ derivatives that MPC goes by come out wrong). From the second round on MPC has d
 leads into states of its own.
 """
 
+import argparse
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,16 +20,16 @@ import torch
 from jaxtyping import Float
 
 from nmfd import closed_loop
+from nmfd.api import load_scenario
 from nmfd.arrays import StatesOverTime
 from nmfd.controllers import registry
 from nmfd.controllers.dpc.policy import DpcController, Policy
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.dpc.rollout import Demands, Rollout
 from nmfd.controllers.mpc.controller import EconomicMpc
-from nmfd.controllers.mpc.terminal import LATE, OFFSET, Terminal, clock
+from nmfd.controllers.mpc.terminal import LATE, OFFSET, Terminal, clock, write
 from nmfd.controllers.no_control import NoControl
 from nmfd.controllers.pi_gating import PiGating
-from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
@@ -47,19 +50,18 @@ def learn(
     scenario: Scenario,
     controller: str,
     *,
-    seed: int,
-    samples: int,
-    rounds: int,
-    steps: int,
+    seed: int = 0,
+    samples: int = 12_000,
+    rounds: int = 2,
+    steps: int = 4000,
     policy: Path | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Terminal:
-    """The terminal cost of `controller`, one of registry.TERMINAL.
+    """Learn the terminal cost of `controller`, one of registry.TERMINAL; the same seed gives the same numbers.
 
-    samples: states per round; steps: of Adam, per round; policy: the file of the DPC policy that takes over after the
-    horizon, the scenario's own if None. The same seed gives the same numbers. Raises InputError.
+    samples: states per round; steps: Adam steps per round; policy: file of the DPC policy that takes over after the
+    horizon, the scenario's own if None
     """
-    check(controller)
     follows, guidance = registry.TERMINAL[controller], registry.guides(controller)
     planning = planning_model(scenario, controller)
     file = registry.policy_path(follows, scenario, policy)
@@ -96,12 +98,6 @@ def learn(
             terminal = _fitted(planning, rollout, found, controller, steps, generator, tell, samples)
         assert terminal is not None  # there is a round
         return terminal
-
-
-def check(controller: str) -> None:
-    """InputError for a controller without a terminal cost."""
-    if controller not in registry.TERMINAL:
-        raise InputError(f"--controller: {controller!r} has no terminal cost; choose {' or '.join(registry.TERMINAL)}")
 
 
 def _sampled(rollout: Rollout, policy: Policy, visited: Demands, generator: torch.Generator) -> Batch:
@@ -177,3 +173,12 @@ def _fitted(
         network_hash=planning.network.hash,
         controller=controller,
     )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("controller", choices=list(registry.TERMINAL))
+    parser.add_argument("--seed", type=int, default=0)
+    options, folder = parser.parse_args(), Path(__file__).parent
+    learned = learn(load_scenario(folder), options.controller, seed=options.seed)
+    write(learned, folder / f"{options.controller}.npz")
