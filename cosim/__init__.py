@@ -5,7 +5,7 @@
     result = cosim.run("grid7_peak", "dpc-pcrg", seed=1)
     print(result.facts["mean_trip_time_s"], result.to_frame())
 
-`run` is one closed loop in SUMO, `run_tasks` many with a run folder, `sweep` many more on processes or a cluster;
+`run` is one closed loop in SUMO, `run_tasks` many with a run folder;
 `read_run` reads a run folder, `City` shows a city before anything runs. Names here are
 imported when they are first used.
 """
@@ -14,10 +14,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cosim.api import read_run, run, run_tasks, sweep
+    from cosim.api import read_run, run, run_tasks
     from cosim.evaluation.experiment import overview
     from cosim.evaluation.simulate import Result, Task
-    from cosim.evaluation.sweeps import Sweep
     from cosim.plant.plant import SumoPlant
     from cosim.plant.settings import Settings, settings
     from cosim.report.city import City
@@ -27,14 +26,12 @@ __all__ = [
     "Result",
     "Settings",
     "SumoPlant",
-    "Sweep",
     "Task",
     "overview",
     "read_run",
     "run",
     "run_tasks",
     "settings",
-    "sweep",
 ]
 _PLACES = {
     "City": "report.city.City",
@@ -47,8 +44,6 @@ _PLACES = {
     "run": "api.run",
     "run_tasks": "api.run_tasks",
     "settings": "plant.settings.settings",
-    "Sweep": "evaluation.sweeps.Sweep",
-    "sweep": "api.sweep",
 }
 
 

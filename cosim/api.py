@@ -1,4 +1,4 @@
-"""What `cosim run` and `cosim sweep` do, as functions of a few arguments; exported by the package `cosim`."""
+"""What `cosim run` does, as functions of a few arguments; exported by the package `cosim`."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from cosim.evaluation import dask_cluster, experiment, sweeps
+from cosim.evaluation import experiment
 from cosim.evaluation.simulate import Result, Task, drive
-from cosim.evaluation.sweeps import Sweep
 from cosim.plant.strategy import ALONE, configured, parse, planning_of
 from cosim.sumo.outputs import check
 from nmfd.api import load_scenario, named
@@ -101,22 +100,6 @@ def run_tasks(
             progress=show,
             tell=tell,
         )
-
-
-def sweep(
-    order: Sweep,
-    *,
-    workers: int = 1,
-    scheduler: dask_cluster.Scheduler | str | None = None,
-    progress: Progress = None,
-    tell: Callable[[str], None] | None = None,
-) -> pd.DataFrame:
-    """Controllers x seeds x demand levels x compliance in SUMO, as one table: cosim.evaluation.sweeps.sweep.
-
-    scheduler: a Dask scheduler or its address, instead of `workers` processes here; progress, tell: as in `run_tasks`.
-    """
-    with watched("sweep", progress) as show:
-        return sweeps.sweep(order, workers=workers, scheduler=scheduler, progress=show, tell=tell)
 
 
 def read_run(folder: Path | str, controller: str, seed: int) -> Result:

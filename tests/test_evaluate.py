@@ -153,7 +153,6 @@ def test_another_city_needs_another_folder(city, tmp_path, ran, old, new, key):
             "'--demand': expected a list of distinct numbers above 0 up to 10",
         ),
         (("--controllers", "no-control", "--demand", "1,1.0"), "'--demand': expected a list of distinct numbers"),
-        (("--controllers", "no-control", "--reference", "mpc-pc", "--out", "{tmp}/none"), "'mpc-pc' is neither among"),
         (("--controllers", "no-control", "--policy", "dpc-pc=x.pt"), "--policy: 'dpc-pc' is not among --controllers"),
     ],
 )

@@ -1,4 +1,4 @@
-"""cosim tune and cosim frontier: what is searched, what is kept, what is told; SUMO is not started."""
+"""cosim tune: what is searched, what is kept, what is told; SUMO is not started."""
 
 import math
 from functools import cache
@@ -12,9 +12,9 @@ from click.testing import CliRunner
 from trajectories import in_city
 
 from cosim.cli.main import main
-from cosim.evaluation import experiment, frontier, tuning
+from cosim.evaluation import experiment, statistics, tuning
 from nmfd.errors import InputError
-from nmfd.runs import config, trail
+from nmfd.runs import config
 from nmfd.runs.workers import Failure
 
 ROOT = Path(__file__).parents[1]
@@ -132,7 +132,6 @@ def test_a_candidate_whose_run_failed_has_no_score(city, tmp_path, runs):
         (["--option", "kp=1:2", "--option", "kp=1:3"], "kp is there twice"),
         (["--option", "set_point[1]=1:2"], "set_point[0], set_point[1]"),
         (["--option", "kp=-1:2"], "kp: expected a number from 0 up"),
-        (["--option", "kp=1:2", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "--workers"),
     ],
 )
 def test_one_line_for_what_cannot_be_tuned(city, tmp_path, arguments, expected):
@@ -170,198 +169,10 @@ def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_pat
     assert seen[0].read_bytes() != seen[1].read_bytes()
 
 
-SERVED = {  # demand -> of four seeds, how many serve all trips
-    "max-pressure": {1.0: 4, 1.5: 0, 2.0: 0},
-    "pi-gating": {1.0: 4, 1.5: 2, 2.0: 4},
-    "dpc-pc": {1.0: 4, 1.5: 4, 2.0: 1},
-}
-
-
-@pytest.fixture
-def demanded(monkeypatch):
-    tasks = []
-
-    def outcomes(function, todo, workers, *, fresh, group=None, look=None):
-        for task in todo:
-            tasks.append((task.controller, task.demand_factor))
-            served = task.seed - 1000 < SERVED[task.controller][task.demand_factor]
-            yield task, in_city(task, 1e6 * task.demand_factor, TRIPS, TRIPS - (not served))
-
-    monkeypatch.setattr(experiment, "outcomes", outcomes)
-    return tasks
-
-
-def test_the_frontier_ends_where_nobody_is_served(city, tmp_path, demanded):
-    out = tmp_path / "out"
-    arguments = [
-        "frontier",
-        str(city),
-        "--controllers",
-        ",".join(SERVED),
-        "--demand",
-        "2,1,1.5",
-        "--seeds",
-        "4",
-        "--steps",
-        "1",
-        "--out",
-        str(out),
-    ]
-    done = CliRunner().invoke(main, arguments)
-    assert done.exit_code == 0, done.output + str(done.exception)
-    assert ("max-pressure", 1.5) in demanded and ("max-pressure", 2.0) not in demanded
-    table = pd.read_csv(out / "frontier.csv")
-    shares = table.set_index(["controller", "demand"])["served_share"]
-    assert shares["pi-gating"].to_dict() == {1.0: 1.0, 1.5: 0.5, 2.0: 1.0} and shares["dpc-pc", 2.0] == 0.25
-    assert frontier.highest(table) == {"max-pressure": 1.0, "pi-gating": 1.0, "dpc-pc": 1.5}
-    lines = (out / "frontier.md").read_text().splitlines()
-    assert "dpc-pc" in lines[2] and "1 of 4" in lines[2] and "not run" in next(x for x in lines if "max-pr" in x)
-    assert (out / "frontier.png").stat().st_size > 10_000
-    kept = len(demanded)
-    assert CliRunner().invoke(main, [*arguments, "--everything"]).exit_code == 0
-    assert demanded[kept:] == [("max-pressure", 2.0)] * 4
-
-
-def test_rows_of_an_earlier_table_count_too(city, tmp_path, demanded):
-    """Of runs that are not kept any more; they are named in the trail."""
-
-    def invoke(name, demand, *more):
-        return CliRunner().invoke(
-            main,
-            [
-                "frontier",
-                str(city),
-                "--controllers",
-                "pi-gating",
-                "--demand",
-                demand,
-                "--seeds",
-                "4",
-                "--steps",
-                "1",
-                "--out",
-                str(tmp_path / name),
-                *more,
-            ],
-        )
-
-    assert invoke("before", "1").exit_code == 0
-    before = tmp_path / "before" / "runs.csv"
-    done = invoke("after", "1.5", "--earlier", str(before))
-    assert done.exit_code == 0, done.output + str(done.exception)
-    before.unlink()  # a copy is kept
-    assert invoke("after", "2").exit_code == 0
-    table = pd.read_csv(tmp_path / "after" / "frontier.csv")
-    assert table["demand"].to_list() == [1.0, 1.5, 2.0] and table["served_runs"].to_list() == [4, 2, 4]
-    assert len(pd.read_csv(tmp_path / "after" / "runs.csv")) == 12 and len(demanded) == 12
-    found = trail.read(tmp_path / "after" / "frontier.csv")
-    assert {place for place in found["hashes"]} == {"demand-1", "demand-1.5", "demand-2"}
-    (kept,) = (tmp_path / "after" / "earlier").iterdir()
-    assert found["runs"] == [*trail.of_runs(tmp_path / "after")["runs"], *trail.read(kept)["runs"]]
-
-
-def test_what_was_run_again_may_be_another_one(city, tmp_path, demanded):
-    """Then only what the others depend on must be the same."""
-
-    def invoke(name, controllers, *more):
-        return CliRunner().invoke(
-            main,
-            [
-                "frontier",
-                str(city),
-                "--controllers",
-                controllers,
-                "--demand",
-                "1",
-                "--seeds",
-                "1",
-                "--steps",
-                "1",
-                "--out",
-                str(tmp_path / name),
-                *more,
-            ],
-        )
-
-    assert invoke("before", "pi-gating,max-pressure").exit_code == 0
-    before = tmp_path / "before" / "runs.csv"
-    before.write_text(before.read_text().replace('""model_hash"":""', '""model_hash"":""0'))
-    assert invoke("after", "pi-gating").exit_code == 0
-    done = invoke("after", "pi-gating", "--earlier", str(before))
-    assert done.exit_code == 0, done.output
-    assert set(pd.read_csv(tmp_path / "after" / "frontier.csv")["controller"]) == {"pi-gating", "max-pressure"}
-
-
-@pytest.mark.parametrize("first", ["5", "7"])
-def test_of_a_run_in_two_tables_the_first_one_counts(city, tmp_path, demanded, first):
-    def invoke(name, controller, *more):
-        return CliRunner().invoke(
-            main,
-            [
-                "frontier",
-                str(city),
-                "--controllers",
-                controller,
-                "--demand",
-                "1",
-                "--seeds",
-                "1",
-                "--steps",
-                "1",
-                "--out",
-                str(tmp_path / name),
-                *more,
-            ],
-        )
-
-    assert invoke("before", "pi-gating").exit_code == 0
-    made = (tmp_path / "before" / "runs.csv").read_text()
-    assert made.count("1000000.0") == 1
-    tables = [tmp_path / f"{n}.csv" for n in ("5", "7")]
-    for table in tables:
-        table.write_text(made.replace("1000000.0", f"{table.stem}000000.0"))
-    tables.sort(key=lambda table: table.stem != first)
-    for again in (tables, tables[::-1]):  # a second time they are there already
-        done = invoke("after", "max-pressure", *(word for table in again for word in ("--earlier", str(table))))
-        assert done.exit_code == 0, done.output
-        table = pd.read_csv(tmp_path / "after" / "runs.csv").set_index("controller")["total_time_spent_veh_s"]
-        assert table.to_dict() == {"max-pressure": 1e6, "pi-gating": float(first) * 1e6}
-
-
-@pytest.mark.parametrize(
-    "old, new, said",
-    [
-        ('""demand_hash"":""', '""demand_hash"":""0', "demand-1 demand_hash (0"),
-        ("demand,controller", "level,controller", "is no table of runs"),
-    ],
-)
-def test_a_table_of_other_runs_is_refused(city, tmp_path, demanded, old, new, said):
-    arguments = [
-        "frontier",
-        str(city),
-        "--controllers",
-        "pi-gating",
-        "--demand",
-        "1",
-        "--seeds",
-        "1",
-        "--steps",
-        "1",
-        "--out",
-        str(tmp_path / "out"),
-    ]
-    assert CliRunner().invoke(main, arguments).exit_code == 0
-    other = tmp_path / "other.csv"
-    other.write_text((tmp_path / "out" / "runs.csv").read_text().replace(old, new))
-    done = CliRunner().invoke(main, [*arguments, "--earlier", str(other)])
-    assert done.exit_code == 2 and f"{other}: " in done.output and said in done.output
-    assert not (tmp_path / "out" / "earlier").exists()
-
-
 def test_the_interval_of_a_share_is_never_empty():
     rows = pd.DataFrame(
-        {"demand": 1.0, "controller": "a", "completed_veh": [9, 9], "trips": [9, 9], frontier.TTS: [1.0, 3.0]}
+        {"demand": 1.0, "controller": "a", "completed_veh": [9, 9], "trips": [9, 9], statistics.TTS: [1.0, 3.0]}
     )
-    (row,) = frontier.shares(rows).to_dict("records")
+    (row,) = statistics.shares(rows).to_dict("records")
     assert row["served_share_low"] == pytest.approx(1.0 / (1.0 + 1.96**2 / 2), rel=1e-3)  # Wilson, both of two
     assert row["served_share_high"] == pytest.approx(1.0)

@@ -3,15 +3,11 @@
 import os
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import click
 
 from nmfd.cli.options import FILE, FOLDER
 from nmfd.errors import InputError
-
-if TYPE_CHECKING:  # heavy
-    from cosim.evaluation.dask_cluster import Scheduler
 
 CONTROLLER_HELP = (
     "no-control, pi-gating, mpc-pc, mpc-pcrg, dpc-pc or dpc-pcrg; what else the city does is joined by +: webster, "
@@ -41,15 +37,13 @@ def scheduler_options(command: Callable) -> Callable:
     )(command)
 
 
-def chosen_scheduler(workers: int | None, address: str | None) -> "Scheduler | None":
+def chosen_scheduler(workers: int | None, address: str | None) -> str | None:
     """Return the Dask scheduler, None for processes here. Raise InputError if both are given."""
     if address is None:
         return None
     if workers is not None:
         raise InputError("--workers: is for processes here, and --scheduler has workers of its own; omit one")
-    from cosim.evaluation.dask_cluster import Scheduler  # heavy
-
-    return Scheduler(address=address)
+    return address
 
 
 def parsed_level(text: str, no_run: bool) -> float | None:

@@ -1,7 +1,6 @@
 """The evaluation: controllers x seeds x demand levels in SUMO, paired by seed, with tables.
 
 <folder>/demand-<level>/    the run folder of a demand level (cosim.evaluation.experiment)
-<folder>/earlier/           tables whose rows are in these (cosim.evaluation.earlier)
 <folder>/evaluate.md, evaluate.csv, pairs.csv, runs.csv    the tables (statistics), new after every run; in the
     first,  at the end, why (explain)
 what is drawn of a level lies in its folder, what is drawn across levels here (cosim.report.pictures)
@@ -14,7 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from cosim.evaluation import dask_cluster, earlier, experiment, explain, statistics
+from cosim.evaluation import experiment, explain, statistics
 from cosim.evaluation.simulate import Task
 from nmfd.api import load_scenario
 from nmfd.errors import InputError, did_you_mean
@@ -27,7 +26,7 @@ class Evaluation:
     """scenario: its folder; controllers: strategies; levels: multiples of the scenario's demand; steps: control
     intervals, all if None; policies: controller -> file instead of the scenario's own; reference: a controller to
     pair with, besides no control; time_limit: of controllers of the user's own, instead of the scenario's; out: the
-    folder of the evaluation; earlier: tables whose rows are added to it."""
+    folder of the evaluation."""
 
     scenario: Path
     controllers: tuple[str, ...]
@@ -38,7 +37,6 @@ class Evaluation:
     policies: Mapping[str, Path] = field(default_factory=dict)
     time_limit: float | None = None
     reference: str | None = None
-    earlier: tuple[Path, ...] = ()
 
     def plan(self) -> list[tuple[Path, Task]]:
         """Every run with its run folder, seed by seed, so that whatever is finished compares like with like."""
@@ -65,19 +63,17 @@ def evaluate(
     evaluation: Evaluation,
     *,
     workers: int = 1,
-    scheduler: dask_cluster.Scheduler | str | None = None,
+    scheduler: str | None = None,
     progress: Callable[[int, int, str], None] | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Run what is not there yet and write tables; returns `tables.statistics` and a line per failed run.
 
-    The tables are of all runs in the folder. scheduler: a Dask scheduler or its address, whose workers do the runs
-    instead of `workers` processes here; progress, tell: as in `experiment.perform`. Raises InputError.
+    The tables are of all runs in the folder. progress, tell: as in `experiment.perform`. Raises InputError.
     """
     out = evaluation.out
     check_folder(out)
-    earlier.add(out, evaluation.earlier, kept_runs(evaluation))
-    known = {*evaluation.controllers, *all_runs(evaluation)["controller"]}
+    known = {*evaluation.controllers, *kept_runs(evaluation)["controller"]}
     if evaluation.reference is not None and evaluation.reference not in known:
         raise InputError(
             f"--reference: {evaluation.reference!r} is neither among --controllers nor in {out}"
@@ -89,10 +85,9 @@ def evaluate(
         fresh=True,
         progress=progress,
         tell=tell,
-        source=dask_cluster.source(scheduler, tell),
-        kept=lambda: statistics.write_tables(out, all_runs(evaluation), None),
+        kept=lambda: statistics.write_tables(out, kept_runs(evaluation), None),
     )
-    rows, table = all_runs(evaluation), pd.DataFrame()
+    rows, table = kept_runs(evaluation), pd.DataFrame()
     if len(rows):
         table = statistics.write_tables(out, rows, evaluation.reference)
         scenario = load_scenario(evaluation.scenario)
@@ -130,12 +125,10 @@ def kept_runs(evaluation: Evaluation) -> pd.DataFrame:
         rows = experiment.overview(folder)
         rows.insert(0, "demand", level)
         parts.append(rows)
-    return _ordered(evaluation, pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=[*earlier.KEYS]))
-
-
-def all_runs(evaluation: Evaluation) -> pd.DataFrame:
-    """`kept_runs` and the rows of earlier tables."""
-    return _ordered(evaluation, earlier.joined(evaluation.out, kept_runs(evaluation)))
+    return _ordered(
+        evaluation,
+        pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=["demand", "controller", "seed"]),
+    )
 
 
 def _ordered(evaluation: Evaluation, rows: pd.DataFrame) -> pd.DataFrame:

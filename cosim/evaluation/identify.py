@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.evaluation import dask_cluster, experiment, results, verdict
+from cosim.evaluation import experiment, results, verdict
 from cosim.evaluation.model_validation import outflow_samples
 from cosim.evaluation.simulate import Result, Task
 from cosim.sumo.arrays import Points
@@ -93,7 +93,7 @@ def identify(
     *,
     out: Path,
     workers: int = 1,
-    scheduler: dask_cluster.Scheduler | str | None = None,
+    scheduler: str | None = None,
     progress: experiment.Progress | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> str:
@@ -102,8 +102,8 @@ def identify(
     Samples, mfd.png, fit.csv and the loading runs go to `out`, one run folder per level. Returns the fit as a table,
     with what is doubtful about it, and whether perimeter control can help (verdict.txt beside network.toml). Raises
     InputError for a network that does not come from a folder, RunFailed if a loading run failed. Loading runs are kept:
-    the same call goes on where it was interrupted, and gives the same model. scheduler: a Dask scheduler or its
-    address, whose workers do them instead of `workers` processes here; tell: takes a line when it is lost.
+    the same call goes on where it was interrupted, and gives the same model. tell: takes a line where
+    runs do not count any more.
     """
     loaded = load_scenario(scenario)
     target, own = loading.target(loaded), network_folder(loaded.network)
@@ -119,7 +119,7 @@ def identify(
         raise InputError(f"--network: {there} is no folder that can be written to; choose another")
     first, second = loading.stages
     more = [run for folder in loading.runs for run in finished(folder, scenario)]
-    loads = partial(_load, scenario, loading, out=out, workers=workers, source=dask_cluster.source(scheduler, tell))
+    loads = partial(_load, scenario, loading, out=out, workers=workers)
     found = loads(first, {}, progress=_named(progress, "1 of 2"))
     network = static_model(loaded, found, guided=loading.guided)
     set_point = tuple(network.mfds[region].critical for region in loaded.protected)

@@ -27,18 +27,6 @@ class Evaluation(Settings):
     workers: int | None = whole("runs at a time, each in a process of its own", None, low=1, high=MOST)
 
 
-class Sweep(Evaluation):
-    """The same with compliance."""
-
-    seeds: int = whole("runs per controller, demand level and compliance", 1, low=1, high=MOST)
-    first_seed: int = whole("the seeds are S to S + N - 1", 0, high=MOST_SEED)
-    compliance: Annotated[tuple[Annotated[int, Field(ge=0, le=100)], ...], *DISTINCT] = setting(
-        "drivers who follow route guidance; of controllers that guide nobody there is one run all the same",
-        (),
-        unit="%",
-    )
-
-
 class Search(Evaluation):
     """Of the options of a controller."""
 
@@ -54,44 +42,6 @@ class Search(Evaluation):
     )
     search_seed: int = whole("of CMA-ES, and of training", 0, high=MOST_SEED)
     population: int | None = whole("candidates per generation", None, low=2, high=1000)
-
-
-class Bound(Evaluation):
-    """Of the room that is left to a controller."""
-
-    seeds: int = whole("each has a search of its own", 2, low=1, high=MOST)
-    first_seed: int = whole(
-        "the seeds are S to S + N - 1; those from 2000 on are for evaluations", FIRST_DEVELOPMENT, high=MOST_SEED
-    )
-    candidates: int = whole(
-        "schedules per seed and demand level, the first without any; each takes one run", 60, low=2, high=MOST
-    )
-    knots: int = whole("numbers of every channel of a schedule, evenly over the horizon", 6, low=1, high=10)
-    search_seed: int = whole("of CMA-ES", 0, high=MOST_SEED)
-
-
-class Improvement(Evaluation):
-    """Of a policy by its own runs."""
-
-    seeds: int = whole("runs per round and demand level", 2, low=1, high=MOST)
-    first_seed: int = whole(
-        "the seeds are S to S + N - 1; those from 2000 on are for evaluations", FIRST_DEVELOPMENT, high=MOST_SEED
-    )
-    rounds: int = whole("after round 0, which runs the policy as it is", 4, low=1, high=1000)
-    descent: int = whole(
-        "Adam steps of a round, half of them after every round that was not kept", 40, low=1, high=MOST
-    )
-    learning_rate: float | None = setting("of Adam", None, gt=0.0, le=1.0)
-    iterations: int = whole("of the fit of the regional model; 0 leaves it as it is", 600, high=MOST)
-
-
-class Range(Evaluation):
-    """Of the demand that controllers serve."""
-
-    first_seed: int = whole(
-        "the seeds are S to S + N - 1; those from 2000 on are for evaluations", FIRST_DEVELOPMENT, high=MOST_SEED
-    )
-    demand: Levels = setting("demand levels: multiples of the scenario's demand", (0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0))
 
 
 class Identification(Settings):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.stats import binomtest
 
 from nmfd.metrics import COUNTED, percent_change
 from nmfd.runs import files, trail
@@ -54,6 +55,7 @@ COLUMNS = {  # heading of a table, without its unit -> what it says
     **dict(COUNTED.values()),
     "outside SUMO": "share of the wall time that was not SUMO's",
 }
+SERVED_SHARE = 0.9  # of the seeds in which all trips are completed
 PAIRS = {  # columns of pairs.csv
     "demand": "multiple of the scenario's",
     "controller": "the strategy",
@@ -273,3 +275,36 @@ def write_tables(folder: Path, rows: pd.DataFrame, reference: str | None = None)
         files.write_table(folder / name, content)
     files.write_text(folder / "evaluate.md", markdown(table, reference) + trail.comment(folder / "evaluate.md"))
     return table
+
+
+def shares(rows: pd.DataFrame) -> pd.DataFrame:
+    """One row per demand level and controller of `rows`, which are those of `evaluate.kept_runs`."""
+    out = []
+    for (level, name), part in rows.groupby(["demand", "controller"], sort=False):
+        served = int((part["completed_veh"] >= part["trips"]).sum())
+        between = binomtest(served, len(part)).proportion_ci(method="wilson")
+        out.append(
+            {
+                "demand": level,
+                "controller": name,
+                "seeds": len(part),
+                "served_runs": served,
+                "served_share": served / len(part),
+                "served_share_low": between.low,
+                "served_share_high": between.high,
+                "completed_share": float((part["completed_veh"] / part["trips"].clip(lower=1)).mean()),
+                "mean_trips": float(part["trips"].mean()),
+                f"mean_{TTS}": float(part[TTS].mean()),
+                f"half_interval_{TTS}": interval(list(part[TTS])),
+            }
+        )
+    return pd.DataFrame(out)
+
+
+def highest(table: pd.DataFrame) -> dict[str, float]:
+    """Controller -> the highest demand level up to which every level that was run was SERVED_SHARE; 0 for none."""
+    found = {}
+    for name, part in table.sort_values("demand").groupby("controller", sort=False):
+        good = part["served_share"] >= SERVED_SHARE - 1e-9
+        found[str(name)] = float(part["demand"][good.cummin()].max()) if good.iloc[0] else 0.0
+    return found

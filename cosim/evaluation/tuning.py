@@ -21,7 +21,7 @@ import cma
 import numpy as np
 import pandas as pd
 
-from cosim.evaluation import dask_cluster, experiment, scores
+from cosim.evaluation import experiment, scores
 from cosim.evaluation.scores import SCORE
 from cosim.evaluation.simulate import Task, scenario_of
 from cosim.plant.strategy import configured, parse
@@ -203,22 +203,20 @@ def tune(
     order: Tuning,
     *,
     workers: int = 1,
-    scheduler: dask_cluster.Scheduler | str | None = None,
+    scheduler: str | None = None,
     progress: experiment.Progress | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
     """Try candidates; returns the table of tune.csv.
 
     Every run is kept: the same call goes on where it was interrupted, asks for the same candidates again and finds
-    their runs there; with more `candidates` it goes on from there. Runs on `workers` processes, or on those of a Dask
-    `scheduler`; policies are trained here. A candidate of which a run failed has no score, and counts as the worst.
-    Raises InputError, and RunFailed if none of a generation could be scored.
+    their runs there; with more `candidates` it goes on from there. Policies are trained here. A
+    candidate of which a run failed has no score, and counts as the worst. Raises InputError, and RunFailed if none of a generation could be scored.
     """
     check(order)
     return search(
         order,
         workers=workers,
-        source=dask_cluster.source(scheduler, tell),
         progress=progress,
         tell=tell,
         kept=lambda table: files.write_text(order.out / "tune.toml", toml(order, table)),
