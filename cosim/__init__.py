@@ -3,7 +3,7 @@
     import cosim
 
     result = cosim.run("grid7_peak", "dpc-pcrg", seed=1)
-    print(result.facts["mean_trip_time_s"], result.to_frame())
+    print(result.mean_trip_time_s, result.to_frame())
 
 `run` is one closed loop in SUMO, `run_tasks` many with a run folder;
 `read_run` reads a run folder, `City` shows a city before anything runs. Names here are

@@ -33,9 +33,9 @@ def run(
     """One closed loop in SUMO, in this process and without a run folder.
 
         >>> result = cosim.run("grid7_peak", "pi-gating+rerouting-30", seed=3, steps=2)
-        >>> result.trajectory.accumulation.shape, result.record["crossings"].shape
+        >>> result.accumulation.shape, result.crossings.shape
         ((3, 7, 7), (2, 7, 7, 7))
-        >>> result.facts["teleports"]
+        >>> int(result.teleports.sum())
         0
 
     scenario: a name of `cosim list`, the folder of a scenario.toml, or what nmfd.load_scenario made of it
@@ -49,8 +49,7 @@ def run(
     progress: None for a bar in a notebook or on a terminal, False for none, or your own, which is called as
         progress(done, steps) after every control interval
 
-    The result holds `trajectory` (nmfd.Trajectory), `record` (arrays, see cosim.plant.record.Record) and `facts` (the
-    row of sumo.csv). The same seed gives the same result, but for wall times. Raises InputError, and RuntimeError while
+    The result holds the arrays of cosim.plant.record.Record too, and the columns of sumo.csv as attributes. The same seed gives the same result, but for wall times. Raises InputError, and RuntimeError while
     another simulation is open in this process.
     """
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
@@ -103,10 +102,5 @@ def run_tasks(
 
 
 def read_run(folder: Path | str, controller: str, seed: int) -> Result:
-    """A finished run of a run folder, with its row of sumo.csv as `facts`. Raises InputError."""
-    result, file = experiment.read_run(Path(folder), controller, seed), Path(folder) / "sumo.csv"
-    if not file.is_file():  # the files of the runs alone were copied
-        return result
-    rows = experiment.read_facts(file)
-    rows = rows[(rows["controller"] == controller) & (rows["seed"] == seed)]
-    return replace(result, facts=next(iter(rows.to_dict("records")), {}))
+    """Return a finished run of a run folder. Raises InputError."""
+    return experiment.read_run(Path(folder), controller, seed)

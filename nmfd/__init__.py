@@ -3,8 +3,8 @@
     import nmfd
 
     scenario = nmfd.load_scenario("economic_mpc")
-    trajectory = nmfd.run(scenario, "dpc-pcrg", seed=1)
-    print(nmfd.summary(trajectory)["total_time_spent_veh_s"])
+    result = nmfd.run(scenario, "dpc-pcrg", seed=1)
+    print(nmfd.summary(result)["total_time_spent_veh_s"])
 
 `run` is one closed loop, `benchmark` many with a run folder, `train` makes a DPC policy, `controller` gives a
 controller by name. A controller of your own is any object with `reset` and `act` (see `Controller`; `nmfd
@@ -22,10 +22,9 @@ if TYPE_CHECKING:
     from nmfd.model.plant import AcyclicPlant, NmfdPlant
     from nmfd.model.regional_model import RegionalModel, load_network
     from nmfd.model.scenario import Scenario
-    from nmfd.runs.run_folder import read_trajectory, write_trajectory
     from nmfd.studies.measured import Identified
     from nmfd.studies.summary import Summary, summary_table
-    from nmfd.types import Controller, Controls, Observation, Plant, State, Status, Trajectory
+    from nmfd.types import Controller, Controls, Observation, Plant, Result, State, Status
 
 __version__ = "0.1.0"  # of the package perimeter-cosim, nmfd and cosim alike
 _MODULES = {
@@ -36,10 +35,9 @@ _MODULES = {
     "model.plant": ("AcyclicPlant", "NmfdPlant"),
     "model.regional_model": ("RegionalModel", "load_network"),
     "model.scenario": ("Scenario",),
-    "runs.run_folder": ("read_trajectory", "write_trajectory"),
     "studies.measured": ("Identified",),
     "studies.summary": ("Summary", "summary_table"),
-    "types": ("Controller", "Controls", "Observation", "Plant", "State", "Status", "Trajectory"),
+    "types": ("Controller", "Controls", "Observation", "Plant", "Result", "State", "Status"),
 }
 __all__ = [
     "AcyclicPlant",
@@ -52,23 +50,21 @@ __all__ = [
     "Plant",
     "PlanningModel",
     "RegionalModel",
+    "Result",
     "Scenario",
     "State",
     "Status",
     "Summary",
-    "Trajectory",
     "benchmark",
     "controller",
     "identify",
     "load_network",
     "load_scenario",
-    "read_trajectory",
     "run",
     "summary",
     "summary_table",
     "total_time_spent",
     "train",
-    "write_trajectory",
 ]
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -15,7 +15,7 @@ from nmfd.studies.benchmark import PLANTS, run_all
 from nmfd.studies.measured import Identified
 from nmfd.studies.settings import Measured
 from nmfd.studies.summary import Summary
-from nmfd.types import Controller, Plant, Trajectory
+from nmfd.types import Controller, Plant, Result
 
 
 def load_scenario(folder: Path | str) -> Scenario:
@@ -53,7 +53,7 @@ def run(
     steps: int | None = None,
     policy: Path | str | None = None,
     progress: Progress = None,
-) -> Trajectory:
+) -> Result:
     """One closed loop on a regional model.
 
         >>> trajectory = nmfd.run("economic_mpc", "pi-gating", steps=20)

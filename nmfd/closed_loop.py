@@ -9,9 +9,8 @@ import numpy as np
 from nmfd import faults
 from nmfd.arrays import PerPair
 from nmfd.model.scenario import Scenario
-from nmfd.runs import workers
 from nmfd.threads import one_thread
-from nmfd.types import Controller, Controls, Observation, Plant, State, Status, Trajectory
+from nmfd.types import Controller, Controls, Observation, Plant, Result, State, Status
 
 
 @one_thread()
@@ -22,11 +21,11 @@ def run(
     *,
     seed: int,
     progress: Callable[[int, int], None] | None = None,
-) -> Trajectory:
+) -> Result:
     """Drive `plant` with `controller` for `scenario.steps` control intervals.
 
     The controller is given what the plant's own instruments tell, or, of a plant that has none, every x_ij with
-    Gaussian noise of `scenario.measurement_std`, drawn from `seed`; the trajectory holds this and the exact state. What
+    Gaussian noise of `scenario.measurement_std`, drawn from `seed`; the result holds this and the exact state. What
     goes to and fro is copied: a controller that writes into what it is given, or into what it returned, changes
     nothing. `progress(done, steps)` is called after every interval. The faults that the scenario orders are injected
     (nmfd.faults). What was wrong with an observation, or what the plant could not do in an interval, is in the status
@@ -54,28 +53,29 @@ def run(
         controls.append(_booked(decided, Status.PLANT_FAULT, fault) if fault else decided)
         observed, problem = sensors.observe(states[-1], plant.observe())
         observations.append(observed)
-        workers.reached((k + 1) / scenario.steps)
         if progress:
             progress(k + 1, scenario.steps)
-    return Trajectory(
-        controller=controller.name,
-        plant=type(plant).__name__,
-        seed=seed,
-        step=scenario.step,
+    return Result.make(
+        {
+            "controller": controller.name,
+            "plant": type(plant).__name__,
+            "seed": seed,
+            "step": scenario.step,
+            "estimated": int(sensors.estimated),
+            "wall_time": time.perf_counter() - begin,
+        },
         accumulation=np.stack([s.accumulation for s in states]),
         backlog=np.stack([s.backlog for s in states]),
         completed=np.array([s.completed for s in states]),
         observed=np.stack([o.accumulation for o in observations]),
         observed_backlog=np.stack([o.backlog for o in observations]),
-        estimated=sensors.estimated,
         perimeter=np.stack([c.perimeter for c in controls]),
         splits=np.stack([network.nominal_splits if c.splits is None else c.splits for c in controls]),
         decision_time=np.array(decision_time),
         status=np.array([c.status.value for c in controls]),
-        note=tuple(c.note for c in controls),
+        note=np.array([c.note for c in controls]),
         removed=np.stack([np.zeros_like(s.backlog) if s.removed is None else s.removed for s in states]),
         prices=np.stack([np.zeros(network.regions) if c.prices is None else c.prices for c in controls]),
-        wall_time=time.perf_counter() - begin,
     )
 
 

@@ -1,4 +1,4 @@
-"""Figures of merit of a trajectory."""
+"""Figures of merit of a run."""
 
 import math
 from collections import Counter
@@ -6,9 +6,9 @@ from collections import Counter
 import numpy as np
 
 from nmfd.arrays import PerRegion
-from nmfd.types import Status, Trajectory
+from nmfd.types import Result, Status
 
-# What was not as it should be with decisions: column of summary.csv -> its heading in every table, and what it counts.
+# Counts of decisions that are not OK: column -> its heading in every table, and its meaning.
 COUNTED = {
     "solver_failures": ("failures", "of the solver or policy"),
     "fallbacks": ("fallbacks", "controls of something behind the controller"),
@@ -17,7 +17,9 @@ COUNTED = {
     "plant_faults": ("plant", "intervals in which the city could not do what was commanded"),
 }
 
-# Columns of summary.csv: type, and what they say.
+# Attributes of a Result that are no column of a table of runs.
+NO_COLUMNS = {"step", "estimated", "wall_time", "key"}
+# Columns of a table of runs on any plant: type and meaning.
 SUMMARY: dict[str, tuple[type, str]] = {
     "controller": (str, "the strategy"),
     "seed": (int, "of trips, drivers and guidance"),
@@ -30,10 +32,11 @@ SUMMARY: dict[str, tuple[type, str]] = {
     "control_step_ms_median": (float, "wall time of a decision"),
     "control_step_ms_max": (float, "of the longest decision"),
     **{column: (int, text) for column, (_, text) in COUNTED.items()},
+    "wall_time_s": (float, "wall time of the run"),
 }
 
 
-def total_time_spent(trajectory: Trajectory) -> float:
+def total_time_spent(result: Result) -> float:
     """dt * sum over k = 0 .. T-1 of all vehicles, running, waiting to enter, and removed before that [veh s].
 
     The objective of Tumu et al., with those who wait outside; the state at the end of the horizon is not counted. A
@@ -44,8 +47,8 @@ def total_time_spent(trajectory: Trajectory) -> float:
         >>> bool(total_time_spent(run) == run.step * run.accumulation[:2].sum())  # nobody waits or was removed
         True
     """
-    vehicles = trajectory.accumulation[:-1].sum() + trajectory.backlog[:-1].sum() + trajectory.removed[:-1].sum()
-    return float(trajectory.step * vehicles)
+    vehicles = result.accumulation[:-1].sum() + result.backlog[:-1].sum() + result.removed[:-1].sum()
+    return float(result.step * vehicles)
 
 
 def percent_change(value: float, reference: float) -> float:
@@ -74,44 +77,49 @@ def gini(values: PerRegion, weights: PerRegion) -> float:
     return float(weights @ apart @ weights / (2.0 * people * total))
 
 
-def decisions(trajectory: Trajectory, kind: Status) -> int:
-    """How many decisions have `kind` in their status."""
-    return int(((trajectory.status & kind.value) != 0).sum())
+def decisions(result: Result, kind: Status) -> int:
+    """Return the number of decisions with `kind` in their status."""
+    return int(((result.status & kind.value) != 0).sum())
 
 
-def late_decisions(trajectory: Trajectory) -> int:
-    """Decisions that took longer than the control interval or their own deadline, by the wall clock."""
-    return int(((trajectory.decision_time > trajectory.step) | (trajectory.status & Status.LATE.value != 0)).sum())
+def late_decisions(result: Result) -> int:
+    """Return the number of decisions after the end of the control interval or their own deadline."""
+    return int(((result.decision_time > result.step) | (result.status & Status.LATE.value != 0)).sum())
 
 
-def notes(trajectory: Trajectory, most: int = 3) -> str:
-    """What was said of the decisions that were not OK, the `most` frequent ones, such as "2 x solver failed: ..."."""
-    counted = Counter(note for note, status in zip(trajectory.note, trajectory.status, strict=True) if status)
+def notes(result: Result, most: int = 3) -> str:
+    """Return the `most` frequent notes of decisions that were not OK, such as "2 x solver failed: ..."."""
+    counted = Counter(note for note, status in zip(result.note, result.status, strict=True) if status)
     return "; ".join(f"{count} x {note}" for note, count in counted.most_common(most))
 
 
-def summary(trajectory: Trajectory) -> dict[str, float | int | str]:
-    """One row of summary.csv: column (with its unit in the name) -> value, such as "total_time_spent_veh_s".
+def summary(result: Result) -> dict[str, float | int | str]:
+    """Return one row of a table of runs: column, with its unit in the name -> value.
 
-    >>> round(summary(nmfd.run("economic_mpc", "no-control", steps=20))["max_accumulation_veh"])
-    12558
+    The figures of merit (SUMMARY), and all scalar facts of the run.
+
+        >>> round(summary(nmfd.run("economic_mpc", "no-control", steps=20))["max_accumulation_veh"])
+        12558
     """
-    total = trajectory.accumulation.sum(axis=(1, 2))
-    decision_ms = 1e3 * trajectory.decision_time
+    facts = {name: value for name, value in result.data.attrs.items() if name not in NO_COLUMNS}
+    if "accumulation" not in result:
+        return facts
+    total = result.accumulation.sum(axis=(1, 2))
+    decision_ms = 1e3 * result.decision_time
     return {
-        "controller": trajectory.controller,
-        "seed": trajectory.seed,
-        "plant": trajectory.plant,
-        "total_time_spent_veh_s": total_time_spent(trajectory),
+        **{name: facts.pop(name) for name in ("controller", "seed", "plant")},
+        "total_time_spent_veh_s": total_time_spent(result),
         "final_accumulation_veh": float(total[-1]),
         "max_accumulation_veh": float(total.max()),
-        "completed_veh": float(trajectory.completed[-1]),
-        "evaluation_time_s": float(trajectory.decision_time.sum()),
+        "completed_veh": float(result.completed[-1]),
+        "evaluation_time_s": float(result.decision_time.sum()),
         "control_step_ms_median": float(np.median(decision_ms)),
         "control_step_ms_max": float(decision_ms.max()),
-        "solver_failures": decisions(trajectory, Status.SOLVER_FAILURE),
-        "fallbacks": decisions(trajectory, Status.FALLBACK),
-        "late_decisions": late_decisions(trajectory),
-        "sensor_faults": decisions(trajectory, Status.SENSOR_FAULT),
-        "plant_faults": decisions(trajectory, Status.PLANT_FAULT),
+        "solver_failures": decisions(result, Status.SOLVER_FAILURE),
+        "fallbacks": decisions(result, Status.FALLBACK),
+        "late_decisions": late_decisions(result),
+        "sensor_faults": decisions(result, Status.SENSOR_FAULT),
+        "plant_faults": decisions(result, Status.PLANT_FAULT),
+        "wall_time_s": float(result.wall_time),
+        **facts,
     }

@@ -1,25 +1,17 @@
 """What plants, controllers and the closed loop hand to one another."""
 
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Flag
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from nmfd.arrays import (
-    Cumulative,
-    Flags,
-    Intervals,
-    PairsOverTime,
-    PerPair,
-    PerRegion,
-    PerTurn,
-    RegionsOverTime,
-    StatesOverTime,
-    TurnsOverTime,
-)
-from nmfd.html import html_table
-from nmfd.quantities import quantity, variables
+from nmfd.arrays import PerPair, PerRegion, PerTurn
+from nmfd.errors import InputError
+from nmfd.quantities import Quantity, dataset_variables
 
 if TYPE_CHECKING:
     import pandas
@@ -153,135 +145,157 @@ class Controller(Protocol):
         """The controls of the interval that begins now. The arrays of `observation` are the controller's own."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Trajectory:
-    """One closed-loop run of T control intervals.
-
-    controller, plant, seed
-    step: control interval [s]
-    estimated: whether what was observed is an estimate of the plant's own instruments
-    wall_time: of the whole loop [s]
-    """
-
-    controller: str
-    plant: str
-    seed: int
-    step: float
-    estimated: bool
-    wall_time: float
-    accumulation: StatesOverTime = quantity("time", "region", "destination", unit="veh", text="vehicles inside")
-    backlog: StatesOverTime = quantity("time", "region", "destination", unit="veh", text="vehicles waiting to enter")
-    completed: Cumulative = quantity("time", unit="veh", text="trips that reached their end, cumulative")
-    observed: StatesOverTime = quantity(
-        "time",
-        "region",
-        "destination",
-        unit="veh",
-        text="vehicles inside as the controller was given them; the last as it would have been",
-    )
-    observed_backlog: StatesOverTime = quantity(
-        "time", "region", "destination", unit="veh", text="vehicles waiting to enter as the controller was given them"
-    )
-    perimeter: PairsOverTime = quantity(
-        "interval",
-        "region",
-        "next_region",
-        unit="1",
-        text="share of the desired transfer flow that may pass; 0 between regions that are not adjacent",
-    )
-    splits: TurnsOverTime = quantity(
-        "interval",
-        "region",
-        "next_region",
-        "destination",
-        unit="1",
-        text="share of the vehicles that heads for the next region; nominal where there was no route guidance",
-    )
-    decision_time: Intervals = quantity("interval", unit="s", text="wall time of Controller.act; not in files")
-    status: Flags = quantity(
-        "interval",
-        unit="1",
-        text="what was not as it should be with the decision, 0 if nothing (nmfd.types.Status)",
-        attributes={
-            "flag_masks": [kind.value for kind in Status],
+VARIABLES: dict[str, Quantity] = {
+    "accumulation": Quantity(("time", "region", "destination"), "veh", "vehicles inside"),
+    "backlog": Quantity(("time", "region", "destination"), "veh", "vehicles waiting to enter"),
+    "completed": Quantity(("time",), "veh", "completed trips, cumulative"),
+    "removed": Quantity(("time", "region", "destination"), "veh", "vehicles removed on their way, cumulative"),
+    "observed": Quantity(("time", "region", "destination"), "veh", "vehicles inside as observed by the controller"),
+    "observed_backlog": Quantity(
+        ("time", "region", "destination"), "veh", "vehicles waiting to enter as observed by the controller"
+    ),
+    "perimeter": Quantity(
+        ("interval", "region", "next_region"),
+        "1",
+        "share of the desired transfer flow that may pass; 0 if not adjacent",
+    ),
+    "splits": Quantity(
+        ("interval", "region", "next_region", "destination"),
+        "1",
+        "share of the vehicles that heads for the next region; nominal without route guidance",
+    ),
+    "prices": Quantity(("interval", "region"), "1", "added share of the travel time through the region"),
+    "status": Quantity(
+        ("interval",),
+        "1",
+        "status of the decision, 0 if OK (nmfd.types.Status)",
+        {
+            "flag_masks": np.array([kind.value for kind in Status]),
             "flag_meanings": " ".join(str(kind.name).lower() for kind in Status),
         },
-    )
-    note: tuple[str, ...] = quantity("interval", unit="", text="the status in words", repr=False)
-    removed: StatesOverTime = quantity(
-        "time", "region", "destination", unit="veh", text="vehicles taken out on their way, cumulative", default=None
-    )
-    prices: RegionsOverTime = quantity(
-        "interval",
-        "region",
-        unit="1",
-        text="by how much longer than it is drivers were told that a way through the region takes",
-        default=None,
-    )
+    ),
+    "note": Quantity(("interval",), "", "the status in words"),
+    "decision_time": Quantity(("interval",), "s", "wall time of Controller.act"),
+}
+HOST_TIMES = ("decision_time", "wall_time", "sumo_time_s", "setup_time_s", "overhead_share")  # differ between two runs
 
-    def __post_init__(self) -> None:
-        """Nobody is removed, and nothing has a price, where nothing is said of it."""
-        if self.removed is None:
-            object.__setattr__(self, "removed", np.zeros_like(self.backlog))
-        if self.prices is None:
-            object.__setattr__(self, "prices", np.zeros(self.perimeter.shape[:2]))
 
-    @property
-    def variables(self) -> dict[str, tuple]:
-        """The arrays and their times as xarray.Dataset takes them: name -> (dimensions, array, attributes)."""
-        times = self.step * np.arange(len(self.accumulation))
-        return {
+@dataclass(frozen=True, eq=False)
+class Result:
+    """One closed-loop run of T control intervals, as a Dataset.
+
+    data: variables over time (T+1 states), interval (T decisions), region, next_region and destination; in SUMO over
+        gateway and edge, too. Attributes: controller, plant, seed, step (s), estimated (0 or 1), wall_time (s), and all
+        scalar facts of the run
+
+    `result.accumulation` is the array of that variable, `result.controller` the attribute of that name; a variable
+    comes before an attribute of the same name.
+    """
+
+    data: "xarray.Dataset"
+
+    @classmethod
+    def make(cls, attrs: Mapping[str, Any], **arrays: Any) -> "Result":
+        """Return the result of a closed loop with these `attrs` and the arrays of VARIABLES.
+
+        `removed` and `prices` default to zeros.
+        """
+        import xarray  # half a second, which few commands need
+
+        arrays.setdefault("removed", np.zeros_like(arrays["backlog"]))
+        arrays.setdefault("prices", np.zeros(arrays["perimeter"].shape[:2]))
+        times = attrs["step"] * np.arange(len(arrays["accumulation"]))
+        coordinates = {
             "time": ("time", times, {"long_name": "time since the start", "units": "s"}),
             "interval": ("interval", times[:-1], {"long_name": "beginning of the interval", "units": "s"}),
-            **variables(Trajectory, vars(self)),
         }
+        return cls(xarray.Dataset(dataset_variables(VARIABLES, arrays), coordinates, dict(attrs)))
 
-    def _repr_html_(self) -> str:
-        """Its regions, for notebooks."""
-        present, names = self.accumulation + self.backlog + self.removed, [*range(self.accumulation.shape[1]), "all"]
-        inside, waiting, spending = (
-            np.column_stack([x.sum(axis=2), x.sum(axis=(1, 2))]).T for x in (self.accumulation, self.backlog, present)
-        )
-        lines = [
-            [
-                name,
-                f"{x.mean():,.0f}",
-                f"{x.max():,.0f}",
-                f"{x[-1]:,.0f}",
-                f"{queue.max():,.0f}",
-                f"{self.step * spent[:-1].sum():.3e}",
-            ]
-            for name, x, queue, spent in zip(names, inside, waiting, spending, strict=True)
-        ]
-        return html_table(
-            ["region", "mean [veh]", "most [veh]", "end [veh]", "most waiting [veh]", "time spent [veh s]"],
-            lines,
-            f"{self.controller}, plant {self.plant}, seed {self.seed}: {len(self.status)} control intervals of "
-            f"{self.step:g} s, {self.completed[-1]:,.0f} trips completed, {int((self.status != 0).sum())} decisions "
-            "not as they should be",
-        )
+    @classmethod
+    def read(cls, path: Path | str) -> "Result":
+        """Return the result in the netCDF file `path`.
 
-    @property
-    def labels(self) -> dict[str, str | int | float]:
-        """What run this is: controller, plant, seed, step [s] and estimated (0 or 1)."""
-        return {
-            "controller": self.controller,
-            "plant": self.plant,
-            "seed": self.seed,
-            "step": self.step,
-            "estimated": int(self.estimated),
+        Raises:
+            InputError: the file is missing, or damaged
+        """
+        import xarray
+
+        try:
+            data = xarray.load_dataset(path, engine="netcdf4", decode_times=False, mask_and_scale=False)
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such run") from None
+        except (OSError, RuntimeError, ValueError, KeyError, AttributeError, TypeError) as error:
+            raise InputError(
+                f"{path}: is no run ({str(error).partition(chr(10))[0]}); delete it and run again"
+            ) from None
+        data.attrs = {
+            name: value.item() if isinstance(value, np.generic) else value for name, value in data.attrs.items()
         }
+        return cls(data)
 
-    def to_xarray(self) -> "xarray.Dataset":
-        """Everything but `wall_time`, with named dimensions, times in seconds, and units as attributes."""
-        import xarray  # with the pandas under it half a second of the start-up, which few commands need
+    def write(self, path: Path | str) -> None:
+        """Write the Dataset to the netCDF file `path`, whole or not at all."""
+        data = self.data.copy()
+        data.attrs = {name: int(value) if isinstance(value, bool) else value for name, value in data.attrs.items()}
+        for name, variable in data.variables.items():
+            if variable.dtype == np.float16:  # netCDF has no such type
+                data[name] = variable.astype(np.float32)
+        encoding = {
+            name: {"zlib": True, "_FillValue": None}
+            for name, variable in data.variables.items()
+            if variable.dtype.kind in "fiu"
+        }
+        path = Path(path)
+        temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp")
+        try:
+            data.to_netcdf(temporary, engine="netcdf4", encoding=encoding)
+            os.replace(temporary, path)
+        except RuntimeError as error:  # netCDF hides the reason of the system
+            raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from None
+        finally:
+            temporary.unlink(missing_ok=True)
 
-        return xarray.Dataset(self.variables, attrs=self.labels)
+    def __getattr__(self, name: str) -> Any:
+        """Return the array of a variable, or an attribute."""
+        if name.startswith("__") or name == "data":
+            raise AttributeError(name)
+        if name in self.data.variables:
+            return self.data.variables[name].values
+        try:
+            return self.data.attrs[name]
+        except KeyError:
+            raise AttributeError(f"result without variable or attribute {name!r}") from None
 
-    to_dataset = to_xarray  # its name before
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return the array of a variable."""
+        return self.data.variables[name].values
+
+    def __contains__(self, name: str) -> bool:
+        """Return whether there is a variable `name`."""
+        return name in self.data.variables
+
+    def assign(self, **values: Any) -> "Result":
+        """Return the result with other arrays of its variables, or other attributes."""
+        data = self.data.copy()
+        for name, value in values.items():
+            if name in data.variables:
+                data[name] = (data[name].dims, np.asarray(value), data[name].attrs)
+            else:
+                data.attrs[name] = value
+        return Result(data)
+
+    def add(self, variables: Mapping[str, tuple], attrs: Mapping[str, Any]) -> "Result":
+        """Return the result with more variables (name -> dimensions, array, attributes) and attributes."""
+        return Result(self.data.assign(variables).assign_attrs(attrs))
+
+    def without_times(self) -> "xarray.Dataset":
+        """Return the Dataset without wall times: the same for every run of the same seed."""
+        data = self.data.drop_vars(HOST_TIMES, errors="ignore")
+        data.attrs = {name: value for name, value in data.attrs.items() if name not in HOST_TIMES}
+        return data
 
     def to_frame(self) -> "pandas.DataFrame":
-        """The states as a table: one row per time and pair of regions, (T+1) R R rows.
+        """Return the states as a table: one row per time and pair of regions, (T+1) R R rows.
 
         Columns controller, plant, seed; time_s; region, destination (x_ij: in region i, bound for j);
         accumulation_veh; backlog_veh (waiting to enter region i).
@@ -295,16 +309,18 @@ class Trajectory:
         return self._table({"time": "time_s", "accumulation": "accumulation_veh", "backlog": "backlog_veh"})
 
     def controls_frame(self) -> "pandas.DataFrame":
-        """The perimeter controls as a table: one row per control interval and pair of regions, T R R rows.
+        """Return the perimeter controls as a table: one row per interval and pair of regions, T R R rows.
 
-        Columns controller, plant, seed; time_s, when the interval begins; region, next_region (u_ih: from i to h);
+        Columns controller, plant, seed; time_s, the beginning of the interval; region, next_region (u_ih: from i to h);
         perimeter [-]; 0 between regions that are not adjacent.
         """
         return self._table({"interval": "time_s", "perimeter": "perimeter"})
 
     def _table(self, columns: dict[str, str]) -> "pandas.DataFrame":
-        data = self.to_xarray()
-        rows = data[[name for name in columns if name in data.data_vars]].to_dataframe().reset_index()
+        rows = self.data[[name for name in columns if name in self.data.data_vars]].to_dataframe().reset_index()
         for place, name in enumerate(("controller", "plant", "seed")):
-            rows.insert(place, name, getattr(self, name))
+            rows.insert(place, name, self.data.attrs[name])
         return rows.rename(columns=columns)
+
+    def _repr_html_(self) -> str:
+        return self.data._repr_html_()

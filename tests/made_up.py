@@ -68,7 +68,7 @@ def result(task, city) -> Result:
         "teleports": 3 * (task.controller == "pi-gating"),
         "final_backlog_veh": 20,
     }
-    return Result(trajectory=trajectory, record=record, facts=facts)
+    return trajectories.recorded(trajectory, record, facts)
 
 
 def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1.0,)) -> Path:

@@ -83,9 +83,9 @@ def simulated(
                 .reshape(-1, intervals, city.regions)
                 .mean(axis=1)
                 for values in (
-                    result.record["mean_accumulation"],
+                    result["mean_accumulation"],
                     _production(edges, city, scenario),
-                    regional_outflow(result.record, scenario.step),
+                    regional_outflow(result, scenario.step),
                 )
             ]
         )

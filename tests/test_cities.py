@@ -116,8 +116,8 @@ def test_max_pressure_takes_no_longer_than_fixed_time(tmp_path, name, level):
     spent = {}
     for signals in ("no-control", "max-pressure", "max-pressure-cyclic"):
         run = simulate(Task(scenario=tmp_path / "scenarios" / name, controller=signals, seed=1, demand_factor=level))
-        spent[signals] = total_time_spent(run.trajectory)
-        assert run.trajectory.completed[-1] == run.facts["trips"], signals
+        spent[signals] = total_time_spent(run)
+        assert run.completed[-1] == run.trips, signals
     assert max(spent, key=spent.get) == "no-control", spent
 
 

@@ -11,7 +11,6 @@ import trajectories
 
 from cosim.evaluation.identify import as_it_was, samples_of, static_model
 from cosim.evaluation.model_validation import errors, held_up, outflow_samples, predict, predict_next
-from cosim.evaluation.simulate import Result
 from cosim.plant.strategy import planning_of
 from nmfd.api import load_scenario
 from nmfd.model import dynamics, mfd
@@ -61,7 +60,7 @@ def result(scenario):
         "crossings": np.stack(crossings),
         "arrivals": np.stack(arrivals),
     }
-    return Result(trajectory=trajectory, record=record, facts={})
+    return trajectories.recorded(trajectory, record, {})
 
 
 def test_a_perfect_model_has_no_error(scenario, result):
@@ -80,7 +79,7 @@ def test_a_model_that_discharges_too_slowly_holds_too_many(scenario, result):
 
 
 def test_several_intervals_ahead(scenario, result):
-    simulated = result.trajectory.accumulation.sum(-1)
+    simulated = result.accumulation.sum(-1)
     assert np.abs(predict_next(scenario, result, 10) - simulated[10:]).max() < 1e-6
 
 
@@ -114,9 +113,7 @@ def test_the_model_of_those_who_drive():
 
 def test_outflow_samples_lie_on_the_mfd(scenario, result):
     for region in (0, 3):
-        cloud = outflow_samples(
-            [result.trajectory], [result.record], scenario.network.u_max, region, scenario.network.adjacency
-        )
+        cloud = outflow_samples([result], [result], scenario.network.u_max, region, scenario.network.adjacency)
         points = np.concatenate(list(cloud.values()))
         expected = scenario.network.mfds[region].outflow(points[:, 0])
         # The samples are taken at the middle of an interval, the flows at its beginning.
@@ -129,7 +126,7 @@ def test_outflow_samples_lie_on_the_mfd(scenario, result):
 
 def test_own_splits_are_the_crossings_shares(scenario, result):
     network = scenario.network
-    crossings = result.record["crossings"].sum(axis=0)
+    crossings = result["crossings"].sum(axis=0)
     assert observed_split_ratios(network, crossings)[0, 6] == {3: 1.0}
     crossings[0, 1, 6] = crossings[0, 3, 6] / 3.0
     assert observed_split_ratios(network, crossings)[0, 6] == pytest.approx({1: 0.25, 3: 0.75})
@@ -137,7 +134,7 @@ def test_own_splits_are_the_crossings_shares(scenario, result):
 
 def test_network_file_comes_back_the_same(scenario, result, tmp_path):
     network = scenario.network
-    crossings = result.record["crossings"].sum(axis=0)
+    crossings = result["crossings"].sum(axis=0)
     crossings[0, 1, 6] = crossings[0, 3, 6] / 3.0
     network = replace(network, observed_split_ratios=observed_split_ratios(network, crossings))
     for kind in (network, tiny.limited(network)):
@@ -192,9 +189,10 @@ def test_regions_that_no_loading_run_filled_are_named(scenario):
 def test_an_empty_region_keeps_its_model_in_identification(scenario, result):
     """Nobody is ever in region 0: all others are fitted, and 0 stays as it was."""
     network = scenario.network
-    state, record = result.trajectory.accumulation.copy(), {key: value.copy() for key, value in result.record.items()}
-    state[:, 0], record["crossings"][:, 0], record["arrivals"][:, 0] = 0.0, 0.0, 0.0
-    alone = Result(trajectory=replace(result.trajectory, accumulation=state), record=record, facts={})
+    alone = result.assign(
+        **{name: result[name].copy() for name in ("accumulation", "crossings", "arrivals")},
+    )
+    alone.accumulation[:, 0], alone.crossings[:, 0], alone.arrivals[:, 0] = 0.0, 0.0, 0.0
     static = static_model(scenario, [alone], guided=False)
     assert static.mfds[0] == network.mfds[0] and static.mfds[3] != network.mfds[3]
     assert 0 in nearly_empty(samples_of(network, [alone])) and 3 not in nearly_empty(samples_of(network, [alone]))

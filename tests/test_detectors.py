@@ -151,7 +151,7 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
     models = [planning_of(scenario_of(task), task.controller).network for task in tasks]
     assert [model.folder.name for model in models] == ["grid7_guided", "grid7_max_pressure"]
     scenario = scenario_of(tasks[0])
-    found = simulate(tasks[0]).trajectory
+    found = simulate(tasks[0])
     for model, same in zip(models, (True, False), strict=True):
         plant = SumoPlant(
             scenario,
@@ -175,7 +175,7 @@ def test_same_seed_same_bytes(scenario, run, tmp_path):
 
 
 def test_table_and_picture(scenario, run, tmp_path):
-    rows = estimation_errors.write_errors(tmp_path, scenario.network, [run, replace(run, seed=4, estimated=False)])
+    rows = estimation_errors.write_errors(tmp_path, scenario.network, [run, run.assign(seed=4, estimated=False)])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate-pi-gating-3.png", "estimation.csv"]
     assert len(pd.read_csv(tmp_path / "estimation.csv")) == len(rows) == 8
     shown = estimation_errors.error_table(rows)
@@ -183,7 +183,7 @@ def test_table_and_picture(scenario, run, tmp_path):
     ax = plots.region_estimate(plots.figure(4.0, 3.0).subplots(), scenario.network, 3, run)
     lines = [line.get_ydata() for line in ax.get_lines()]
     np.testing.assert_allclose(lines, [run.accumulation[:, 3].sum(axis=1), run.observed[:, 3].sum(axis=1)])
-    assert estimation_errors.write_errors(tmp_path / "none", scenario.network, [replace(run, estimated=False)]).empty
+    assert estimation_errors.write_errors(tmp_path / "none", scenario.network, [run.assign(estimated=False)]).empty
 
 
 @pytest.mark.parametrize(

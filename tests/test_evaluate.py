@@ -64,7 +64,7 @@ def made_up(task) -> Result:
         wall_time=1.0,
     )
     facts = {name: 0 for name in FACTS} | {"outside_training": "", "controller": task.controller, "seed": task.seed}
-    return Result(trajectory=trajectory, record=trajectories.record(2, regions=7), facts=facts)
+    return trajectories.recorded(trajectory, trajectories.record(2, regions=7), facts)
 
 
 def evaluation(city, tmp_path, *, controllers=("no-control", "pi-gating"), seeds=(2000, 2001), **others):

@@ -1,7 +1,5 @@
 """Figures of an evaluation: data that arrives in them, distinct colours, every seed told apart."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from trajectories import trajectory
@@ -53,7 +51,7 @@ def test_prices_of_the_regions_that_have_one_and_the_trips_that_wait_there(monke
     told, waiting = np.zeros(run.perimeter.shape[:2]), np.zeros(run.backlog.shape)
     told[1:, 1], waiting[2:, 0, 1], waiting[:, 1, 0] = 0.25, 40.0, 1.0  # one waits for a gap in traffic anywhere
     monkeypatch.setattr(plots, "save", lambda drawing, path: drawn.extend(drawing.axes) or path)
-    pictures.prices(tmp_path / "prices.png", network, replace(run, prices=told, backlog=waiting), "no teleport")
+    pictures.prices(tmp_path / "prices.png", network, run.assign(prices=told, backlog=waiting), "no teleport")
     shown = [{step.get_label(): step.get_data().values for step in ax.patches} for ax in drawn]
     assert [list(each) for each in shown] == [title[1:], title[:1]]
     np.testing.assert_allclose(shown[0][title[1]], 100.0 * told[:, 1])

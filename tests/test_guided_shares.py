@@ -258,8 +258,5 @@ def test_guided_is_guidance_by_travel_times_wherever_the_controller_says_nothing
         drive(scenario, parse(name), _Gate(splits), seed=1)
         for name, splits in (("pi-gating", own), ("pi-gating+guided", None), ("pi-gating", None))
     )
-    assert option.record["guided"].sum() > 0 and off.record["guided"].sum() == 0
-    for key, values in by_hand.record.items():
-        np.testing.assert_array_equal(option.record[key], values, err_msg=key)
-    np.testing.assert_array_equal(option.trajectory.accumulation, by_hand.trajectory.accumulation)
-    np.testing.assert_array_equal(option.trajectory.splits, by_hand.trajectory.splits)
+    assert option["guided"].sum() > 0 and off["guided"].sum() == 0
+    assert option.without_times().equals(by_hand.without_times())

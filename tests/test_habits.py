@@ -3,7 +3,6 @@
 import io
 import re
 import sys
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,12 +14,9 @@ from commands import nmfd as command
 
 import cosim
 import nmfd
-from cosim.evaluation.simulate import Result
 from cosim.plant import strategy
-from cosim.plant.record import Record
 from nmfd.controllers import registry
 from nmfd.controllers.names import chosen
-from nmfd.quantities import quantities
 from nmfd.runs import progress
 
 NAMES = ("no-control", "dpc-pc", "dpc-pcrg", "pi-gating")
@@ -93,35 +89,6 @@ def test_a_benchmark_of_one_name_is_a_table_in_every_form(tmp_path, monkeypatch)
     assert re.search("<td>no-control *</td>", rows._repr_html_()) and "TTS [veh s]" in rows._repr_html_()
     with pytest.raises(nmfd.InputError, match="did you mean acyclic?"):
         nmfd.benchmark(tmp_path / "scenario", "no-control", plant="acylic", out=tmp_path / "other")
-
-
-def test_results_of_runs_are_tables_and_datasets(tmp_path):
-    trajectory = nmfd.run(tiny.write(tmp_path), "pi-gating", steps=3)
-    record = {
-        name: np.ones(
-            [
-                {"interval": 3, "region": 2, "destination": 2, "next_region": 2}.get(axis, 4)
-                for axis in about["dimensions"]
-            ]
-        )
-        for name, about in quantities(Record).items()
-    }
-    result = Result(trajectory=trajectory, record=record, facts={"trips": 12, "co2_kg": 3.25, "notes": "a & b"})
-    assert result.to_frame().equals(trajectory.to_frame())
-    data = result.to_xarray()
-    assert data.gateway_queue.sizes == {"interval": 3, "gateway": 4} and data.gateway_queue.attrs["units"] == "veh"
-    assert data.attrs["co2_kg"] == 3.25 and data.accumulation.equals(trajectory.to_xarray().accumulation)
-    assert "co2_kg" in result._repr_html_() and "a & b" not in result._repr_html_()
-
-
-def test_html_is_escaped_and_says_units(tmp_path):
-    trajectory = replace(nmfd.run(tiny.write(tmp_path), "no-control"), controller="<script>&")
-    html = trajectory._repr_html_()
-    assert "&lt;script&gt;&amp;" in html and "<script>" not in html and "time spent [veh s]" in html
-    total = nmfd.total_time_spent(trajectory)
-    assert re.search(r"<td>all *</td>.*" + re.escape(f"{total:.3e}"), html)
-    rows = nmfd.Summary([{**nmfd.summary(trajectory)}])
-    assert "<script>" not in rows._repr_html_()
 
 
 def test_progress_is_shown_on_a_terminal_and_in_notebooks_only(monkeypatch, capsys, tmp_path):

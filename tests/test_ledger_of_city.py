@@ -491,7 +491,7 @@ def test_a_run_says_who_was_removed_and_gains_nothing_by_it(tmp_path):
     trips = tmp_path / "trips.xml"
     run = cosim.run(scenario, f"{tmp_path / 'mine.py'}:Meddler", steps=8, seed=1, sumo_output={"tripinfo": trips})
     ended = [trip.get("vaporized") for trip in ElementTree.parse(trips).getroot() if float(trip.get("arrival")) >= 0]
-    trajectory, facts, record = run.trajectory, run.facts, run.record
+    trajectory, facts, record = run, run.data.attrs, run
     assert {"", "traci", "calibrator"} <= set(ended) and ended.count("traci") >= 24
     assert trajectory.completed[-1] == ended.count("") == record["arrivals"].sum() > 0
     removed, inside = facts["removed_veh"], trajectory.accumulation[-1].sum()

@@ -24,7 +24,7 @@ from nmfd.errors import InputError
 from nmfd.runs import files, progress, provenance, run_folder, workers
 from nmfd.runs.tables import markdown_table
 from nmfd.runs.tally import Tally
-from nmfd.types import Trajectory
+from nmfd.types import Result
 
 ROOT = Path(__file__).parents[1]
 CONFIGURATION = {"scenario": "x", "step": 30.0, "protected": (1, 2)}
@@ -71,7 +71,7 @@ def test_xarray_opens_a_run_with_names_and_units(tmp_path):
             "edge": 5,
         }
         assert data.attrs == {"controller": "no-control", "plant": "nmfd", "seed": 0, "step": 30.0, "estimated": 1}
-        assert set(data.data_vars) == {*quantities.quantities(Trajectory), *record} - {"decision_time"}
+        assert set(data.data_vars) == {*quantities.quantities(Result), *record} - {"decision_time"}
         for name, values in data.variables.items():
             assert values.attrs["long_name"] and ("units" in values.attrs or name == "note"), name
         assert tuple(data["note"].values) == original.note == ("", "", "", "no")
@@ -85,7 +85,7 @@ def test_xarray_opens_a_run_with_names_and_units(tmp_path):
     assert run_folder.read_trajectory(tmp_path / "a.nc").estimated is True
 
 
-@pytest.mark.parametrize("page, kind", [("nmfd/runs/README.md", Trajectory), ("cosim/plant/record.md", Record)])
+@pytest.mark.parametrize("page, kind", [("nmfd/runs/README.md", Result), ("cosim/plant/record.md", Record)])
 def test_the_pages_list_what_is_in_a_file(page, kind):
     table = markdown_table(
         ("variable", "dimensions", "unit", "what"),

@@ -67,16 +67,16 @@ def test_what_is_booked(tmp_path, monkeypatch):
     text = file.read_text(encoding="utf-8").replace("[sumo]\n", "[sumo]\nbook_standstill = true\n")
     file.write_text(text, encoding="utf-8")
     booked = simulate(task)
-    assert (simulated.facts["booked_intervals"], booked.facts["booked_intervals"]) == (0, 2)
-    there, trajectory = simulated.trajectory.accumulation, booked.trajectory
+    assert (simulated.data.attrs["booked_intervals"], booked.data.attrs["booked_intervals"]) == (0, 2)
+    there, trajectory = simulated.accumulation, booked
     np.testing.assert_array_equal(trajectory.accumulation, there[[0, 1, 2, 2, 2]])
-    inside, waiting = there[2].sum(), simulated.trajectory.backlog[2].sum()
+    inside, waiting = there[2].sum(), simulated.backlog[2].sum()
     assert inside > 0 and total_time_spent(trajectory) == 90.0 * (
         trajectory.accumulation[:4].sum() + trajectory.backlog[:4].sum()
     )
     for key in ("departures", "arrivals", "crossings", "gateway_flow"):
-        assert not booked.record[key][2:].any(), key
-        np.testing.assert_array_equal(booked.record[key][:2], simulated.record[key][:2], err_msg=key)
-    np.testing.assert_array_equal(booked.record["edge_vehicles"][2:], booked.record["edge_vehicles"][[1, 1]])
-    spent = booked.facts["mean_trip_time_s"] * booked.facts["departed_veh"]
-    assert spent >= 180.0 * inside and booked.facts["co2_kg"] > 0 and waiting >= 0
+        assert not booked[key][2:].any(), key
+        np.testing.assert_array_equal(booked[key][:2], simulated[key][:2], err_msg=key)
+    np.testing.assert_array_equal(booked["edge_vehicles"][2:], booked["edge_vehicles"][[1, 1]])
+    spent = booked.data.attrs["mean_trip_time_s"] * booked.data.attrs["departed_veh"]
+    assert spent >= 180.0 * inside and booked.data.attrs["co2_kg"] > 0 and waiting >= 0

@@ -144,6 +144,6 @@ def test_a_run_on_the_regional_model_shows_the_outflow_of_its_gates(tmp_path):
     gone = scenario.step * (inflow - out).sum()
     crossed = scenario.step * out.sum() - trajectory.completed[-1]
     assert crossed > 0 and gone + crossed == pytest.approx(trajectory.accumulation[-1].sum(), abs=5.0)
-    assert model_outflow(scenario.network)(replace(trajectory, plant="sumo")) is None
+    assert model_outflow(scenario.network)(trajectory.assign(plant="sumo")) is None
     draw_accumulations(tmp_path, scenario, [trajectory])
     assert (tmp_path / "region_accumulation.png").stat().st_size > 5000

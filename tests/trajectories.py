@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from cosim.evaluation.simulate import FACTS, Result, Task
+from cosim.evaluation.simulate import FACTS, Task
 from cosim.plant.record import Record
-from nmfd.quantities import quantities
-from nmfd.types import Status, Trajectory
+from nmfd.quantities import quantities, variables
+from nmfd.types import Result, Status
 
 
-def made(**fields) -> Trajectory:
-    """A Trajectory of `fields`; what they do not say is as in a run without noise, faults or failures."""
+def made(**fields) -> Result:
+    """A Result of `fields`; what they do not say is as in a run without noise, faults or failures."""
     steps = len(fields["perimeter"])
     usual = {
         "observed": fields["accumulation"],
@@ -20,14 +20,21 @@ def made(**fields) -> Trajectory:
         "note": ("",) * steps,
         "wall_time": 1.0,
     }
-    return Trajectory(**usual | fields)
+    values = usual | fields
+    attrs = {name: values.pop(name) for name in ("controller", "plant", "seed", "step", "estimated", "wall_time")}
+    return Result.make(attrs, **values)
+
+
+def recorded(run: Result, arrays: dict[str, np.ndarray], facts: dict) -> Result:
+    """`run` in a city, with the arrays of a Record and its facts."""
+    return run.add(variables(Record, arrays), facts)
 
 
 def record(steps: int, *, regions: int, gateways: int = 3, edges: int = 5) -> dict[str, np.ndarray]:
     """The arrays of a Record, at random."""
     sizes, random = {"interval": steps, "gateway": gateways, "edge": edges}, np.random.default_rng(0)
     return {
-        name: random.random([sizes.get(axis, regions) for axis in about["dimensions"]])
+        name: random.random([sizes.get(axis, regions) for axis in about.dimensions])
         for name, about in quantities(Record).items()
     }
 
@@ -70,8 +77,6 @@ def in_city(task: Task, tts: float, trips: int, completed: int) -> Result:
     )
     facts = {name: 0 for name in FACTS} | {
         "outside_training": "",
-        "controller": task.controller,
-        "seed": task.seed,
         "trips": trips,
     }
-    return Result(trajectory=run, record=record(1, regions=7), facts=facts)
+    return recorded(run, record(1, regions=7), facts)

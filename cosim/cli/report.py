@@ -17,7 +17,7 @@ from nmfd.errors import InputError
 
 if TYPE_CHECKING:
     from cosim.evaluation.simulate import Task
-    from nmfd.types import Trajectory
+    from nmfd.types import Result
 
 
 @click.command()
@@ -135,7 +135,7 @@ def watch(
         )
     for seen in runs:
         if isinstance(seen.outcome, Result):
-            _tell(seen.name, seed, seen.outcome.trajectory)
+            _tell(seen.name, seed, seen.outcome)
         if seen.faults:
             click.echo(
                 "Gates were switched by hand; the same run: --controller "
@@ -161,7 +161,7 @@ def _window(task: "Task", delay: float | None) -> None:
     _tell(task.controller, task.seed, result.trajectory)
 
 
-def _tell(controller: str, seed: int, trajectory: "Trajectory") -> None:
+def _tell(controller: str, seed: int, trajectory: "Result") -> None:
     from nmfd.metrics import summary
 
     row = summary(trajectory)

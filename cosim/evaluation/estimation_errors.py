@@ -11,7 +11,7 @@ from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
 from nmfd.studies.traffic_states import OutflowOf, remembered
-from nmfd.types import Trajectory
+from nmfd.types import Result
 
 COLUMNS = (
     "controller",
@@ -31,7 +31,7 @@ CAPTION = (
 )
 
 
-def errors(network: RegionalModel, trajectory: Trajectory) -> list[dict]:
+def errors(network: RegionalModel, trajectory: Result) -> list[dict]:
     """One row of COLUMNS per region, and one for all of them (region "all"): the mean over regions of the errors, as
     roots of mean squares."""
     exact, off = trajectory.accumulation, trajectory.observed - trajectory.accumulation
@@ -74,7 +74,7 @@ def errors(network: RegionalModel, trajectory: Trajectory) -> list[dict]:
 
 
 def write_errors(
-    folder: Path, network: RegionalModel, trajectories: Sequence[Trajectory], outflow: OutflowOf | None = None
+    folder: Path, network: RegionalModel, trajectories: Sequence[Result], outflow: OutflowOf | None = None
 ) -> pd.DataFrame:
     """estimation.csv, and one picture per run that was controlled on estimates; nothing without such a run.
 

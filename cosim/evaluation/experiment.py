@@ -12,11 +12,10 @@ import numpy as np
 import pandas as pd
 
 from cosim.evaluation import estimation_errors, run_metrics, signal_reasons
-from cosim.evaluation.simulate import FACTS, Result, Task, scenario_of, simulate
+from cosim.evaluation.simulate import FACTS, Task, scenario_of, simulate
 from cosim.plant import incidents
 from cosim.plant.feasible import check_strategy
 from cosim.plant.launch import own_files, own_vehicles
-from cosim.plant.record import Record
 from cosim.plant.settings import FILES, PRESSURES, Settings, settings
 from cosim.plant.strategy import configured, parse
 from cosim.sumo import outputs
@@ -28,7 +27,6 @@ from nmfd.controllers import registry
 from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
-from nmfd.quantities import quantities, variables
 from nmfd.runs import run_folder
 from nmfd.runs.files import file_hash, read_table, write_table
 from nmfd.runs.tables import text_table
@@ -36,7 +34,7 @@ from nmfd.runs.tally import Progress, Tally
 from nmfd.runs.workers import Failure, Source, attempt, ended, outcomes
 from nmfd.studies.benchmark import REFERENCE, compared_with, draw_accumulations, interval
 from nmfd.studies.traffic_states import OutflowOf, RegionalOutflow
-from nmfd.types import Trajectory
+from nmfd.types import Result
 
 Outcomes = Iterator[tuple[Task, Result | Failure]]
 MINUTE = 60.0
@@ -141,7 +139,7 @@ def perform(
                 continue
             folder = folders[where[task]]
             _write_facts(folder, outcome)
-            folder.add(outcome.trajectory, variables(Record, outcome.record))
+            folder.add(outcome)
             if kept:
                 kept()
     return failures
@@ -280,26 +278,15 @@ def _apart(task: Task) -> str:
 
 
 def read_run(folder: Path, controller: str, seed: int) -> Result:
-    """A finished run of the run folder. Raises InputError."""
-    with run_folder.opened(run_folder.run_path(folder, controller, seed)) as file:
-        return Result(
-            trajectory=run_folder.trajectory_in(file),
-            record={name: file[name][...] for name in quantities(Record)},
-            facts={},
-        )
+    """Return a finished run of the run folder. Raises InputError."""
+    return Result.read(run_folder.run_path(folder, controller, seed))
 
 
 def measured_outflow(folder: Path) -> OutflowOf:
-    """What left every region in a run of the folder, as SUMO counted it (T, R) [veh/s]; None of a run that an older
-    version recorded without it."""
+    """Return the outflow of every region in a run of the folder, as SUMO counted it (T, R) [veh/s]."""
 
-    def outflow(trajectory: Trajectory) -> RegionalOutflow | None:
-        with run_folder.opened(run_folder.run_path(folder, trajectory.controller, trajectory.seed)) as file:
-            if not {"arrivals", "crossings"} <= set(file.variables):
-                return None
-            return run_metrics.regional_outflow(
-                {name: file[name][...] for name in ("arrivals", "crossings")}, trajectory.step
-            )
+    def outflow(result: Result) -> RegionalOutflow | None:
+        return run_metrics.regional_outflow(read_run(folder, result.controller, result.seed), result.step)
 
     return outflow
 
@@ -307,9 +294,12 @@ def measured_outflow(folder: Path) -> OutflowOf:
 def _write_facts(folder: run_folder.RunFolder, result: Result) -> None:
     path = folder.path / "sumo.csv"
     rows = read_facts(path) if path.is_file() else pd.DataFrame(columns=[*FACTS])
-    same = (rows["controller"] == result.facts["controller"]) & (rows["seed"] == result.facts["seed"])
+    same = (rows["controller"] == result.controller) & (rows["seed"] == result.seed)
     found = sorted(
-        [*rows[~same].to_dict("records"), result.facts],  # not as they ended, which is chance
+        [
+            *rows[~same].to_dict("records"),
+            {name: result.data.attrs[name] for name in FACTS},
+        ],  # not as they ended, which is chance
         key=lambda row: folder.position(row["controller"], row["seed"]),
     )
     rows = pd.DataFrame(found, columns=[*FACTS])

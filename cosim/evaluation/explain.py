@@ -19,7 +19,7 @@ from nmfd.arrays import PerRegion
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import run_folder
 from nmfd.studies.benchmark import REFERENCE
-from nmfd.types import Trajectory
+from nmfd.types import Result
 
 NO_AUTHORITY = 0.5  # of the flow over the boundaries passes without a signal under control
 HARDLY = 0.01  # of the commands, or of the time
@@ -44,7 +44,7 @@ class Loading:
         return np.flatnonzero(self.beyond > HARDLY)
 
 
-def load(network: RegionalModel, trajectories: Sequence[Trajectory], records: Iterable[Mapping]) -> Loading:
+def load(network: RegionalModel, trajectories: Sequence[Result], records: Iterable[Mapping]) -> Loading:
     """What some runs were like."""
     critical = network.critical
     states = [trajectory.accumulation.sum(axis=2) / critical for trajectory in trajectories]
@@ -83,7 +83,7 @@ class ControlActivity:
 
 
 def deeds(
-    network: RegionalModel, trajectories: Sequence[Trajectory], records: Iterable[Mapping], *, metered: bool = False
+    network: RegionalModel, trajectories: Sequence[Result], records: Iterable[Mapping], *, metered: bool = False
 ) -> ControlActivity:
     """What a controller did in some runs; metered: whether it could make trips wait."""
     limit = network.u_max - NEARLY_OPEN * (network.u_max - network.u_min)
@@ -168,11 +168,11 @@ def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.Dat
     )
 
 
-def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Trajectory], Iterable[Mapping]]:
+def _runs(folder: Path, name: str, seeds: Sequence[int]) -> tuple[list[Result], Iterable[Mapping]]:
     """Trajectories and records of one controller."""
     return (
         [run_folder.read_trajectory(run_folder.run_path(folder, name, seed)) for seed in seeds],
-        (experiment.read_run(folder, name, seed).record for seed in seeds),
+        (experiment.read_run(folder, name, seed) for seed in seeds),
     )
 
 

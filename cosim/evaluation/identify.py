@@ -124,7 +124,7 @@ def identify(
     network = static_model(loaded, found, guided=loading.guided)
     set_point = tuple(network.mfds[region].critical for region in loaded.protected)
     found += loads(second, {"set_point": set_point}, progress=_named(progress, "2 of 2"))
-    held_out = [result for result in found if len(loading.seeds) > 1 and result.trajectory.seed == loading.seeds[-1]]
+    held_out = [result for result in found if len(loading.seeds) > 1 and result.seed == loading.seeds[-1]]
     found += more
     scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
@@ -141,7 +141,7 @@ def identify(
 
     samples = samples_of(network, found)
     model = fitted(found, samples, "fitting")
-    fits = region_fits(model, samples, [result.trajectory.accumulation for result in found], seeds=len(loading.seeds))
+    fits = region_fits(model, samples, [result.accumulation for result in found], seeds=len(loading.seeds))
     text, foreseen = fit_table(model, samples, fits), None
     if held_out:
         kept = [result for result in found if not any(result is other for other in held_out)]
@@ -152,7 +152,7 @@ def identify(
     files.write_text(out / "fit.txt", text + "\n")
     write_fits(out / "fit.csv", fits, foreseen)
     model = replace(model, placeholder=False, doubts=tuple(fit.doubts for fit in fits))
-    judged = verdict.of_runs(model, [result for result in found if result.trajectory.controller == first])
+    judged = verdict.of_runs(model, [result for result in found if result.controller == first])
     model = replace(model, controllable=judged.boundaries.shares)
     text = "\n".join([text, *wrapped("\n".join(judged.sentences))])
     _write_samples(out / "samples.csv", samples)
@@ -222,8 +222,8 @@ def _and_runs(runs: Sequence[Result]) -> str:
     """What the model was fitted to besides, as the first lines of network.toml say it."""
     if not runs:
         return ""
-    names = ", ".join(sorted({run.trajectory.controller for run in runs}))
-    seeds = [run.trajectory.seed for run in runs]
+    names = ", ".join(sorted({run.controller for run in runs}))
+    seeds = [run.seed for run in runs]
     return f",\n# and from {len(runs)} runs under {names}, seeds {min(seeds)} to {max(seeds)}"
 
 
@@ -249,23 +249,20 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
     )
     if guided:  # what theta is compared with stays what it is for the plant (cosim.plant.guidance)
         return network
-    crossings = sum(result.record["crossings"].sum(axis=0) for result in results)
+    crossings = sum(result["crossings"].sum(axis=0) for result in results)
     return replace(network, observed_split_ratios=observed_split_ratios(network, crossings))
 
 
 def samples_of(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, Points]]:
     """Outflow samples of every region (cosim.evaluation.model_validation.outflow_samples)."""
     return [
-        outflow_samples(
-            [r.trajectory for r in results], [r.record for r in results], network.u_max, region, network.adjacency
-        )
-        for region in range(network.regions)
+        outflow_samples(results, results, network.u_max, region, network.adjacency) for region in range(network.regions)
     ]
 
 
 def observed(result: Result) -> Observed:
     """A run as identification sees it; the demand is what entered the streets."""
-    trajectory, record = result.trajectory, result.record
+    trajectory, record = result, result
     return Observed(
         accumulation=trajectory.accumulation,
         demand=record["departures"] / trajectory.step,
@@ -278,7 +275,7 @@ def observed(result: Result) -> Observed:
 def followed(network: RegionalModel, result: Result) -> Observed:
     """A run as identification sees it with the split ratios that drivers followed instead of those that were commanded,
     if any: counted over WINDOW control intervals, besides PRIOR vehicles that did as they were told."""
-    seen, crossings = observed(result), result.record["crossings"] * network.split_mask
+    seen, crossings = observed(result), result["crossings"] * network.split_mask
     total = np.cumsum(np.concatenate([np.zeros_like(crossings[:1]), crossings]), axis=0)
     first = np.arange(len(crossings)) - WINDOW // 2
     last = np.clip(first + WINDOW, 0, len(crossings))

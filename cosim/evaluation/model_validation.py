@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float
 
 from cosim.evaluation import run_metrics
-from cosim.evaluation.simulate import Result
 from cosim.sumo.arrays import Points, RegionCounts, Series
 from nmfd import closed_loop
 from nmfd.arrays import Adjacency
@@ -22,7 +21,7 @@ from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
 from nmfd.studies.fit_quality import SPILLBACK
 from nmfd.studies.traffic_states import model_outflow, remembered
-from nmfd.types import Controls, Observation, Trajectory
+from nmfd.types import Controls, Observation, Result
 
 COLUMNS = (
     "region",
@@ -49,7 +48,7 @@ CAPTION = (
 class Replay:
     """The recorded controls of a trajectory, as a controller (nmfd.types.Controller)."""
 
-    def __init__(self, trajectory: Trajectory):
+    def __init__(self, trajectory: Result):
         """trajectory: with as many intervals as are to be controlled"""
         self.name, self._trajectory = trajectory.controller, trajectory
 
@@ -62,27 +61,27 @@ class Replay:
         return Controls(perimeter=self._trajectory.perimeter[k], splits=self._trajectory.splits[k])
 
 
-def predict(scenario: Scenario, result: Result) -> Trajectory:
+def predict(scenario: Scenario, result: Result) -> Result:
     """The regional model from the same start, under the departures and controls that the microsimulation recorded.
 
     Demand is what entered the streets, not what wished to: the backlog is none of the model's business here.
     """
     same = replace(
         scenario,
-        steps=len(result.trajectory.perimeter),
-        demand=result.record["departures"] / scenario.step,
+        steps=len(result.perimeter),
+        demand=result["departures"] / scenario.step,
         measurement_std=0.0,
         faults=(),
     )
-    trajectory = closed_loop.run(NmfdPlant(same), Replay(result.trajectory), same, seed=result.trajectory.seed)
-    return replace(trajectory, plant="nmfd")
+    trajectory = closed_loop.run(NmfdPlant(same), Replay(result), same, seed=result.seed)
+    return trajectory.assign(plant="nmfd")
 
 
 def predict_next(scenario: Scenario, result: Result, intervals: int = 1) -> Float[np.ndarray, "K R"]:
     """(T + 1 - intervals, R) [veh]: accumulations `intervals` ahead of every recorded state, by the regional model."""
-    trajectory, steps = result.trajectory, len(result.trajectory.perimeter)
+    trajectory, steps = result, len(result.perimeter)
     x = torch.from_numpy(trajectory.accumulation[: steps + 1 - intervals])
-    demand = torch.from_numpy(result.record["departures"] / scenario.step)
+    demand = torch.from_numpy(result["departures"] / scenario.step)
     perimeter, splits = torch.from_numpy(trajectory.perimeter), torch.from_numpy(trajectory.splits)
     p = parameters(scenario.network)
     for n in range(intervals):
@@ -100,13 +99,13 @@ def predict_next(scenario: Scenario, result: Result, intervals: int = 1) -> Floa
     return x.sum(-1).numpy()
 
 
-def errors(scenario: Scenario, result: Result, predicted: Trajectory) -> list[dict]:
+def errors(scenario: Scenario, result: Result, predicted: Result) -> list[dict]:
     """One row of COLUMNS per region, and one for all of them (region "all").
 
     rmse, bias: of the predicted accumulation over the whole run, model minus simulation; share: of the critical
     accumulation; next_interval: predicted from the recorded state one control interval before.
     """
-    simulated = result.trajectory.accumulation.sum(-1)
+    simulated = result.accumulation.sum(-1)
     whole = predicted.accumulation.sum(-1) - simulated
     ahead = predict_next(scenario, result) - simulated[1:]
     critical = scenario.network.critical
@@ -150,7 +149,7 @@ def _row(
 
 
 def outflow_samples(
-    trajectories: Sequence[Trajectory], records: Sequence[dict], u_max: float, region: int, adjacency: Adjacency
+    trajectories: Sequence[Result], records: Sequence[dict], u_max: float, region: int, adjacency: Adjacency
 ) -> dict[str, Points]:
     """MFD samples of one region: label -> (n, 2) of accumulation [veh] and outflow [veh/s].
 
@@ -226,24 +225,20 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
     """Compare, and add compare-<run>.csv and two pictures to the run folder; returns the rows of `errors`."""
     predicted = predict(scenario, result)
     rows = pd.DataFrame(errors(scenario, result, predicted), columns=COLUMNS)
-    name = run_folder.run_name(result.trajectory.controller, result.trajectory.seed)
+    name = run_folder.run_name(result.controller, result.seed)
     files.write_table(folder / f"compare-{name}.csv", rows)
     drawing, axes = plots.panels(scenario.network.regions + 1)
-    measured = run_metrics.regional_outflow(result.record, result.trajectory.step)
+    measured = run_metrics.regional_outflow(result, result.step)
     predicted_outflow = model_outflow(scenario.network)
     outflow = remembered(lambda t: measured if t.plant == "sumo" else predicted_outflow(t))
     for region, ax in enumerate(axes[:-1]):
-        plots.region_accumulation(ax, scenario.network, region, [result.trajectory, predicted], outflow=outflow)
-    plots.total_accumulation(
-        axes[-1], [replace(result.trajectory, backlog=np.zeros_like(result.trajectory.backlog)), predicted]
-    )
+        plots.region_accumulation(ax, scenario.network, region, [result, predicted], outflow=outflow)
+    plots.total_accumulation(axes[-1], [result.assign(backlog=np.zeros_like(result.backlog)), predicted])
     axes[-1].set_title("all regions", fontsize="medium")
     plots.legend_below(drawing, axes, columns=4)
     plots.save(drawing, folder / f"compare-{name}-accumulation.png")
     samples = [
-        outflow_samples(
-            [result.trajectory], [result.record], scenario.network.u_max, region, scenario.network.adjacency
-        )
+        outflow_samples([result], [result], scenario.network.u_max, region, scenario.network.adjacency)
         for region in range(scenario.network.regions)
     ]
     plots.draw_mfds(folder / f"compare-{name}-mfd.png", scenario.network, samples)

@@ -11,7 +11,7 @@ from cosim.sumo.net import City, Gateway, gateway_room_taken
 from cosim.sumo.tripinfo import TripFacts
 from nmfd.arrays import PerRegion
 from nmfd.metrics import gini
-from nmfd.types import Trajectory
+from nmfd.types import Result
 
 FULL = 0.8  # share of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards
 
@@ -28,7 +28,7 @@ def trip_facts(facts: TripFacts) -> dict:
     }
 
 
-def delay_gini(trajectory: Trajectory, record: Record, time_loss: PerRegion) -> float:
+def delay_gini(trajectory: Result, record: Record, time_loss: PerRegion) -> float:
     """Fairness over origins: the Gini coefficient (nmfd.metrics.gini) of the mean delays of regions of origin, each
     weighted by its trips.
 
@@ -78,7 +78,7 @@ def leaking_share(record: Record, city: City, leaks: Collection[Gateway]) -> flo
     return float(leaking / max(flow.sum(), 1))
 
 
-def regional_outflow(record: Mapping[str, np.ndarray], step: float) -> RegionCounts:
+def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> RegionCounts:
     """(T, R) [veh/s]: trips that ended in every region, and vehicles that went on to another one, by a record's arrays;
     step: control interval [s]"""
     return (record["arrivals"] + record["crossings"].sum(axis=(2, 3))) / step

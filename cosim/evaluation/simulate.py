@@ -6,10 +6,6 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
-import pandas as pd
 
 from cosim.evaluation import estimation_errors, run_metrics
 from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
@@ -23,28 +19,13 @@ from cosim.sumo.session import Window
 from nmfd import closed_loop, metrics
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
-from nmfd.html import html_table
 from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import Scenario, with_demand, with_faults, with_time_limit
 from nmfd.quantities import variables
 from nmfd.runs import run_folder
 from nmfd.runs.files import atomic
-from nmfd.types import Controller, Trajectory
+from nmfd.types import Controller, Result
 
-if TYPE_CHECKING:
-    import xarray
-
-SHOWN = (  # of FACTS, in notebooks
-    "trips",
-    "departed_veh",
-    "final_backlog_veh",
-    "removed_veh",
-    "teleports",
-    "mean_trip_time_s",
-    "co2_kg",
-    "gateway_queue_mean_veh",
-    "wall_time_s",
-)
 # Columns of sumo.csv, beside those of summary.csv, and what they say.
 FACTS = {
     "controller": "the strategy",
@@ -68,7 +49,6 @@ FACTS = {
     "leaking_share": "share of the flow over the boundaries that passes no signal under control",
     "estimate_rmse_share": "error of estimated accumulations, as a share of the critical ones",
     "estimate_cell_rmse_veh": "error of estimated accumulations by destination",
-    "wall_time_s": "of the run",
     "sumo_time_s": "of it, SUMO's own steps",
     "overhead_share": "of it, the share outside SUMO",
     "setup_time_s": "before the first interval",
@@ -105,39 +85,6 @@ class Task:
     def __post_init__(self) -> None:
         """A text will do for the scenario's folder."""
         object.__setattr__(self, "scenario", Path(self.scenario))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Result:
-    """trajectory; record: the fields of cosim.plant.record.Record; facts: a row of sumo.csv."""
-
-    trajectory: Trajectory
-    record: dict[str, np.ndarray]
-    facts: dict[str, float | int | str]
-
-    def to_frame(self) -> pd.DataFrame:
-        """The states as a table (nmfd.Trajectory.to_frame)."""
-        return self.trajectory.to_frame()
-
-    def to_xarray(self) -> "xarray.Dataset":
-        """Trajectory and record with named dimensions and units, facts as attributes."""
-        import xarray  # half a second of every worker's start
-
-        return xarray.Dataset(
-            {**self.trajectory.variables, **variables(Record, self.record)},
-            attrs={**self.facts, **self.trajectory.labels},
-        )
-
-    def _repr_html_(self) -> str:
-        """Regions and figures, for notebooks."""
-        return self.trajectory._repr_html_() + html_table(
-            ["sumo.csv", "value"],
-            (
-                [name, f"{value:.4g}" if isinstance(value, float) else value]
-                for name, value in self.facts.items()
-                if name in SHOWN
-            ),
-        )
 
 
 def scenario_of(task: Task) -> Scenario:
@@ -178,7 +125,7 @@ def simulate(
         window=window,
     )
     outside = registry.outside_training(variant, scenario, task.demand_factor, file=task.policy)
-    return replace(result, facts={**result.facts, "outside_training": outside})
+    return result.assign(outside_training=outside)
 
 
 def drive(
@@ -223,8 +170,6 @@ def drive(
         trajectory = settled(trajectory, record)
         backlog = trajectory.backlog.sum(axis=(1, 2))
         row = {
-            "controller": strategy.name,
-            "seed": seed,
             "trips": trips,
             "departed_veh": int(record.departures.sum()),
             "final_backlog_veh": int(backlog[-1]),
@@ -237,7 +182,6 @@ def drive(
             "outside_training": "",
             "leaking_share": run_metrics.leaking_share(record, plant.city, leaks),
             **_estimation(scenario, trajectory),
-            "wall_time_s": trajectory.wall_time,
             "sumo_time_s": sumo_time,
             "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
             "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
@@ -250,10 +194,10 @@ def drive(
             **plant.pressure_facts(),
         }
         check_whole(files)
-    return Result(trajectory=trajectory, record=asdict(record), facts=row)
+    return trajectory.add(variables(Record, asdict(record)), row)
 
 
-def _estimation(scenario: Scenario, trajectory: Trajectory) -> dict[str, float]:
+def _estimation(scenario: Scenario, trajectory: Result) -> dict[str, float]:
     """Errors of the estimate, over all regions; NaN where the controller saw the exact state."""
     if not trajectory.estimated:
         return {"estimate_rmse_share": math.nan, "estimate_cell_rmse_veh": math.nan}

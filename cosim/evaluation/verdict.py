@@ -17,9 +17,9 @@ from nmfd.runs import files
 def of_runs(network: RegionalModel, results: Sequence[Result]) -> Verdict:
     """Of the city of `network`, by runs in which no gateway was closed."""
     critical = network.critical
-    most = np.max([result.trajectory.accumulation.sum(axis=2).max(axis=0) for result in results], axis=0) / critical
-    started = np.sum([result.record["departures"].sum(axis=(0, 2)) for result in results], axis=0)
-    where = f"in {len(results)} loading run{'s' * (len(results) > 1)} under {results[0].trajectory.controller}"
+    most = np.max([result.accumulation.sum(axis=2).max(axis=0) for result in results], axis=0) / critical
+    started = np.sum([result["departures"].sum(axis=(0, 2)) for result in results], axis=0)
+    where = f"in {len(results)} loading run{'s' * (len(results) > 1)} under {results[0].controller}"
     seen = boundaries(city_of(network), results)
     return authority.verdict(network, seen, most=most, started=started.astype(float), where=where)
 
@@ -31,8 +31,8 @@ def boundaries(city: City, results: Sequence[Result]) -> Boundaries:
     count, controllable = np.zeros(shape, dtype=int), np.zeros(shape, dtype=int)
     for n, gateway in enumerate(city.gateways):
         pair = gateway.source, gateway.target
-        reached = not np.isnan(results[0].record["gateway_original_green"][0, n])
-        passed = sum(float(result.record["gateway_flow"][:, n].sum()) for result in results)
+        reached = not np.isnan(results[0]["gateway_original_green"][0, n])
+        passed = sum(float(result["gateway_flow"][:, n].sum()) for result in results)
         count[pair] += 1
         flow[pair] += passed
         controllable[pair] += reached

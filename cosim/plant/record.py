@@ -1,6 +1,6 @@
 """What a run in SUMO leaves behind, beside its trajectory."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from cosim.plant.meter import Meter
 from cosim.plant.sampling import StreetMeans
 from cosim.sumo.arrays import EdgesOverTime, GatewaysOverTime, PairCounts, RegionCounts, Series, TurnCounts
 from nmfd.quantities import quantity
-from nmfd.types import Trajectory
+from nmfd.types import Result
 
 BOOKS = ("departures", "arrivals", "removals", "given_up", "crossings", "jumps", "redirected")  # of the meter
 
@@ -79,7 +79,7 @@ class Record:
     )
 
 
-def settled(trajectory: Trajectory, record: Record) -> Trajectory:
+def settled(trajectory: Result, record: Record) -> Result:
     """What became of vehicles as the closed books have it, for where SUMO told late (cosim.plant.meter). Who was taken
     out in the last step, too, is no longer there at the end."""
 
@@ -89,8 +89,7 @@ def settled(trajectory: Trajectory, record: Record) -> Trajectory:
     moved, redirected = (record.crossings + record.jumps).sum(axis=0), record.redirected.sum(axis=0)
     inside = (record.departures - record.removals).sum(axis=0) - np.diag(record.arrivals.sum(axis=0))
     inside = inside + moved.sum(axis=0) - moved.sum(axis=1) + redirected.sum(axis=1) - redirected.sum(axis=2)
-    return replace(
-        trajectory,
+    return trajectory.assign(
         accumulation=np.concatenate([trajectory.accumulation[:-1], inside[None].astype(float)]),
         completed=since_start(record.arrivals.sum(axis=1)),
         removed=since_start(record.removals + record.given_up),

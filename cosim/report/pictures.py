@@ -7,7 +7,6 @@ import numpy as np
 import pandas as pd
 
 from cosim.evaluation import experiment, model_validation, statistics
-from cosim.evaluation.simulate import Result
 from cosim.report import figures
 from cosim.sumo.net import City, city_of
 from nmfd.model.regional_model import RegionalModel
@@ -15,7 +14,7 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
 from nmfd.studies import plots
 from nmfd.studies.benchmark import draw_accumulations
-from nmfd.types import Trajectory
+from nmfd.types import Result
 
 PANELS = 11  # boundaries, or pairs of region and destination, that are shown one by one
 FEW = 5  # trips of one region; so many wait at any time for a gap in traffic
@@ -54,13 +53,15 @@ def draw(folder: Path, scenario: Scenario, city: City | None, rows: pd.DataFrame
     )
     if city is None:
         return
-    results = [run for run in recorded(folder, rows, seed).values() if set(DRAWN) <= set(run.record)]  # best first
+    results = [
+        run for run in recorded(folder, rows, seed).values() if set(DRAWN) <= set(run.data.data_vars)
+    ]  # best first
     if gating := next((run for run in results if acts(run, scenario.network)), None):
         perimeter(out / "perimeter.png", city, scenario.network, gating, note)
-    if guiding := next((run for run in results if run.record["guided"].sum() > 0), None):
+    if guiding := next((run for run in results if run["guided"].sum() > 0), None):
         splits(out / "splits.png", scenario.network, guiding, note)
-    if telling := next((run for run in results if run.trajectory.prices.any()), None):
-        prices(out / "prices.png", scenario.network, telling.trajectory, note)
+    if telling := next((run for run in results if run.prices.any()), None):
+        prices(out / "prices.png", scenario.network, telling, note)
 
 
 def recorded(folder: Path, rows: pd.DataFrame, seed: int) -> dict[str, Result]:
@@ -71,7 +72,7 @@ def recorded(folder: Path, rows: pd.DataFrame, seed: int) -> dict[str, Result]:
 
 def acts(result: Result, network: RegionalModel) -> bool:
     """Whether a gateway was ever commanded to less than its original programme."""
-    return bool((result.trajectory.perimeter[:, network.adjacency] < network.u_max - 1e-9).any())
+    return bool((result.perimeter[:, network.adjacency] < network.u_max - 1e-9).any())
 
 
 def ranked(rows: pd.DataFrame) -> list[str]:
@@ -107,7 +108,7 @@ def teleports(rows: pd.DataFrame) -> str:
 def perimeter(path: Path, city: City, network: RegionalModel, result: Result, note: str) -> None:
     """Commanded u against green and flow: the boundaries that were closed most over time, and all in one cloud; no
     picture of a city without a signal under control."""
-    trajectory, record = result.trajectory, result.record
+    trajectory, record = result, result
     pairs = {}
     for pair in map(tuple, np.argwhere(network.adjacency)):
         members = [
@@ -142,7 +143,7 @@ def perimeter(path: Path, city: City, network: RegionalModel, result: Result, no
 def splits(path: Path, network: RegionalModel, result: Result, note: str) -> None:
     """Commanded theta against the shares that went there: the busiest choices over time, and all in one cloud; no
     picture where there is nothing to choose, as with two regions."""
-    trajectory, crossings = result.trajectory, result.record["crossings"].astype(float)
+    trajectory, crossings = result, result["crossings"].astype(float)
     leaving = crossings.sum(axis=2)  # (T, R, R), from i bound for j
     choices = [
         (i, j)
@@ -183,7 +184,7 @@ def splits(path: Path, network: RegionalModel, result: Result, note: str) -> Non
     plots.save(drawing, path)
 
 
-def prices(path: Path, network: RegionalModel, trajectory: Trajectory, note: str) -> None:
+def prices(path: Path, network: RegionalModel, trajectory: Result, note: str) -> None:
     """By how much longer ways through each region were told, and the trips that waited to begin there, over time."""
     told, waiting = 100.0 * trajectory.prices, trajectory.backlog[1:].sum(axis=2)
     shown = [np.flatnonzero(told.max(axis=0) > 0.0).tolist(), np.flatnonzero(waiting.max(axis=0) > FEW).tolist()]
@@ -243,9 +244,7 @@ def outflows(path: Path, network: RegionalModel, results: dict[str, Result]) -> 
     samples = []
     for region in range(network.regions):
         clouds = {
-            name: model_validation.outflow_samples(
-                [result.trajectory], [result.record], network.u_max, region, network.adjacency
-            )
+            name: model_validation.outflow_samples([result], [result], network.u_max, region, network.adjacency)
             for name, result in results.items()
         }
         samples.append({name: np.concatenate(list(parts.values())) for name, parts in clouds.items()})

@@ -33,7 +33,7 @@ def chosen(finished: Finished, reference: str | None = None, seed: int | None = 
     picture, runs = CityPicture.of(finished.scenario, finished.map()), {}
     for name in reversed(names):
         result = read_run(level.folder, name, seed)
-        runs[name] = frames(picture, result.trajectory, result.record)
+        runs[name] = frames(picture, result)
     picture = replace(picture, steps=max(map(len, runs.values())) - 1)
     return Shown(names=tuple(runs), seed=seed, replay=replay.embedded(picture, runs))
 

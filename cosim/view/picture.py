@@ -17,7 +17,7 @@ from cosim.sumo.arrays import EdgeNumbers, PerEdge, PerGateway, Points
 from cosim.sumo.net import City, edge_shapes
 from nmfd.arrays import PerPair, PerRegion
 from nmfd.model.scenario import Scenario
-from nmfd.types import Controls, State, Trajectory
+from nmfd.types import Controls, Result, State
 
 CURVE = 60  # points of an MFD
 BLOCKS = 0.06  # of the map's extent: no hole in a region
@@ -206,7 +206,7 @@ def after(
     )
 
 
-def frames(picture: CityPicture, trajectory: Trajectory, record: Mapping[str, np.ndarray]) -> list[Frame]:
+def frames(picture: CityPicture, trajectory: Result) -> list[Frame]:
     """Of a finished run, one at its beginning and one at the end of every control interval."""
     states = [
         State(
@@ -219,7 +219,8 @@ def frames(picture: CityPicture, trajectory: Trajectory, record: Mapping[str, np
         )
         for k in range(len(trajectory.accumulation))
     ]
-    found = [first(picture, record["gateway_green"].shape[1], states[0])]
+    record = {name: x.values for name, x in trajectory.data.data_vars.items() if x.dims[0] == "interval"}
+    found = [first(picture, trajectory.gateway_green.shape[1], states[0])]
     for k, state in enumerate(states[1:]):
         controls = Controls(perimeter=trajectory.perimeter[k], splits=None, note=trajectory.note[k])
         row = {name: values[k] for name, values in record.items()}

@@ -136,7 +136,6 @@ def train(
     from nmfd.api import load_scenario  # heavy
     from nmfd.controllers.dpc import rollout, training
     from nmfd.runs import shipped
-    from nmfd.runs.files import file_name
 
     loaded = load_scenario(scenario)
     device = training.available(device)

@@ -1,8 +1,8 @@
 """Run folders as Parquet files, for pandas, DuckDB, R and the like.
 
 summary.parquet     one row per run: summary.csv, in SUMO with sumo.csv
-states.parquet      one row per run, time and pair of regions (Trajectory.to_frame)
-controls.parquet    one row per run, control interval and pair of regions (Trajectory.controls_frame)
+states.parquet      one row per run, time and pair of regions (Result.to_frame)
+controls.parquet    one row per run, control interval and pair of regions (Result.controls_frame)
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,10 +12,10 @@ import pandas as pd
 
 from nmfd.runs import trail
 from nmfd.runs.files import atomic
-from nmfd.types import Trajectory
+from nmfd.types import Result
 
 
-def write(folder: Path, trajectories: Sequence[Trajectory], tables: Mapping[str, pd.DataFrame]) -> list[Path]:
+def write(folder: Path, trajectories: Sequence[Result], tables: Mapping[str, pd.DataFrame]) -> list[Path]:
     """Write `tables` by name, and those of the trajectories, to `folder`, atomically; the files."""
     frames = {
         **tables,

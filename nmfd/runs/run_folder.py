@@ -2,116 +2,31 @@
 
 <folder>/manifest.json              configuration, controllers, and seeds, versions and commit of every session
 <folder>/summary.csv                one row per finished run (metrics.summary)
-<folder>/<controller>-<seed>.nc     all else of it (nmfd.types.Trajectory, in SUMO cosim.plant.record.Record too)
+<folder>/<controller>-<seed>.nc     all else of it (nmfd.types.Result, in SUMO cosim.plant.record.Record too)
                                     but wall times, so that the same run gives the same bytes; a netCDF file:
                                     xarray.open_dataset, with dimensions, units and long names
 """
 
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
-import netCDF4
-import numpy as np
-
 from nmfd.errors import InputError
 from nmfd.metrics import SUMMARY, summary
-from nmfd.quantities import quantities
 from nmfd.runs import files, trail
-from nmfd.types import Trajectory
+from nmfd.types import Result
 
 COLUMNS = {name: kind for name, (kind, _) in SUMMARY.items()}
 LOCK = ".lock"  # of a run folder
-YOUNGER = {"removed", "prices"}  # quantities that older runs do not have
-# What reading raises for a file that is no netCDF, cut off, changed, or without a variable that it should have.
-DAMAGED = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError, MemoryError)
 
 
-def write_trajectory(path: Path, trajectory: Trajectory, record: Mapping[str, tuple] | None = None) -> None:
-    """All of `trajectory` but its wall times in a netCDF file, atomically. Raises InputError if it cannot be written.
-
-    record: more variables (nmfd.quantities.variables). Not by way of xarray: after Ctrl-C in the middle of it, it waits
-    for a lock of its own for ever.
-
-        >>> import tempfile
-        >>> run = nmfd.run("economic_mpc", "no-control", steps=2)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     nmfd.write_trajectory(Path(folder, "run.nc"), run)
-        ...     bool((nmfd.read_trajectory(Path(folder, "run.nc")).accumulation == run.accumulation).all())
-        True
-    """
-    content = {**trajectory.variables, **(record or {})}
-    del content["decision_time"]
-    with files.atomic(path) as temporary:
-        try:
-            with netCDF4.Dataset(temporary, "w") as file:
-                file.setncatts(trajectory.labels)
-                for name, variable in content.items():
-                    _write_variable(file, name, *variable)
-        except RuntimeError as error:  # netCDF does not hand on what the system says
-            raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from None
-
-
-def _write_variable(
-    file: netCDF4.Dataset, name: str, axes: str | Sequence[str], values: np.ndarray, attributes: Mapping
-) -> None:
-    dimensions, text = np.atleast_1d(axes), values.dtype.kind == "U"
-    if values.dtype == np.float16:  # netCDF has none; compressed it takes no more room
-        values = values.astype(np.float32)
-    for dimension, size in zip(dimensions, values.shape, strict=True):
-        if dimension not in file.dimensions:
-            file.createDimension(dimension, size)
-    variable = file.createVariable(name, str if text else values.dtype, dimensions, zlib=not text)
-    variable.setncatts(attributes)
-    variable[...] = values.astype(object) if text else values
-
-
-def read_trajectory(path: Path) -> Trajectory:
-    """What `write_trajectory` wrote; the wall times, which are in summary.csv, are NaN. Raises InputError."""
-    with opened(path) as file:
-        return trajectory_in(file)
-
-
-def trajectory_in(file: netCDF4.Dataset) -> Trajectory:
-    """That of a run's file (`opened`)."""
-    arrays = {
-        name: file[name][...]
-        for name in quantities(Trajectory)
-        if name != "decision_time" and (name in file.variables or name not in YOUNGER)
-    }
-    arrays["note"] = tuple(arrays["note"])
-    return Trajectory(
-        controller=file.controller,
-        plant=file.plant,
-        seed=int(file.seed),
-        step=float(file.step),
-        estimated=bool(file.estimated),
-        decision_time=np.full(len(arrays["note"]), math.nan),
-        wall_time=math.nan,
-        **arrays,
-    )
-
-
-@contextmanager
-def opened(path: Path) -> Iterator[netCDF4.Dataset]:
-    """The file of a run. Raises InputError, also where the body finds something missing."""
-    files.check_file(path, "delete it and run it again")
-    try:
-        with netCDF4.Dataset(path) as file:
-            file.set_auto_mask(False)
-            yield file
-    except FileNotFoundError:
-        refuse_old(Path(path).parent)
-        raise InputError(f"{path}: no such run; choose one of {Path(path).parent / 'summary.csv'}, or run it") from None
-    except DAMAGED as error:
-        problem = getattr(error, "strerror", None) or str(error).partition("\n")[0]
-        raise InputError(f"{path}: is no run ({problem}); delete it and run it again") from None
+def read_trajectory(path: Path) -> Result:
+    """Return the run in the netCDF file `path`. Raises InputError."""
+    return Result.read(path)
 
 
 def refuse_old(folder: Path) -> None:
@@ -174,7 +89,7 @@ def default_folder(scenario: str) -> Path:
     return next(folder for folder in candidates if not folder.exists())
 
 
-def trajectories(folder: Path) -> list[Trajectory]:
+def trajectories(folder: Path) -> list[Result]:
     """The runs in summary.csv of a run folder. Raises InputError."""
     rows = read_summary(folder / "summary.csv")
     return [read_trajectory(run_path(folder, row["controller"], row["seed"])) for row in rows]
@@ -202,18 +117,19 @@ class RunFolder:
         """Its file, there or not."""
         return run_path(self.path, controller, seed)
 
-    def add(self, trajectory: Trajectory, record: Mapping[str, tuple] | None = None) -> None:
-        """Write a finished run at once: its file (`write_trajectory`), then summary.csv, which makes it count."""
-        run = trajectory.controller, trajectory.seed
-        write_trajectory(self.trajectory_path(*run), trajectory, record)
-        self._rows[run] = summary(trajectory)
+    def add(self, result: Result) -> None:
+        """Write a finished run at once: its file, then summary.csv, which makes it count."""
+        run = result.controller, result.seed
+        result.write(self.trajectory_path(*run))
+        row = summary(result)
+        self._rows[run] = {name: row[name] for name in COLUMNS}
         write_summary(self.path / "summary.csv", self.rows())
 
     def rows(self) -> list[dict]:
         """The rows of summary.csv, one per finished run."""
         return [self._rows[run] for run in self._order if run in self._rows]
 
-    def trajectories(self) -> list[Trajectory]:
+    def trajectories(self) -> list[Result]:
         """The finished runs."""
         return [read_trajectory(self.trajectory_path(*run)) for run in self.finished]
 
@@ -358,6 +274,6 @@ def _continued(manifest_path: Path, configuration: Mapping, controllers: Mapping
     return sessions, {**known, **controllers}, changed
 
 
-def labelled(trajectory: Trajectory, *, controller: str, plant: str) -> Trajectory:
-    """`trajectory` under the names of the command line, which summary.csv shows."""
-    return replace(trajectory, controller=controller, plant=plant)
+def labelled(result: Result, *, controller: str, plant: str) -> Result:
+    """`result` under the names of the command line, which summary.csv shows."""
+    return result.assign(controller=controller, plant=plant)

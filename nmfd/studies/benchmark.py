@@ -19,7 +19,7 @@ from nmfd.runs.tally import Tally
 from nmfd.runs.workers import Failure, Source, Worker, attempt, ended, outcomes
 from nmfd.studies import plots
 from nmfd.studies.traffic_states import OutflowOf, model_outflow, remembered
-from nmfd.types import Plant, Trajectory
+from nmfd.types import Plant, Result
 
 PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
@@ -46,7 +46,7 @@ def run_one(
     policies: Mapping[str, Path],
     noise: Noise | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Trajectory:
+) -> Result:
     """The closed loop of `run` = (controller, seed), on one thread; the controller knows nothing of the `noise`."""
     name, seed = run
     controller, actual = registry.make(name, scenario, policy=policies.get(name)), happening(scenario, noise, seed)
@@ -216,7 +216,7 @@ def _apart(run: tuple) -> str:
     return name if registry.runs_apart(name) else ""
 
 
-def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -> None:
+def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Result]) -> None:
     """The paper's figures of `trajectories` and of their scenario, as png files in `folder`."""
     draw_accumulations(folder, scenario, trajectories)
     draw_scenario(folder, scenario)
@@ -225,7 +225,7 @@ def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Trajectory]) -
 def draw_accumulations(
     folder: Path,
     scenario: Scenario,
-    trajectories: Sequence[Trajectory],
+    trajectories: Sequence[Result],
     *,
     seed: int | None = None,
     title: str | None = None,

@@ -25,7 +25,7 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import trail
 from nmfd.runs.files import atomic
 from nmfd.studies.traffic_states import LOOKS, OutflowOf, draw_strips, states
-from nmfd.types import Trajectory
+from nmfd.types import Result
 
 # Colours that stay apart for colour-blind readers and on coloured zones.
 CONTROLLER_COLOURS = {
@@ -123,7 +123,7 @@ def optimal_band(mfd: Mfd) -> tuple[float, float]:
     return float(inside[0]), float(inside[-1])
 
 
-def total_accumulation(ax: Axes, trajectories: Sequence[Trajectory], seed: int | None = None) -> Axes:
+def total_accumulation(ax: Axes, trajectories: Sequence[Result], seed: int | None = None) -> Axes:
     """Vehicles in the network, with those that wait to enter, over time. seed: shown instead of the mean over seeds."""
     _curves(ax, trajectories, lambda t: t.accumulation.sum(axis=(1, 2)) + t.backlog.sum(axis=(1, 2)), seed)
     ax.set_ylabel("vehicles in the network [veh]")
@@ -135,7 +135,7 @@ def region_accumulation(
     ax: Axes,
     network: RegionalModel,
     region: int,
-    trajectories: Sequence[Trajectory],
+    trajectories: Sequence[Result],
     seed: int | None = None,
     outflow: OutflowOf | None = None,
 ) -> Axes:
@@ -171,10 +171,10 @@ def region_accumulation(
 
 
 def _strips(
-    ax: Axes, mfd: Mfd, region: int, trajectories: Sequence[Trajectory], seed: int | None, outflow: OutflowOf | None
+    ax: Axes, mfd: Mfd, region: int, trajectories: Sequence[Result], seed: int | None, outflow: OutflowOf | None
 ) -> float:
     """The strips of a region; returns the share of `ax` below them."""
-    chosen: dict[tuple[str, str], Trajectory] = {}
+    chosen: dict[tuple[str, str], Result] = {}
     for t in sorted(trajectories, key=lambda t: t.seed != seed):  # stable: the first where none has the seed
         chosen.setdefault((t.controller, t.plant), t)
     known = {key: out for key, t in chosen.items() if (out := outflow(t) if outflow else None) is not None}
@@ -195,7 +195,7 @@ def _strips(
 
 
 def region_estimate(
-    ax: Axes, network: RegionalModel, region: int, trajectory: Trajectory, outflow: OutflowOf | None = None
+    ax: Axes, network: RegionalModel, region: int, trajectory: Result, outflow: OutflowOf | None = None
 ) -> Axes:
     """Accumulation of one region over time, and the estimate of it that the controller saw."""
     estimate = replace(trajectory, accumulation=trajectory.observed, plant="estimate")
@@ -383,10 +383,10 @@ def demand(ax: Axes, scenario: Scenario) -> Axes:
 
 
 def _curves(
-    ax: Axes, trajectories: Sequence[Trajectory], quantity: Callable[[Trajectory], np.ndarray], seed: int | None = None
+    ax: Axes, trajectories: Sequence[Result], quantity: Callable[[Result], np.ndarray], seed: int | None = None
 ) -> None:
     """One curve per controller and plant: the mean over its seeds, or one `seed`, and their range as a shade."""
-    groups: dict[tuple[str, str], list[Trajectory]] = {}
+    groups: dict[tuple[str, str], list[Result]] = {}
     for trajectory in trajectories:
         groups.setdefault((trajectory.controller, trajectory.plant), []).append(trajectory)
     plants = list(dict.fromkeys(plant for _, plant in groups))

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from nmfd.model import dynamics
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
-from nmfd.types import Trajectory
+from nmfd.types import Result
 
 WINDOW = 3  # control intervals over which accumulation and outflow are averaged: single ones are noisy
 NEAR = 0.9  # of the largest outflow: near capacity
@@ -29,7 +29,7 @@ COUNTED = 30.0  # vehicles that left at the largest outflow: with fewer, less ma
 STRIP, STRIPS = 0.045, 0.3  # height of a strip, and of all together at most, as shares of the axes
 
 RegionalOutflow = Float[np.ndarray, "T R"]
-OutflowOf = Callable[[Trajectory], RegionalOutflow | None]
+OutflowOf = Callable[[Result], RegionalOutflow | None]
 
 
 class TrafficState(IntEnum):
@@ -97,7 +97,7 @@ def model_outflow(network: RegionalModel) -> OutflowOf:
     itself."""
     p = dynamics.parameters(network)
 
-    def outflow(trajectory: Trajectory) -> RegionalOutflow | None:
+    def outflow(trajectory: Result) -> RegionalOutflow | None:
         if trajectory.plant not in ("nmfd", "acyclic"):
             return None
         x, u, theta = (
@@ -114,7 +114,7 @@ def remembered(outflow: OutflowOf) -> OutflowOf:
     """The same, asked once per run: pictures ask for every region."""
     known: dict[tuple[str, str, int], RegionalOutflow | None] = {}
 
-    def once(trajectory: Trajectory) -> RegionalOutflow | None:
+    def once(trajectory: Result) -> RegionalOutflow | None:
         key = trajectory.controller, trajectory.plant, trajectory.seed
         if key not in known:
             known[key] = outflow(trajectory)

@@ -112,7 +112,7 @@ def _import(folder: str) -> None:
 def _run(folder: str, controller: str) -> dict:
     """One run, in a process of its own; processor time [s], memory [GB], and what `simulate` measured."""
     begin = time.process_time()
-    facts = simulate(Task(scenario=Path(folder) / "scenarios" / "grid", controller=controller, seed=0)).facts
+    facts = simulate(Task(scenario=Path(folder) / "scenarios" / "grid", controller=controller, seed=0)).data.attrs
     return {
         "cpu_s": time.process_time() - begin,
         "memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
