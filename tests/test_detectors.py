@@ -169,7 +169,7 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
 def test_same_seed_same_bytes(scenario, run, tmp_path):
     again = drive(scenario, measurement="estimate")
     for name, trajectory in (("a", run), ("b", again)):
-        run_folder.write_trajectory(tmp_path / f"{name}.nc", trajectory)
+        trajectory.write(tmp_path / f"{name}.nc")
     assert (tmp_path / "a.nc").read_bytes() == (tmp_path / "b.nc").read_bytes()
     assert (run_folder.read_trajectory(tmp_path / "a.nc").observed == run.observed).all()
 

@@ -158,7 +158,7 @@ def _window(task: "Task", delay: float | None) -> None:
     except LOST:
         click.echo("The window was closed before the end.")
         return
-    _tell(task.controller, task.seed, result.trajectory)
+    _tell(task.controller, task.seed, result)
 
 
 def _tell(controller: str, seed: int, trajectory: "Result") -> None:
