@@ -10,9 +10,7 @@ from click.testing import CliRunner, Result
 
 from cosim.cli.main import main as main_of_cosim
 from nmfd.cli.main import main as main_of_nmfd
-from nmfd.runs import progress
 
-progress.EVERY = 3600.0  # on a slow machine its lines would come between those that a test looks at
 MAINS = {"nmfd": main_of_nmfd, "cosim": main_of_cosim}
 
 

@@ -47,7 +47,7 @@ def test_every_controller_runs(small, tmp_path, controller):
     out = tmp_path / "run"
     text = good(cosim("run", small, "--controller", controller, "--steps", STEPS, "--out", out))
     summary, facts = pd.read_csv(out / "summary.csv"), pd.read_csv(out / "sumo.csv")
-    assert list(summary.columns) == [*COLUMNS, "trail"] and len(summary) == len(facts) == 1
+    assert list(summary.columns) == [*COLUMNS] and len(summary) == len(facts) == 1
     assert summary.loc[0, "plant"] == "sumo" and summary.loc[0, "solver_failures"] == 0
     assert 0 < facts.loc[0, "overhead_share"] < 1 and "outside SUMO" in text and controller in text
     assert facts.loc[0, "departed_veh"] - summary.loc[0, "completed_veh"] == summary.loc[0, "final_accumulation_veh"]

@@ -17,7 +17,7 @@ from cosim.evaluation import experiment, explain, statistics
 from cosim.evaluation.simulate import Task
 from nmfd.api import load_scenario
 from nmfd.errors import InputError, did_you_mean
-from nmfd.runs import files, trail
+from nmfd.runs import files
 from nmfd.runs.workers import ended
 
 
@@ -95,8 +95,7 @@ def evaluate(
         remarks = "".join(f"- {line}\n" for line in experiment.remarks(rows))
         files.write_text(
             out / "evaluate.md",
-            "\n".join(filter(None, (statistics.markdown(table, evaluation.reference), remarks, why)))
-            + trail.comment(out / "evaluate.md"),
+            "\n".join(filter(None, (statistics.markdown(table, evaluation.reference), remarks, why))),
         )
     if failures and table.empty and all(failure.mistake for _, failure in failures):
         raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])

@@ -14,7 +14,7 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from nmfd.metrics import COUNTED, percent_change
-from nmfd.runs import files, trail
+from nmfd.runs import files
 from nmfd.runs.tables import markdown_table, text_table, wrapped
 from nmfd.studies import benchmark
 from nmfd.studies.benchmark import REFERENCE, interval
@@ -273,7 +273,7 @@ def write_tables(folder: Path, rows: pd.DataFrame, reference: str | None = None)
     table = statistics(rows, reference)
     for name, content in (("runs.csv", rows), ("evaluate.csv", table), ("pairs.csv", pairs(rows))):
         files.write_table(folder / name, content)
-    files.write_text(folder / "evaluate.md", markdown(table, reference) + trail.comment(folder / "evaluate.md"))
+    files.write_text(folder / "evaluate.md", markdown(table, reference))
     return table
 
 

@@ -13,7 +13,6 @@ from cosim.importing.quality import Tables
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers, PerEdge
 from nmfd.arrays import Positions
-from nmfd.runs import trail
 from nmfd.studies import plots
 
 
@@ -37,7 +36,7 @@ def draw_map(
         lines = _streets(axes[1], streets, array=np.minimum(density, 120.0), cmap="viridis_r")
         drawing.colorbar(lines, ax=axes[1], shrink=0.7, label="density [veh per lane-km]")
         axes[1].set_title("busiest quarter of an hour, no control", fontsize="medium")
-    drawing.savefig(path, dpi=130, metadata={"Software": None, **trail.metadata(path)})
+    drawing.savefig(path, dpi=130, metadata={"Software": None})
 
 
 def region_map(ax: Axes, streets: Streets, regions: EdgeNumbers, names: Sequence[str], places: Positions) -> Axes:

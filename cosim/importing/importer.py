@@ -22,7 +22,6 @@ from cosim.sumo.net import City, load_city
 from nmfd.errors import InputError
 from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs.files import synced
 from nmfd.runs.scratch import LOCK, Scratch
 
 LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
@@ -247,9 +246,7 @@ def _folders(order: ImportOptions) -> Iterator[tuple[Path, Path]]:
                 (folder / GUIDED / "network.toml").unlink(missing_ok=True)
             for file in sorted(temporary.iterdir(), key=lambda file: (file.suffix == ".toml", file.name)):
                 if file.name != LOCK:
-                    synced(file)
                     os.replace(file, folder / file.name)
-                    synced(folder)
 
 
 def _probe(

@@ -10,7 +10,6 @@ from typing import Any, NoReturn
 import click
 
 from nmfd.errors import InputError, RunFailed
-from nmfd.runs import command
 
 
 class Interrupted(Exception):
@@ -37,8 +36,7 @@ class Commands(click.Group):
         with _told_to_end() as told:
             try:
                 _check_texts(arguments)
-                with command.called(self.name or "", arguments):
-                    result = super().main(arguments, self.name, **extra)
+                result = super().main(arguments, self.name, **extra)
                 if signal.SIGTERM in told:  # a command that makes do with what it has found
                     raise Interrupted("interrupted")
             except (Exception, KeyboardInterrupt) as error:

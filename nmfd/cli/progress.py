@@ -6,7 +6,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nmfd.cli.errors import Interrupted
-from nmfd.runs.progress import Show, progress_line
+from nmfd.runs.progress import Show
+from nmfd.runs.progress import watched as progress_line
 
 __all__ = ["progress_line", "resumable"]
 

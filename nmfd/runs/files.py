@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 from filelock import FileLock, Timeout
 
 from nmfd.errors import InputError
-from nmfd.runs import trail
 
 if TYPE_CHECKING:  # heavy
     import pandas as pd
@@ -28,37 +27,19 @@ TEMPORARY = re.compile(r"\.(?P<stem>.+)-\d+\.tmp(\.\w+)?")  # names that `atomic
 def atomic(path: Path) -> Iterator[Path]:
     """A temporary name in the folder of `path` to write to; it becomes `path` if all goes well, else it goes.
 
-    The suffix of `path` is kept, because matplotlib and NumPy choose the format by it. A process that is killed leaves
-    the temporary file behind; `sweep` removes it. After a power loss `path` is what it was before or what it became,
-    never empty, and with the end of the block it stays: that takes about 10 ms.
+    The suffix of `path` is kept, because matplotlib and NumPy choose the format by it.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary
-        synced(temporary)
         os.replace(temporary, path)
-        synced(path.parent)
     except BaseException as error:
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):  # a full disk is met without a name
             error.filename = str(path)
         with suppress(OSError):
             temporary.unlink()
         raise
-
-
-def synced(path: Path) -> None:
-    """Have what is in a file, or the names in a folder, on the disk."""
-    if os.name == "nt" and path.is_dir():  # no such thing
-        return
-    handle = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):  # a file system that cannot
-            raise
-    finally:
-        os.close(handle)
 
 
 def sweep(folder: Path, stems: Collection[str] | None = None) -> None:
@@ -115,20 +96,18 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_table(path: Path, frame: "pd.DataFrame", **options: str) -> None:
-    """`frame` as a csv file with its trail (nmfd.runs.trail), atomically; options: of DataFrame.to_csv."""
-    if len(frame):
-        frame = frame.assign(**{trail.COLUMN: [trail.text(trail.of(path)), *[""] * (len(frame) - 1)]})
+    """`frame` as a csv file, atomically; options: of DataFrame.to_csv."""
     write_text(path, frame.to_csv(index=False, **options))
 
 
 def read_table(path: Path, types: Mapping[str, type], remedy: str, columns: Collection[str] = ()) -> "pd.DataFrame":
-    """A table of runs as `write_table` wrote it, without its trail. types: of some columns; columns: those to be added,
+    """A table of runs as `write_table` wrote it. types: of some columns; columns: those to be added,
     with NaN, where an older version did not write them. Raises InputError."""
     import pandas as pd  # heavy
 
     check_file(path, remedy)
     try:
-        rows = pd.read_csv(path).drop(columns=trail.COLUMN, errors="ignore")
+        rows = pd.read_csv(path)
         missing = [name for name in columns if name not in rows.columns]
         return rows.reindex(columns=[*rows.columns, *missing]).astype(types)
     except FileNotFoundError:
@@ -138,11 +117,11 @@ def read_table(path: Path, types: Mapping[str, type], remedy: str, columns: Coll
 
 
 def write_rows(path: Path, columns: Mapping[str, type], rows: Sequence[Mapping]) -> None:
-    """`rows` as a csv file with `columns` and their trail (nmfd.runs.trail), atomically."""
+    """`rows` as a csv file with `columns`, atomically."""
     with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=[*columns, trail.COLUMN], lineterminator="\n")
+        writer = csv.DictWriter(file, fieldnames=[*columns], lineterminator="\n")
         writer.writeheader()
-        writer.writerows([{**row, trail.COLUMN: "" if n else trail.text(trail.of(path))} for n, row in enumerate(rows)])
+        writer.writerows(rows)
 
 
 def read_rows(path: Path, columns: Mapping[str, type]) -> list[dict]:
@@ -151,7 +130,7 @@ def read_rows(path: Path, columns: Mapping[str, type]) -> list[dict]:
     try:
         with Path(path).open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
-            if [name for name in reader.fieldnames or () if name != trail.COLUMN] != list(columns):
+            if list(reader.fieldnames or ()) != list(columns):
                 raise ValueError(f"expected the columns {', '.join(columns)}")
             return [{name: convert(row[name]) for name, convert in columns.items()} for row in reader]
     except FileNotFoundError:

@@ -17,7 +17,8 @@ from urllib.parse import quote
 
 from nmfd.errors import InputError
 from nmfd.metrics import SUMMARY, summary
-from nmfd.runs import files, trail
+from nmfd.runs import files
+from nmfd.runs.run_many import provenance
 from nmfd.types import Result
 
 COLUMNS = {name: kind for name, (kind, _) in SUMMARY.items()}
@@ -221,8 +222,6 @@ def manifest(
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
-        for folder in made:
-            files.synced(folder.parent)
         with files.locked(path / LOCK, path):
             files.sweep(path)
             if file.is_file():
@@ -232,7 +231,7 @@ def manifest(
                 if changed and renew is not None:
                     renew(changed)
             first = not sessions
-            sessions.append({**trail.session(), **(session or {})})
+            sessions.append({**provenance(), **(session or {})})
             content = {"configuration": configuration, "controllers": controllers, "sessions": sessions}
             try:
                 files.write_text(file, json.dumps(content, indent=2) + "\n")

@@ -22,7 +22,6 @@ from nmfd.arrays import Adjacency
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
-from nmfd.runs import trail
 from nmfd.runs.files import atomic
 from nmfd.studies.traffic_states import LOOKS, OutflowOf, draw_strips, states
 from nmfd.types import Result
@@ -86,9 +85,9 @@ def figure(width: float, height: float) -> Figure:
 
 
 def save(drawing: Figure, path: Path) -> Path:
-    """Write `drawing` to `path`, atomically, with its trail (nmfd.runs.trail); the suffix chooses the format."""
+    """Write `drawing` to `path`, whole or not at all; the suffix chooses the format."""
     with atomic(path) as temporary:
-        drawing.savefig(temporary, dpi=150, metadata=trail.metadata(path))
+        drawing.savefig(temporary, dpi=150)
     return path
 
 

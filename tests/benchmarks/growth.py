@@ -15,7 +15,6 @@ import argparse
 import multiprocessing
 import resource
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -29,7 +28,6 @@ from scipy.spatial import cKDTree
 from cosim.evaluation.simulate import Task, simulate
 from cosim.importing.importer import ImportOptions, import_city
 from cosim.importing.partition import Clustered
-from nmfd.runs import command
 from nmfd.runs.files import write_table
 from nmfd.studies import plots
 
@@ -175,11 +173,10 @@ def main() -> None:
     chosen = parser.parse_args()
     chosen.out.mkdir(parents=True, exist_ok=True)
     rows: list[dict] = []
-    with command.called("python", ["tests/benchmarks/growth.py", *sys.argv[1:]]):
-        for count in map(int, chosen.vehicles.split(",")):
-            rows += measured(count)
-            write_table(chosen.out / "growth.csv", pd.DataFrame(rows))
-        draw(chosen.out / "growth.png", pd.DataFrame(rows))
+    for count in map(int, chosen.vehicles.split(",")):
+        rows += measured(count)
+        write_table(chosen.out / "growth.csv", pd.DataFrame(rows))
+    draw(chosen.out / "growth.png", pd.DataFrame(rows))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,340 @@
+"""Many independent runs in a folder: finished ones are skipped, each result is written whole or not at all.
+
+<folder>/manifest.json                       keys of all runs; commands, commits, versions and seeds of all sessions
+<folder>/runs.csv                            one row per run (nmfd.metrics.summary), the reason of a failure in the last
+                                             column
+<folder>/[<subfolder>/]<controller>-<seed>.nc    the Dataset of a run (nmfd.types.Result)
+"""
+
+import json
+import multiprocessing
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, as_completed
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote, unquote
+
+from filelock import FileLock, Timeout
+from pebble import ProcessExpired, ProcessPool
+
+from nmfd import __version__
+from nmfd.errors import InputError
+from nmfd.extras import need
+from nmfd.metrics import summary
+from nmfd.runs.files import write_table, write_text
+from nmfd.runs.progress import Progress, watched
+from nmfd.types import Result
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MANIFEST, TABLE, LOCK = "manifest.json", "runs.csv", ".lock"
+DASK_PATIENCE_S = 10.0  # for the scheduler to answer
+PACKAGES = ("numpy", "torch", "casadi", "libsumo")  # whose versions are in the manifest
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run to do.
+
+    name: stem of its file (`run_name`)
+    key: everything the result depends on, as JSON types: hashes, settings, versions. Its item "controller" holds what
+        only runs of this controller depend on; all else is the same for all runs of a folder
+    job: a picklable function without arguments that returns the Result
+    folder: below that of all runs
+    """
+
+    name: str
+    key: Mapping[str, Any]
+    job: Callable[[], Result]
+    folder: str = ""
+
+    @property
+    def file(self) -> str:
+        """Return the path of its file below the folder of all runs."""
+        return f"{self.folder}/{self.name}.nc" if self.folder else f"{self.name}.nc"
+
+
+def run_name(controller: str, seed: int) -> str:
+    """Return the stem of the file of a run; of a controller path/to/file.py:Class, too."""
+    return f"{quote(controller, safe='+,-._ ')}-{seed}"
+
+
+def run_many(
+    runs: Sequence[Run],
+    out: Path | str,
+    *,
+    workers: int = 1,
+    fresh: bool = True,
+    scheduler: str | None = None,
+    time_limit: float | None = None,
+    progress: Progress = None,
+) -> "pd.DataFrame":
+    """Do the `runs` whose files are not in the folder `out`, and return one row per run.
+
+    Columns are those of `nmfd.metrics.summary`, `folder` if there are several, and `failure`: "" of a finished run,
+    else the reason with file and line. Finished runs of earlier calls that share the keys come last.
+
+    workers: number of processes; 0: this process
+    fresh: a new process for every run
+    scheduler: address of a Dask scheduler, whose workers do the runs; it takes TLS certificates from Dask's own
+        configuration
+    time_limit: wall time of a run (s), in processes only
+    progress: None for a bar, False for none, or a function of done, total and the name of a run
+
+    Raises:
+        InputError: another process has the folder, or it is not a folder of runs
+    """
+    import pandas as pd  # half a second
+
+    out = Path(out)
+    with _locked(out):
+        keys = {run.file: json.loads(json.dumps(run.key)) for run in runs}
+        shared = _write_manifest(out, runs, workers)
+        rows: dict[str, dict] = {}
+        for file in [*keys, *_other_files(out, shared, keys)]:
+            if (row := _finished_row(out, file, keys.get(file), shared)) is not None:
+                rows[file] = row
+        todo = [run for run in runs if run.file not in rows]
+        with watched("runs", progress) as show:
+            if show and todo:
+                show(0, len(todo))
+            for done, (run, outcome) in enumerate(_outcomes(todo, workers, fresh, scheduler, time_limit), 1):
+                if isinstance(outcome, Result):
+                    outcome = outcome.assign(key=json.dumps(keys[run.file]))
+                    (out / run.file).parent.mkdir(parents=True, exist_ok=True)
+                    outcome.write(out / run.file)
+                rows[run.file] = _row(run.file, outcome)
+                write_table(out / TABLE, _table(rows, keys))
+                if show:
+                    show(done, len(todo), run.name)
+        table = _table(rows, keys) if rows else pd.DataFrame(columns=["controller", "seed", "failure"])
+        write_table(out / TABLE, table)
+    return table
+
+
+def attempt(job: Callable[[], Result]) -> Result | str:
+    """Return the result of `job`, or why there is none, with file and line."""
+    try:
+        return job()
+    except InputError as error:
+        return str(error)
+    except (Exception, SystemExit) as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})"
+
+
+def _outcomes(
+    todo: Sequence[Run], workers: int, fresh: bool, scheduler: str | None, time_limit: float | None
+) -> Iterator[tuple[Run, Result | str]]:
+    """Yield every run with its result or the reason of its failure, as they end."""
+    if not todo:
+        return
+    if scheduler is not None:
+        with _dask(scheduler) as executor:
+            futures = {executor.submit(_alone, run.job, os.getcwd(), time_limit): run for run in todo}
+            yield from _ended(futures)
+    elif workers == 0:
+        for run in todo:
+            yield run, attempt(run.job)
+    else:
+        pool = _pool(min(workers, len(todo)), fresh)
+        try:
+            yield from _ended({pool.schedule(attempt, [run.job], timeout=time_limit): run for run in todo})
+        finally:
+            pool.stop()
+            pool.join()
+
+
+def _ended(futures: dict[Future, Run]) -> Iterator[tuple[Run, Result | str]]:
+    for future in as_completed(list(futures)):
+        run = futures.pop(future)  # with its result, which may be large
+        try:
+            yield run, future.result()
+        except TimeoutError:
+            yield run, "not finished within the time limit"
+        except ProcessExpired as error:
+            yield run, f"its process died (status {error.exitcode})"
+        except Exception as error:
+            yield run, f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _pool(workers: int, fresh: bool, **options: Any) -> ProcessPool:
+    context = multiprocessing.get_context("spawn")
+    return ProcessPool(max_workers=workers, max_tasks=int(fresh), context=context, **options)
+
+
+def _alone(job: Callable[[], Result], folder: str, time_limit: float | None) -> Result | str:
+    """Do `job` in a new process in `folder`, from a worker of Dask."""
+    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # may have a child
+    with _pool(1, True, initializer=os.chdir, initargs=[folder]) as pool:
+        future = pool.schedule(attempt, [job], timeout=time_limit)
+        return next(outcome for _, outcome in _ended({future: Run("", {}, job)}))
+
+
+@contextmanager
+def _dask(address: str) -> Iterator[Executor]:
+    """Connect to a Dask scheduler; its workers see the same files under the same paths. Raises InputError."""
+    need("--scheduler", "dask", "distributed")
+    from distributed import Client  # of an extra
+
+    try:
+        client = Client(address, timeout=DASK_PATIENCE_S, set_as_default=False)
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        raise InputError(
+            f"--scheduler: no Dask scheduler answers at {address!r} ({' '.join(str(error).split())}); start one with "
+            "'dask scheduler' and give its address, such as tcp://host:8786"
+        ) from None
+    executor = client.get_executor(pure=False)
+    try:
+        yield executor
+    finally:
+        executor.shutdown(wait=False)
+        client.close()
+
+
+@contextmanager
+def _locked(out: Path) -> Iterator[None]:
+    """Make the folder, and hold it against other processes. Raises InputError."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file; choose another folder with --out")
+    if out.is_dir() and not (out / MANIFEST).is_file() and {path.name for path in out.iterdir()} - {LOCK}:
+        raise InputError(f"{out}: is not empty and holds no {MANIFEST}; choose another folder with --out")
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(out / LOCK, timeout=0):
+            yield
+    except Timeout:
+        raise InputError(
+            f"{out}: another process is writing to it; wait for its end, or choose another folder with --out"
+        ) from None
+
+
+def read_manifest(folder: Path) -> dict:
+    """Return manifest.json of a folder of runs: its folders and sessions. Raises InputError."""
+    try:
+        content = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        content["folders"].items(), content["sessions"][0]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
+        raise InputError(f"{folder / MANIFEST}: is no manifest of runs; choose another folder with --out") from None
+    return content
+
+
+def _write_manifest(out: Path, runs: Sequence[Run], workers: int) -> dict[str, dict]:
+    """Add the keys of `runs` and this session to the manifest; return folder -> what all runs there share."""
+    manifest = read_manifest(out) if (out / MANIFEST).is_file() else {"folders": {}, "sessions": []}
+    folders = manifest["folders"]
+    for run in runs:
+        shared = {name: value for name, value in run.key.items() if name != "controller"}
+        shared = json.loads(json.dumps(shared))
+        if folders.get(run.folder, {}).get("key") != shared:
+            folders[run.folder] = {"key": shared, "controllers": {}}
+        folders[run.folder]["controllers"][_controller_and_seed(run.file)[0]] = run.key.get("controller")
+    seeds = sorted({_controller_and_seed(run.file)[1] for run in runs})
+    manifest["sessions"].append({**provenance(), "seeds": seeds, "workers": workers})
+    write_text(out / MANIFEST, json.dumps(manifest, indent=2) + "\n")
+    return {folder: content["key"] for folder, content in folders.items()}
+
+
+def _other_files(out: Path, shared: Mapping[str, dict], keys: Mapping[str, dict]) -> list[str]:
+    """Return the files of runs that are not asked for."""
+    there = (
+        f"{folder}/{p.name}" if folder else p.name for folder in shared for p in sorted((out / folder).glob("[!.]*.nc"))
+    )
+    return [file for file in there if file not in keys]
+
+
+def _finished_row(out: Path, file: str, key: Mapping | None, shared: Mapping[str, dict]) -> dict | None:
+    """Return the row of a finished run; None if there is none, or its key is another one."""
+    if not (out / file).is_file():
+        return None
+    try:
+        result = Result.read(out / file)
+        kept = json.loads(result.key)
+    except (InputError, AttributeError, ValueError):  # cut off, or not of this package
+        return None
+    if key is None:
+        same = {name: value for name, value in kept.items() if name != "controller"} == shared[_folder(file)]
+        return _row(file, result) if same else None
+    if kept != key:
+        changed = ", ".join(sorted(name for name in {**kept, **key} if kept.get(name) != key.get(name)))
+        print(f"{out / file}: done again, {changed} changed", file=sys.stderr)
+        return None
+    return _row(file, result)
+
+
+def _row(file: str, outcome: Result | str) -> dict:
+    controller, seed = _controller_and_seed(file)
+    row = {"folder": _folder(file), "controller": controller, "seed": seed}
+    return {**row, "failure": outcome} if isinstance(outcome, str) else {**row, **summary(outcome), "failure": ""}
+
+
+def _folder(file: str) -> str:
+    return file.rpartition("/")[0]
+
+
+def _controller_and_seed(file: str) -> tuple[str, int]:
+    controller, _, seed = file.rpartition("/")[2].removesuffix(".nc").rpartition("-")
+    return unquote(controller), int(seed)
+
+
+def _table(rows: Mapping[str, dict], keys: Mapping[str, dict]) -> "pd.DataFrame":
+    """Return the rows as a table: the runs asked for, then the others."""
+    import pandas as pd
+
+    files = [*(file for file in keys if file in rows), *(file for file in rows if file not in keys)]
+    table = pd.DataFrame([rows[file] for file in files])
+    table.insert(len(table.columns) - 1, "failure", table.pop("failure"))
+    return table if any(table["folder"]) else table.drop(columns="folder")
+
+
+def provenance() -> dict:
+    """Return date, command, versions, and the commit of the checkout, None outside one."""
+    commit, dirty = _checkout()
+    return {
+        "date": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "commit": commit,
+        "dirty": dirty,
+        "versions": dict(_versions()),
+    }
+
+
+@cache
+def _versions() -> tuple[tuple[str, str], ...]:
+    versions = {"python": platform.python_version(), "perimeter-cosim": __version__}
+    for package in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            versions[package] = metadata.version(package)
+    return tuple(versions.items())
+
+
+@cache
+def _checkout() -> tuple[str | None, bool | None]:
+    """Return the commit of this package, and whether files differ from it, at the first call."""
+    here = Path(__file__).resolve()
+    # an installed copy may lie inside another checkout: the commit counts only if this file is tracked
+    tracked = _git(here.parent, "ls-files", "--error-unmatch", here.name) is not None
+    commit = _git(here.parent, "rev-parse", "HEAD") if tracked else None
+    changes = _git(here.parent, "status", "--porcelain", "--untracked-files=no") if commit else None
+    return commit, None if changes is None else bool(changes)
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
