@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from nmfd.model.regional_model import RegionalModel, load_network
     from nmfd.model.scenario import Scenario
     from nmfd.studies.measured import Identified
-    from nmfd.studies.summary import Summary, summary_table
     from nmfd.types import Controller, Controls, Observation, Plant, Result, State, Status
 
 __version__ = "0.1.0"  # of the package perimeter-cosim, nmfd and cosim alike
@@ -36,7 +35,6 @@ _MODULES = {
     "model.regional_model": ("RegionalModel", "load_network"),
     "model.scenario": ("Scenario",),
     "studies.measured": ("Identified",),
-    "studies.summary": ("Summary", "summary_table"),
     "types": ("Controller", "Controls", "Observation", "Plant", "Result", "State", "Status"),
 }
 __all__ = [
@@ -54,7 +52,6 @@ __all__ = [
     "Scenario",
     "State",
     "Status",
-    "Summary",
     "benchmark",
     "controller",
     "identify",
@@ -62,7 +59,6 @@ __all__ = [
     "load_scenario",
     "run",
     "summary",
-    "summary_table",
     "total_time_spent",
     "train",
 ]

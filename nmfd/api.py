@@ -2,20 +2,25 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from nmfd import closed_loop
 from nmfd.controllers import names, registry
 from nmfd.controllers.dpc import training
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario, with_demand
-from nmfd.runs import config, run_folder
+from nmfd.runs import config
+from nmfd.runs.files import default_folder
 from nmfd.runs.progress import Progress, watched
+from nmfd.studies import benchmark as benchmark_study
 from nmfd.studies import measured
-from nmfd.studies.benchmark import PLANTS, run_all
+from nmfd.studies.benchmark import PLANTS
 from nmfd.studies.measured import Identified
 from nmfd.studies.settings import Measured
-from nmfd.studies.summary import Summary
 from nmfd.types import Controller, Plant, Result
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def load_scenario(folder: Path | str) -> Scenario:
@@ -83,10 +88,8 @@ def run(
     name, acting = named(controller, scenario, policy)
     driven = PLANTS[plant](scenario) if isinstance(plant, str) else plant
     with watched(name, progress) as show:
-        trajectory = closed_loop.run(driven, acting, scenario, seed=seed, progress=show)
-    return run_folder.labelled(
-        trajectory, controller=name, plant=plant if isinstance(plant, str) else type(plant).__name__
-    )
+        result = closed_loop.run(driven, acting, scenario, seed=seed, progress=show)
+    return result.assign(controller=name, plant=plant if isinstance(plant, str) else type(plant).__name__)
 
 
 def benchmark(
@@ -99,37 +102,34 @@ def benchmark(
     policies: Mapping[str, Path | str] | None = None,
     workers: int = 1,
     progress: Progress = None,
-) -> Summary:
-    """`nmfd benchmark`: controllers x seeds with a run folder; returns the rows of its summary.csv.
+) -> "pd.DataFrame":
+    """Run controllers x seeds with a run folder, as `nmfd benchmark`; return one row per run.
 
         >>> rows = nmfd.benchmark("economic_mpc", ["no-control", "dpc-*"])  # doctest: +SKIP
-        >>> print(rows), rows.to_frame(), rows.to_xarray()  # doctest: +SKIP
+        >>> rows.groupby("controller")["total_time_spent_veh_s"].mean()  # doctest: +SKIP
 
     controllers: a name, several, or patterns, which stand for the controllers that can be made for this scenario
     seeds: how many, from 0, or which
     out: the run folder, runs/<scenario>-<time> if None; finished runs in it are kept
     policies: controller -> file, if not SCENARIO/NAME.pt
+    workers: runs at a time
+    progress: as in `nmfd.run`; your own is called as progress(done, runs, name)
 
-    progress: as in `nmfd.run`; your own is called as progress(done, steps, what)
-
-    Raises InputError and nmfd.runs.workers.RunFailed.
+    The column `failure` is "" of a finished run, else its reason. Raises InputError.
     """
     scenario, files = _loaded(scenario), {name: Path(file) for name, file in (policies or {}).items()}
     chosen = names.chosen(controllers, registry.check, lambda: dict.fromkeys([*registry.ready(scenario), *files]))
     _check_plant(plant)
-    with watched("benchmark", progress) as show:
-        return Summary(
-            run_all(
-                scenario,
-                chosen,
-                range(seeds) if isinstance(seeds, int) else list(seeds),
-                plant,
-                out=run_folder.default_folder(scenario.name) if out is None else Path(out),
-                policies=files,
-                workers=workers,
-                progress=show,
-            )
-        )
+    return benchmark_study.benchmark(
+        scenario,
+        chosen,
+        range(seeds) if isinstance(seeds, int) else list(seeds),
+        plant,
+        out=default_folder(scenario.name) if out is None else Path(out),
+        policies=files,
+        workers=workers,
+        progress=progress,
+    )
 
 
 def train(

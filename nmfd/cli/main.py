@@ -60,7 +60,7 @@ def benchmark(
     """Run controllers on a regional model; print a table and write a run folder.
 
     SCENARIO is, here and in all commands, a name of nmfd list, or a folder with a scenario.toml. The run folder holds
-    summary.csv, the trajectories, manifest.json and figures. Every finished run is kept: the same command with the same
+    runs.csv, a netCDF file per run, manifest.json and figures. Every finished run is kept: the same command with the same
     --out goes on where it was interrupted, and other controllers or more seeds are added to what is there.
 
     \b
@@ -73,17 +73,18 @@ def benchmark(
     files = policy_files(policies, names)
 
     from nmfd.api import load_scenario  # heavy
-    from nmfd.runs import run_folder
-    from nmfd.studies.benchmark import run_all
-    from nmfd.studies.summary import summary_table
+    from nmfd.runs.files import default_folder
+    from nmfd.runs.run_many import raise_failures
+    from nmfd.studies import benchmark as study
 
     loaded = load_scenario(scenario)
-    out = run_folder.default_folder(loaded.name) if out is None else out
-    with resumable("benchmark", out, "summary.csv") as progress:
-        rows = run_all(loaded, names, range(seeds), plant, out=out, policies=files, workers=workers, progress=progress)
+    out = default_folder(loaded.name) if out is None else out
+    with resumable("benchmark", out, "runs.csv"):
+        rows = study.benchmark(loaded, names, range(seeds), plant, out=out, policies=files, workers=workers)
     click.echo(f"{loaded.name}, {plant} plant, {loaded.steps} control intervals of {loaded.step:g} s")
-    click.echo(summary_table(rows))
+    click.echo(study.summary_table(rows))
     click.echo(f"Written to {out}")
+    raise_failures(rows)
 
 
 @main.command()

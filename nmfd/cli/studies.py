@@ -41,7 +41,7 @@ def robustness(
     """Run controllers against perturbed demand; print a table and draw the improvement over no control.
 
     Controllers know the demand of the scenario; what comes is max(0, demand + noise) with Gaussian noise of standard
-    deviation sigma, drawn for every pair of regions and control interval. The run folder holds robustness.csv,
+    deviation sigma, drawn for every pair of regions and control interval. The run folder holds runs.csv,
     robustness.png and manifest.json; the same command with the same --out goes on where it was interrupted, and
     controllers, sigmas or scenarios can be added.
 
@@ -53,12 +53,13 @@ def robustness(
     files = policy_files(policies, names)
 
     from nmfd.api import load_scenario  # heavy
-    from nmfd.runs import run_folder
+    from nmfd.runs.files import default_folder
+    from nmfd.runs.run_many import raise_failures
     from nmfd.studies import robustness as method
 
     loaded = load_scenario(scenario)
-    out = run_folder.default_folder(loaded.name) if out is None else out
-    with resumable("robustness", out, "robustness.csv") as progress:
+    out = default_folder(loaded.name) if out is None else out
+    with resumable("robustness", out, "runs.csv"):
         rows = method.robustness(
             loaded,
             names,
@@ -69,10 +70,10 @@ def robustness(
             out=out,
             policies=files,
             workers=workers,
-            progress=progress,
         )
     click.echo(method.improvement_table(rows))
     click.echo(f"Written to {out}")
+    raise_failures(rows)
 
 
 @click.command()

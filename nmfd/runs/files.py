@@ -9,6 +9,7 @@ import re
 import stat
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -167,3 +168,10 @@ def relative(path: Path, folder: Path) -> str:
 def file_name(name: str) -> str:
     """`name` with everything that is awkward in a file name replaced."""
     return re.sub(r"[^\w.-]+", "-", name)
+
+
+def default_folder(scenario: str) -> Path:
+    """Return runs/<scenario>-<timestamp> in the current folder, a name that is not taken; scenario: its name."""
+    stem = f"{file_name(scenario)}-{datetime.now():%Y%m%d-%H%M%S}"
+    candidates = (Path("runs") / (stem + (f"-{n}" if n > 1 else "")) for n in range(1, 1000))
+    return next(folder for folder in candidates if not folder.exists())

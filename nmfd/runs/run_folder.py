@@ -10,15 +10,14 @@
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from datetime import datetime
 from functools import partial
 from pathlib import Path
-from urllib.parse import quote
 
 from nmfd.errors import InputError
 from nmfd.metrics import SUMMARY, summary
 from nmfd.runs import files
-from nmfd.runs.run_many import provenance
+from nmfd.runs.files import default_folder as default_folder
+from nmfd.runs.run_many import provenance, run_name
 from nmfd.types import Result
 
 COLUMNS = {name: kind for name, (kind, _) in SUMMARY.items()}
@@ -68,26 +67,9 @@ def read_summary(path: Path) -> list[dict]:
     return files.read_rows(path, COLUMNS)
 
 
-def controller_name(controller: str) -> str:
-    """What files of a controller are called; of one in a file, path/to/file.py:Class, without the / and :."""
-    return quote(controller, safe="+,-._ ")
-
-
-def run_name(controller: str, seed: int) -> str:
-    """What the files of a run are called."""
-    return f"{controller_name(controller)}-{seed}"
-
-
 def run_path(folder: Path, controller: str, seed: int) -> Path:
     """The file of a run in its folder."""
     return folder / f"{run_name(controller, seed)}.nc"
-
-
-def default_folder(scenario: str) -> Path:
-    """runs/<scenario>-<timestamp> in the current folder, a name not taken yet; scenario: its name."""
-    stem = f"{files.file_name(scenario)}-{datetime.now():%Y%m%d-%H%M%S}"
-    candidates = (Path("runs") / (stem + (f"-{n}" if n > 1 else "")) for n in range(1, 1000))
-    return next(folder for folder in candidates if not folder.exists())
 
 
 def trajectories(folder: Path) -> list[Result]:

@@ -29,7 +29,7 @@ from filelock import FileLock, Timeout
 from pebble import ProcessExpired, ProcessPool
 
 from nmfd import __version__
-from nmfd.errors import InputError
+from nmfd.errors import InputError, RunFailed
 from nmfd.extras import need
 from nmfd.metrics import summary
 from nmfd.runs.files import write_table, write_text
@@ -96,8 +96,6 @@ def run_many(
     Raises:
         InputError: another process has the folder, or it is not a folder of runs
     """
-    import pandas as pd  # half a second
-
     out = Path(out)
     with _locked(out):
         keys = {run.file: json.loads(json.dumps(run.key)) for run in runs}
@@ -107,21 +105,30 @@ def run_many(
             if (row := _finished_row(out, file, keys.get(file), shared)) is not None:
                 rows[file] = row
         todo = [run for run in runs if run.file not in rows]
-        with watched("runs", progress) as show:
-            if show and todo:
-                show(0, len(todo))
-            for done, (run, outcome) in enumerate(_outcomes(todo, workers, fresh, scheduler, time_limit), 1):
-                if isinstance(outcome, Result):
-                    outcome = outcome.assign(key=json.dumps(keys[run.file]))
-                    (out / run.file).parent.mkdir(parents=True, exist_ok=True)
-                    outcome.write(out / run.file)
-                rows[run.file] = _row(run.file, outcome)
-                write_table(out / TABLE, _table(rows, keys))
-                if show:
-                    show(done, len(todo), run.name)
-        table = _table(rows, keys) if rows else pd.DataFrame(columns=["controller", "seed", "failure"])
-        write_table(out / TABLE, table)
+        try:
+            with watched("runs", progress) as show:
+                if show and todo:
+                    show(0, len(todo))
+                for done, (run, outcome) in enumerate(_outcomes(todo, workers, fresh, scheduler, time_limit), 1):
+                    if isinstance(outcome, Result):
+                        outcome = outcome.assign(key=json.dumps(keys[run.file]))
+                        (out / run.file).parent.mkdir(parents=True, exist_ok=True)
+                        outcome.write(out / run.file)
+                    rows[run.file] = _row(run.file, outcome)
+                    if show:
+                        show(done, len(todo), run.name)
+        finally:
+            table = _table(rows, keys)
+            write_table(out / TABLE, table)
     return table
+
+
+def raise_failures(rows: "pd.DataFrame") -> None:
+    """Raise RunFailed that names all failed runs in the rows of `run_many`."""
+    failed = rows[rows["failure"] != ""]
+    if len(failed):
+        labels = failed["controller"] + ", seed " + failed["seed"].astype(str)
+        raise RunFailed("; ".join(f"{label}: {why}" for label, why in zip(labels, failed["failure"], strict=True)))
 
 
 def attempt(job: Callable[[], Result]) -> Result | str:
@@ -293,6 +300,8 @@ def _table(rows: Mapping[str, dict], keys: Mapping[str, dict]) -> "pd.DataFrame"
     """Return the rows as a table: the runs asked for, then the others."""
     import pandas as pd
 
+    if not rows:
+        return pd.DataFrame(columns=["controller", "seed", "failure"])
     files = [*(file for file in keys if file in rows), *(file for file in rows if file not in keys)]
     table = pd.DataFrame([rows[file] for file in files])
     table.insert(len(table.columns) - 1, "failure", table.pop("failure"))

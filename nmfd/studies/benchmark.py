@@ -2,64 +2,68 @@
 
 import math
 import statistics
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from scipy.special import stdtrit
 
 from nmfd import closed_loop, faults
 from nmfd.controllers import registry
+from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.demand_noise import perturbed
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario
-from nmfd.runs import run_folder
-from nmfd.runs.tally import Tally
-from nmfd.runs.workers import Failure, Source, Worker, attempt, ended, outcomes
+from nmfd.runs.progress import Progress
+from nmfd.runs.run_many import Run, run_many, run_name
+from nmfd.runs.tables import text_table
 from nmfd.studies import plots
 from nmfd.studies.traffic_states import OutflowOf, model_outflow, remembered
 from nmfd.types import Plant, Result
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
+CAPTION = (
+    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against {against}; control: time of all "
+    "decisions of a run; step: median / longest decision; decisions of all seeds: "
+    + "; ".join(f"{heading}: {what}" for heading, what in COUNTED.values())
+)
+BOUND_CAPTION = (
+    "; above bound: TTS against the bound with the same controls, perimeter alone (PC) or with routes (PCRG)"
+)
 
 
 class Noise(NamedTuple):
-    """On the demand (nmfd.model.demand_noise), drawn from the seed of a run: its standard deviation [veh/s]."""
+    """Noise on the demand (nmfd.model.demand_noise), drawn from the seed of a run; sigma: its deviation (veh/s)."""
 
     sigma: float
     where: str
 
 
 def compared_with(controllers: Iterable[str]) -> str:
-    """What controllers are compared with: no control, or the first of them where that is not among them."""
+    """Return the controller that others are compared with: no control, or the first if that is not among them."""
     names = list(controllers)
     return REFERENCE if REFERENCE in names else names[0]
 
 
-def run_one(
-    run: tuple[str, int],
-    *,
-    scenario: Scenario,
-    plant: str,
-    policies: Mapping[str, Path],
-    noise: Noise | None = None,
-    progress: Callable[[int, int], None] | None = None,
+def closed_loop_of(
+    name: str, seed: int, *, scenario: Scenario, plant: str, policy: Path | None = None, noise: Noise | None = None
 ) -> Result:
-    """The closed loop of `run` = (controller, seed), on one thread; the controller knows nothing of the `noise`."""
-    name, seed = run
-    controller, actual = registry.make(name, scenario, policy=policies.get(name)), happening(scenario, noise, seed)
-    trajectory = closed_loop.run(PLANTS[plant](actual), controller, actual, seed=seed, progress=progress)
-    return run_folder.labelled(trajectory, controller=name, plant=plant)
+    """Run the controller `name`, which is made for `scenario`, in the scenario with `noise`."""
+    controller, actual = registry.make(name, scenario, policy=policy), with_noise(scenario, noise, seed)
+    return closed_loop.run(PLANTS[plant](actual), controller, actual, seed=seed).assign(controller=name, plant=plant)
 
 
-def happening(scenario: Scenario, noise: Noise | None, seed: int) -> Scenario:
-    """What happens in the run of `seed`, where controllers are made for `scenario`."""
+def with_noise(scenario: Scenario, noise: Noise | None, seed: int) -> Scenario:
+    """Return `scenario` with the demand of the run of `seed`."""
     return scenario if noise is None else perturbed(scenario, noise.sigma, seed, where=noise.where)
 
 
-def run_all(
+def benchmark(
     scenario: Scenario,
     controllers: Sequence[str],
     seeds: Sequence[int],
@@ -68,81 +72,52 @@ def run_all(
     out: Path,
     policies: Mapping[str, Path] | None = None,
     workers: int = 1,
-    progress: Callable[[int, int, str], None] | None = None,
-) -> list[dict]:
-    """Run what is not yet in the run folder `out`, add the figures, and return all rows of its summary.csv.
+    progress: Progress = None,
+) -> "pd.DataFrame":
+    """Do the runs that are not in the folder `out`, draw the figures, and return one row per run (`run_many`).
 
-    As `perform` does it; RunFailed, or an InputError, at the end if runs failed, which the message names.
+    Raises:
+        InputError: a controller cannot be made
     """
-    rows, failures = perform(
-        scenario, controllers, seeds, plant, out=out, policies=policies, workers=workers, progress=progress
-    )
-    if rows:
-        kept = [run_folder.run_path(out, row["controller"], row["seed"]) for row in rows]
-        draw(out, scenario, [run_folder.read_trajectory(path) for path in kept if path.is_file()])
-    if failures:
-        raise ended([(f"controller {_label(run)}", failure) for run, failure in failures])
+    policies = policies or {}
+    key = key_of(scenario, controllers, plant, policies)
+    runs = [
+        Run(
+            run_name(name, seed),
+            key(name),
+            partial(closed_loop_of, name, seed, scenario=scenario, plant=plant, policy=policies.get(name)),
+        )
+        for name in controllers
+        for seed in seeds
+    ]
+    rows = run_many(runs, out, **processes(controllers, workers), progress=progress)
+    done = rows[rows["failure"] == ""]
+    names = [run_name(name, seed) for name, seed in zip(done["controller"], done["seed"], strict=True)]
+    if names:
+        draw(out, scenario, [Result.read(out / f"{name}.nc") for name in names])
     return rows
 
 
-def perform(
-    scenario: Scenario,
-    controllers: Sequence[str],
-    seeds: Sequence[int],
-    plant: str,
-    *,
-    out: Path,
-    policies: Mapping[str, Path] | None = None,
-    noise: Noise | None = None,
-    workers: int = 1,
-    progress: Callable[[int, int, str], None] | None = None,
-    renew: Callable[[str], None] | None = None,
-    source: Source | None = None,
-    omit: Collection[tuple[str, int]] = (),
-) -> tuple[list[dict], list[tuple[tuple[str, int], Failure]]]:
-    """Run what is not yet in the run folder `out`; returns all rows of its summary.csv, and the runs that failed.
+def processes(controllers: Sequence[str], workers: int) -> dict:
+    """Return the options of `run_many`: this process for one worker, a new one for each run of a user's controller."""
+    own = any(map(registry.is_own, controllers))
+    return {"workers": workers if own or workers > 1 else 0, "fresh": own}
 
-    progress: called with the control intervals done and to do, and what is running
-    renew: takes one line where the runs of a controller do not count any more because it changed; None: an InputError
-    source: does the runs elsewhere, instead of `workers` processes here
-    omit: controllers and seeds that are not run
 
-    Raises InputError, before anything is written, for a controller that cannot be made. Every finished run is kept,
-    whatever happens to the others.
+def key_of(
+    scenario: Scenario, controllers: Sequence[str], plant: str, policies: Mapping[str, Path]
+) -> Callable[[str], dict]:
+    """Return the function that gives everything the runs of a controller depend on.
+
+    Raises:
+        InputError: a controller cannot be made, or the regional model has no such fault
     """
-    policies = policies or {}
+    faults.without_city(scenario.ordered_faults, f"{scenario.name}: faults")
+    own = {}
     for name in controllers:
         registry.verify(name, scenario, policy=policies.get(name))
-    common, settings = configuration(scenario, controllers, plant, policies)
-    if noise is not None:
-        common["demand_noise"] = noise._asdict()
-    wanted = [(name, seed) for name in controllers for seed in seeds]
-    session = {"scenario_folder": str(scenario.folder), "workers": workers}
-    with run_folder.open_folder(
-        out, configuration=common, controllers=settings, order=wanted, session=session, renew=renew
-    ) as folder:
-        todo = [run for run in wanted if run not in folder.finished and run not in omit]
-        failures = []
-        work = partial(run_one, scenario=scenario, plant=plant, policies=policies, noise=noise)
-        for run, outcome in results(work, todo, workers, scenario.steps, progress, label=_label, source=source):
-            if isinstance(outcome, Failure):
-                failures.append((run, outcome))
-            else:
-                folder.add(outcome)
-        return folder.rows(), failures
-
-
-def configuration(
-    scenario: Scenario, controllers: Sequence[str], plant: str, policies: Mapping[str, Path]
-) -> tuple[dict, dict]:
-    """What all runs have in common, and what each controller depends on besides. InputError for a fault that the
-    regional model cannot have."""
-    faults.without_city(scenario.ordered_faults, f"{scenario.name}: faults")
-    settings = {}
-    for name in controllers:
-        policy = registry.policy_path(name, scenario, policies.get(name))
-        settings[name] = registry.fingerprint(name, policy)
-    common = {
+        own[name] = registry.fingerprint(name, registry.policy_path(name, scenario, policies.get(name)))
+    shared = {
         "scenario": scenario.name,
         "scenario_hash": scenario.hash,
         "network": scenario.network.name,
@@ -152,68 +127,50 @@ def configuration(
         "steps": scenario.steps,
         "measurement_std_veh": scenario.measurement_std,
     }
-    return common, settings
+    return lambda name: {**shared, "controller": own[name]}
 
 
-def _label(run: tuple[str, int]) -> str:
-    return f"{run[0]}, seed {run[1]}"
-
-
-def results(
-    work: Callable,
-    todo: Sequence[tuple],
-    workers: int,
-    steps: int,
-    progress: Callable[[int, int, str], None] | None,
-    *,
-    label: Callable[..., str],
-    source: Source | None = None,
-) -> Iterator[tuple]:
-    """(run, result or Failure) of every run, in this process if there is one worker; those of controllers of the
-    user's own in processes of their own.
-
-    work(run), or work(run, progress=...) in this process, is one closed loop of `steps` control intervals; progress
-    as in `benchmark`, with the `label` of the run; source: as in `perform`.
-    """
-    tally = Tally(progress, todo, steps=lambda run: steps, label=label)
-    if source or workers > 1:
-        found = (
-            source(work, todo)
-            if source
-            else outcomes(work, todo, min(workers, len(todo)), group=_apart, look=tally.look)
+def summary_table(rows: "pd.DataFrame") -> str:
+    """Return one line per controller as text: means over seeds, TTS with its 95 % interval."""
+    groups = dict(list(rows[rows["failure"] == ""].groupby("controller", sort=False)))
+    tts = {name: group["total_time_spent_veh_s"].tolist() for name, group in groups.items()}
+    if not groups:
+        return "no run is finished"
+    against = compared_with(tts)
+    with_bound = any(name in tts for name in ("bound-pc", "bound-pcrg"))
+    lines = []
+    for name, group in groups.items():
+        mean, spread = group.mean(numeric_only=True), interval(tts[name])
+        bound = "bound-pcrg" if "-pcrg" in name else "bound-pc"
+        above = _percent(tts[name], tts[bound]) if bound in tts and name != bound else ""
+        lines.append(
+            {
+                "controller": name,
+                "seeds": len(group),
+                "TTS [veh s]": _scientific(statistics.fmean(tts[name]))
+                + ("" if math.isnan(spread) else f" ± {_scientific(spread, 1)}"),
+                "change": _percent(tts[name], tts[against]) if name != against else "",
+                **({"above bound": above} if with_bound else {}),
+                "final [veh]": f"{mean['final_accumulation_veh']:,.0f}",
+                "max [veh]": f"{mean['max_accumulation_veh']:,.0f}",
+                "completed [veh]": f"{mean['completed_veh']:,.0f}",
+                "control [s]": f"{mean['evaluation_time_s']:.3g}",
+                "step [ms]": f"{mean['control_step_ms_median']:.3g} / {group['control_step_ms_max'].max():.3g}",
+                **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
+            }
         )
-        for run, outcome in found:
-            tally.end(run, failed=isinstance(outcome, Failure))
-            yield run, outcome
-        return
-    apart: dict[str, Worker] = {}
-    try:
-        for run in todo:
-
-            def tick(k: int, _: int, run: tuple = run) -> None:
-                tally.look([(run, k / steps)])
-
-            if name := _apart(run):
-                tick(0, steps)
-                if name not in apart or not apart[name].alive:
-                    apart[name] = Worker(work)
-                apart[name].hand(run)
-                outcome = apart[name].receive()
-            else:
-                outcome = attempt(partial(work, progress=tick), run)
-            tally.end(run, failed=isinstance(outcome, Failure))
-            yield run, outcome
-    finally:
-        for worker in apart.values():
-            worker.terminate()
-            worker.close()
+    return text_table(lines, CAPTION.format(against=against) + BOUND_CAPTION * with_bound)
 
 
-def _apart(run: tuple) -> str:
-    """The controller of the user's own, which has a process to itself, "" for others; run: (controller, ...), or with a
-    field of that name."""
-    name = getattr(run, "controller", run[0])
-    return name if registry.runs_apart(name) else ""
+def _percent(values: Sequence[float], reference: Sequence[float]) -> str:
+    change = percent_change(statistics.fmean(values), statistics.fmean(reference))
+    return "-" if math.isnan(change) else f"{change:+.1f} %"
+
+
+def _scientific(value: float, digits: int = 4) -> str:
+    """Return a number like 1.7730e8."""
+    mantissa, exponent = f"{value:.{digits}e}".split("e")
+    return f"{mantissa}e{int(exponent)}" if value else "0"
 
 
 def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Result]) -> None:
