@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from nmfd import closed_loop
 from nmfd.controllers import names, registry
@@ -23,14 +23,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def load_scenario(folder: Path | str) -> Scenario:
-    """The scenario in `folder`, or of this name among those that come with the package (`nmfd list`), with its network;
-    the options of all its controllers are checked. Raises InputError.
+def load_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None) -> Scenario:
+    """Read the scenario in `folder`, or a shipped one by its name, and check its options. Raises InputError.
+
+    settings: dotted key -> value instead of that in the file, such as {"steps": 12, "controllers.pi-gating.kp": 2.0}
 
         >>> nmfd.load_scenario("economic_mpc").network.region_names
         ('north-west', 'north-east', 'west', 'centre', 'east', 'south-west', 'south-east')
     """
-    scenario = read_scenario(folder)
+    scenario = read_scenario(folder, settings)
     registry.check_options(scenario)
     return scenario
 

@@ -15,8 +15,7 @@ from cosim.plant.strategy import planning_of
 from nmfd.api import load_scenario
 from nmfd.model import dynamics, mfd
 from nmfd.model.identification import observed_split_ratios
-from nmfd.model.model_file import network_toml
-from nmfd.model.regional_model import load_network
+from nmfd.model.regional_model import load_network, network_toml
 from nmfd.studies.fit_quality import fit_table, nearly_empty, region_fits
 
 ROOT = Path(__file__).parents[1]
@@ -196,7 +195,7 @@ def test_an_empty_region_keeps_its_model_in_identification(scenario, result):
     static = static_model(scenario, [alone], guided=False)
     assert static.mfds[0] == network.mfds[0] and static.mfds[3] != network.mfds[3]
     assert 0 in nearly_empty(samples_of(network, [alone])) and 3 not in nearly_empty(samples_of(network, [alone]))
-    table = fit_table(static, samples_of(network, [alone]))
+    table = fit_table(static, region_fits(static, samples_of(network, [alone])))
     assert f"nearly empty in all loading runs: 0 {network.region_names[0]}" in table
     fitted = replace(static, exit_rates=np.full((7, 7), 2.0), storage=np.full(7, 10.0))
     kept = as_it_was(static, fitted, [0])

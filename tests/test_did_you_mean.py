@@ -48,7 +48,7 @@ def test_folders(tmp_path, load, name):
 
 @pytest.mark.parametrize(
     "old, new, key",
-    [("step = 30.0", "stepp = 30.0", "step"), ("ramp_up", "rampup", "ramp_up"), ("[noise]", "[nois]", "noise")],
+    [("step = 30.0", "stepp = 30.0", "step"), ("ramp_up", "rampup", "ramp_up"), ("measurement_std", "measurment_std", "measurement_std")],
     ids=["in place of a required key", "in a list", "a table"],
 )
 def test_keys(tmp_path, old, new, key):

@@ -16,8 +16,7 @@ from nmfd.model import identification
 from nmfd.model.authority import Boundaries, verdict
 from nmfd.model.identification import Observed
 from nmfd.model.mfd import Mfd
-from nmfd.model.model_file import network_toml
-from nmfd.model.regional_model import load_network
+from nmfd.model.regional_model import load_network, network_toml
 from nmfd.studies import fit_quality
 from nmfd.studies.fit_quality import MEANINGS, fit_table, prediction_table, region_fits, write_fits
 
@@ -57,7 +56,7 @@ def test_good_fits_have_no_warning_and_bad_ones_say_what_is_wrong(network):
 
 def test_warnings_are_in_the_table_the_files_and_the_network(network, tmp_path):
     fits = region_fits(network, [cloud([1.0], [1.0])] * 3, seeds=1)
-    table = fit_table(network, [cloud([1.0], [1.0])] * 3, fits)
+    table = fit_table(network, fits)
     assert "WARNINGS" in table.splitlines()[0] and table.count("few samples (1); not reached (0 % of critical)") == 3
     for kind in ("few samples", "not reached", "one seed"):
         assert f"WARNING, {kind}: " in table and kind in MEANINGS
@@ -96,7 +95,7 @@ def test_persistence_is_what_it_says(network):
     shares = identification.persistence_shares(network, [run, run], (1, 4))
     assert shares[:, 0] * critical == pytest.approx([10.0, 40.0]) and (shares[:, 1:] == 0.0).all()
     table = prediction_table(network, [run], {"step": 30.0, "substeps": 1, "integrator": "euler"})
-    assert table.splitlines()[0].count("if nothing changed") == 2
+    assert table.splitlines()[0].count("unchanged") == 2
     assert f"{100 * shares[0, 0]:.1f} %" in table.splitlines()[1]
 
 
@@ -113,12 +112,10 @@ def test_every_table_of_predictions_has_persistence():
         most=np.ones(2),
         ahead=900.0,
         errors=0.5 * still,
-        corrected=0.4 * still,
         persistence=still,
     )
     line = prediction_error.foresight_table([one]).splitlines()
     assert line[0].count("if nothing changed") == 2 and line[1].count("25.0 %") == 2
-    assert line[0].count("corrected") == 2 and line[1].count("10.0 %") == 2
     simulated = np.array([0.0, 3.0, 3.0])
     row = model_validation._row(0, "a", 10.0, simulated, np.zeros(3), np.zeros(2))
     assert row["persistence_rmse_veh"] == pytest.approx(np.sqrt(6.0))

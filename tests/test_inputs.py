@@ -42,10 +42,6 @@ SCENARIO_ERRORS = {
     "network missing": (tiny.SCENARIO.replace("../network", "../none"), ["network.toml: no such file"]),
 }
 NETWORK_ERRORS = {
-    "adjacency not symmetric": (
-        tiny.row_network().replace("[0]", "[]"),
-        ["network.toml: regions[0].adjacent: not symmetric"],
-    ),
     "own neighbour": (tiny.row_network().replace("[0]", "[0, 1]"), ["network.toml: regions[1].adjacent:", "itself"]),
     "neighbour unknown": (tiny.row_network().replace("[0]", "[5]"), ["network.toml: regions[1].adjacent:", "[5]"]),
     "no way": (

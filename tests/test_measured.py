@@ -74,7 +74,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def without_pictures(monkeypatch):
-    monkeypatch.setattr("nmfd.studies.mfd_bands.draw_mfds", lambda *given: None)
+    monkeypatch.setattr("nmfd.studies.plots.draw_mfds", lambda *given: None)
 
 
 def written(folder: Path, counts: pd.DataFrame, detectors: pd.DataFrame) -> dict[str, Path]:

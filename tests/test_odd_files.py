@@ -82,7 +82,7 @@ def test_whatever_is_read_is_no_pipe(place):
         with pytest.raises(InputError, match="is a pipe, no file"):
             read()
     Path("scenario/scenario.toml").write_text(
-        tiny.SCENARIO.replace("[noise]", 'demand_file = "../pipe"\n\n[noise]'), encoding="utf-8"
+        tiny.SCENARIO.replace("[[demand]]", 'demand_file = "../pipe"\n\n[[demand]]', 1), encoding="utf-8"
     )
     assert "is a pipe, no file" in error_line(nmfd(*COMMAND, "out"), "nmfd")
 

@@ -24,7 +24,7 @@ from nmfd.studies import bound
 from nmfd.types import Observation
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
-INITIAL = "\n[[initial]]\nregion = 0\nto = 1\nvehicles = 100.0\n\n[[initial]]\nregion = 1\nto = 1\nvehicles = 50.0\n"
+INITIAL = "initial = [[0.0, 100.0], [0.0, 50.0]]"
 
 
 @pytest.fixture(scope="module")

@@ -19,9 +19,9 @@ from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint
 from nmfd.controllers.pi_gating import PiGating
 from nmfd.metrics import total_time_spent
-from nmfd.model.demand_noise import WHERE, entries, perturbed
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import WHERE, perturbed, perturbed_entries
 from nmfd.studies import robustness
 from nmfd.types import Observation, Status
 
@@ -42,7 +42,7 @@ def scenario(folder):
 def test_noise_has_the_declared_size_and_place(scenario, where):
     long = replace(scenario, demand=np.tile(10.0 * np.sign(scenario.demand), (200, 1, 1)))
     noisy = perturbed(long, 1.0, 0, where=where)
-    change, touched = noisy.demand - long.demand, entries(long.demand, where)
+    change, touched = noisy.demand - long.demand, perturbed_entries(long.demand, where)
     assert (change[~touched] == 0.0).all() and noisy.demand.min() >= 0.0
     assert change[long.demand > 0].std() == pytest.approx(1.0, rel=0.05)
     added = noisy.demand[touched & (long.demand == 0)]

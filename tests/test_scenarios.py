@@ -126,7 +126,6 @@ width = 16
         training.train(scenario, name, seed=0, out=folder / f"{name}.pt", steps=1)
         assert registry.policy_path(name, scenario) == folder / f"{name}.pt"
         assert registry.make(name, scenario).name == "dpc-pc"
-    assert registry.make("dpc-pc-guarded+max-pressure", scenario).name == "dpc-pc-guarded"
     with pytest.raises(InputError, match="network"):  # each was trained on its own model
         registry.make("dpc-pc", scenario, policy=folder / "dpc-pc+max-pressure.pt")
     with pytest.raises(InputError, match="'dpc-pc\\+webster' needs a table"):

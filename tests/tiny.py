@@ -32,7 +32,6 @@ step = 30.0
 steps = 20
 protected = [1]
 
-[noise]
 measurement_std = 0.5
 
 [[demand]]

@@ -24,9 +24,8 @@ from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model import identification, mfd
 from nmfd.model.identification import Observed, observed_split_ratios
-from nmfd.model.model_file import network_toml, schema_line
 from nmfd.model.planning import GUIDED, GUIDING, PlanningModel
-from nmfd.model.regional_model import RegionalModel
+from nmfd.model.regional_model import RegionalModel, network_toml, schema_line
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
 from nmfd.runs.tables import wrapped
@@ -134,15 +133,14 @@ def identify(
                 progress(done, total, f"{what}, {note}")
 
         runs = [observed(result) for result in results]
-        model = fitted_to(
+        return fitted_to(
             network, runs, samples, loaded, iterations=loading.iterations, progress=fitting if progress else None
         )
-        return identification.fit_disturbance(model, runs, iterations=loading.iterations // 4, **scheme)
 
     samples = samples_of(network, found)
     model = fitted(found, samples, "fitting")
     fits = region_fits(model, samples, [result.accumulation for result in found], seeds=len(loading.seeds))
-    text, foreseen = fit_table(model, samples, fits), None
+    text, foreseen = fit_table(model, fits), None
     if held_out:
         kept = [result for result in found if not any(result is other for other in held_out)]
         without = fitted(kept, samples_of(network, kept), "fitting without the last seed")

@@ -30,17 +30,14 @@ COLUMNS = (
     "critical_veh",
     "most_share",
     "next_interval_rmse_share",
-    "next_interval_corrected_rmse_share",
     "next_interval_persistence_rmse_share",
     "ahead_s",
     "ahead_rmse_share",
-    "ahead_corrected_rmse_share",
     "ahead_persistence_rmse_share",
 )
 CAPTION = (
     "RMSE of the predicted accumulation, predicted from every recorded state under the recorded departures and "
-    f"controls, as a share of the region's critical accumulation, mean of the regions; {fit_quality.CORRECTED}; if "
-    "nothing changed: of the "
+    "controls, as a share of the region's critical accumulation, mean of the regions; if nothing changed: of the "
     "prediction that every region keeps what it holds; most: the largest accumulation "
     "of any region in any of the runs, as a share of its critical one"
 )
@@ -52,8 +49,7 @@ class ModelError:
 
     model: the folder of its network; critical: (R,) [veh]; most: (R,) [-], the largest accumulation in the runs, as a
     share of the critical one; errors: (2, R) [-], RMSE one control interval and `ahead` [s] ahead, as such a share;
-    corrected: (2, R) [-], the same with the model's disturbance, NaN without; persistence: (2, R) [-], if nothing
-    changed
+    persistence: (2, R) [-], if nothing changed
     """
 
     demand: float
@@ -64,7 +60,6 @@ class ModelError:
     most: PerRegion
     ahead: float
     errors: Float[np.ndarray, "2 R"]
-    corrected: Float[np.ndarray, "2 R"]
     persistence: Float[np.ndarray, "2 R"]
 
 
@@ -105,7 +100,6 @@ def _of(
         most=np.max([run.accumulation.sum(axis=2).max(axis=0) for run in seen], axis=0) / critical,
         ahead=found.ahead,
         errors=found.model,
-        corrected=found.corrected,
         persistence=found.persistence,
     )
 
@@ -121,10 +115,8 @@ def foresight_table(foresights: Sequence[ModelError]) -> str:
                 "model": one.model.name if one.model else "",
                 "most": f"{one.most.max():.1f}",
                 "next interval": f"{100 * one.errors[0].mean():.1f} %",
-                "corrected": fit_quality.percent(one.corrected[0].mean()),
                 "if nothing changed": f"{100 * one.persistence[0].mean():.1f} %",
                 "later": f"{100 * one.errors[1].mean():.1f} % ({one.ahead:g} s)",
-                "corrected ": fit_quality.percent(one.corrected[1].mean()),
                 "if nothing changed ": f"{100 * one.persistence[1].mean():.1f} %",
             }
             for one in foresights
@@ -145,11 +137,9 @@ def write_foresights(path: Path, foresights: Sequence[ModelError]) -> None:
             one.critical[region],
             one.most[region],
             one.errors[0, region],
-            one.corrected[0, region],
             one.persistence[0, region],
             one.ahead,
             one.errors[1, region],
-            one.corrected[1, region],
             one.persistence[1, region],
         )
         for one in foresights

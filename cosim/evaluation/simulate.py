@@ -20,7 +20,7 @@ from nmfd import closed_loop, metrics
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
 from nmfd.model.planning import PlanningModel
-from nmfd.model.scenario import Scenario, with_demand, with_faults, with_time_limit
+from nmfd.model.scenario import Scenario, with_demand, with_faults
 from nmfd.quantities import variables
 from nmfd.runs import run_folder
 from nmfd.runs.files import atomic
@@ -90,7 +90,7 @@ class Task:
 def scenario_of(task: Task) -> Scenario:
     """The scenario with the horizon and demand of `task`. Raises InputError."""
     scenario = with_faults(load_scenario(task.scenario), task.faults)
-    scenario = with_time_limit(with_demand(scenario, steps=task.steps, factor=task.demand_factor), task.time_limit)
+    scenario = with_demand(scenario, steps=task.steps, factor=task.demand_factor)
     if not task.options:
         return scenario
     tables = scenario.controller_options

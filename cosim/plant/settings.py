@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Literal, Self, get_args
 
 from pydantic import model_validator
 
-from nmfd.model.scenario_file import read_tables
 from nmfd.runs import config
 from nmfd.runs.config import Problem, Seconds, Share, Texts, setting
 
@@ -148,7 +147,7 @@ def settings(scenario: "Scenario") -> Settings:
     path = scenario_file(scenario)
     if scenario.initial is not None:
         raise config.error(path, "initial", "a city in SUMO begins empty; remove it, or use the regional model (nmfd)")
-    chosen = Settings(**vars(config.checked(SumoTable, read_tables(scenario.folder).get("sumo", {}), path, "sumo.")))
+    chosen = Settings(**vars(config.checked(SumoTable, scenario.sumo, path, "sumo.")))
     for key in FILES:
         for name in getattr(chosen, key):
             if not Path(scenario.folder, name).is_file():

@@ -150,21 +150,16 @@ def check_adjacency(city: City, network: RegionalModel) -> None:
     where = f"{network.folder}/network.toml: regions"
     joined = np.zeros((city.regions, city.regions), dtype=bool)
     for gateway in city.gateways:
-        if not (network.adjacency | network.adjacency.T)[gateway.source, gateway.target]:
+        if not network.adjacency[gateway.source, gateway.target]:
             raise InputError(
                 f"{where}[{gateway.source}].adjacent: region {gateway.target} is missing, although edge "
                 f"{gateway.from_edge} leads to {gateway.to_edge}; add it, or move the edges to other regions"
-            )
-        if not network.adjacency[gateway.source, gateway.target]:
-            raise InputError(
-                f"{where}[{gateway.source}].no_way_to: lists {gateway.target}, but edge {gateway.from_edge} leads to "
-                f"{gateway.to_edge} there; remove it, or move the edges to other regions"
             )
         joined[gateway.source, gateway.target] = True
     for i, h in np.argwhere(network.adjacency & ~joined):
         raise InputError(
             f"{where}[{i}].adjacent: lists {h}, but no edge leads from region {i} to region {h} in {city.net_file}; "
-            f"remove it, add no_way_to = [{h}], or change the regions of edges"
+            "remove it, or change the regions of edges"
         )
 
 

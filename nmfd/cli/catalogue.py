@@ -7,8 +7,8 @@ from pathlib import Path
 
 from nmfd.controllers import registry
 from nmfd.controllers.dpc.policy_file import read_policy_file
-from nmfd.model.network_file import NetworkTable
-from nmfd.model.scenario_file import ScenarioTable, read_tables
+from nmfd.model.regional_model import NetworkTable
+from nmfd.model.scenario import ScenarioTable, read_tables
 from nmfd.runs import config, shipped
 
 LONGEST = 100  # characters of what a file says

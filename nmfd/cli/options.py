@@ -14,7 +14,7 @@ FILE = click.Path(path_type=Path, dir_okay=False)
 SEED = click.IntRange(0, 2**31 - 1)  # SUMO's are 32 bits long
 
 SCENARIO = click.argument("scenario", type=FOLDER)
-STEPS = declared("nmfd.model.scenario_file:ScenarioTable", "steps", instead="the scenario's")
+STEPS = declared("nmfd.model.scenario:ScenarioTable", "steps", instead="the scenario's")
 ADAM_STEPS = declared("nmfd.controllers.dpc.options:Training", "steps", instead="what scenario.toml says, else {}")
 POLICIES = click.option(
     "--policy",

@@ -6,7 +6,7 @@ The class is made with the planning model (nmfd.model.planning) as its one argum
 
 It is the user's own code, and may do to its process whatever code can: exit, hang, change what all share. Commands
 therefore run it in processes of its own only (nmfd.runs.workers): `verify` and `facts` ask one that does nothing else.
-There, and where it runs in this process, from Python, every call has a time limit (`Scenario.own_time_limit`).
+There, and where it runs in this process, from Python, every call has a time limit.
 """
 
 import copy
@@ -32,11 +32,11 @@ from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
-from nmfd.model.scenario_file import OWN_TIME_LIMIT
 from nmfd.runs import workers
 from nmfd.runs.files import check_file, file_hash
 from nmfd.types import Controls, Observation, Status
 
+OWN_TIME_LIMIT = 600.0  # s
 GROUP = "nmfd.controllers"
 FILE_AND_CLASS = re.compile(r"(?P<file>.+\.py):(?P<cls>[^\W\d]\w*)")
 ROUNDING = 1e-5  # by how much bounds and sums may be missed: float32
@@ -134,7 +134,7 @@ def _answer(task: tuple[str, Scenario | None, str]) -> Facts:
     """The other side of `_ask`."""
     name, scenario, folder = task
     os.chdir(folder)
-    _class(name, OWN_TIME_LIMIT if scenario is None else scenario.own_time_limit)
+    _class(name, OWN_TIME_LIMIT)
     if scenario is not None:
         make(name, scenario)
     return _facts(name)
@@ -162,7 +162,7 @@ def with_tables(scenario: Scenario) -> Scenario:
 
 def make(name: str, scenario: Scenario) -> "OwnController":
     """The controller `name`, tried once on an empty city. Raises InputError, on one line, for whatever is wrong."""
-    limit = scenario.own_time_limit
+    limit = OWN_TIME_LIMIT
     cls = _class(name, limit)
     planning = planning_model(with_tables(scenario), _facts(name).table)
     try:

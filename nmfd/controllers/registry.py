@@ -19,9 +19,8 @@ from nmfd.controllers.no_control import NoControl, RouteGuidance
 from nmfd.controllers.options import Options, options
 from nmfd.controllers.pi_gating import Gating, PiGating, SetPoint
 from nmfd.errors import InputError, did_you_mean
-from nmfd.model.planning import planning_model
+from nmfd.model.planning import PlanningOptions, planning_model
 from nmfd.model.scenario import Scenario
-from nmfd.model.scenario_file import PlanningOptions
 from nmfd.runs import config, shipped
 from nmfd.runs.files import file_hash
 from nmfd.types import Controller

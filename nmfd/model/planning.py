@@ -17,11 +17,21 @@ from nmfd.arrays import PairsOverTime, PerPair
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel, check_step, load_network
 from nmfd.model.scenario import Scenario
-from nmfd.model.scenario_file import PlanningOptions
 from nmfd.runs import config
+from nmfd.runs.config import Settings, Text, setting
 
 GUIDED = "guided"  # in a network's folder: that of the same city's model with guided drivers
 GUIDING = ("mpc-pcrg", "dpc-pcrg")  # beginnings of the names of the controllers that plan with it
+
+
+class PlanningOptions(Settings):
+    """Options of every controller, beside its own."""
+
+    model: Text | None = setting(
+        "folder or shipped name of the regional model to plan with; by default that of the scenario's network or, for "
+        "controllers that guide routes, the one in its folder guided",
+        None,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,52 +1,53 @@
-"""Regions, their adjacency, control bounds and MFDs; loaded from network.toml and checked."""
+"""Regions, their adjacency, control bounds and MFDs, and the network.toml that declares them."""
 
 import hashlib
+import io
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field, model_validator
 from scipy.sparse import csgraph, csr_array
 
 from nmfd.arrays import Adjacency, Hops, PerPair, PerRegion, PerTurn, Positions, TurnMask
 from nmfd.errors import InputError
-from nmfd.model.disturbance import Disturbance
 from nmfd.model.mfd import Mfd
-from nmfd.model.network_file import NetworkTable, RegionTable
 from nmfd.runs import config, shipped
+from nmfd.runs.config import Problem, Regions, Rows, Settings, Share, got, quoted, setting
 
-# Of boundaries with a capacity. What passes is a smooth minimum of wish and limit, (wish^-n + limit^-n)^(-1/n), 84 % of
-# either where they are equal: demand within a control interval is not even.
+# Flow over a boundary with a capacity: a smooth minimum of desired flow and limit, (desired^-n + limit^-n)^(-1/n), 84 %
+# of either where they are equal, because demand within a control interval is not even.
 SHARPNESS = 4
-LEAST_ROOM = 0.03  # of the capacity, into a region however full: it never locks for good
+LEAST_ROOM = 0.03  # of the capacity, into a region however full: no boundary closes for good
 LEAST_LIMIT = 1e-6  # veh/s, against a division by zero
+
+MOST_VEHICLES = 1e9  # in a region
+FOR_ALL = ("exit_rates", "capacity", "storage", "controllable")  # given for every region or for none
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegionalModel:
     """R regions, numbered from 0.
 
-    name
     region_names: R names
-    positions: (R, 2), where a region is drawn on the map [any unit]
-    adjacency: (R, R) bool, [i, h] = vehicles can go from i to h; false on the diagonal, and symmetric but for the
-        neighbours that only one-way streets join
-    mfds: one outflow MFD per region
+    positions: (R, 2), place on the map [any unit]
+    adjacency: (R, R) bool, [i, h]: roads lead from i to h; false on the diagonal
+    mfds: R outflow MFDs
     u_min, u_max: bounds of the perimeter control [-]
-    observed_split_ratios: {(i, j): {h: share}}, what drivers do by themselves where it was measured; elsewhere they
-        follow the fewest boundaries
-    exit_rates: (R, R) [-], [i, j]: how fast vehicles in i bound for j leave i, relative to the mean g_i(x_i)/x_i of
-        the MFD; None for 1: trips of all kinds have the same length in a region
-    capacity: (R, R) [veh/s], [i, h]: the most that passes from i to an empty region h under u_max; None: u_ih is a
-        share of the flow that wishes to pass, however little that is
-    storage: (R,) [veh], the accumulation that leaves no room for vehicles from other regions; with `capacity`
-    controllable: (R, R) [-], [i, h]: share of the flow from i to h that passes signals under control; None if unknown
-    disturbance: how what the model got wrong lately says what it will get wrong; None if unknown
-    placeholder: whether the MFDs are a guess that no run has measured
-    doubts: of every region, what is doubtful about its fit; () if unknown
-    folder: where network.toml was, or None
+    observed_split_ratios: {(i, j): {h: share}}, measured; elsewhere vehicles cross the fewest boundaries
+    exit_rates: (R, R) [-], [i, j]: rate of vehicles in i bound for j relative to g_i(x_i)/x_i; None: 1
+    capacity: (R, R) [veh/s], [i, h]: largest flow from i into an empty region h under u_max; None: u_ih is a share of
+        the desired flow
+    storage: (R,) [veh], accumulation that leaves no room for vehicles from other regions; with `capacity`
+    controllable: (R, R) [-], [i, h]: share of the flow that passes signals under control; None if unknown
+    placeholder: the MFDs are guesses that no run has measured
+    doubts: warnings about the fit of each region; () if unknown
+    folder: of network.toml, or None
     """
 
     name: str
@@ -61,7 +62,6 @@ class RegionalModel:
     capacity: PerPair | None = None
     storage: PerRegion | None = None
     controllable: PerPair | None = None
-    disturbance: Disturbance | None = None
     placeholder: bool = False
     doubts: tuple[tuple[str, ...], ...] = ()
     folder: Path | None = None
@@ -73,48 +73,45 @@ class RegionalModel:
 
     @property
     def critical(self) -> PerRegion:
-        """(R,) [veh]: the critical accumulations."""
+        """Critical accumulations (R,) [veh]."""
         return np.array([mfd.critical for mfd in self.mfds])
 
     @cached_property
     def hops(self) -> Hops:
-        """(R, R) int: boundaries to cross on a shortest way; -1 where there is none."""
-        return _hops(self.adjacency)
+        """Boundaries on a shortest path (R, R) int; -1 where there is none."""
+        hops = csgraph.shortest_path(self.adjacency, unweighted=True)
+        return np.where(np.isfinite(hops), hops, -1).astype(int)
 
     @cached_property
     def split_mask(self) -> TurnMask:
-        """(R, R, R) bool, [i, h, j]: theta_ihj may be positive.
-
-        h must be adjacent to i, j != i, and j must be reachable from h without coming back to i.
-        """
+        """Turns with theta_ihj > 0 allowed (R, R, R) bool: h adjacent to i, and j reachable from h without i."""
         mask = np.zeros((self.regions,) * 3, dtype=bool)
         roads = csr_array(self.adjacency)
         for i in range(self.regions):
             others, onward = np.arange(self.regions) != i, self.adjacency[i]
-            mask[np.ix_([i], onward, others)] = _reaches(roads[others][:, others])[onward[others]]
+            mask[np.ix_([i], onward, others)] = _reachable(roads[others][:, others])[onward[others]]
         return mask
 
     @cached_property
     def nominal_splits(self) -> PerTurn:
-        """(R, R, R), [i, h, j]: theta without guidance [-]: `observed_split_ratios`, else the fewest boundaries,
-        equally where there are several such ways."""
+        """Theta without guidance (R, R, R) [-], [i, h, j]: observed, otherwise equal shares of shortest paths."""
         closer = self.hops[None, :, :] == self.hops[:, None, :] - 1
         theta = (self.adjacency[:, :, None] & closer & self.split_mask).astype(float)
         for (i, j), shares in self.observed_split_ratios.items():
             theta[i, :, j] = 0.0
             theta[i, list(shares), j] = list(shares.values())
         sums = theta.sum(axis=1, keepdims=True)
-        theta /= np.where(sums > 0, sums, 1.0)  # in place: of very many regions it is as large as memory
+        theta /= np.where(sums > 0, sums, 1.0)  # in place: large for hundreds of regions
         return theta
 
     @property
     def open_capacity(self) -> PerPair | None:
-        """(R, R) [veh/s]: `capacity` for u = 1."""
+        """`capacity` for u = 1 (R, R) [veh/s]."""
         return None if self.capacity is None else self.capacity / self.u_max
 
     @cached_property
     def hash(self) -> str:
-        """A fingerprint of all that the dynamics depend on; a policy is valid for one network only."""
+        """Hash of all that the dynamics depend on; a policy is valid for one network only."""
         content = [
             self.adjacency.astype(int).tolist(),
             [[m.a, m.b, m.c, m.jam] for m in self.mfds],
@@ -127,34 +124,135 @@ class RegionalModel:
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
-def _reaches(roads: csr_array) -> Adjacency:
-    """(R, R) bool, [h, j]: j can be reached from h by roads (R, R) bool, [h, j] = from h to j.
-
-    Where all one-way streets lie on ways back, as nearly always, by the parts that hang together: in a city of many
-    regions shortest ways would take most of the time that a controller needs to be made.
-    """
+def _reachable(roads: csr_array) -> Adjacency:
+    """Return (R, R) bool, [h, j]: j is reachable from h; by components where possible, which is much faster."""
     parts, label = csgraph.connected_components(roads, connection="weak")
     if parts == csgraph.connected_components(roads, connection="strong", return_labels=False):
         return label[:, None] == label
     return np.isfinite(csgraph.shortest_path(roads, unweighted=True))
 
 
-def _hops(adjacency: Adjacency) -> Hops:
-    hops = csgraph.shortest_path(adjacency, unweighted=True)
-    return np.where(np.isfinite(hops), hops, -1).astype(int)
+class PerimeterTable(Settings):
+    """Bounds of the perimeter control at every boundary."""
+
+    min: Share = setting("least control")
+    max: Share = setting("largest control, more than min")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "PerimeterTable":
+        if self.min >= self.max:
+            raise Problem("", f"min must be less than max, got min = {self.min:g} and max = {self.max:g}")
+        return self
+
+
+class MfdTable(Settings):
+    """Outflow MFD: a n^3 + b n^2 + c n [veh/s] at accumulation n [veh]."""
+
+    a: float = setting("cubic coefficient", unit="veh^-2 s^-1")
+    b: float = setting("quadratic coefficient", unit="veh^-1 s^-1")
+    c: float = setting("linear coefficient, positive", unit="s^-1")
+    jam: float = setting("accumulation beyond which the outflow is constant", unit="veh", gt=0.0, le=MOST_VEHICLES)
+
+    @model_validator(mode="after")
+    def _valid(self) -> "MfdTable":
+        if problem := self.mfd.problem():
+            raise Problem("c" if self.c <= 0 else "jam", problem)
+        return self
+
+    @property
+    def mfd(self) -> Mfd:
+        """The curve."""
+        return Mfd(**vars(self))
+
+
+class RegionTable(Settings):
+    """Region; regions are numbered from 0 in the order of the file."""
+
+    name: config.Name | None = setting("name; by default the number", None)
+    position: Annotated[tuple[float, float], Field(strict=False)] = setting("place on the map, in any unit")
+    adjacent: Regions = setting("regions into which roads lead from here")
+    mfd: MfdTable | None = setting("own MFD instead of [mfd]", None)
+    exit_rates: config.PositiveNumbers | None = setting(
+        "rate at which vehicles leave, relative to the MFD, per destination region; for all regions or none",
+        None,
+        unit="-",
+    )
+    capacity: config.PositiveNumbers | None = setting(
+        "largest flow into each adjacent region while that is empty, under the largest control, in the order of "
+        "adjacent; with storage, for all regions or none",
+        None,
+        unit="veh/s",
+    )
+    storage: float | None = setting(
+        "accumulation that leaves no room for vehicles from other regions; with capacity",
+        None,
+        unit="veh",
+        gt=0.0,
+        le=MOST_VEHICLES,
+    )
+    controllable: Annotated[tuple[Share, ...], Field(strict=False)] | None = setting(
+        "share of the flow into each adjacent region that passes signals under control, in the order of adjacent; for "
+        "all regions or none",
+        None,
+        unit="-",
+    )
+    doubts: config.Texts = setting("warnings of cosim identify about the fit", ())
+    observed_split_ratios: dict[str, dict[str, Share]] = setting(
+        "measured shares: destination region = { next region = share }, sum 1; elsewhere vehicles cross the fewest "
+        "boundaries",
+        {},
+    )
+
+
+class NetworkTable(Settings):
+    """Regional model of a city."""
+
+    name: config.Name = setting("name of the model")
+    placeholder: bool = setting("MFDs are guesses from lanes and speed limits; no policy is trained on them", False)
+    perimeter: PerimeterTable = setting("bounds of the control")
+    mfd: MfdTable | None = setting("MFD of every region without one of its own", None)
+    regions: Rows[RegionTable] = setting("one table per region", min_length=1)
+    sumo: dict[str, Any] = setting("simulated city, for cosim", {})
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "NetworkTable":
+        count = len(self.regions)
+        for i, row in enumerate(self.regions):
+            where = f"regions[{i}]"
+            if max(row.adjacent, default=0) >= count:
+                allowed = f"a list of distinct whole numbers from 0 to {count - 1}"
+                raise Problem(f"{where}.adjacent", got(allowed, list(row.adjacent)))
+            if i in row.adjacent:
+                raise Problem(f"{where}.adjacent", f"region {i} is listed as adjacent to itself; remove it")
+            if row.mfd is None and self.mfd is None:
+                raise Problem(f"{where}.mfd", "missing; add a table [regions.mfd], or [mfd] for all regions")
+            if (row.storage is None) != (row.capacity is None):
+                raise Problem(f"{where}.capacity", "capacity and storage belong together; add or remove one")
+            for key in FOR_ALL:
+                if getattr(row, key) is None and any(getattr(other, key) is not None for other in self.regions):
+                    raise Problem(f"{where}.{key}", "missing; give it for every region or for none")
+            lengths = {"exit_rates": count, "capacity": len(row.adjacent), "controllable": len(row.adjacent)}
+            for key, length in lengths.items():
+                if (values := getattr(row, key)) is not None and len(values) != length:
+                    raise Problem(f"{where}.{key}", got(f"a list of {length} numbers", list(values)))
+            for destination, shares in row.observed_split_ratios.items():
+                if destination not in map(str, range(count)):
+                    allowed = f"destination regions from 0 to {count - 1}"
+                    raise Problem(f"{where}.observed_split_ratios", got(allowed, destination))
+                if not set(shares) <= set(map(str, row.adjacent)) or abs(sum(shares.values()) - 1.0) > 1e-3:
+                    allowed = f"shares of some of the adjacent regions {list(row.adjacent)} with sum 1"
+                    raise Problem(f"{where}.observed_split_ratios.{destination}", got(allowed, shares))
+        return self
 
 
 def load_network(folder: Path | str) -> RegionalModel:
-    """Read `folder`/network.toml (nmfd.model.network_file); a name alone is that of one that comes with the package.
+    """Read `folder`/network.toml, or a shipped network by its name. Raises InputError.
 
-    Raises InputError for a missing file, an unknown key, a wrong type or range, an adjacency that is not symmetric
-    or not connected, or an MFD that is none. The table [sumo] is left to the microsimulation.
-
-        >>> network = load_network("hexagon7")
-        >>> network.regions, network.u_min, network.u_max
-        (7, 0.1, 0.9)
-        >>> network.nominal_splits[2, :, 4]  # from west to east by the centre
-        array([0., 0., 0., 1., 0., 0., 0.])
+    >>> network = load_network("hexagon7")
+    >>> network.regions, network.u_min, network.u_max
+    (7, 0.1, 0.9)
+    >>> network.nominal_splits[2, :, 4]  # from west to east through the centre
+    array([0., 0., 0., 1., 0., 0., 0.])
     """
     folder = shipped.found(folder, shipped.NETWORK)
     path = folder / "network.toml"
@@ -162,63 +260,53 @@ def load_network(folder: Path | str) -> RegionalModel:
     rows = table.regions
     adjacency = np.zeros((len(rows), len(rows)), dtype=bool)
     for i, row in enumerate(rows):
-        adjacency[i, list(row.onward)] = True
-    capacity, controllable = (_by_pair(rows, name) for name in ("capacity", "controllable"))
+        adjacency[i, list(row.adjacent)] = True
+
+    def numbers(key: str, *, by_pair: bool = False) -> Any:
+        values = [getattr(row, key) for row in rows]
+        if values[0] is None or not by_pair:
+            return None if values[0] is None else np.array(values)
+        matrix = np.zeros(adjacency.shape)
+        for i, row in enumerate(rows):
+            matrix[i, list(row.adjacent)] = values[i]
+        return matrix
+
     network = RegionalModel(
         name=table.name,
         region_names=tuple(row.name or str(number) for number, row in enumerate(rows)),
         positions=np.array([row.position for row in rows]),
         adjacency=adjacency,
-        mfds=tuple(table.mfd_of(row) for row in rows),
+        mfds=tuple((row.mfd or table.mfd).mfd for row in rows),  # type: ignore[union-attr]  # `_consistent`
         u_min=table.perimeter.min,
         u_max=table.perimeter.max,
         observed_split_ratios={
-            (row.region, row.destination): dict(zip(row.next, row.share, strict=True))
-            for row in table.observed_split_ratios
+            (i, int(j)): {int(h): share for h, share in shares.items()}
+            for i, row in enumerate(rows)
+            for j, shares in row.observed_split_ratios.items()
         },
-        exit_rates=None if rows[0].exit_rates is None else np.array([row.exit_rates for row in rows]),
-        capacity=capacity,
-        storage=None if rows[0].storage is None else np.array([row.storage for row in rows]),
-        controllable=controllable,
+        exit_rates=numbers("exit_rates"),
+        capacity=numbers("capacity", by_pair=True),
+        storage=numbers("storage"),
+        controllable=numbers("controllable", by_pair=True),
         placeholder=table.placeholder,
         folder=folder,
-        disturbance=None if table.disturbance is None else table.disturbance.law,
         doubts=tuple(row.doubts for row in rows) if any(row.doubts for row in rows) else (),
     )
-    _check_ways(network, path)
-    return network
-
-
-def _by_pair(rows: Sequence[RegionTable], name: str) -> PerPair | None:
-    """(R, R), [i, h]: a key of every region that has a number for each region into which roads lead."""
-    if getattr(rows[0], name) is None:
-        return None
-    found = np.zeros((len(rows),) * 2)
-    for i, row in enumerate(rows):
-        found[i, list(row.onward)] = getattr(row, name)
-    return found
-
-
-def _check_ways(network: RegionalModel, path: Path) -> None:
-    """InputError for a region that cannot be reached, or drivers whose way leads back to where they are."""
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
         raise config.error(path, "regions", f"region {j} cannot be reached from region {i}; connect them with adjacent")
-    for (i, j), shares in network.observed_split_ratios.items():
-        for h in shares:
+    for (i, j), observed in network.observed_split_ratios.items():
+        for h in observed:
             if not network.split_mask[i, h, j]:
-                raise config.error(
-                    path,
-                    "observed_split_ratios",
-                    f"from region {i} to {j} by way of {h} leads back into {i}; remove it",
-                )
+                key = f"regions[{i}].observed_split_ratios.{j}"
+                raise config.error(path, key, f"region {h} leads back into {i}; remove it")
+    return network
 
 
 def check_step(network: RegionalModel, step: float, where: str) -> None:
-    """InputError unless forward Euler with `step` [s] keeps every accumulation non-negative (step * q <= 1)."""
+    """Raise InputError unless forward Euler with `step` [s] keeps accumulations non-negative (step * q <= 1)."""
     for region, mfd in enumerate(network.mfds):
-        grid = np.linspace(0.0, mfd.jam, 2001)
-        fastest = float(mfd.rate(grid).max())
+        fastest = float(mfd.rate(np.linspace(0.0, mfd.jam, 2001)).max())
         if network.exit_rates is not None:
             fastest *= float(network.exit_rates[region].max())
         if step * fastest > 1.0:
@@ -227,3 +315,45 @@ def check_step(network: RegionalModel, step: float, where: str) -> None:
                 f"{network.name}, whose vehicles leave at up to {fastest:.3g} 1/s; allowed is at most "
                 f"{1.0 / fastest:.3g} s: raise substeps or shorten step"
             )
+
+
+def schema_line(folder: Path) -> str:
+    """Return the line that names the JSON schema above `folder` for editors; "" where there is none."""
+    above = (parent / "network.schema.json" for parent in folder.absolute().parents)
+    schema = next((file for file in above if file.is_file()), None)
+    return f"#:schema {Path(os.path.relpath(schema, folder)).as_posix()}\n" if schema else ""
+
+
+def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) -> str:
+    """Return network.toml of `network` with this table [sumo]."""
+    out = io.StringIO()
+    out.write(f"# {comment}\nname = {quoted(network.name)}\n")
+    out.write("placeholder = true\n\n" if network.placeholder else "\n")
+    out.write(f"[perimeter]\nmin = {network.u_min:g}\nmax = {network.u_max:g}\n")
+    if sumo:
+        out.write("\n[sumo]\n" + "".join(f"{key} = {quoted(value)}\n" for key, value in sumo.items()))
+    for region, (x, y) in enumerate(network.positions):
+        onward, curve = network.adjacency[region], network.mfds[region]
+        out.write(f"\n[[regions]]\nname = {quoted(network.region_names[region])}\nposition = [{x:.6g}, {y:.6g}]\n")
+        out.write(f"adjacent = [{', '.join(map(str, np.flatnonzero(onward)))}]\n")
+        if network.exit_rates is not None:
+            out.write(f"exit_rates = {_listed(network.exit_rates[region])}\n")
+        if network.capacity is not None and network.storage is not None:
+            out.write(f"capacity = {_listed(network.capacity[region, onward])}\n")
+            out.write(f"storage = {network.storage[region]:.6g}\n")
+        if network.controllable is not None:
+            out.write(f"controllable = {_listed(network.controllable[region, onward])}\n")
+        if network.doubts and network.doubts[region]:
+            out.write(f"doubts = [{', '.join(map(quoted, network.doubts[region]))}]\n")
+        out.write("\n[regions.mfd]\n")
+        out.write(f"a = {curve.a:.6g}\nb = {curve.b:.6g}\nc = {curve.c:.6g}\njam = {curve.jam:.6g}\n")
+        splits = [(j, shares) for (i, j), shares in sorted(network.observed_split_ratios.items()) if i == region]
+        if splits:
+            out.write("\n[regions.observed_split_ratios]\n")
+        for j, shares in splits:
+            out.write(f"{j} = {{ {', '.join(f'{h} = {share:.4f}' for h, share in shares.items())} }}\n")
+    return out.getvalue()
+
+
+def _listed(values: Sequence[float] | np.ndarray) -> str:
+    return f"[{', '.join(f'{value:.4g}' for value in values)}]"

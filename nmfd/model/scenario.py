@@ -1,44 +1,55 @@
-"""Demand, noise, horizon: loaded from scenario.toml and checked."""
+"""Demand, noise and horizon of a run, and the scenario.toml that declares them."""
 
-import csv
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Bool
+from pydantic import model_validator
 
 from nmfd.arrays import Intervals, PairsOverTime, PerPair
 from nmfd.errors import InputError
 from nmfd.faults import Fault, parse
 from nmfd.model.regional_model import RegionalModel, check_step, load_network
-from nmfd.model.scenario_file import MOST_NUMBERS, OWN_TIME_LIMIT, ScenarioTable, read_tables
-from nmfd.runs import config, shipped
-from nmfd.runs.files import check_file
+from nmfd.runs import config, files, shipped
+from nmfd.runs.config import Name, Numbers, Problem, Regions, Rows, Settings, Text, Texts, setting, whole
+
+LONGEST_STEP_S = 86_400.0
+MOST_STEPS = 10**6
+MOST_FLOW_VEH_S = 1e6
+# Entries d_ij(k) of the demand that noise perturbs. Clipping passes only the positive half of the noise where no demand
+# was planned, so that "pairs" and "all" add 0.4 sigma veh/s per pair, from start to end.
+WHERE = {
+    "planned": "pairs of regions with demand, while it lasts: about as many vehicles as planned",
+    "pairs": "pairs of regions with demand, all the time: more vehicles than planned",
+    "all": "every pair of regions, all the time: many times the planned vehicles",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
     """T control intervals on a network.
 
-    name, network
     step: control interval [s]
     steps: T
-    demand: (T, R, R) [veh/s], [k, i, j] = vehicles that start in i bound for j, during interval k
-    measurement_std: of the Gaussian noise on every x_ij that a controller sees [veh]
+    demand: (T, R, R) [veh/s], [k, i, j]: vehicles that start in i bound for j during interval k
+    measurement_std: standard deviation of the Gaussian noise on each observed x_ij [veh]
     integrator: "euler" or "rk4", of the regional model
     substeps: integration steps of the regional model per control interval
-    protected: the regions that gating protects
-    demand_factor: what the demand was multiplied by already, for a city that drives vehicles of its own
-    forecast_error: standard deviation of the logarithm of what a controller is told of the demand, over the truth [-]
-    forecast_seed: of that error
-    controller_options: controller name -> its table in [controllers], checked by that controller
+    protected: regions that gating protects
+    controller_options: controller -> its table in [controllers], checked by that controller
+    demand_factor: factor already applied to the demand, for a city with vehicles of its own
+    forecast_error: standard deviation of the logarithm of forecast over demand [-]
     faults: injected into every run (nmfd.faults)
-    own_time_limit: of every call of a controller of the user's own [s], 0 for none; no result depends on it
-    initial: (R, R) [veh], [i, j] = vehicles that are in i bound for j when a run begins; None: nobody
-    folder: where scenario.toml was, or None
+    initial: (R, R) [veh], [i, j]: vehicles in i bound for j at the start; None: empty
+    sumo: table [sumo], checked by cosim
+    folder: of scenario.toml, or None
     """
 
     name: str
@@ -53,35 +64,33 @@ class Scenario:
     controller_options: Mapping[str, dict] = field(default_factory=dict)
     demand_factor: float = 1.0
     forecast_error: float = 0.0
-    forecast_seed: int = 0
     faults: tuple[str, ...] = ()
-    own_time_limit: float = OWN_TIME_LIMIT
     initial: PerPair | None = None
+    sumo: Mapping[str, Any] = field(default_factory=dict)
     folder: Path | None = None
 
     @property
     def start(self) -> PerPair:
-        """(R, R) [veh]: `initial` as an array of its own, zeros for nobody."""
+        """A copy of `initial` (R, R) [veh]; zeros if the network is empty."""
         return np.zeros(self.demand.shape[1:]) if self.initial is None else self.initial.copy()
 
     @cached_property
     def forecast(self) -> PairsOverTime:
-        """(T, R, R) [veh/s]: the demand as controllers that look ahead know it.
+        """Demand (T, R, R) [veh/s] as predictive controllers know it.
 
-        Each pair is off by a factor for the whole run and one per interval, lognormal with mean 1, which share the
-        variance equally: a forecast is wrong about the day, and about the quarter of an hour.
+        Each pair is off by a factor for the whole run and one per interval, lognormal with mean 1 and equal variance.
         """
         if not self.forecast_error:
             return self.demand
-        random = np.random.default_rng([self.forecast_seed, 0x666F72])
+        random = np.random.default_rng([0, 0x666F72])
         spread = self.forecast_error / np.sqrt(2.0)
         normal = random.standard_normal((1, *self.demand.shape[1:])) + random.standard_normal(self.demand.shape)
         return self.demand * np.exp(spread * normal - spread**2)
 
     @cached_property
     def hash(self) -> str:
-        """A fingerprint of all that a run depends on, whatever its files are called."""
-        settings = [
+        """Hash of all that a run depends on, whatever the names of its files."""
+        content = [
             self.network.hash,
             self.step,
             self.steps,
@@ -91,160 +100,242 @@ class Scenario:
             self.protected,
             self.controller_options,
         ]
-        if self.forecast_error:
-            settings.append([self.forecast_error, self.forecast_seed])
-        if self.faults:
-            settings.append(self.faults)
-        if self.initial is not None:
-            settings.append(self.initial.tolist())
-        text = json.dumps(settings, sort_keys=True, default=str)
+        content += [[self.forecast_error, 0]] if self.forecast_error else []
+        content += [self.faults] if self.faults else []
+        content += [self.initial.tolist()] if self.initial is not None else []
+        text = json.dumps(content, sort_keys=True, default=str)
         return hashlib.sha256(text.encode() + np.ascontiguousarray(self.demand).tobytes()).hexdigest()[:16]
 
     @cached_property
     def ordered_faults(self) -> tuple[Fault, ...]:
-        """`faults`, parsed. InputError."""
+        """`faults`, parsed. Raises InputError."""
         where = "scenario.toml" if self.folder is None else self.folder / "scenario.toml"
         return tuple(parse(text, f"{where}: faults", self.network.regions) for text in self.faults)
 
 
 def with_faults(scenario: Scenario, texts: Sequence[str]) -> Scenario:
-    """`scenario` with more faults, as the option --fault gives them. InputError."""
-    for text in texts:
-        parse(text, "--fault", scenario.network.regions)
-    return replace(scenario, faults=(*scenario.faults, *texts))
-
-
-def with_time_limit(scenario: Scenario, seconds: float | None) -> Scenario:
-    """`scenario` with the option --time-limit, if it is given."""
-    return scenario if seconds is None else replace(scenario, own_time_limit=seconds)
+    """Return `scenario` with more faults. Raises InputError."""
+    more = replace(scenario, faults=(*scenario.faults, *texts))
+    _ = more.ordered_faults
+    return more
 
 
 def with_demand(scenario: Scenario, *, steps: int | None = None, factor: float = 1.0) -> Scenario:
-    """The first `steps` control intervals of `scenario`, at most all of them, with `factor` times its demand."""
+    """Return at most the first `steps` control intervals of `scenario`, with `factor` times its demand."""
     steps = scenario.steps if steps is None else min(steps, scenario.steps)
     return replace(
         scenario, steps=steps, demand=factor * scenario.demand[:steps], demand_factor=factor * scenario.demand_factor
     )
 
 
-def trapezoid(
-    time: Intervals, *, start: float, peak: float, ramp_up: float, flat: float, ramp_down: float
-) -> Intervals:
-    """Demand [veh/s] at `time` (T,) [s]: rises from 0 at `start`, stays at `peak` for `flat` and falls to 0."""
-    end = start + ramp_up + flat + ramp_down
-    rising = (time - start) / ramp_up if ramp_up > 0 else np.where(time >= start, 1.0, 0.0)
-    falling = (end - time) / ramp_down if ramp_down > 0 else np.where(time < end, 1.0, 0.0)
-    return peak * np.clip(np.minimum(rising, falling), 0.0, 1.0)
+def perturbed_entries(demand: PairsOverTime, where: str) -> Bool[np.ndarray, "T R R"]:
+    """Return the entries of `demand` (T, R, R) that `where`, a key of WHERE, perturbs."""
+    if where == "planned":
+        return demand > 0
+    if where == "pairs":
+        return np.broadcast_to((demand > 0).any(axis=0), demand.shape)
+    return np.ones(demand.shape, dtype=bool)
 
 
-def read_scenario(folder: Path | str) -> Scenario:
-    """Read `folder`/scenario.toml and its network; a name alone is that of one that comes with the package.
+def perturbed(scenario: Scenario, sigma: float, seed: int, *, where: str) -> Scenario:
+    """Return `scenario` with demand max(0, d_ij(k) + sigma n_ij(k)) [veh/s], n standard normal.
 
-    Raises InputError.
+    The same seed gives the same n for every sigma (common random numbers).
+    """
+    noise = np.random.default_rng([seed, 0x64656D]).standard_normal(scenario.demand.shape)
+    noise *= perturbed_entries(scenario.demand, where)
+    return replace(scenario, demand=np.maximum(scenario.demand + sigma * noise, 0.0))
 
-    The table [controllers] is left to the controllers (nmfd.controllers.registry.checked_scenario), [sumo] to cosim.
+
+class DemandTable(Settings):
+    """One flow, a trapezoid over time; flows of the same pair of regions add up."""
+
+    origin: config.Region = setting("origin region", alias="from")
+    to: config.Region = setting("destination region")
+    start: config.Seconds = setting("begin of the flow")
+    peak: config.Flow = setting("largest flow")
+    ramp_up: config.Seconds = setting("time to rise to the peak")
+    flat: config.Seconds = setting("time at the peak")
+    ramp_down: config.Seconds = setting("time to fall to 0")
+
+    def rate(self, time: Intervals) -> Intervals:
+        """Return the flow [veh/s] at `time` (T,) [s]."""
+        end = self.start + self.ramp_up + self.flat + self.ramp_down
+        rising = (time - self.start) / self.ramp_up if self.ramp_up > 0 else np.where(time >= self.start, 1.0, 0.0)
+        falling = (end - time) / self.ramp_down if self.ramp_down > 0 else np.where(time < end, 1.0, 0.0)
+        return self.peak * np.clip(np.minimum(rising, falling), 0.0, 1.0)
+
+
+class ScenarioTable(Settings):
+    """A network, its demand and noise, and the horizon."""
+
+    name: Name = setting("name of the scenario")
+    base: Text | None = setting(
+        "folder or shipped name of a scenario that gives what this one omits; tables are completed key by key", None
+    )
+    network: Text = setting("folder or shipped name of the network")
+    step: float = setting("control interval", unit="s", gt=0.0, le=LONGEST_STEP_S)
+    steps: int = whole("control intervals", low=1, high=MOST_STEPS)
+    integrator: Literal["euler", "rk4"] = setting("integration scheme of the regional model", "euler")
+    substeps: int = whole("integration steps of the regional model per control interval", 1, low=1, high=1000)
+    protected: Regions = setting("regions that gating protects", ())
+    demand: Rows[DemandTable] | None = setting("one table per flow; optional beside demand_file", None)
+    demand_file: Text | None = setting("csv with the columns interval, from, to, veh_s, added to [[demand]]", None)
+    demand_factor: float = setting("factor of the whole demand", 1.0, unit="-", ge=0.0, le=1000.0)
+    measurement_std: float = setting(
+        "standard deviation of the noise on each observed accumulation by destination", 0.0, unit="veh", ge=0.0, le=1e6
+    )
+    forecast_error: float = setting(
+        "standard deviation of the logarithm of forecast over demand", 0.0, unit="-", ge=0.0, le=2.0
+    )
+    initial: Rows[Numbers] = setting(
+        "vehicles at the start, regional model only: one row per region, by destination", (), unit="veh"
+    )
+    faults: Texts = setting("injected into every run: KIND[:VALUE][@FROM-TO]", ())
+    controllers: dict[str, dict[str, Any]] = setting("options of controllers", {})
+    sumo: dict[str, Any] = setting("simulation of the city, for cosim", {})
+
+    @model_validator(mode="after")
+    def _has_demand(self) -> "ScenarioTable":
+        if self.demand is None and self.demand_file is None:
+            raise Problem("demand", "missing; add a list of tables [[demand]], or demand_file")
+        return self
+
+
+def read_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None) -> Scenario:
+    """Read `folder`/scenario.toml and its network, or a shipped scenario by its name. Raises InputError.
+
+    settings: dotted key -> value, which replace those of the file, such as {"sumo.compliance": 0.5}
     """
     folder = shipped.found(folder, shipped.SCENARIO)
     path = folder / "scenario.toml"
-    table = config.checked(ScenarioTable, read_tables(folder), path)
+    tables = read_tables(folder)
+    for key, value in (settings or {}).items():
+        tables = _completed(_nested(key, value), tables)
+    table = config.checked(ScenarioTable, tables, path)
     network = load_network(folder / table.network)
-    _check_regions(table, network, path)
-    demand = _trapezoids(table, network.regions)
-    if table.demand_file is not None:
-        demand += _demand_file(folder / table.demand_file, table.steps, network.regions)
     check_step(network, table.step / table.substeps, str(path))
     scenario = Scenario(
         name=table.name,
         network=network,
         step=table.step,
         steps=table.steps,
-        demand=table.demand_factor * demand,
-        measurement_std=table.noise.measurement_std,
+        demand=table.demand_factor * _demand(table, network, folder),
+        measurement_std=table.measurement_std,
         integrator=table.integrator,
         substeps=table.substeps,
         protected=table.protected,
         controller_options=table.controllers,
         demand_factor=table.demand_factor,
-        forecast_error=table.forecast.error,
-        forecast_seed=table.forecast.seed,
+        forecast_error=table.forecast_error,
         faults=table.faults,
-        own_time_limit=table.own_time_limit,
-        initial=_initial(table, network.regions),
+        initial=np.array(table.initial) if table.initial else None,
+        sumo=table.sumo,
         folder=folder,
     )
-    _ = scenario.ordered_faults  # checked here, where the file is known
+    if max(table.protected, default=0) >= network.regions:
+        allowed = f"a list of distinct whole numbers from 0 to {network.regions - 1}"
+        raise config.error(path, "protected", config.got(allowed, list(table.protected)))
+    if table.initial and (
+        {len(row) for row in table.initial} | {len(table.initial)} != {network.regions} or scenario.start.min() < 0
+    ):
+        allowed = f"{network.regions} lists of {network.regions} numbers from 0 up"
+        raise config.error(path, "initial", config.got(allowed, [list(row) for row in table.initial]))
+    _ = scenario.ordered_faults
     return scenario
 
 
-def _check_regions(table: ScenarioTable, network: RegionalModel, path: Path) -> None:
-    """InputError for regions that the network has not, or more intervals than there is memory for."""
-    most, known = network.regions - 1, f"network {network.name} has the regions 0 to {network.regions - 1}"
-    if max(table.protected, default=0) > most:
-        raise config.error(
-            path, "protected", config.got(f"a list of distinct whole numbers from 0 to {most}", list(table.protected))
-        )
-    ends = [(f"demand[{n}]", (("from", row.origin), ("to", row.to))) for n, row in enumerate(table.demand or ())]
-    ends += [(f"initial[{n}]", (("region", row.region), ("to", row.to))) for n, row in enumerate(table.initial)]
-    for where, pair in ends:
-        for key, region in pair:
-            if region > most:
-                raise config.error(path, f"{where}.{key}", f"region {region} is unknown; {known}")
-    if table.steps > MOST_NUMBERS // network.regions**2:
-        raise config.error(
-            path, "steps", config.got(f"a whole number from 1 to {MOST_NUMBERS // network.regions**2}", table.steps)
-        )
+def read_tables(folder: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Return `folder`/scenario.toml, completed by the scenario that it names as `base`. Raises InputError.
 
-
-def _trapezoids(table: ScenarioTable, regions: int) -> PairsOverTime:
-    """(T, R, R) [veh/s]: the flows of [[demand]]."""
-    demand = np.zeros((table.steps, regions, regions))
-    time = table.step * np.arange(table.steps)
-    for row in table.demand or ():
-        rate = trapezoid(time, **row.model_dump(include={"start", "peak", "ramp_up", "flat", "ramp_down"}))
-        demand[:, row.origin, row.to] += rate
-        if row.both_ways:
-            demand[:, row.to, row.origin] += rate
-    return demand
-
-
-def _initial(table: ScenarioTable, regions: int) -> PerPair | None:
-    """(R, R) [veh]: the vehicles of [[initial]]."""
-    if not table.initial:
-        return None
-    inside = np.zeros((regions, regions))
-    for row in table.initial:
-        inside[row.region, row.to] += row.vehicles
-    return inside
-
-
-def _demand_file(path: Path, steps: int, regions: int) -> PairsOverTime:
-    """(T, R, R) [veh/s] of a csv with the columns interval, from, to, veh_s; intervals beyond T are left out.
-
-    Raises InputError.
+    above: folders of the scenarios based on this one
     """
-    demand = np.zeros((steps, regions, regions))
-    check_file(path, "give a csv file")
-    try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.reader(stream))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give a table with the columns interval,from,to,veh_s") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read ({error}); give a csv file") from None
-    if not rows or rows[0] != ["interval", "from", "to", "veh_s"]:
-        found = ",".join(rows[0]) if rows else "nothing"
-        raise InputError(f"{path}: line 1: expected interval,from,to,veh_s, got {found} instead")
-    for number, row in enumerate(rows[1:], start=2):
-        try:
-            k, i, j, rate = int(row[0]), int(row[1]), int(row[2]), float(row[3])
-            good = len(row) == 4 and k >= 0 and 0 <= i < regions and 0 <= j < regions and 0.0 <= rate <= 1e6
-        except (ValueError, IndexError):
-            good = False
-        if not good:
-            raise InputError(
-                f"{path}: line {number}: expected an interval from 0 up, two regions from 0 to {regions - 1} and "
-                f"veh/s from 0 to 1e6, got {','.join(row)} instead"
-            )
-        if k < steps:
-            demand[k, i, j] += rate
+    file, folders = folder / "scenario.toml", (*above, folder)
+    own = config.read(file)
+    base = own.pop("base", None)
+    _relocate(own, folder, folders[0])
+    if folder.resolve() in (other.resolve() for other in above):
+        raise config.error(file, "base", "the scenarios are each other's base; remove one of the keys")
+    if base is None:
+        return own
+    if not isinstance(base, str) or not base.isprintable():
+        raise config.error(file, "base", config.got("the folder of a scenario in quotes", base))
+    return _completed(own, read_tables(shipped.found(base, shipped.SCENARIO, beside=folder), folders))
+
+
+def _relocate(own: dict, folder: Path, here: Path) -> None:
+    """Rewrite the paths in a scenario.toml in `folder` relative to the folder `here`."""
+
+    def seen(name: str, *kinds: str) -> str:
+        return files.relative(shipped.found(name, *kinds, beside=folder), here)
+
+    for key, kinds in (("network", (shipped.NETWORK,)), ("demand_file", ())):
+        if isinstance(own.get(key), str):
+            own[key] = seen(own[key], *kinds)
+    sumo = own.get("sumo")
+    if isinstance(sumo, dict):
+        for key in ("routes", "background", "additional"):
+            if isinstance(sumo.get(key), list) and all(isinstance(name, str) for name in sumo[key]):
+                sumo[key] = [seen(name) for name in sumo[key]]
+    controllers = own.get("controllers")
+    for options in controllers.values() if isinstance(controllers, dict) else ():
+        if isinstance(options, dict) and isinstance(options.get("model"), str):
+            options["model"] = seen(options["model"], shipped.NETWORK)
+
+
+def _nested(key: str, value: Any) -> dict:
+    """Return {"a": {"b": value}} of the key a.b; parts with dots stand in double quotes."""
+    for part in reversed(re.findall(r'"[^"]*"|[^.]+', key)):
+        value = {part.strip('"'): value}
+    return value
+
+
+def _completed(content: dict, base: dict) -> dict:
+    """Return `content` with what only `base` has, table by table."""
+    both = {
+        key: _completed(content[key], base[key])
+        for key in content
+        if isinstance(content[key], dict) and isinstance(base.get(key), dict)
+    }
+    return {**base, **content, **both}
+
+
+def _demand(table: ScenarioTable, network: RegionalModel, folder: Path) -> PairsOverTime:
+    """Return the demand (T, R, R) [veh/s] of [[demand]] and demand_file. Raises InputError."""
+    demand = np.zeros((table.steps, network.regions, network.regions))
+    time = table.step * np.arange(table.steps)
+    for n, row in enumerate(table.demand or ()):
+        for key, region in (("from", row.origin), ("to", row.to)):
+            if region >= network.regions:
+                known = f"region {region} is unknown; network {network.name} has 0 to {network.regions - 1}"
+                raise config.error(folder / "scenario.toml", f"demand[{n}].{key}", known)
+        demand[:, row.origin, row.to] += row.rate(time)
+    if table.demand_file is not None:
+        from_file = np.zeros_like(demand)
+        interval, origin, to, rate = _demand_rows(folder / table.demand_file, network.regions)
+        inside = interval < table.steps
+        np.add.at(from_file, (interval[inside], origin[inside], to[inside]), rate[inside])
+        demand += from_file
     return demand
+
+
+def _demand_rows(path: Path, regions: int) -> tuple[np.ndarray, ...]:
+    """Return interval, origin, destination (N,) and flow (N,) [veh/s] of a csv file. Raises InputError."""
+    files.check_file(path, "give a csv file")
+    try:
+        text = path.read_text(encoding="utf-8").splitlines()
+        if not text or text[0] != "interval,from,to,veh_s":
+            raise ValueError("its first line is not interval,from,to,veh_s")
+        rows = np.loadtxt(text[1:], delimiter=",", ndmin=2).reshape(-1, 4)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as demand ({error}); give a csv file") from None
+    interval, origin, to, rate = rows.T
+    whole_numbers = (rows[:, :3] == np.floor(rows[:, :3])).all(axis=1) & (rows[:, :3] >= 0).all(axis=1)
+    good = whole_numbers & (np.maximum(origin, to) < regions) & (rate >= 0.0) & (rate <= MOST_FLOW_VEH_S)
+    if not good.all():
+        line = int(np.argmin(good))
+        raise InputError(
+            f"{path}: line {line + 2}: expected an interval from 0 up, two regions from 0 to {regions - 1} and "
+            f"veh/s from 0 to {MOST_FLOW_VEH_S:g}, got {text[line + 1]} instead"
+        )
+    return interval.astype(int), origin.astype(int), to.astype(int), rate

@@ -12,9 +12,8 @@ from scipy.special import stdtrit
 from nmfd import closed_loop, faults
 from nmfd.controllers import registry
 from nmfd.metrics import COUNTED, percent_change
-from nmfd.model.demand_noise import perturbed
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
-from nmfd.model.scenario import Scenario
+from nmfd.model.scenario import Scenario, perturbed
 from nmfd.runs.progress import Progress
 from nmfd.runs.run_many import Run, run_many, run_name
 from nmfd.runs.tables import text_table
@@ -38,7 +37,7 @@ BOUND_CAPTION = (
 
 
 class Noise(NamedTuple):
-    """Noise on the demand (nmfd.model.demand_noise), drawn from the seed of a run; sigma: its deviation (veh/s)."""
+    """Noise on the demand (nmfd.model.scenario), drawn from the seed of a run; sigma: its deviation (veh/s)."""
 
     sigma: float
     where: str

@@ -22,9 +22,7 @@ from nmfd.errors import InputError
 from nmfd.html import html_table
 from nmfd.model import detector_tables, mfd
 from nmfd.model.detector_tables import SPEEDS
-from nmfd.model.model_file import network_toml, schema_line
-from nmfd.model.network_file import NetworkTable
-from nmfd.model.regional_model import RegionalModel, load_network
+from nmfd.model.regional_model import NetworkTable, RegionalModel, load_network, network_toml, schema_line
 from nmfd.runs import config, files
 from nmfd.runs.tables import wrapped
 from nmfd.studies import fit_quality, plots
@@ -199,7 +197,7 @@ def identify(
     network = replace(network, doubts=tuple(fit.doubts for fit in fits))
     text = "\n".join(
         [
-            fit_quality.fit_table(network, samples, fits, MEANINGS),
+            fit_quality.fit_table(network, fits, MEANINGS),
             *_told(rows, left, coverage, trip_km),
             *wrapped(UNSAID),
         ]
