@@ -130,11 +130,6 @@ class Detectors:
         self._region = np.array([city.region_of[city.edges[edge]] for edge in edges], dtype=int)
         self._occupancy, self._samples = np.zeros(len(self._loops)), 0
         self._departed = meter.probe_departures.copy()
-        self._working = np.ones(len(self._loops), dtype=bool)
-
-    def silence(self, share: float) -> None:
-        """Let a share of the loops tell nothing from now on, always the same ones."""
-        self._working = np.random.default_rng([LAYOUT, 1]).random(len(self._loops)) >= share
 
     def sample(self) -> None:
         """Read the loops once."""
@@ -147,13 +142,7 @@ class Detectors:
         the counted ones are looked at."""
         regions, share = self._city.regions, self._known.detector_share
         density = self._occupancy / max(self._samples, 1) / 100.0 / VEHICLE_LENGTH
-        length = self._length * self._working
-        vehicles = np.bincount(self._region, density * length, regions)
-        share = (
-            share
-            * np.bincount(self._region, length, regions)
-            / np.maximum(np.bincount(self._region, self._length, regions), 1e-9)
-        )
+        vehicles = np.bincount(self._region, density * self._length, regions)
         counts = np.zeros((regions, regions))
         for gateway, there, flow in zip(self._city.gateways, self._layout.counted, gateway_flow, strict=True):
             counts[gateway.source, gateway.target] += flow if there else 0.0

@@ -1,6 +1,6 @@
 """What SUMO is started with: the vehicles of a run, the files beside them, and the command line."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from cosim.sumo.recorded_trips import (
     RecordedTrips,
     check_edges,
     draw,
+    edges_of,
     read_recorded_trips,
     read_routes,
     write_held_trips,
@@ -22,8 +23,8 @@ from cosim.sumo.recorded_trips import (
 )
 from cosim.sumo.session import Session, Window
 from cosim.sumo.tripinfo import trip_options
-from cosim.sumo.trips import HeldTrips, held, write_trips
-from cosim.sumo.turning_flows import own_flows, turning_flows
+from cosim.sumo.trips import HeldTrips, held, make_trips, write_trips
+from cosim.sumo.turning_flows import PLANNING_SEEDS, own_flows, turning_flows
 from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
@@ -132,7 +133,7 @@ class Launch:
         """SUMO's additional files, in the order in which it reads them: of several programmes the last one runs."""
         scenario, chosen, folder = self._scenario, self._settings, self._scratch.path
         files = own_files(scenario, chosen.additional)
-        files += write_signal_programmes(folder, self._city, scenario, chosen, self._signals, self._own_flows())
+        files += write_signal_programmes(folder, self._city, scenario, chosen, self._signals, self._planning_trips())
         if chosen.measurement == ESTIMATE:
             files.append(folder / "loops.add.xml")
             write_loops(self._city, self._layout, scenario.step, files[-1])
@@ -172,6 +173,17 @@ class Launch:
     @cached_property
     def _shared_routes(self) -> Mapping[str, tuple[str, ...]]:
         return read_routes(own_files(self._scenario, self._settings.additional))
+
+    def _planning_trips(self) -> Iterator[tuple[float, Sequence[str]]]:
+        """Yield departure [s] and edges of the trips that Webster's plan is made for."""
+        if self._originals is None:
+            trips = make_trips(self._city, self._scenario.demand, self._scenario.step, PLANNING_SEEDS[0])
+            yield from zip(trips.depart.tolist(), trips.routes, strict=True)
+        else:
+            for depart, element in zip(self._originals.depart.tolist(), self._originals.elements, strict=True):
+                edges, driven = edges_of(element, self._shared_routes)
+                if driven:
+                    yield depart, edges
 
     def _own_flows(self) -> Mapping[tuple[str, str], float] | None:
         """Turning flows of the city's own vehicles; None where trips are drawn from the scenario's demand."""

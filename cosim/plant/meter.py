@@ -18,7 +18,7 @@ from cosim.sumo.arrays import PerGateway
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
 from cosim.sumo.tripinfo import End, TripReader
-from nmfd.arrays import PerPair, PerRegion
+from nmfd.arrays import PerPair
 from nmfd.ledger import LedgerError
 from nmfd.types import State
 
@@ -303,11 +303,6 @@ class Meter:
     def held(self) -> PerPair:
         """(R, R) [veh]: those of the backlog who are made to wait."""
         return np.zeros(self._running.shape) if self._metering is None else self._metering.backlog()
-
-    def on_the_road(self) -> PerRegion:
-        """(R,) [veh]: those on their way, by the region where they began."""
-        begun = [known.origin for known in self._vehicles.values() if known.region is not None]
-        return np.bincount(begun, minlength=len(self.time_loss)).astype(float)
 
     def probes(self) -> PerPair:
         """(R, R) [veh]: the probes among the accumulation, where it last counted them."""

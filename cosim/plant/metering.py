@@ -1,5 +1,4 @@
-"""Metering: trips begin at a commanded rate; who is due beyond that waits outside, first come, first served, or those
-with a long way to go longest.
+"""Metering: trips begin at a commanded rate; who is due beyond that waits outside, first come, first served.
 
 Gates move a queue; what cannot stand inside must stand outside. The trips of a metered city are not given to SUMO
 beforehand, but one by one when they may begin: on the same routes, with the same ids and by the same seed as without
@@ -11,29 +10,16 @@ Without a command, PI control of the accumulation of every region (velocity form
     r_i(k) = clip(r_i(k-1) + (KP (n_i(k-1) - n_i(k)) + KI (level n_cr,i - n_i(k))) / dt,  0, n_cr,i / FILLING)
 """
 
-import heapq
+from collections import deque
 
 import numpy as np
 
-from cosim.sumo.net import City
 from cosim.sumo.session import Session
-from cosim.sumo.trips import HeldTrips, PerTrip
+from cosim.sumo.trips import HeldTrips
 from nmfd.arrays import PerPair, PerRegion
 
 KP, KI = 1.0, 0.3  # of the vehicles too many, those that are kept out in the next control interval [-]; not tuned
 FILLING = 60.0  # s, in which the largest rate fills a region to its critical accumulation
-
-
-def ways(session: Session, city: City, trips: HeldTrips) -> PerTrip:
-    """(N,) [s] on empty streets; nothing for those of another vehicle class, which the city does not have."""
-
-    def empty(route: tuple[str, ...]) -> float:
-        if len(route) == 2 and route[1] not in city.successors.get(route[0], route):  # SUMO looks for the way
-            return session.fastest(*route)[0]
-        return sum(city.length[edge] / city.speed[edge] for edge in route if edge in city.length)
-
-    times = {route: empty(route) for route in set(trips.routes)}
-    return np.array([times[route] for route in trips.routes])
 
 
 class Metering:
@@ -50,14 +36,11 @@ class Metering:
         *,
         level: float,
         step: float,
-        way: PerTrip | None = None,
     ):
-        """critical: (R,) [veh]; level: accumulation that PI control holds, in these [-]; step: control interval [s];
-        way: (N,) [s], if of those who wait in a region whoever has the shortest begins first; None: who is due first"""
+        """critical: (R,) [veh]; level: accumulation that PI control holds, in these [-]; step: control interval [s]"""
         self._session, self._trips, self._set_point, self._interval = session, trips, level * critical, step
         self._most = critical / FILLING
-        self._way = np.zeros(len(trips.depart)) if way is None else way
-        self._queues: list[list[tuple[float, int]]] = [[] for _ in critical]  # heaps of ways and trips
+        self._queues: list[deque[int]] = [deque() for _ in critical]  # trips by their number, in order of departure
         self._due, self.waited = 0, 0.0
         self._rate, self._credit = self._most.copy(), np.ones(len(critical))
         self._before: PerRegion | None = None
@@ -77,14 +60,14 @@ class Metering:
         """Let begin who is due and may."""
         now, depart, origin = self._session.time, self._trips.depart, self._trips.origin
         while self._due < len(depart) and depart[self._due] <= now:
-            heapq.heappush(self._queues[origin[self._due]], (self._way[self._due], self._due))
+            self._queues[origin[self._due]].append(self._due)
             self._due += 1
         # What is not used is not saved: after an hour without traffic nobody comes in a flood.
         self._credit = np.minimum(self._credit + self._rate * self._session.step_length, np.maximum(1.0, self._rate))
         for region, queue in enumerate(self._queues):
             while queue and self._credit[region] >= 1.0 - 1e-9:
                 self._credit[region] -= 1.0
-                _, trip = heapq.heappop(queue)
+                trip = queue.popleft()
                 self._session.begin_trip(self._trips.orders[trip])
                 self.waited += now - depart[trip]
 
@@ -92,11 +75,11 @@ class Metering:
         """(R, R) [veh]: due to depart from i for j, and made to wait."""
         waiting = np.zeros((len(self._queues),) * 2)
         for region, queue in enumerate(self._queues):
-            for _, trip in queue:
+            for trip in queue:
                 waiting[region, self._trips.destination[trip]] += 1
         return waiting
 
     def waiting(self) -> tuple[int, float]:
         """Those who still wait, and how long they have [s]."""
-        since = [self._session.time - self._trips.depart[trip] for queue in self._queues for _, trip in queue]
+        since = [self._session.time - self._trips.depart[trip] for queue in self._queues for trip in queue]
         return len(since), float(sum(since))

@@ -1,6 +1,6 @@
 """What looks at a run while it goes on."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Protocol
 
 import numpy as np
@@ -12,14 +12,10 @@ from nmfd.types import Controls, State
 
 class Observer(Protocol):
     """Is called by the plant in the middle of its run: it may take its time, which holds up the run, and an exception
-    of it ends the run. What it is given is not its own: it only reads, and changes nothing but by `orders`."""
+    of it ends the run. What it is given is not its own: it only reads."""
 
     def began(self, city: City, state: State) -> None:
         """The run begins now, in this state."""
-
-    def orders(self, k: int) -> Iterable[tuple[int, int, float | None]]:
-        """Gates from one region to another to be held from control interval k on, which begins now, whatever is
-        commanded: (i, h, share between u_min and u_max). None: to let go of."""
 
     def sampled(self, time: float, vehicles: PerEdge, speed: PerEdge) -> None:
         """Every few seconds: SUMO's time [s], and vehicles (E,) [veh] and mean speed (E,) [m/s] by edge."""

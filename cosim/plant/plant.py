@@ -14,12 +14,11 @@ from cosim.plant.incidents import Incidents
 from cosim.plant.junctions import Junctions
 from cosim.plant.launch import Launch
 from cosim.plant.meter import Meter
-from cosim.plant.metering import Metering, ways
+from cosim.plant.metering import Metering
 from cosim.plant.observer import Observer
 from cosim.plant.record import Record, Recorder
 from cosim.plant.sensing import Estimation, Sensing
-from cosim.plant.settings import ESTIMATE, PRESSURES, SHORT, Settings, settings
-from cosim.plant.standstill import Standstill
+from cosim.plant.settings import ESTIMATE, PRESSURES, Settings, settings
 from cosim.sumo.arrays import PerEdge, Points
 from cosim.sumo.net import City, Gateway, check_adjacency, city_of, edge_shapes
 from cosim.sumo.session import Session, Window
@@ -37,7 +36,7 @@ class SumoPlant:
 
     `simple_signals` may get another programme, `other_signals` are left alone (cosim.sumo.signals).
     `record()` tells what happened; `trips` is their number; `sumo_time` [s] is the wall time inside SUMO's own step
-    since the reset; `booked` control intervals were not simulated any more (cosim.plant.standstill).
+    since the reset.
     """
 
     def __init__(
@@ -84,9 +83,7 @@ class SumoPlant:
         self._actuation = self._new_actuation()
         self._junctions = None if self._settings.mesoscopic else Junctions(self.session, self.city)
         self._state = state = self._sensing.state(0)
-        self._standstill = Standstill(len(self._launch.vehicles), self._scenario.step, self._scenario.steps)
-        self.booked, self._facts = 0, TripFacts()
-        self._standing = self._stands(state)
+        self._facts = TripFacts()
         self._recorder = Recorder(self._sensing.meter, self._guide, self._actuation)
         if self._observer:
             self._observer.began(self.city, state)
@@ -94,7 +91,7 @@ class SumoPlant:
 
     def step(self, controls: Controls) -> State:
         """One control interval: in every simulation step actuate, simulate, measure and guide; then record."""
-        state = self._book() if self._standing else self._drive(controls)
+        state = self._drive(controls)
         if self._observer:
             self._observer.recorded(controls, state, self._recorder.last)
         return state
@@ -103,11 +100,8 @@ class SumoPlant:
         session, streets = self.session, self._sensing.streets
         end = session.time + self._scenario.step
         vehicles = None if streets is None else streets.vehicles
-        for source, target, share in self._observer.orders(self._k) if self._observer else ():
-            self._incidents.hold(source, target, share)
         self._incidents.begin(self._k)
-        network = self._scenario.network
-        self._actuation.command(self._incidents.gated(controls.perimeter, network.u_min, network.u_max), vehicles)
+        self._actuation.command(controls.perimeter, vehicles)
         self._guide.command(self._splits(controls), streets, controls.prices)
         if self._metering:
             self._metering.command(controls.metering, self._state.accumulation.sum(axis=1))
@@ -125,7 +119,6 @@ class SumoPlant:
         self._k += 1
         self._state, means = self._sensing.finish(self._k, controls)
         self._recorder.add(means)
-        self._standing = self._stands(self._state)
         return self._state
 
     def observe(self) -> Observation | None:
@@ -145,18 +138,16 @@ class SumoPlant:
         """Ends the simulation, for only then does SUMO tell of the trips under way, and closes the books. LedgerError
         if they are not SUMO's."""
         if self._session is not None:
-            emitted = self.session.emitted() if self.booked else (0.0, 0.0)
             self._end_session()
             self._sensing.meter.close_books()
             self._recorder.close()
-            self._facts = self._with_standstill(self._with_held(self._trips.facts), *emitted)
+            self._facts = self._with_held(self._trips.facts)
         return self._facts
 
     def time_loss(self) -> PerRegion:
         """(R,) [s]: lost on the road against driving freely until the end, by the region where trips began. After
         `trip_facts`."""
-        meter = self._sensing.meter
-        return meter.time_loss + self.booked * self._scenario.step * meter.on_the_road()
+        return self._sensing.meter.time_loss
 
     def map(self) -> tuple[Positions, list[Points]]:
         """Where the regions are (R, 2), and the streets, E lines (n, 2) [m]."""
@@ -202,15 +193,6 @@ class SumoPlant:
         meter = self._sensing.meter
         return int(meter.departures.sum() + meter.backlog().sum() + meter.given_up.sum())
 
-    def _stands(self, state: State) -> bool:
-        """Whether what is left of the run may be booked."""
-        if not self._settings.book_standstill:
-            return False
-        meter = self._sensing.meter
-        left = meter.arrivals.sum() + meter.removals.sum() + meter.given_up.sum()
-        standing = self._standstill.reached(state, float(left))
-        return standing and self.session.expected() <= state.accumulation.sum() + state.backlog.sum()
-
     def _with_held(self, facts: TripFacts) -> TripFacts:
         """And those who were made to wait, of which SUMO does not know."""
         if self._metering is None:
@@ -219,25 +201,6 @@ class SumoPlant:
         return replace(
             facts, trips=facts.trips + held, departure_delay=facts.departure_delay + self._metering.waited + waiting
         )
-
-    def _with_standstill(self, facts: TripFacts, co2: float, fuel: float) -> TripFacts:
-        """And what was booked without being simulated. co2, fuel: of everybody on the road at the end [kg/s]"""
-        time, state = self.booked * self._scenario.step, self._state
-        return replace(
-            facts,
-            travel_time=facts.travel_time + time * float(state.accumulation.sum()),
-            departure_delay=facts.departure_delay + time * float(state.backlog.sum()),
-            time_loss=facts.time_loss + time * float(state.accumulation.sum()),
-            co2=facts.co2 + time * co2,
-            fuel=facts.fuel + time * fuel,
-        )
-
-    def _book(self) -> State:
-        """One control interval in which nothing moves."""
-        self._k, self.booked = self._k + 1, self.booked + 1
-        self._recorder.repeat()
-        self._state = replace(self._state, step=self._k, time=self._k * self._scenario.step)
-        return self._state
 
     def _splits(self, controls: Controls) -> PerTurn | None:
         """What drivers are guided by: their own split ratios mean guidance by travel times alone; where there are
@@ -249,10 +212,7 @@ class SumoPlant:
         chosen, network, trips = self._settings, self._planning.network, self._launch.held
         if trips is None:
             return None
-        way = ways(self.session, self.city, trips) if chosen.metering_first == SHORT else None
-        return Metering(
-            self.session, trips, network.critical, level=chosen.metering_level, step=self._scenario.step, way=way
-        )
+        return Metering(self.session, trips, network.critical, level=chosen.metering_level, step=self._scenario.step)
 
     def _new_sensing(self, seed: int) -> Sensing:
         chosen = self._settings

@@ -1,10 +1,16 @@
 """Which programme a signal of the city runs: its own, Webster's, an actuated one, or what max-pressure decides."""
 
-from collections.abc import Mapping, Sequence
+import hashlib
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
-from cosim.plant import webster
+import sumo
+
 from cosim.plant.actuated import actuated_row
 from cosim.plant.settings import ACTUATED, FIXED, PRESSURES, WEBSTER, Settings
 from cosim.sumo.build import network_folder
@@ -14,6 +20,7 @@ from cosim.sumo.signals import HELD, Signal, read_signals, write_programmes
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
+from nmfd.runs.scratch import Scratch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,25 +56,54 @@ def write_signal_programmes(
     scenario: Scenario,
     chosen: Settings,
     signals: CitySignals,
-    own_flows: Mapping[tuple[str, str], float] | None,
+    trips: Iterable[tuple[float, Sequence[str]]],
 ) -> list[Path]:
     """Additional files with which SUMO runs other programmes than those of the network file; none for fixed ones.
 
-    folder: of this run; Webster's plan is kept with the network. own_flows: of the city's own vehicles
+    folder: of this run; trips: departure [s] and edges, for Webster's plan
     """
     if chosen.signals == WEBSTER:
-        return [
-            webster.plan(
-                city,
-                signals.simple,
-                scenario.demand,
-                scenario.step,
-                folder=shipped.build_folder(network_folder(scenario.network)),
-                flows=own_flows,
-            )
-        ]
+        return optimised_plans(network_folder(scenario.network), city, signals.others, trips)
     if chosen.signals == ACTUATED:
         path = folder / "actuated.add.xml"
         write_programmes(path, [actuated_row(signal) for signal in signals.steered])
         return [path]
     return []
+
+
+def optimised_plans(
+    network: Path, city: City, others: Sequence[str], trips: Iterable[tuple[float, Sequence[str]]]
+) -> list[Path]:
+    """Return fixed-time plans by SUMO's own tools: cycles by Webster's formula, then offsets for green waves.
+
+    network: its folder, in whose build folder plans are kept; others: signals that keep their programme; trips:
+    departure [s] and edges, sorted by departure
+    Raises InputError if a tool fails.
+    """
+    rows = [
+        f'<vehicle id="{n}" depart="{depart:.2f}"><route edges={quoteattr(" ".join(edges))}/></vehicle>'
+        for n, (depart, edges) in enumerate(trips)
+    ]
+    routes = "\n".join(["<routes>", *rows, "</routes>\n"]).encode()
+    key = hashlib.sha256(routes + city.net_file.read_bytes() + metadata.version("eclipse-sumo").encode()).hexdigest()
+    folder = shipped.build_folder(network)
+    cycles, offsets = (folder / f"webster-{key[:16]}-{kind}.add.xml" for kind in ("cycles", "offsets"))
+    if cycles.is_file() and offsets.is_file():
+        return [cycles, offsets]
+    shipped.made(folder)
+    unified = ("-u", "-y", "3", "-p", "webster", "--skip", ",".join(others))
+    with Scratch("cosim-") as scratch:
+        (scratch / "routes.xml").write_bytes(routes)
+        for tool, target, options in (
+            ("tlsCycleAdaptation.py", cycles, unified),
+            ("tlsCoordinator.py", offsets, ("-a", str(cycles))),
+        ):
+            program = Path(sumo.SUMO_HOME) / "tools" / tool
+            command = [sys.executable, str(program), "-n", str(city.net_file), "-r", "routes.xml", *options]
+            result = subprocess.run(
+                [*command, "-o", str(target)], cwd=scratch, capture_output=True, text=True, check=False
+            )
+            if result.returncode:
+                words = (result.stderr.strip() or "no message").splitlines()[-1]
+                raise InputError(f"{city.net_file}: {tool} cannot plan its signals ({words}); choose other signals")
+    return [cycles, offsets]

@@ -31,10 +31,6 @@ class Estimation:
         self._meter, self._detectors = meter, Detectors(session, city, layout, meter, known)
         self._filter, self._flow = Estimator(planning, known), meter.gateway_flow()
 
-    def silence(self, share: float) -> None:
-        """Let a share of the loops tell nothing from now on."""
-        self._detectors.silence(share)
-
     def sample(self) -> None:
         """Read the loops."""
         self._detectors.sample()
@@ -91,8 +87,6 @@ class Sensing:
     def begin(self) -> None:
         """A control interval begins."""
         self._measured = 0
-        if self._estimation:
-            self._estimation.silence(self._incidents.silent_loops)
 
     def measure(self) -> list[Event]:
         """Account for the last simulation step; which vehicles departed or entered a region in it."""
@@ -113,4 +107,4 @@ class Sensing:
         self.streets = means = self._sampler.finish(self._incidents.closed)
         if self._estimation:
             self._estimation.update(controls)
-        return replace(state, problem=self._incidents.problem(estimating=self._estimation is not None)), means
+        return replace(state, problem=self._incidents.problem()), means

@@ -13,12 +13,10 @@ if TYPE_CHECKING:  # at run time it would bring numpy, and the help of an option
 
 Signals = Literal["fixed", "webster", "actuated", "max-pressure", "max-pressure-cyclic"]
 Mode = Literal["hold-back", "redistribute"]
-First = Literal["due", "short"]
 SIGNALS, MODES = get_args(Signals), get_args(Mode)
 FIXED, WEBSTER, ACTUATED, MAX_PRESSURE, CYCLIC = SIGNALS
 PRESSURES = (MAX_PRESSURE, CYCLIC)
 HOLD_BACK, REDISTRIBUTE = MODES
-DUE, SHORT = get_args(First)
 EXACT, ESTIMATE = "exact", "estimate"
 FILES = ("routes", "background", "additional")
 
@@ -69,9 +67,6 @@ class SumoTable(config.Settings):
         gt=0.0,
         le=10.0,
     )
-    metering_first: First = setting(
-        "who begins first of those who wait in a region: who is due first, or who has the shortest way to go", DUE
-    )
     measurement: Literal["exact", "estimate"] = setting(
         "what controllers see: the exact state, or what detectors and probes tell", EXACT
     )
@@ -88,11 +83,6 @@ class SumoTable(config.Settings):
         "departures of the city's own vehicles are moved by up to this, either way, by the seed", 10.0
     )
     leave_signals: Texts = setting("signals that perimeter control leaves alone", ())
-    book_standstill: bool = setting(
-        "once every trip is due and nothing moves any more, the rest of the run is booked without simulating it, "
-        "within 0.1 % of the total time spent",
-        False,
-    )
     mesoscopic: bool = setting(
         "SUMO's queue model instead of its car-following, about ten times as fast, for quick studies: no lanes and no "
         "positions on them, queues hold the vehicles that fit on an edge, signals cap the flow by their green share",
@@ -106,10 +96,6 @@ class SumoTable(config.Settings):
                 "measurement",
                 '"estimate" needs detectors or probes, but sumo.detector_share and '
                 "sumo.probe_share are both 0; raise one of them",
-            )
-        if self.metering_first == SHORT and not self.metering:
-            raise Problem(
-                "metering_first", '"short" says whom sumo.metering lets begin first; set that to true, or omit it'
             )
         if self.max_green < self.min_green:
             raise Problem(

@@ -26,7 +26,6 @@ _WORDS = {
     **{name: ("actuation", name) for name in MODES},
     "estimate": ("measurement", "estimate"),
     "metering": ("metering", True),
-    "short-first": ("metering_first", "short"),
     GUIDED: ("guided", True),
 }
 PERCENT, SECONDS = "percent", "seconds"
@@ -48,7 +47,6 @@ _TEXTS = {
     "hold-back": "green taken from a gateway is red for all",
     "redistribute": "green taken from a gateway goes to the other movements",
     "estimate": "the controller sees what loops and probe vehicles tell, not the truth",
-    "short-first": "of trips that wait, with +metering, those with a short way begin first",
     "metering": "trips wait outside where their region is full, or as the controller commands",
     "metering-N": "the same, and without a command at N percent of the region's critical accumulation",
     GUIDED: "drivers are guided by travel times",

@@ -91,7 +91,7 @@ class Session:
         if Session._open:
             raise RuntimeError("a SUMO session is already open in this process; close it first")
         _keep_freed()
-        self.sumo_time, self.step_length, self._exits = 0.0, step_length, False
+        self.sumo_time, self.step_length = 0.0, step_length
         routes = file_list([route_file] if isinstance(route_file, Path) else route_file)
         self.command = [
             "sumo",
@@ -172,8 +172,6 @@ class Session:
         """Advance by one simulation step. RunFailed, with its own words, if SUMO gives up."""
         before = time.perf_counter()
         try:
-            if self._exits:
-                raise libsumo.FatalTraCIError("ordered by the fault sumo-exits")
             self._sumo.simulationStep()
         except (libsumo.FatalTraCIError, *REFUSALS) as error:
             raise RunFailed(f"SUMO stopped at {self.time:g} s: {_one_line(error)}") from None
@@ -218,16 +216,6 @@ class Session:
     def teleports(self) -> int:
         """How many there were so far, by SUMO's own count: the mesoscopic model has no events for them."""
         return int(self._sumo.simulation.getParameter("", "stats.teleports.total"))
-
-    def expected(self) -> int:
-        """Vehicles on the road, and those that SUMO has read and that wait for their departure."""
-        return self._sumo.simulation.getMinExpectedNumber()
-
-    def emitted(self) -> tuple[float, float]:
-        """CO2 and fuel of all vehicles on the road at this moment [kg/s]."""
-        running = self.running()
-        co2, fuel = self._sumo.vehicle.getCO2Emission, self._sumo.vehicle.getFuelConsumption
-        return 1e-6 * sum(map(co2, running)), 1e-6 * sum(map(fuel, running))
 
     def known(self) -> tuple[str, ...]:
         """All that were loaded and have not arrived, wherever they are."""
@@ -372,10 +360,6 @@ class Session:
         for lane, limit in zip(lanes, limits * len(lanes) if len(limits) == 1 else limits, strict=True):
             self._sumo.lane.setMaxSpeed(lane, limit)
         return before
-
-    def exit_at_next_step(self) -> None:
-        """As if SUMO gave up by itself."""
-        self._exits = True
 
     # What is drawn in the window.
 
