@@ -1,10 +1,9 @@
-"""A misspelt key, controller, option, fault or folder gets a hint; something else gets none."""
+"""A misspelt key, controller, option or folder gets a hint; something else gets none."""
 
 import pytest
 import tiny
 
 from cosim.plant import strategy
-from nmfd import faults
 from nmfd.api import load_scenario
 from nmfd.controllers import registry
 from nmfd.errors import InputError, did_you_mean
@@ -27,8 +26,6 @@ def problem(call, *arguments) -> str:
         (strategy.parse, ["no-controll"], "no-control"),
         (strategy.parse, ["dpc-pcrg+complience-50"], "compliance-N"),
         (strategy.parse, ["actuatd"], "actuated"),
-        (faults.parse, ["delaid:2@3-4", "--fault", 7], "delayed"),
-        (faults.parse, ["solver-fail", "--fault", 7], "solver-fails"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )

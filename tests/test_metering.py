@@ -10,7 +10,7 @@ import pytest
 import tiny_city
 from commands import cosim, error_line
 
-from cosim.plant.metering import FILLING, KI, KP, Metering, ways
+from cosim.plant.metering import FILLING, KI, KP, Metering
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.sumo.trips import Trips, held
@@ -22,7 +22,7 @@ from nmfd.types import Controls
 CRITICAL = np.array([100.0, 50.0])
 
 
-def metering(depart, origin, level=1.2, way=None):
+def metering(depart, origin, level=1.2):
     """Of trips to region 1, and who has begun: (time, vehicle, route)."""
     begun, count = [], len(depart)
     session = SimpleNamespace(time=0.0, step_length=1.0)
@@ -34,7 +34,7 @@ def metering(depart, origin, level=1.2, way=None):
         routes=(("a", "b"),) * count,
         arrival=np.zeros(count),
     )
-    return Metering(session, held(trips), CRITICAL, level=level, step=90.0, way=way), session, begun
+    return Metering(session, held(trips), CRITICAL, level=level, step=90.0), session, begun
 
 
 def played(meters, session, seconds):
@@ -59,24 +59,6 @@ def test_trips_begin_in_turn_at_the_rate_and_what_is_not_used_is_not_saved():
     assert meters.waited == 10.0 + 20.0 + 30.0
     played(meters, session, 55)
     assert [time for time, _, _ in begun[5:]] == [100.0, 110.0]
-
-
-def test_who_has_a_short_way_begins_first_where_that_is_asked_for():
-    meters, session, begun = metering([0.0] * 4 + [15.0], [0] * 5, way=np.array([9.0, 50.0, 20.0, 20.0, 1.0]))
-    meters.command(np.array([0.1, 0.0]), CRITICAL)
-    played(meters, session, 60)
-    assert [(time, vehicle) for time, vehicle, _ in begun] == [
-        (0.0, "v0"),
-        (10.0, "v2"),
-        (20.0, "v4"),
-        (30.0, "v3"),
-        (40.0, "v1"),
-    ]
-
-
-def test_short_first_needs_metering(tmp_path):
-    line = error_line(cosim("run", "grid7_peak", "--controller", "no-control+short-first", "--out", tmp_path / "out"))
-    assert "metering_first" in line and "sumo.metering" in line and not (tmp_path / "out").exists()
 
 
 def test_without_a_command_regions_are_held_at_their_level():
@@ -169,17 +151,6 @@ def test_a_citys_own_vehicles_wait_as_well(own):
     spent = step * sum(state.backlog.sum() for state in held_back[:-1])
     assert spent < facts.departure_delay < spent + step * held_back[-1].backlog.sum()
     assert facts.trips >= count
-
-
-def test_how_far_those_have_to_go_who_wait():
-    city = SimpleNamespace(
-        length={"a": 100.0, "b": 50.0, "c": 30.0},
-        speed={"a": 10.0, "b": 10.0, "c": 10.0},
-        successors={"a": ("b",), "b": ("c",), "c": ()},
-    )
-    session = SimpleNamespace(fastest=lambda start, end: (77.0, (start, "b", end)))
-    routes = (("a", "b"), ("a", "c"), ("b", "c"), ("a", "bus lane", "c"), ("bus lane", "c"), ("c",))
-    assert ways(session, city, SimpleNamespace(routes=routes)).tolist() == [15.0, 77.0, 8.0, 13.0, 3.0, 3.0]
 
 
 def test_where_nobody_can_be_made_to_wait(own, tmp_path):

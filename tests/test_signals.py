@@ -11,10 +11,8 @@ import pytest
 from signal_rules import CROSS, MIN_GREEN, check, cross, signal
 
 from cosim.plant.max_pressure import Roads
-from cosim.plant.offsets import offsets
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import Settings
-from cosim.plant.webster import LOST, SATURATION, optimised, plan
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import gateway_room_taken, load_city
 from cosim.sumo.signals import Link, read_signals
@@ -198,47 +196,6 @@ def test_actuated_signals(scenario, plant_of, gateways_fixed):
     shown, original, _ = drive(plant, scenario, 2)
     for name, states in shown.items():
         check(states, [(phase.state, phase.duration) for phase in original[name].phases], 5.0)
-
-
-def test_webster_gives_green_where_the_flow_is():
-    def greens(first, second):
-        [found] = optimised(street(), [cross()], {("a", "b"): first, ("c", "d"): second})
-        return found.phases[0].duration, found.phases[2].duration
-
-    even, uneven, heavy = greens(0.15, 0.15), greens(0.2, 0.1), greens(0.2, 0.2)
-    assert abs(even[0] - even[1]) <= 1
-    assert uneven[0] / uneven[1] == pytest.approx(2.0, rel=0.25)
-    assert sum(heavy) > sum(even)
-
-
-@pytest.mark.parametrize("flow", [0.12, 0.16, 0.18])
-def test_cycle_is_near_webster_s_formula(flow):
-    [found] = optimised(street(), [cross()], {("a", "b"): flow, ("c", "d"): flow})
-    lost = 2 * (3 + LOST)
-    formula = (1.5 * lost + 5.0) / (1.0 - 2 * flow / SATURATION)
-    assert abs(sum(phase.duration for phase in found.phases) - formula) <= max(12.0, 0.3 * formula)
-
-
-def test_green_wave_along_a_street():
-    """The signal at the end turns green when the platoon gets there, 1.15 times 20 s later."""
-    second = signal(
-        CROSS,
-        (Link(index=0, from_edge="b", lane=0, to_edge="e"), Link(index=1, from_edge="f", lane=0, to_edge="g")),
-        "t",
-    )
-    flows = {("a", "b"): 0.2, ("c", "d"): 0.2, ("b", "e"): 0.2, ("f", "g"): 0.2}
-    first, last = offsets(street(), [cross(), second], flows, SATURATION)
-    assert abs((last.offset - first.offset) % 66 - 23) <= 2
-
-
-def test_plan_is_kept_and_depends_on_the_demand(city, scenario, tmp_path):
-    simple = read_signals(city)[0][:6]
-    first = plan(city, simple, scenario.demand, scenario.step, folder=tmp_path)
-    content = first.read_bytes()
-    assert plan(city, simple, scenario.demand, scenario.step, folder=tmp_path) == first
-    assert plan(city, simple, 2.0 * scenario.demand, scenario.step, folder=tmp_path) != first
-    first.unlink()
-    assert plan(city, simple, scenario.demand, scenario.step, folder=tmp_path).read_bytes() == content
 
 
 def test_webster_in_sumo_and_under_perimeter_control(scenario, plant_of):

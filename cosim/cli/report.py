@@ -136,12 +136,6 @@ def watch(
     for seen in runs:
         if isinstance(seen.outcome, Result):
             _tell(seen.name, seed, seen.outcome)
-        if seen.faults:
-            click.echo(
-                "Gates were switched by hand; the same run: --controller "
-                + seen.name
-                + "".join(f" --fault {text}" for text in seen.faults)
-            )
 
 
 def _window(task: "Task", delay: float | None) -> None:

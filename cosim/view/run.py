@@ -112,13 +112,6 @@ class Reporter:
         self._send(self._frame)
         self._wait(0.0)
 
-    def orders(self, k: int) -> list[tuple[int, int, float | None]]:
-        """The gates that were switched."""
-        switches, self._switches = self._switches, []
-        for switch in switches:
-            self._send(Switched(k=k, switch=switch))
-        return [(switch.source, switch.target, switch.share) for switch in switches]
-
     def sampled(self, time_: float, vehicles: PerEdge, speed: PerEdge) -> None:
         """Send a frame, if the last one is long enough ago, and wait if need be."""
         now, self._speed = time_ - self._begin, np.where(vehicles > 0, speed, np.nan)

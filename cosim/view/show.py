@@ -10,7 +10,6 @@ from multiprocessing.connection import Connection
 from cosim.evaluation.simulate import Result, Task
 from cosim.view.picture import CityPicture, Frame
 from cosim.view.run import Pace, Switch, Switched, run
-from nmfd import faults
 from nmfd.runs.workers import LEAVE, Failure, Worker
 
 DELAYS = (0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s of wall time per simulated second
@@ -40,11 +39,6 @@ class Seen:
         if self.latest is not None and self.latest.time <= time:
             return self.latest
         return next((frame for frame in reversed(self.whole) if frame.time <= time), None)
-
-    @property
-    def faults(self) -> list[str]:
-        """What orders the same in a run that nobody watches."""
-        return faults.by_hand(self.switched)
 
 
 class Show:
