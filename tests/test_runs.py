@@ -1,186 +1,114 @@
-"""Run folders: nothing half-written, resumable, the same bytes; and the processes that fill them."""
+"""Results and their files; many runs in a folder: nothing half-written, resumable, the same numbers everywhere."""
 
-import ast
-import hashlib
-import io
 import json
 import os
+import pickle
 import subprocess
-import termios
 import time
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import trajectories
 import xarray as xr
+from filelock import FileLock
 from trajectories import trajectory
 
 from cosim.plant.record import Record
-from nmfd import quantities
-from nmfd.cli.progress import progress_line
-from nmfd.errors import InputError
-from nmfd.runs import files, progress, provenance, run_folder, workers
-from nmfd.runs.tables import markdown_table
-from nmfd.runs.tally import Tally
-from nmfd.types import Result
-
-ROOT = Path(__file__).parents[1]
-CONFIGURATION = {"scenario": "x", "step": 30.0, "protected": (1, 2)}
+from nmfd import metrics
+from nmfd.errors import InputError, RunFailed
+from nmfd.quantities import quantities, variables
+from nmfd.runs import files
+from nmfd.runs import run_many as module
+from nmfd.runs.run_many import Run, raise_failures, read_manifest, run_many, run_name
+from nmfd.types import VARIABLES, Result
 
 
-def opened(path, *, controllers=("no-control",), seeds=(0,), settings=None):
-    order = [(name, seed) for name in controllers for seed in seeds]
-    return run_folder.open_folder(path, configuration=CONFIGURATION, order=order, controllers=settings)
-
-
-def test_trajectory_round_trip_and_same_bytes(tmp_path):
-    original = trajectory()
-    run_folder.write_trajectory(tmp_path / "a.nc", original)
-    run_folder.write_trajectory(tmp_path / "b.nc", replace(original, decision_time=2 * original.decision_time))
-    back = run_folder.read_trajectory(tmp_path / "a.nc")
-    for name in ("accumulation", "backlog", "completed", "observed", "observed_backlog", "perimeter", "splits"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(original, name))
+def test_a_result_is_read_as_it_was_written(tmp_path):
+    original = trajectories.recorded(trajectory(), trajectories.record(4, regions=2), {"co2_kg": 3.25, "notes": ""})
+    original.write(tmp_path / "a.nc")
+    back = Result.read(tmp_path / "a.nc")
+    xr.testing.assert_identical(back.data, original.data)
     assert (back.controller, back.plant, back.seed, back.step) == ("no-control", "nmfd", 0, 30.0)
-    assert back.note == original.note and back.estimated is False and (back.status == original.status).all()
-    assert (tmp_path / "a.nc").read_bytes() == (tmp_path / "b.nc").read_bytes()
+    assert back.co2_kg == 3.25 and back.gateway_flow.shape == (4, 3) and list(back.note) == ["", "", "", "no"]
+    assert list(tmp_path.iterdir()) == [tmp_path / "a.nc"]
+    assert pickle.loads(pickle.dumps(back)).seed == 0
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = back.nothing
 
 
-def test_the_same_run_gives_the_same_bytes_at_another_time(tmp_path, monkeypatch):
-    """HDF5 can keep times of its objects."""
-    more = quantities.variables(Record, trajectories.record(4, regions=2))
-    run_folder.write_trajectory(tmp_path / "a.nc", trajectory(), more)
-    time.sleep(1.1)
-    run_folder.write_trajectory(tmp_path / "b.nc", trajectory(), more)
-    first, second = ((tmp_path / name).read_bytes() for name in ("a.nc", "b.nc"))
-    assert hashlib.sha256(first).digest() == hashlib.sha256(second).digest()
+def test_the_same_run_is_the_same_but_for_times():
+    one = trajectory()
+    other = one.assign(decision_time=2.0 * one.decision_time, wall_time=7.0)
+    assert not one.data.identical(other.data) and one.without_times().identical(other.without_times())
+    assert not one.without_times().identical(trajectory(seed=1).without_times())
 
 
 def test_xarray_opens_a_run_with_names_and_units(tmp_path):
-    original, record = replace(trajectory(), estimated=True), trajectories.record(4, regions=2)
-    run_folder.write_trajectory(tmp_path / "a.nc", original, quantities.variables(Record, record))
+    original, record = trajectory(), trajectories.record(4, regions=2)
+    original.add(variables(Record, record), {}).assign(estimated=True).write(tmp_path / "a.nc")
     with xr.open_dataset(tmp_path / "a.nc") as data:
         assert dict(data.sizes) == {
-            "time": 5,
-            "interval": 4,
-            "region": 2,
-            "destination": 2,
-            "next_region": 2,
-            "gateway": 3,
-            "edge": 5,
+            **{"time": 5, "interval": 4, "region": 2, "destination": 2, "next_region": 2},
+            **{"gateway": 3, "edge": 5},
         }
-        assert data.attrs == {"controller": "no-control", "plant": "nmfd", "seed": 0, "step": 30.0, "estimated": 1}
-        assert set(data.data_vars) == {*quantities.quantities(Result), *record} - {"decision_time"}
+        assert data.attrs["estimated"] == 1
+        assert set(data.data_vars) == {*VARIABLES, *quantities(Record)}
         for name, values in data.variables.items():
             assert values.attrs["long_name"] and ("units" in values.attrs or name == "note"), name
-        assert tuple(data["note"].values) == original.note == ("", "", "", "no")
         assert list(data["status"].values) == [0, 0, 0, 3]  # a solver failure and a fallback
         assert data["status"].attrs["flag_meanings"] == "solver_failure fallback sensor_fault plant_fault late"
-        assert list(data["status"].attrs["flag_masks"]) == [1, 2, 4, 8, 16]
         assert list(data["time"].values) == [0.0, 30.0, 60.0, 90.0, 120.0] and data["time"].attrs["units"] == "s"
         assert float(data["accumulation"].sel(time=60.0, region=1, destination=0)) == original.accumulation[2, 1, 0]
-        for name, values in record.items():
-            np.testing.assert_array_equal(data[name].values, values)
-    assert run_folder.read_trajectory(tmp_path / "a.nc").estimated is True
 
 
-@pytest.mark.parametrize("page, kind", [("nmfd/runs/README.md", Result), ("cosim/plant/record.md", Record)])
-def test_the_pages_list_what_is_in_a_file(page, kind):
-    table = markdown_table(
-        ("variable", "dimensions", "unit", "what"),
-        (
-            (name, ", ".join(about["dimensions"]), about["attributes"].get("units", ""), about["text"])
-            for name, about in quantities.quantities(kind).items()
-        ),
-    )
-    assert table in (ROOT / page).read_text()
+def test_half_precision_is_kept_in_a_file(tmp_path):
+    record = trajectories.record(4, regions=2) | {"edge_vehicles": np.full((4, 5), 0.1, np.float16)}
+    trajectories.recorded(trajectory(), record, {}).write(tmp_path / "a.nc")
+    np.testing.assert_array_equal(Result.read(tmp_path / "a.nc").edge_vehicles, record["edge_vehicles"])
+
+
+def test_removed_and_prices_are_zero_by_default():
+    run = trajectory()
+    assert (run.removed == 0).all() and run.removed.shape == (5, 2, 2)
+    assert (run.prices == 0).all() and run.prices.shape == (4, 2)
 
 
 def test_the_tables_of_a_run_row_by_row():
     run = trajectory()
     states, controls = run.to_frame(), run.controls_frame()
-    assert list(states.columns) == [
-        "controller",
-        "plant",
-        "seed",
-        "time_s",
-        "region",
-        "destination",
-        "accumulation_veh",
-        "backlog_veh",
-    ]
+    assert list(states.columns[:5]) == ["controller", "plant", "seed", "time_s", "region"]
+    assert list(states.columns[5:]) == ["destination", "accumulation_veh", "backlog_veh"]
     assert list(controls.columns) == ["controller", "plant", "seed", "time_s", "region", "next_region", "perimeter"]
     for n, (k, i, j) in enumerate(np.ndindex(5, 2, 2)):
         assert tuple(states.loc[n]) == ("no-control", "nmfd", 0, 30.0 * k, i, j, run.accumulation[k, i, j], 0.0)
     assert (controls["perimeter"] == run.perimeter.ravel()).all() and controls["time_s"].max() == 90.0
 
 
-@pytest.mark.parametrize(
-    "plant, command",
-    [
-        ("nmfd", "nmfd benchmark scenarios/x, with no-control, pi-gating"),
-        ("sumo", "cosim run, evaluate or sweep scenarios/x, with no-control, pi-gating"),
-        (None, "the command that made it"),
-    ],
-)
-def test_a_folder_of_an_older_version_says_what_to_run(tmp_path, plant, command):
-    (tmp_path / "no-control-0.npz").write_bytes(b"PK")
-    if plant:
-        (tmp_path / "manifest.json").write_text(
-            json.dumps(
-                {
-                    "configuration": {"plant": plant},
-                    "controllers": {"no-control": {}, "pi-gating": {}},
-                    "sessions": [{"scenario_folder": "scenarios/x"}],
-                }
-            )
-        )
-    for use in (
-        lambda: run_folder.read_trajectory(tmp_path / "no-control-0.nc"),
-        lambda: opened(tmp_path).__enter__(),
-        lambda: run_folder.read_summary(tmp_path / "summary.csv"),
-    ):
-        with pytest.raises(InputError, match=f"older version .*; delete it and run again: {command}$"):
-            use()
+def test_a_row_holds_the_figures_and_the_facts_of_a_run():
+    row = metrics.summary(trajectories.recorded(trajectory(), {}, {"trips": 12}))
+    assert list(row) == [*metrics.SUMMARY, "trips"] and row["trips"] == 12 and row["solver_failures"] == 1
+    facts = Result(xr.Dataset(attrs={"controller": "x", "seed": 1, "trips_veh": 2.0, "key": "{}"}))
+    assert metrics.summary(facts) == {"controller": "x", "seed": 1, "trips_veh": 2.0}
+    assert "accumulation" in trajectory()._repr_html_()
 
 
-@pytest.mark.parametrize("content", [b"", b"nonsense", b"PK\x03\x04 cut off"])
-def test_a_file_that_is_no_trajectory(tmp_path, content):
-    (tmp_path / "a.nc").write_bytes(content)
-    with pytest.raises(InputError, match="a.nc: is no run"):
-        run_folder.read_trajectory(tmp_path / "a.nc")
+@pytest.mark.parametrize("damage", ["missing", "cut off", "empty", "a table"])
+def test_what_is_no_run_is_one_line(tmp_path, damage):
+    file = tmp_path / "a.nc"
+    if damage != "missing":
+        trajectory().write(file)
+        whole = file.read_bytes()
+        file.write_bytes({"cut off": whole[: len(whole) // 2], "empty": b"", "a table": b"a,b\n1,2\n"}[damage])
+    with pytest.raises(InputError, match=r"a\.nc: (no such run|is no run)") as error:
+        Result.read(file)
+    assert "\n" not in str(error.value)
 
 
-def test_a_run_that_was_cut_off_anywhere(tmp_path):
-    run_folder.write_trajectory(tmp_path / "a.nc", trajectory())
-    whole = (tmp_path / "a.nc").read_bytes()
-    for length in [*range(0, len(whole), len(whole) // 20), len(whole) - 1]:
-        (tmp_path / "a.nc").write_bytes(whole[:length])
-        with pytest.raises(InputError, match="a.nc: is no run"):
-            run_folder.read_trajectory(tmp_path / "a.nc")
-
-
-def test_a_netcdf_file_of_somebody_else(tmp_path):
-    xr.Dataset({"temperature": ("time", np.ones(3))}).to_netcdf(tmp_path / "a.nc", engine="netcdf4")
-    with pytest.raises(InputError, match="a.nc: is no run"):
-        run_folder.read_trajectory(tmp_path / "a.nc")
-
-
-def test_no_module_of_one_system_is_imported_at_the_top_of_a_file():
-    found = [
-        (path.name, name.name)
-        for folder in ("nmfd", "cosim")
-        for path in (ROOT / folder).rglob("*.py")
-        for line in ast.parse(path.read_text()).body
-        if isinstance(line, ast.Import)
-        for name in line.names
-    ]
-    assert len(found) > 100 and not [pair for pair in found if pair[1] in ("fcntl", "grp", "pwd", "resource")]
-
-
-def test_atomic_leaves_the_old_file_and_nothing_else_when_writing_fails(tmp_path):
-    path = tmp_path / "a.txt"
+def test_atomic_write_leaves_the_old_file_when_interrupted(tmp_path):
+    path = tmp_path / "a.csv"
     path.write_text("old")
     with pytest.raises(KeyboardInterrupt), files.atomic(path) as temporary:
         temporary.write_text("half")
@@ -188,150 +116,146 @@ def test_atomic_leaves_the_old_file_and_nothing_else_when_writing_fails(tmp_path
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_rows_come_in_the_order_asked_for_and_are_kept(tmp_path):
-    with opened(tmp_path / "r", controllers=("a", "b"), seeds=(0, 1)) as folder:
-        for run in (("b", 1), ("a", 0)):
-            folder.add(trajectory(*run))
-        assert folder.finished == [("a", 0), ("b", 1)]
-    with opened(tmp_path / "r", controllers=("c",)) as folder:
-        folder.add(trajectory("c"))
-    rows = run_folder.read_summary(tmp_path / "r" / "summary.csv")
-    assert [(row["controller"], row["seed"]) for row in rows] == [("a", 0), ("b", 1), ("c", 0)]
-    assert rows[0]["solver_failures"] == 1 and list(rows[0]) == list(run_folder.COLUMNS)
-    sessions = json.loads((tmp_path / "r" / "manifest.json").read_text())["sessions"]
-    assert [session["seeds"] for session in sessions] == [[0, 1], [0]]
+# Jobs, for processes that import this module.
+def job(controller="no-control", seed=0, calls=None):
+    if calls is not None:
+        calls.append((controller, seed))
+    return trajectory(controller, seed)
 
 
-def test_a_run_without_its_trajectory_is_not_finished(tmp_path):
-    with opened(tmp_path / "r") as folder:
-        folder.add(trajectory())
-        folder.trajectory_path("no-control", 0).unlink()
-        assert folder.finished == [] and folder.trajectories() == []
+def die():
+    os._exit(3)
 
 
-def test_another_configuration_or_policy_is_refused(tmp_path):
-    with opened(tmp_path / "r", settings={"no-control": {"policy_hash": "1"}}) as folder:
-        folder.add(trajectory())
-    before = (tmp_path / "r" / "manifest.json").read_bytes()
-    with pytest.raises(InputError, match='no-control: {"policy_hash": "1"} there, {"policy_hash": "2"} asked for'):
-        with opened(tmp_path / "r", settings={"no-control": {"policy_hash": "2"}}):
-            pass
-    with pytest.raises(InputError, match="step: 30.0 there, 60.0 asked for"):
-        with run_folder.open_folder(tmp_path / "r", configuration={**CONFIGURATION, "step": 60.0}, order=[]):
-            pass
-    assert (tmp_path / "r" / "manifest.json").read_bytes() == before
+def divide():
+    return 1 / 0
 
 
-def test_a_folder_in_which_nothing_was_finished_goes_again(tmp_path):
-    with pytest.raises(KeyboardInterrupt), opened(tmp_path / "a" / "b") as folder:
-        run_folder.write_trajectory(folder.trajectory_path("no-control", 0), trajectory())
+def hang():
+    time.sleep(600.0)
+
+
+def run_of(controller="no-control", seed=0, *, calls=None, scenario="s", policy="p", folder="", work=None):
+    key = {"scenario_hash": scenario, "controller": {"policy_hash": policy}}
+    return Run(run_name(controller, seed), key, work or partial(job, controller, seed, calls), folder)
+
+
+def test_runs_are_done_once_and_come_in_the_order_asked_for(tmp_path):
+    calls, out = [], tmp_path / "a" / "out"
+    first = [run_of("b", 1, calls=calls), run_of("a", 0, calls=calls)]
+    rows = run_many(first, out, workers=0)
+    assert list(zip(rows["controller"], rows["seed"], strict=True)) == [("b", 1), ("a", 0)] == calls
+    assert set(rows["failure"]) == {""} and rows["total_time_spent_veh_s"].iloc[1] > 0 and "folder" not in rows
+    again = run_many([run_of("c", calls=calls), *first[1:]], out, workers=0)
+    assert list(again["controller"]) == ["c", "a", "b"] and len(calls) == 3
+    pd.testing.assert_frame_equal(pd.read_csv(out / "runs.csv", keep_default_na=False), again, check_dtype=False)
+    manifest = read_manifest(out)
+    assert [session["seeds"] for session in manifest["sessions"]] == [[0, 1], [0]]
+    assert manifest["folders"][""] == {
+        "key": {"scenario_hash": "s"},
+        "controllers": {name: {"policy_hash": "p"} for name in "bac"},
+    }
+    assert {"command", "commit", "versions", "date"} <= set(manifest["sessions"][0])
+
+
+def test_another_key_does_a_run_again(tmp_path, capsys):
+    calls = []
+    run_many([run_of("a", calls=calls), run_of("b", calls=calls)], tmp_path / "out", workers=0)
+    run_many([run_of("a", calls=calls, policy="q"), run_of("b", calls=calls)], tmp_path / "out", workers=0)
+    assert calls == [("a", 0), ("b", 0), ("a", 0)]
+    assert "a-0.nc: done again, controller changed" in capsys.readouterr().err
+    rows = run_many([run_of("a", calls=calls, scenario="other")], tmp_path / "out", workers=0)
+    assert len(calls) == 4 and list(rows["controller"]) == ["a"]  # b is of another scenario
+
+
+def test_a_run_that_is_cut_off_is_done_again(tmp_path):
+    calls, file = [], tmp_path / "out" / "a-0.nc"
+    run_many([run_of("a", calls=calls)], file.parent, workers=0)
+    file.write_bytes(file.read_bytes()[:100])
+    assert len(run_many([run_of("a", calls=calls)], file.parent, workers=0)) == 1 and len(calls) == 2
+
+
+def test_levels_have_folders_of_their_own(tmp_path):
+    runs = [run_of("path/to/file.py:Class", level, folder=f"demand-{level}") for level in (1, 2)]
+    rows = run_many(runs, tmp_path / "out", workers=0)
+    assert list(rows["folder"]) == ["demand-1", "demand-2"] and set(rows["controller"]) == {"path/to/file.py:Class"}
+    assert len(list((tmp_path / "out" / "demand-1").glob("*.nc"))) == 1
+    assert len(run_many(runs[:1], tmp_path / "out", workers=0)) == 2
+
+
+def test_failures_are_rows_and_the_others_go_on(tmp_path):
+    def mistaken():
+        raise InputError("policy.pt: no such file")
+
+    runs = [run_of("a", work=lambda: 1 / 0), run_of("b", work=mistaken), run_of("c", work=lambda: exit(3)), run_of("d")]
+    rows = run_many(runs, tmp_path / "out", workers=0).set_index("controller")["failure"]
+    assert rows["a"].startswith("ZeroDivisionError: division by zero (test_runs.py:")
+    assert rows["b"] == "policy.pt: no such file" and rows["c"].startswith("SystemExit: 3") and rows["d"] == ""
+    with pytest.raises(RunFailed, match=r"^a, seed 0: ZeroDivisionError.*; b, seed 0: policy.pt"):
+        raise_failures(run_many(runs, tmp_path / "out", workers=0))
+
+
+def test_processes_that_die_or_hang_are_rows_and_give_the_same_numbers(tmp_path):
+    runs = [run_of("a", work=die), run_of("b", work=hang), run_of("c")]
+    rows = run_many(runs, tmp_path / "out", workers=3, time_limit=20.0).set_index("controller")["failure"]
+    assert rows.to_dict() == {"a": "its process died (status 3)", "b": "not finished within the time limit", "c": ""}
+    run_many(runs[2:], tmp_path / "here", workers=0)
+    one, other = (Result.read(tmp_path / where / "c-0.nc") for where in ("out", "here"))
+    assert one.data.identical(other.data)
+
+
+def test_finished_runs_survive_an_interruption(tmp_path):
+    calls = []
+
+    def interrupted():
         raise KeyboardInterrupt
-    assert list(tmp_path.iterdir()) == []
-    with pytest.raises(KeyboardInterrupt), opened(tmp_path) as folder:  # one that was there before stays, empty
-        raise KeyboardInterrupt
-    assert list(tmp_path.iterdir()) == []
+
+    with pytest.raises(KeyboardInterrupt):
+        run_many([run_of("a", calls=calls), run_of("b", work=interrupted)], tmp_path / "out", workers=0)
+    assert list(pd.read_csv(tmp_path / "out" / "runs.csv")["controller"]) == ["a"]
+    run_many([run_of("a", calls=calls), run_of("b", calls=calls)], tmp_path / "out", workers=0)
+    assert calls == [("a", 0), ("b", 0)]
 
 
-def test_finished_runs_survive_a_failure(tmp_path):
-    with pytest.raises(RuntimeError), opened(tmp_path / "r") as folder:
-        folder.add(trajectory())
-        raise RuntimeError
-    with opened(tmp_path / "r") as folder:
-        assert folder.finished == [("no-control", 0)]
+def test_a_folder_is_that_of_one_process_and_of_runs(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file: is a file"):
+        run_many([run_of()], tmp_path / "file", workers=0)
+    with pytest.raises(InputError, match="is not empty and holds no manifest.json"):
+        run_many([run_of()], tmp_path, workers=0)
+    run_many([run_of()], tmp_path / "out", workers=0)
+    with FileLock(tmp_path / "out" / ".lock"), pytest.raises(InputError, match="another process is writing to it"):
+        run_many([run_of()], tmp_path / "out", workers=0)
+    (tmp_path / "out" / "manifest.json").write_text("[]")
+    with pytest.raises(InputError, match="is no manifest of runs"):
+        run_many([run_of()], tmp_path / "out", workers=0)
 
 
-def test_a_file_is_no_folder(tmp_path):
-    (tmp_path / "r").write_text("")
-    with pytest.raises(InputError, match="r: is a file"), opened(tmp_path / "r"):
-        pass
-
-
-def double_or_trouble(task):
-    if task == "die":
-        os._exit(3)
-    return 2 * task if task < 3 else 1 / 0
+def test_progress_counts_runs(tmp_path):
+    shown = []
+    run_many([run_of("a"), run_of("b")], tmp_path / "out", workers=0, progress=lambda *what: shown.append(what))
+    assert shown == [(0, 2), (1, 2, "a-0"), (2, 2, "b-0")]
 
 
 @pytest.mark.slow
-def test_workers_give_every_outcome_and_name_what_failed():
-    outcomes = dict(workers.outcomes(double_or_trouble, [1, "die", 3, 2], workers=2))
-    assert {task: outcomes[task] for task in (1, 2)} == {1: 2, 2: 4}
-    assert outcomes["die"] == workers.Failure("its process died (status 3)")
-    assert outcomes[3].reason.startswith("ZeroDivisionError: division by zero (test_runs.py:")
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-@pytest.mark.usefixtures("unchecked")  # a StringIO is no typing.TextIO
-def test_progress_is_a_line_that_is_wiped_on_a_terminal_and_plain_ones_elsewhere(monkeypatch):
-    stream = io.StringIO()
-    with progress_line("x", stream) as show:
-        show(1, 4)
-    assert stream.getvalue() == ""  # for what is over in a moment
-    monkeypatch.setattr(progress, "EVERY", 0.2)
-    with progress_line("cosim", stream) as show:
-        show(1, 4, "0/2 runs")
-        time.sleep(0.1)
-        show(2, 4, "1/2 runs; seed 1: 17 of 70 min")
-        time.sleep(0.4)
-    first, *_ = stream.getvalue().splitlines()
-    assert first.startswith("cosim: 2/4 after 00:00, 00:0") and first.endswith("left, 1/2 runs; seed 1: 17 of 70 min")
-    stream = Terminal()
-    with progress_line("training", stream) as show:
-        show(0, 4, "best 3")
-    *_, drawn, wiped, end = stream.getvalue().split("\r")
-    assert drawn.startswith("training  [....") and "0/4" in drawn and drawn.endswith("best 3")
-    assert wiped.isspace() and len(wiped) >= len(drawn) and end == ""
-
-
-def test_progress_line_fits_the_terminal():
-    behind, terminal = os.openpty()
-    termios.tcsetwinsize(terminal, (24, 30))
-    with open(terminal, "w", encoding="utf-8") as stream, progress_line("training", stream) as show:
-        show(0, 4, "a long note")
-    drawn = os.read(behind, 1000).decode().split("\r")
-    os.close(behind)
-    assert max(map(len, drawn)) < 30 and any("training" in line for line in drawn)
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_progress_begins_again_with_another_total():
-    """Studies count runs, then iterations: the remaining time is that of what is shown."""
-    stream = Terminal()
-    with progress_line("identify", stream) as show:
-        show(3, 4)
-        show(0, 100, "fitting")
-    assert "0/100  ? left, fitting" in stream.getvalue().split("\r")[-3]
-
-
-def half_way(task):
-    workers.reached(0.5)
-    time.sleep(1.5 * workers.LOOK)
-    return task
-
-
-@pytest.mark.slow
-def test_who_waits_for_workers_sees_how_far_they_are():
-    seen, told = [], []
-    tally = Tally(
-        lambda *what: told.append(what),
-        [1, 2],
-        steps=lambda run: 10 * run,
-        label=lambda run: f"run {run}",
-        at=lambda run, share: f" at {share:.0%}",
+def test_a_dask_cluster_gives_the_same_runs(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None) as cluster:
+        runs = [run_of("a"), run_of("b", work=die), run_of("c", work=divide)]
+        rows = run_many(runs, tmp_path / "out", scheduler=cluster.scheduler_address).set_index("controller")["failure"]
+    assert rows["a"] == "" and rows["b"] == "its process died (status 3)" and "ZeroDivisionError" in rows["c"]
+    assert (
+        Result.read(tmp_path / "out" / "a-0.nc")
+        .without_times()
+        .identical(trajectory("a").assign(key=json.dumps(dict(runs[0].key))).without_times())
     )
-    for task, _ in workers.outcomes(
-        half_way, [1, 2], workers=2, look=lambda running: (seen.append(list(running)), tally.look(running))
-    ):
-        tally.end(task, failed=task == 2)
-    assert [(1, 0.5), (2, 0.5)] in seen
-    assert told[0] == (0, 30, "0/2 runs") and (15, 30, "0/2 runs; run 1 at 50%; run 2 at 50%") in told
-    assert [what[0] for what in told] == sorted(what[0] for what in told) and told[-1][:2] == (30, 30)
-    assert told[-1][2].startswith("2/2 runs; ")
-    workers.reached(0.7)  # in this process, which is no worker: nothing
+
+
+def test_a_scheduler_that_does_not_answer_is_one_line(tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(module, "DASK_PATIENCE_S", 0.2)
+    with pytest.raises(InputError, match="no Dask scheduler answers at 'tcp://127.0.0.1:1'"):
+        run_many([run_of()], tmp_path / "out", scheduler="tcp://127.0.0.1:1")
 
 
 def test_a_look_at_the_checkout_does_not_write_to_it(tmp_path):
@@ -340,5 +264,6 @@ def test_a_look_at_the_checkout_does_not_write_to_it(tmp_path):
         subprocess.run(["git", "-C", tmp_path, *command], check=True)
     os.utime(tmp_path / "a", (1e9, 1e9))  # git would write that down
     before = (tmp_path / ".git" / "index").read_bytes()
-    assert provenance._git(tmp_path, "status", "--porcelain") == ""
+    assert module._git(tmp_path, "status", "--porcelain") == ""
     assert (tmp_path / ".git" / "index").read_bytes() == before
+    assert module._git(Path(tmp_path, "nowhere"), "status") is None
