@@ -1,18 +1,16 @@
 """What `cosim run` does, as functions of a few arguments; exported by the package `cosim`."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 
 from cosim.evaluation import experiment
 from cosim.evaluation.simulate import Result, Task, drive
-from cosim.plant.strategy import ALONE, configured, parse, planning_of
 from cosim.sumo.outputs import check
-from nmfd.api import load_scenario, named
+from nmfd.api import load_scenario
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
-from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs.progress import Progress, watched
 from nmfd.types import Controller
@@ -52,29 +50,25 @@ def run(
     The result holds the arrays of cosim.plant.record.Record too, and the columns of sumo.csv as attributes. The same seed gives the same result, but for wall times. Raises InputError, and RuntimeError while
     another simulation is open in this process.
     """
+    strategy = parse(controller, city)
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     if steps is not None and steps < 1:
         raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
     if not 0.0 < demand_factor <= 10.0:
         raise InputError(f"demand_factor: expected a number above 0 up to 10, got {demand_factor:g} instead")
     scenario = with_demand(scenario, steps=steps, factor=demand_factor)
-    if isinstance(controller, str):
-        strategy = parse(f"{controller}+{city}" if city else controller)
-        _, acting = named(configured(strategy.name, scenario.controller_options), scenario, policy)
-        planning = planning_of(scenario, strategy.name)
-    else:
-        name, acting, planning = *named(controller, scenario, policy), planning_model(scenario)
-        strategy = parse(city or ALONE)
-        strategy = replace(
-            strategy,
-            name=f"{name}+{city}" if city else name,
-            controller=name,
-            overrides={**strategy.overrides, "gateways_fixed": name != ALONE},
-        )
     outputs = {kind: Path(file) for kind, file in (sumo_output or {}).items()}
     check(outputs)
     with watched(strategy.name, progress) as show:
-        return drive(scenario, strategy, acting, seed=seed, progress=show, outputs=outputs, planning=planning)
+        return drive(
+            scenario,
+            strategy,
+            strategy.make(scenario, None if policy is None else Path(policy)),
+            seed=seed,
+            progress=show,
+            outputs=outputs,
+            planning=strategy.planning(scenario),
+        )
 
 
 def run_tasks(

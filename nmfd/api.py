@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nmfd import closed_loop
-from nmfd.controllers import names, registry
 from nmfd.controllers.dpc import training
+from nmfd.controllers.strategy import check_tables, parse, parse_many
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario, with_demand
 from nmfd.runs import config
@@ -32,7 +32,7 @@ def load_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
         ('north-west', 'north-east', 'west', 'centre', 'east', 'south-west', 'south-east')
     """
     scenario = read_scenario(folder, settings)
-    registry.check_options(scenario)
+    check_tables(scenario)
     return scenario
 
 
@@ -47,7 +47,7 @@ def controller(name: str, scenario: Scenario | Path | str, *, policy: Path | str
 
     Raises InputError for an unknown name, a wrong option, or a policy that is missing or made for another network.
     """
-    return registry.make(name, _loaded(scenario), policy=None if policy is None else Path(policy))
+    return parse(name).make(_loaded(scenario), None if policy is None else Path(policy))
 
 
 def run(
@@ -79,18 +79,18 @@ def run(
 
     The same seed gives the same trajectory (but for wall times). Raises InputError.
     """
-    scenario = _loaded(scenario)
+    strategy, scenario = parse(controller).regional(), _loaded(scenario)
     if steps is not None:
         if steps < 1:
             raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
         scenario = with_demand(scenario, steps=steps)
     if isinstance(plant, str):
         _check_plant(plant, ", or give an object")
-    name, acting = named(controller, scenario, policy)
+    acting = strategy.make(scenario, None if policy is None else Path(policy))
     driven = PLANTS[plant](scenario) if isinstance(plant, str) else plant
-    with watched(name, progress) as show:
+    with watched(strategy.name, progress) as show:
         result = closed_loop.run(driven, acting, scenario, seed=seed, progress=show)
-    return result.assign(controller=name, plant=plant if isinstance(plant, str) else type(plant).__name__)
+    return result.assign(controller=strategy.name, plant=plant if isinstance(plant, str) else type(plant).__name__)
 
 
 def benchmark(
@@ -119,11 +119,10 @@ def benchmark(
     The column `failure` is "" of a finished run, else its reason. Raises InputError.
     """
     scenario, files = _loaded(scenario), {name: Path(file) for name, file in (policies or {}).items()}
-    chosen = names.chosen(controllers, registry.check, lambda: dict.fromkeys([*registry.ready(scenario), *files]))
     _check_plant(plant)
     return benchmark_study.benchmark(
         scenario,
-        chosen,
+        parse_many(controllers, scenario, regional=True),
         range(seeds) if isinstance(seeds, int) else list(seeds),
         plant,
         out=default_folder(scenario.name) if out is None else Path(out),
@@ -152,7 +151,7 @@ def train(
     with watched(controller, progress) as show:
         return training.train(
             _loaded(scenario),
-            controller,
+            parse(controller),
             seed=seed,
             out=Path(out),
             steps=steps,
@@ -207,20 +206,6 @@ def _check_plant(plant: str, more: str = "") -> None:
         raise InputError(
             f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from {', '.join(PLANTS)}{more}"
         )
-
-
-def named(controller: str | Controller, scenario: Scenario, policy: Path | str | None) -> tuple[str, Controller]:
-    """The name of `controller`, which may be an object already, and the object. Raises InputError."""
-    if isinstance(controller, str):
-        return controller, registry.make(controller, scenario, policy=None if policy is None else Path(policy))
-    if policy is not None:
-        raise InputError(f"policy: {policy}: is for a controller by name; this one is an object: omit policy")
-    for method in ("reset", "act"):
-        if not callable(getattr(controller, method, None)):
-            raise InputError(
-                f"controller: expected a name or an object with reset and act, got {controller!r} without {method}"
-            )
-    return getattr(controller, "name", type(controller).__name__), controller
 
 
 def _loaded(scenario: Scenario | Path | str) -> Scenario:

@@ -16,9 +16,9 @@ import nmfd
 from cosim.evaluation.run_metrics import regional_outflow
 from cosim.evaluation.simulate import drive
 from cosim.plant.settings import settings
-from cosim.plant.strategy import parse
 from cosim.sumo.net import City, city_of, edge_shapes
 from nmfd.api import controller
+from nmfd.controllers.strategy import parse
 from nmfd.model import mfd
 from nmfd.model.scenario import Scenario
 from nmfd.runs.tables import text_table

@@ -103,7 +103,7 @@ def test_a_controller_and_a_plant_as_objects(tmp_path):
         (("nobody",), {}, "controller 'nobody' is unknown"),
         (("pi-gating",), {"plant": "sumo"}, "plant 'sumo' is unknown; choose from nmfd, acyclic"),
         (("pi-gating",), {"steps": 0}, "steps: expected 1 or more"),
-        ((Half(),), {"policy": "x.pt"}, "policy: x.pt: is for a controller by name"),
+        ((Half(),), {"policy": "x.pt"}, "x.pt: controller half reads no policy"),
         ((3,), {}, "got 3 without reset"),
     ],
 )

@@ -22,7 +22,7 @@ MODULES = (  # in which public names are defined
     "nmfd.model.regional_model",
     "nmfd.runs.run_folder",
     "cosim.plant.settings",
-    "cosim.plant.strategy",
+    "nmfd.controllers.strategy",
     pytest.param("cosim.api", marks=pytest.mark.slow),
 )  # starts SUMO
 

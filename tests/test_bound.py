@@ -10,9 +10,9 @@ from commands import nmfd
 
 from nmfd import closed_loop
 from nmfd.api import load_scenario
-from nmfd.controllers import open_loop, registry
-from nmfd.controllers.no_control import NoControl
-from nmfd.controllers.pi_gating import PiGating
+from nmfd.controllers import open_loop
+from nmfd.controllers.rules import NoControl, PiGating
+from nmfd.controllers.strategy import CONTROLLERS, parse
 from nmfd.errors import InputError
 from nmfd.metrics import total_time_spent
 from nmfd.model.planning import planning_model
@@ -37,7 +37,7 @@ def closed(scenario, controller):
 
 
 def test_names_are_those_of_the_registry():
-    assert set(open_loop.NAMES) < set(registry.names())
+    assert set(open_loop.NAMES) < set(CONTROLLERS)
 
 
 def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
@@ -52,7 +52,7 @@ def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
 def test_plans_are_admissible_and_replayed_exactly(name):
     scenario = replace(load_scenario(ECONOMIC), steps=40)
     scenario = replace(scenario, demand=scenario.demand[:40])
-    plan = bound.compute(scenario, name, starts=["pi-gating"], iterations=20)
+    plan = bound.compute(scenario, name, starts=[parse("pi-gating")], iterations=20)
     network = scenario.network
     u = plan.perimeter[:, network.adjacency]
     assert u.min() >= network.u_min and u.max() <= network.u_max and (plan.perimeter[:, ~network.adjacency] == 0).all()
@@ -68,7 +68,7 @@ def test_plans_are_admissible_and_replayed_exactly(name):
 
 def test_the_bound_is_not_above_the_closed_loop_it_started_from(scenario):
     crowded = replace(scenario, demand=3.0 * scenario.demand)
-    plan = bound.compute(crowded, "bound-pc", starts=["pi-gating"], iterations=200)
+    plan = bound.compute(crowded, "bound-pc", starts=[parse("pi-gating")], iterations=200)
     # A sigmoid never quite reaches the bounds of u.
     assert plan.totals[plan.start] <= (1.0 + 1e-4) * closed(crowded, PiGating(planning_model(crowded)))
 

@@ -17,9 +17,9 @@ from PIL import Image
 from cosim.cli.main import main
 from nmfd import closed_loop
 from nmfd.cli.declared import Declared, shown
-from nmfd.controllers import registry
 from nmfd.controllers.dpc import rollout, training
-from nmfd.controllers.pi_gating import PiGating
+from nmfd.controllers.rules import PiGating
+from nmfd.controllers.strategy import CONTROLLERS
 from nmfd.runs import run_folder
 from nmfd.studies import benchmark
 
@@ -86,7 +86,7 @@ def test_without_arguments_the_help_is_shown():
 
 
 def test_the_help_names_every_controller():
-    assert ",".join(registry.names()) in "".join(nmfd("benchmark", "--help").stdout.split())
+    assert ",".join(CONTROLLERS) in "".join(nmfd("benchmark", "--help").stdout.split())
 
 
 def test_benchmark_writes_a_run_folder(benchmark_command, tmp_path):

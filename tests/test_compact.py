@@ -15,7 +15,7 @@ from nmfd.api import load_scenario
 from nmfd.controllers.dpc.compact import HELD, CompactPolicy, Numbers
 from nmfd.controllers.dpc.policy import Architecture, DpcController
 from nmfd.controllers.dpc.policy_file import checkpoint, load_policy
-from nmfd.controllers.pi_gating import PiGating
+from nmfd.controllers.rules import PiGating
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant

@@ -11,8 +11,8 @@ import trajectories
 
 from cosim.evaluation.identify import as_it_was, samples_of, static_model
 from cosim.evaluation.model_validation import errors, held_up, outflow_samples, predict, predict_next
-from cosim.plant.strategy import planning_of
 from nmfd.api import load_scenario
+from nmfd.controllers.strategy import parse
 from nmfd.model import dynamics, mfd
 from nmfd.model.identification import observed_split_ratios
 from nmfd.model.regional_model import load_network, network_toml
@@ -87,7 +87,7 @@ def test_the_model_of_those_who_drive():
     scenario = load_scenario(ROOT / "scenarios" / "grid7_peak")
     network = scenario.network.folder
     names = {
-        strategy: planning_of(scenario, strategy).network.folder.resolve().name
+        strategy: parse(strategy).planning(scenario).network.folder.resolve().name
         for strategy in (
             "no-control",
             "pi-gating",
@@ -107,7 +107,7 @@ def test_the_model_of_those_who_drive():
         "rerouting-30": "grid7_rerouting",
         "max-pressure+rerouting-30": "grid7_rerouting",
     }
-    assert planning_of(scenario, "dpc-pcrg", network).network.folder == network
+    assert parse("dpc-pcrg").planning(scenario, network).network.folder == network
 
 
 def test_outflow_samples_lie_on_the_mfd(scenario, result):

@@ -12,12 +12,12 @@ from cosim.evaluation.simulate import Task, scenario_of, simulate
 from cosim.plant.detectors import instruments, lay_out, probes
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import Settings, settings
-from cosim.plant.strategy import planning_of
 from cosim.sumo.net import city_of
 from nmfd import closed_loop
+from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
-from nmfd.controllers import registry
-from nmfd.controllers.pi_gating import PiGating
+from nmfd.controllers.rules import PiGating
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.runs import run_folder
@@ -148,7 +148,7 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
         Task(scenario=SCENARIO, controller=name, seed=3, steps=INTERVALS)
         for name in ("route-guidance+estimate", "route-guidance+estimate+max-pressure")
     ]
-    models = [planning_of(scenario_of(task), task.controller).network for task in tasks]
+    models = [parse(task.controller).planning(scenario_of(task)).network for task in tasks]
     assert [model.folder.name for model in models] == ["grid7_guided", "grid7_max_pressure"]
     scenario = scenario_of(tasks[0])
     found = simulate(tasks[0])
@@ -159,7 +159,7 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
             planning=replace(planning_model(scenario), network=model),
         )
         try:
-            again = closed_loop.run(plant, registry.make("route-guidance", scenario), scenario, seed=3)
+            again = closed_loop.run(plant, make_controller("route-guidance", scenario), scenario, seed=3)
         finally:
             plant.close()
         assert (again.accumulation == found.accumulation).all()

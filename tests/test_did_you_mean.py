@@ -3,9 +3,8 @@
 import pytest
 import tiny
 
-from cosim.plant import strategy
 from nmfd.api import load_scenario
-from nmfd.controllers import registry
+from nmfd.controllers.strategy import CONTROLLERS, parse
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.regional_model import load_network
 
@@ -20,12 +19,12 @@ def problem(call, *arguments) -> str:
 @pytest.mark.parametrize(
     "call, arguments, hint",
     [
-        (registry.check, ["dpc-prcg"], "dpc-pcrg"),
-        (registry.check, ["pi_gating"], "pi-gating"),
-        (strategy.parse, ["dpc-pcrg+max-presure"], "max-pressure"),
-        (strategy.parse, ["no-controll"], "no-control"),
-        (strategy.parse, ["dpc-pcrg+complience-50"], "compliance-N"),
-        (strategy.parse, ["actuatd"], "actuated"),
+        (parse, ["dpc-prcg"], "dpc-pcrg"),
+        (parse, ["pi_gating"], "pi-gating"),
+        (parse, ["dpc-pcrg+max-presure"], "max-pressure"),
+        (parse, ["no-controll"], "no-control"),
+        (parse, ["dpc-pcrg+complience-50"], "compliance-N"),
+        (parse, ["actuatd"], "actuated"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
@@ -45,7 +44,11 @@ def test_folders(tmp_path, load, name):
 
 @pytest.mark.parametrize(
     "old, new, key",
-    [("step = 30.0", "stepp = 30.0", "step"), ("ramp_up", "rampup", "ramp_up"), ("measurement_std", "measurment_std", "measurement_std")],
+    [
+        ("step = 30.0", "stepp = 30.0", "step"),
+        ("ramp_up", "rampup", "ramp_up"),
+        ("measurement_std", "measurment_std", "measurement_std"),
+    ],
     ids=["in place of a required key", "in a list", "a table"],
 )
 def test_keys(tmp_path, old, new, key):
@@ -54,5 +57,5 @@ def test_keys(tmp_path, old, new, key):
 
 
 def test_what_is_like_nothing_gets_no_hint():
-    assert did_you_mean("quux", registry.names()) == ""
-    assert "did you mean" not in problem(registry.check, "nobody")
+    assert did_you_mean("quux", CONTROLLERS) == ""
+    assert "did you mean" not in problem(parse, "nobody")

@@ -10,8 +10,7 @@ import pytest
 from commands import MAINS
 from documents import FILES, ROOT, kind, read
 
-from cosim.plant.strategy import parse
-from nmfd.controllers import registry
+from nmfd.controllers.strategy import parse
 from nmfd.runs import shipped
 
 # What a reader replaces, and files and folders that are not kept here: a path that begins so need not exist.
@@ -134,12 +133,11 @@ def _check_words(words: list[str], *, complete: bool) -> None:
     context = command.make_context(words[1], words[2:])  # a usage error for what the command does not take
     for name, value in context.params.items():
         if name in ("controller", "controllers", "against", "reference") and value:
-            check = parse if words[0] == "cosim" else registry.check
             for controller in value if isinstance(value, tuple) else value.split(","):
                 own = controller.partition(".py:")[0]
                 if set(controller) & set("*?[") or own != controller and own.startswith(PLACEHOLDERS):
                     continue  # a pattern, or the reader's own
-                check(controller)
+                parse(controller)
         for path in value if isinstance(value, tuple) else [value]:
             if isinstance(path, Path) and name not in ("out", "target", "scenario" if words[1] == "import" else ""):
                 _check_path(path, words)

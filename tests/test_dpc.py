@@ -13,7 +13,7 @@ from nmfd.controllers.dpc import policy as dpc
 from nmfd.controllers.dpc import training
 from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy, SoftExponential
 from nmfd.controllers.dpc.policy_file import checkpoint, load, load_policy
-from nmfd.controllers.pi_gating import PiGating
+from nmfd.controllers.rules import PiGating
 from nmfd.errors import InputError
 from nmfd.model import dynamics
 from nmfd.model.planning import planning_model

@@ -7,7 +7,7 @@ import pytest
 
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
-from nmfd.controllers.no_control import NoControl
+from nmfd.controllers.rules import NoControl
 from nmfd.metrics import summary
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant

@@ -13,9 +13,9 @@ from click.testing import CliRunner
 from cosim.cli.main import main
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
+from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
-from nmfd.controllers import registry
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.types import Controls
 
@@ -46,7 +46,7 @@ def in_a_fork(measure) -> list[float]:
 
 
 def episodes(scenario, count):
-    controllers = [registry.make(name, scenario) for name in ("pi-gating", "mpc-pcrg")]
+    controllers = [make_controller(name, scenario) for name in ("pi-gating", "mpc-pcrg")]
     for n in range(count):
         make = (NmfdPlant, AcyclicPlant)[n % 2]
         run(make(scenario), controllers[n // 2 % 2], scenario, seed=n)

@@ -14,7 +14,7 @@ from cosim.evaluation import evaluate, experiment
 from cosim.evaluation.simulate import FACTS, Result
 from cosim.report import pictures
 from nmfd.api import load_scenario
-from nmfd.controllers import registry
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.runs.workers import Failure
 
@@ -216,7 +216,7 @@ def test_titles_name_the_most_teleports():
     ],
 )
 def test_a_run_outside_of_what_its_policy_was_trained_on_says_so(name, level, said):
-    found = registry.outside_training(name, load_scenario(ROOT / "scenarios" / "grid7_peak"), level)
+    found = parse(name).outside_training(load_scenario(ROOT / "scenarios" / "grid7_peak"), level)
     assert said in found and bool(said) == bool(found)
 
 

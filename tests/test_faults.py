@@ -16,7 +16,7 @@ from cosim.sumo.net import city_of
 from nmfd import faults
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
-from nmfd.controllers.no_control import NoControl
+from nmfd.controllers.rules import NoControl
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant

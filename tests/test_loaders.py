@@ -12,12 +12,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cosim.importing.case import seconds
-from cosim.plant.strategy import parse
 from cosim.sumo.net import load_city
 from cosim.sumo.recorded_trips import read_recorded_trips
 from nmfd.api import load_scenario
 from nmfd.cli.options import policy_files
 from nmfd.controllers.dpc.policy_file import load_policy
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
 from nmfd.runs import run_folder

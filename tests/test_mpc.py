@@ -14,7 +14,7 @@ from nmfd.api import load_scenario
 from nmfd.closed_loop import run
 from nmfd.controllers.mpc import edge_model
 from nmfd.controllers.mpc.controller import TOLERANCE, EconomicMpc
-from nmfd.controllers.no_control import NoControl
+from nmfd.controllers.rules import NoControl
 from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.model import dynamics

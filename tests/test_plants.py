@@ -11,7 +11,7 @@ from tiny import random_controls
 
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
-from nmfd.controllers.no_control import NoControl
+from nmfd.controllers.rules import NoControl
 from nmfd.metrics import total_time_spent
 from nmfd.model import acyclic
 from nmfd.model.planning import planning_model

@@ -9,7 +9,7 @@ import pytest
 from trajectories import made
 
 from nmfd.api import load_scenario
-from nmfd.controllers import registry
+from nmfd.controllers.strategy import CONTROLLERS
 from nmfd.model.mfd import Mfd
 from nmfd.studies import plots
 
@@ -47,8 +47,8 @@ def runs_of(scenario, *, plants=("nmfd",), controllers=("no-control",), seeds=(0
 
 
 def test_every_controller_has_its_own_colour():
-    assert set(plots.CONTROLLER_COLOURS) == set(registry.names())
-    assert len(set(plots.CONTROLLER_COLOURS.values())) == len(registry.names())
+    assert set(plots.CONTROLLER_COLOURS) == set(CONTROLLERS)
+    assert len(set(plots.CONTROLLER_COLOURS.values())) == len(CONTROLLERS)
     assert plots.colour("mine") == plots.colour("mine") in plots.OTHER_COLOURS
 
 
@@ -121,11 +121,9 @@ def test_region_map_names_every_region(ax, scenario):
 @pytest.mark.parametrize("width", [4, 8, 16])
 def test_the_legend_fits_the_figure(scenario, width):
     drawing = plots.figure(width, 4)
-    ax = plots.region_accumulation(
-        drawing.subplots(), scenario.network, 3, runs_of(scenario, controllers=registry.names())
-    )
+    ax = plots.region_accumulation(drawing.subplots(), scenario.network, 3, runs_of(scenario, controllers=CONTROLLERS))
     plots.legend_below(drawing, [ax], columns=8)
-    assert len(drawing.legends) == 1 and len(drawing.legends[0].get_texts()) == len(registry.names()) + 1  # critical
+    assert len(drawing.legends) == 1 and len(drawing.legends[0].get_texts()) == len(CONTROLLERS) + 1  # critical
     assert drawing.legends[0].get_window_extent(drawing.canvas.get_renderer()).width <= drawing.bbox.width
 
 

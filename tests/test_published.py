@@ -10,9 +10,9 @@ import tiny
 import torch
 
 from cosim.plant.settings import settings
+from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
-from nmfd.controllers import registry
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.errors import InputError
 from nmfd.metrics import total_time_spent
@@ -65,7 +65,7 @@ def test_the_curve_of_2013():
     ],
 )
 def test_greedy_decides_by_table_1(two_regions, inside, u12, u21):
-    controls = registry.make("greedy", two_regions).act(seen(inside))
+    controls = make_controller("greedy", two_regions).act(seen(inside))
     np.testing.assert_array_equal(controls.perimeter, [[0.0, u12], [u21, 0.0]])
     assert controls.splits is None
 
@@ -77,14 +77,14 @@ def test_greedy_closes_the_way_into_the_fuller_of_two_by_their_own_jam():
     mfds[3] = replace(mfds[3], a=16 * mfds[3].a, b=4 * mfds[3].b, jam=0.25 * mfds[3].jam)
     scenario = replace(scenario, network=replace(scenario.network, mfds=tuple(mfds)))
     inside = [4000.0, 0.0, 0.0, 1500.0, 0.0, 0.0, 0.0]
-    perimeter = registry.make("greedy", scenario).act(seen(inside)).perimeter
+    perimeter = make_controller("greedy", scenario).act(seen(inside)).perimeter
     shut = {(i, h) for i, h in np.argwhere(perimeter == 0.1).tolist()}
     assert shut == {(1, 0), (2, 0), (0, 3), (1, 3), (2, 3), (4, 3), (5, 3), (6, 3)}
 
 
 def test_greedy_does_what_the_paper_has_it_do(two_regions):
     """Published: n1(590) = n2(590) = 4125, and 17.07 thousand trips completed in the hour."""
-    trajectory = run(NmfdPlant(two_regions), registry.make("greedy", two_regions), two_regions, seed=0)
+    trajectory = run(NmfdPlant(two_regions), make_controller("greedy", two_regions), two_regions, seed=0)
     assert trajectory.completed[-1] == pytest.approx(17070.0, rel=0.01)
     n1, n2 = trajectory.accumulation.sum(axis=2).T
     assert (n1[0], n2[0]) == (5400.0, 4000.0)
@@ -113,14 +113,14 @@ def test_demand_files_are_what_the_script_writes(name, arguments):
 def test_the_demand_of_figure_4_gives_the_published_row_without_control():
     """Tumu et al., table I: 1.7727e8 veh s; found by nobody's tuning here."""
     scenario = load_scenario("economic_mpc_figure4")
-    trajectory = run(NmfdPlant(scenario), registry.make("no-control", scenario), scenario, seed=0)
+    trajectory = run(NmfdPlant(scenario), make_controller("no-control", scenario), scenario, seed=0)
     assert total_time_spent(trajectory) == pytest.approx(1.7727e8, rel=0.02)
 
 
 def test_drivers_of_2018_prefer_the_fastest_way():
     """In the empty city most go straight through the centre; with that jammed hardly anybody does."""
     scenario = load_scenario("seven_region_2018")
-    made = registry.make(f"{SCENARIOS / 'seven_region_2018' / 'logit.py'}:LogitDrivers", scenario)
+    made = make_controller(f"{SCENARIOS / 'seven_region_2018' / 'logit.py'}:LogitDrivers", scenario)
     for inside, least, most in ((0.0, 0.9, 1.0), (9000.0, 0.0, 0.05)):
         controls = made.act(seen([0.0, 0.0, 0.0, inside, 0.0, 0.0, 0.0]))
         assert least <= controls.splits[0, 3, 6] <= most
@@ -132,7 +132,7 @@ def test_drivers_of_2018_prefer_the_fastest_way():
 def test_a_control_horizon_of_one_holds_the_best_constant_controls(two_regions):
     """No pair of constant gates over the horizon is better than those that the solver finds."""
     options = {"mpc-pc": {"horizon": 10, "control_horizon": 1}}
-    controller = registry.make("mpc-pc", replace(two_regions, controller_options=options))
+    controller = make_controller("mpc-pc", replace(two_regions, controller_options=options))
     begin = Observation(step=0, time=0.0, accumulation=two_regions.start, backlog=np.zeros((2, 2)))
     chosen = controller.act(begin).perimeter[[0, 1], [1, 0]]
     start, demand = controller.forecast(begin)
@@ -149,7 +149,7 @@ def test_a_control_horizon_of_one_holds_the_best_constant_controls(two_regions):
 def test_a_city_that_does_not_begin_empty(begun, plant):
     """Everybody who was inside at first is there, and reaches the end of the trip."""
     quiet = replace(begun, demand=0.0 * begun.demand, steps=20)
-    trajectory = run(plant(quiet), registry.make("no-control", quiet), quiet, seed=0)
+    trajectory = run(plant(quiet), make_controller("no-control", quiet), quiet, seed=0)
     np.testing.assert_array_equal(trajectory.accumulation[0], [[0.0, 100.0], [0.0, 50.0]])
     assert trajectory.accumulation[-1].sum() + trajectory.completed[-1] == pytest.approx(150.0)
     assert trajectory.completed[-1] > 50.0
@@ -170,9 +170,9 @@ def test_policies_are_trained_and_bounds_sought_from_the_same_start(begun):
         torch.tensor(gates).unsqueeze(1),
         torch.tensor(splits).unsqueeze(1),
     )
-    uncontrolled = total_time_spent(run(NmfdPlant(quiet), registry.make("no-control", quiet), quiet, seed=0))
+    uncontrolled = total_time_spent(run(NmfdPlant(quiet), make_controller("no-control", quiet), quiet, seed=0))
     assert float(total) == pytest.approx(uncontrolled, rel=1e-12)
-    assert registry.make("mpc-pc", quiet).act(seen([100.0, 50.0])).note == ""
+    assert make_controller("mpc-pc", quiet).act(seen([100.0, 50.0])).note == ""
 
 
 @pytest.mark.parametrize(

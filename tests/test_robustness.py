@@ -11,13 +11,13 @@ import torch
 from commands import nmfd
 
 from nmfd import closed_loop
+from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
-from nmfd.controllers import registry
 from nmfd.controllers.dpc import fallback, training
 from nmfd.controllers.dpc import policy as dpc
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint
-from nmfd.controllers.pi_gating import PiGating
+from nmfd.controllers.rules import PiGating
 from nmfd.metrics import total_time_spent
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
@@ -212,7 +212,7 @@ def test_a_wrong_policy_does_not_make_it_worse_in_silence():
     states = (alone.accumulation[:-1] / made.scale.numpy()).reshape(-1, 49)
     watched = fallback.Guarded(made, fallback.statistics(np.repeat(states, 4, axis=0)), planning_model(scenario))
     kept = closed_loop.run(NmfdPlant(scenario), watched, scenario, seed=0)
-    nobody = closed_loop.run(NmfdPlant(scenario), registry.make("no-control", scenario), scenario, seed=0)
+    nobody = closed_loop.run(NmfdPlant(scenario), make_controller("no-control", scenario), scenario, seed=0)
     assert total_time_spent(alone) > 1.2 * total_time_spent(nobody)
     assert total_time_spent(kept) <= total_time_spent(nobody)
     assert any("more time than no control, pi-gating in control" in status for status in kept.note)
@@ -278,7 +278,7 @@ def test_split_ratios_that_cost_time_are_left_to_the_drivers():
     watched = fallback.Guarded(astray, fallback.statistics(states), planning_model(benchmark))
     alone, kept, guided = (
         total_time_spent(closed_loop.run(NmfdPlant(benchmark), controller, benchmark, seed=0))
-        for controller in (dpc.DpcController(astray), watched, registry.make("route-guidance", benchmark))
+        for controller in (dpc.DpcController(astray), watched, make_controller("route-guidance", benchmark))
     )
     assert alone > 1.05 * guided and kept < 1.01 * guided
 
@@ -292,7 +292,7 @@ def test_the_limit_lets_the_training_states_pass(scenario):
 
 def test_the_guard_reads_the_statistics_of_a_trained_policy(folder, scenario, tmp_path):
     file = training.train(scenario, "dpc-pc", seed=0, out=tmp_path / "p.pt", steps=1)
-    controller = registry.make("dpc-pc-guarded", scenario, policy=file)
+    controller = make_controller("dpc-pc-guarded", scenario, policy=file)
     assert controller.name == "dpc-pc-guarded" and controller.distance(at(scenario, 0.0).accumulation) < 1.0
     torch.save(checkpoint(Policy(scenario.network, Architecture(width=4)), scenario.network, {}), tmp_path / "old.pt")
     result = nmfd(

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import tiny
 
+from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
-from nmfd.controllers import registry
 from nmfd.controllers.dpc import training
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 
@@ -69,7 +70,7 @@ def test_a_controller_plans_with_the_model_that_it_names(base, tmp_path):
     planned = planning_model(scenario, "mpc-pc")
     assert planned.network.mfds[0].jam == 800.0 and planned.controller_options["mpc-pc"] == {"horizon": 4}
     assert planning_model(scenario, "mpc-pcrg").network.mfds[0].jam == 1000.0
-    assert registry.make("mpc-pc", scenario).options.horizon == 4
+    assert make_controller("mpc-pc", scenario).options.horizon == 4
 
 
 def test_guiding_controllers_find_the_model_of_guided_drivers(base, tmp_path):
@@ -111,25 +112,25 @@ def test_a_variant_has_options_model_and_policy_of_its_own(base, tmp_path):
 base = "../scenario"
 [controllers.dpc-pc]
 steps = 3
-width = 8
-layers = 1
+mfd_spread = 0.1
+detour_cost = 1.0
 [controllers."dpc-pc+max-pressure"]
 model = "../model"
-width = 16
+mfd_spread = 0.2
 """,
     )
     scenario = load_scenario(folder)
-    chosen = training.settings(scenario, "dpc-pc+max-pressure")
-    assert (chosen.steps, chosen.width, chosen.layers) == (3, 16, 1)
-    assert training.settings(scenario, "dpc-pc").width == 8
+    chosen = training.settings(scenario, parse("dpc-pc+max-pressure"))
+    assert (chosen.steps, chosen.mfd_spread, chosen.detour_cost) == (3, 0.2, 1.0)
+    assert training.settings(scenario, parse("dpc-pc")).mfd_spread == 0.1
     for name in ("dpc-pc", "dpc-pc+max-pressure"):
-        training.train(scenario, name, seed=0, out=folder / f"{name}.pt", steps=1)
-        assert registry.policy_path(name, scenario) == folder / f"{name}.pt"
-        assert registry.make(name, scenario).name == "dpc-pc"
+        training.train(scenario, parse(name), seed=0, out=folder / f"{name}.pt", steps=1)
+        assert parse(name).file(scenario) == folder / f"{name}.pt"
+        assert make_controller(name, scenario).name == "dpc-pc"
     with pytest.raises(InputError, match="network"):  # each was trained on its own model
-        registry.make("dpc-pc", scenario, policy=folder / "dpc-pc+max-pressure.pt")
+        make_controller("dpc-pc", scenario, policy=folder / "dpc-pc+max-pressure.pt")
     with pytest.raises(InputError, match="'dpc-pc\\+webster' needs a table"):
-        training.settings(scenario, "dpc-pc+webster")
+        training.settings(scenario, parse("dpc-pc+webster"))
 
 
 def test_a_model_of_another_city_is_refused(base, tmp_path):
@@ -137,4 +138,4 @@ def test_a_model_of_another_city_is_refused(base, tmp_path):
     (tmp_path / "model" / "network.toml").write_text(tiny.row_network(3))
     folder = beside(base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\n')
     with pytest.raises(InputError, match="controllers.mpc-pc.model: network row3 has other regions"):
-        registry.make("mpc-pc", load_scenario(folder))
+        make_controller("mpc-pc", load_scenario(folder))

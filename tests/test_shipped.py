@@ -14,9 +14,10 @@ from cosim.evaluation import results
 from cosim.sumo import build
 from cosim.sumo.build import ensure_built
 from nmfd import __version__
+from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
 from nmfd.api import run as nmfd_run
-from nmfd.controllers import registry
+from nmfd.controllers.strategy import CONTROLLERS
 from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
 from nmfd.runs import shipped
@@ -97,7 +98,7 @@ def test_a_scenario_based_on_a_name_with_a_network_by_name(installed):
         tiny.SCENARIO.replace("../network", "hexagon7") + '[controllers.route-guidance]\nmodel = "hexagon7"\n',
         encoding="utf-8",
     )
-    assert registry.make("route-guidance", load_scenario("mine")) and load_scenario("mine").network.regions == 7
+    assert make_controller("route-guidance", load_scenario("mine")) and load_scenario("mine").network.regions == 7
 
 
 @pytest.mark.parametrize(
@@ -121,9 +122,9 @@ def test_nothing_is_written_into_the_package(installed, command, remedy):
 
 def test_a_missing_policy_is_trained_elsewhere(installed):
     with pytest.raises(InputError, match="nmfd train grid7_peak --controller dpc-pc-robust --out dpc-pc-robust.pt"):
-        registry.make("dpc-pc-robust", load_scenario("grid7_peak"))
+        make_controller("dpc-pc-robust", load_scenario("grid7_peak"))
     scenario = load_scenario("economic_mpc")
-    assert registry.make("dpc-pc", scenario, policy=Path("economic_mpc/dpc-pc.pt"))  # as `nmfd list` calls it
+    assert make_controller("dpc-pc", scenario, policy=Path("economic_mpc/dpc-pc.pt"))  # as `nmfd list` calls it
 
 
 def test_cities_are_built_in_the_cache(installed, tmp_path, monkeypatch):
@@ -146,7 +147,7 @@ def test_what_is_listed(installed):
     text = good(nmfd("show"))
     lines = {line.split()[0] for line in text.splitlines() if line.startswith("  ")}
     assert {"economic_mpc", "grid7_peak", "hexagon7", "grid7_guided", "economic_mpc/dpc-pc.pt"} <= lines
-    assert {*registry.names()} <= lines and "none" not in lines
+    assert {*CONTROLLERS} <= lines and "none" not in lines
     assert all(len(line) < 170 for line in text.splitlines())
     assert good(nmfd("--version")).endswith(f"version {__version__}\n")
     assert good(nmfd("--cite")).startswith("cff-version: 1.2.0\n")

@@ -8,14 +8,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from signal_rules import CROSS, MIN_GREEN, check, cross, signal
+from signal_rules import MIN_GREEN, check
 
 from cosim.plant.max_pressure import Roads
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import Settings
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import gateway_room_taken, load_city
-from cosim.sumo.signals import Link, read_signals
+from cosim.sumo.signals import read_signals
 from cosim.sumo.trips import make_trips
 from cosim.sumo.turning_flows import turning_flows
 from nmfd.api import load_scenario

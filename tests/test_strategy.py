@@ -1,15 +1,27 @@
-"""Strategies by name."""
+"""Strategies: parsing, tables, planning models, fingerprints and lists of names."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
+import tiny
 
 from cosim.plant.settings import Settings
-from cosim.plant.strategy import ALONE, OPTIONS, configured, metered, model_free, parse
-from nmfd.controllers import registry
+from nmfd.api import load_scenario
+from nmfd.controllers.rules import NoControl
+from nmfd.controllers.strategy import ALONE, CITY_NUMBERS, CITY_WORDS, CONTROLLERS, city_words, parse
 from nmfd.errors import InputError
+from nmfd.model.planning import planning_model
+from nmfd.types import Observation
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    return load_scenario(tiny.write(tmp_path))
 
 
 @pytest.mark.parametrize(
-    "name, controller, overrides",
+    "name, controller, city",
     [
         ("no-control", "no-control", {"gateways_fixed": False}),
         ("pi-gating", "pi-gating", {"gateways_fixed": True}),
@@ -35,12 +47,18 @@ from nmfd.errors import InputError
         ("dpc-pcrg+guidance-period-90", "dpc-pcrg", {"gateways_fixed": True, "guidance_period": 90.0}),
         ("dpc-pc+metering", "dpc-pc", {"gateways_fixed": True, "metering": True}),
         ("metering-120", "no-control", {"gateways_fixed": False, "metering": True, "metering_level": 1.2}),
+        ("a.py:Gate", "a.py:Gate", {"gateways_fixed": True}),
+        (
+            "a+b/c d.py:Gate+actuated+rerouting-30",
+            "a+b/c d.py:Gate",
+            {"gateways_fixed": True, "signals": "actuated", "rerouting": 0.3},
+        ),
     ],
 )
-def test_what_a_name_means(name, controller, overrides):
+def test_what_a_name_means(name, controller, city):
     strategy = parse(name)
-    assert (strategy.name, strategy.controller, strategy.overrides) == (name, controller, overrides)
-    assert model_free(name) == (controller == ALONE)
+    assert (strategy.name, strategy.controller.name, strategy.city) == (name, controller, city)
+    assert strategy.metered == ("metering" in city) and hash(strategy) == hash(parse(name))
 
 
 @pytest.mark.parametrize(
@@ -51,33 +69,19 @@ def test_who_guides(name, guides):
     assert parse(name).guides == guides
 
 
-@pytest.mark.parametrize(
-    "name, waits",
-    [
-        ("pi-gating+metering", True),
-        ("route-guidance+metering-90", True),
-        ("mine.py:Gate+metering", True),
-        ("no-control+metering-100+short-first", True),
-        ("pi-gating", False),
-        ("max-pressure+rerouting-30", False),
-    ],
-)
-def test_who_can_make_trips_wait(name, waits):
-    assert metered(name) == waits
-
-
-def test_every_controller_and_option_is_a_strategy():
+def test_every_controller_and_word_is_a_strategy():
     names = set(Settings.model_fields)
-    for controller in registry.names():
-        assert parse(controller).controller == controller
-    for option in OPTIONS:
-        option = option.replace("-N", "-50")
-        assert parse(option).overrides == parse(f"no-control+{option}").overrides
-        assert set(parse(f"mpc-pc+{option}").overrides) <= names
+    for controller in CONTROLLERS:
+        assert parse(controller).controller is CONTROLLERS[controller]
+    for word in (*CITY_WORDS, *(f"{stem}-50" for stem in CITY_NUMBERS)):
+        assert parse(word).city == parse(f"no-control+{word}").city
+        assert set(parse(f"mpc-pc+{word}").city) <= names
+    assert len(city_words()) == len(CITY_WORDS) + len(CITY_NUMBERS)
 
 
-def test_a_strategy_uses_the_table_that_fits_it_best():
+def test_the_table_with_most_words_applies(scenario):
     tables = ["dpc-pc", "dpc-pc+max-pressure", "dpc-pc+max-pressure+rerouting-30", "dpc-pcrg+max-pressure"]
+    scenario = replace(scenario, controller_options=dict.fromkeys(tables, {}))
     for name, expected in (
         ("dpc-pc", "dpc-pc"),
         ("dpc-pc+webster", "dpc-pc"),
@@ -87,23 +91,17 @@ def test_a_strategy_uses_the_table_that_fits_it_best():
         ("max-pressure", "no-control"),
         ("mpc-pc+max-pressure", "mpc-pc"),
     ):
-        assert configured(name, tables) == expected
+        assert parse(name).table(scenario) == expected
 
 
-def test_tables_that_fit_equally_well_are_an_error():
-    tables = ["dpc-pc+max-pressure", "dpc-pc+metering"]
-    with pytest.raises(
-        InputError,
-        match=(
-            r"^scenario.toml: strategy 'dpc-pc\+metering\+max-pressure': the tables "
-            r'\[controllers."dpc-pc\+max-pressure"\] and \[controllers."dpc-pc\+metering"\] fit it equally well; .*'
-            r'\[controllers."dpc-pc\+metering\+max-pressure"\] of its own$'
-        ),
-    ):
-        configured("dpc-pc+metering+max-pressure", tables)
-    assert configured("dpc-pc+max-pressure", tables) == "dpc-pc+max-pressure"
+def test_tables_that_fit_equally_well_are_an_error(scenario):
+    tables = dict.fromkeys(["dpc-pc+max-pressure", "dpc-pc+metering"], {})
+    rivals = replace(scenario, controller_options=tables)
+    with pytest.raises(InputError, match=r'fit it equally well; add a table \[controllers."dpc-pc\+metering\+max-p'):
+        parse("dpc-pc+metering+max-pressure").table(rivals)
     both = "dpc-pc+max-pressure+metering"  # its words may come in any order
-    assert configured("dpc-pc+metering+max-pressure", [*tables, both]) == both
+    solved = replace(scenario, controller_options={**tables, both: {}})
+    assert parse("dpc-pc+metering+max-pressure").table(solved) == both
 
 
 @pytest.mark.parametrize(
@@ -116,19 +114,63 @@ def test_tables_that_fit_equally_well_are_an_error():
         ("webster+no-control", "'no-control' is unknown"),
         ("rerouting-0", "rerouting-N from 1 to 100"),
         ("rerouting-101", "rerouting-N from 1 to 100 percent"),
-        ("guidance-period-0", "guidance-period-N from 1 to 3600 seconds"),
-        ("dpc-pcrg+guidance-period-3601", "unknown"),
+        ("dpc-pcrg+guidance-period-3601", "guidance-period-N from 1 to 3600 seconds"),
         ("rerouting-05", "unknown"),
-        ("metering-0", "metering-N from 1 to 1000 percent"),
         ("rerouting", "unknown"),
         ("rerouting-2.5", "unknown"),
         ("actuated+webster", "actuated and webster exclude each other"),
         ("dpc-pcrg+guided", "dpc-pcrg guides routes itself; omit guided"),
-        ("rerouting-30+rerouting-40", "exclude each other"),
         ("pi-gating+hold-back+redistribute", "exclude each other"),
+        ("mine.py:", "is unknown"),
+        ("mine.py:1a", "or file.py:Class"),
     ],
 )
 def test_errors_say_what_is_allowed(name, expected):
     with pytest.raises(InputError) as caught:
         parse(name)
     assert expected in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_the_regional_model_takes_no_words_for_a_city():
+    assert parse("pi-gating").regional().name == "pi-gating"
+    with pytest.raises(InputError, match=r"\+guided\+max-pressure needs a city in SUMO .*use pi-gating"):
+        parse("pi-gating+guided+max-pressure").regional()
+
+
+def test_an_object_is_a_strategy(scenario):
+    controller = NoControl(planning_model(scenario))
+    strategy = parse(controller, "max-pressure")
+    assert (strategy.name, strategy.city["signals"]) == ("no-control+max-pressure", "max-pressure")
+    assert strategy.make(scenario) is controller and strategy.planning(scenario).network.hash == scenario.network.hash
+    with pytest.raises(InputError, match="without act"):
+        parse(type("Half", (), {"reset": lambda self: None})())
+    with pytest.raises(InputError, match="reads no policy"):
+        strategy.make(scenario, tiny)
+
+
+def test_a_fingerprint_changes_with_what_the_runs_depend_on(scenario):
+    gating = parse("pi-gating")
+    before = gating.fingerprint(scenario)
+    other = replace(scenario, controller_options={"pi-gating": {"kp": 2.0}})
+    assert gating.fingerprint(other) != before == gating.fingerprint(scenario)
+    assert gating.fingerprint(other)["options"] == {"kp": 2.0}
+    assert parse(ALONE).fingerprint(scenario) == {}
+    network = replace(scenario.network, mfds=tuple(replace(m, jam=2 * m.jam) for m in scenario.network.mfds))
+    moved = replace(scenario, network=network)
+    assert gating.fingerprint(moved)["model_hash"] != before["model_hash"]
+    assert parse("probing-pc").fingerprint(moved) == parse("probing-pc").fingerprint(scenario)
+
+
+def test_a_missing_policy_is_named(scenario):
+    with pytest.raises(InputError, match=r"dpc-pc\.pt: no such policy for dpc-pc; make one with nmfd train"):
+        parse("dpc-pc").make(scenario)
+    with pytest.raises(InputError, match="controller greedy reads no policy"):
+        parse("greedy").make(scenario, tiny)
+
+
+@pytest.mark.parametrize("name", ["no-control", "route-guidance", "pi-gating", "greedy", "mpc-pc", "probing-pcrg"])
+def test_controllers_are_made_from_arrays_of_their_own(scenario, name):
+    controller, x = parse(name).make(scenario), np.full((2, 2), 100.0)
+    controller.reset(1)
+    controls = controller.act(Observation(step=0, time=0.0, accumulation=x, backlog=0 * x))
+    assert controls.perimeter.shape == (2, 2) and not np.shares_memory(controls.perimeter, scenario.network.adjacency)

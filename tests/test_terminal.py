@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from nmfd import closed_loop
+from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
-from nmfd.controllers import registry
 from nmfd.controllers.mpc import edge_model, terminal
 from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.errors import InputError
@@ -91,7 +91,7 @@ def test_mpc_looks_beyond_its_horizon(scenario, learned):
 
 @pytest.mark.parametrize("name, most", [("mpc-pc-terminal", 8.787e7), ("mpc-pcrg-terminal", 5.475e7)])
 def test_the_committed_ones_come_within_five_percent_of_the_bound(scenario, name, most):
-    run = closed_loop.run(NmfdPlant(scenario), registry.make(name, scenario), scenario, seed=1)
+    run = closed_loop.run(NmfdPlant(scenario), make_controller(name, scenario), scenario, seed=1)
     assert most < 30.0 * run.accumulation[:-1].sum() < 1.05 * most
 
 

@@ -22,10 +22,10 @@ from nmfd.cli.options import (
     POLICIES,
     SCENARIO,
     STEPS,
-    controller_names,
     controllers_option,
     out_option,
     policy_files,
+    strategies_in,
 )
 from nmfd.cli.progress import resumable
 from nmfd.errors import RunFailed
@@ -76,10 +76,8 @@ def evaluate(
       cosim evaluate grid7_peak --controllers no-control,pi-gating,dpc-pc --seeds 10
       cosim evaluate grid7_peak --controllers no-control,dpc-pc --demand 0.8,1.0,1.3 --out runs/levels
     """
-    from cosim.plant.strategy import parse, ready  # heavy
-
-    names = controller_names(controllers, scenario, policies=policies, check=parse, ready=ready)
-    files = policy_files(policies, names)
+    strategies = strategies_in(controllers, scenario, regional=False)
+    files = policy_files(policies, strategies)
     cluster = chosen_scheduler(workers, scheduler)
 
     from cosim.evaluation import evaluate, statistics  # heavy
@@ -89,7 +87,7 @@ def evaluate(
     loaded = load_scenario(scenario)
     chosen = evaluate.Evaluation(
         scenario=scenario,
-        controllers=tuple(names),
+        controllers=tuple(strategy.name for strategy in strategies),
         seeds=range(first_seed, first_seed + seeds),
         levels=demand,
         steps=steps,

@@ -99,9 +99,9 @@ def watch(
       cosim watch grid7_peak --controller pi-gating --gui
     """
     from cosim.evaluation.simulate import Result, Task, scenario_of  # heavy
-    from cosim.plant.strategy import parse
     from cosim.view.server import LOOPBACK
     from cosim.view.watch import watch
+    from nmfd.controllers.strategy import parse
 
     names = [controller] + ([against] if against and against != controller else [])
     tasks = [

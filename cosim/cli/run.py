@@ -57,8 +57,8 @@ def run(
       cosim run grid7_peak --controller dpc-pc+rerouting-30 --against rerouting-30
       cosim run grid7_peak --controller pi-gating --sumo-output tripinfo,edgedata
     """
-    from cosim.plant import strategy  # heavy
-    from cosim.sumo import outputs
+    from cosim.sumo import outputs  # heavy
+    from nmfd.controllers import strategy
 
     kinds = outputs.parse(sumo_output) if sumo_output is not None else ()
     names = [controller] + ([against] if against and against != controller else [])
@@ -121,7 +121,7 @@ def compare(
     """
     from cosim.evaluation import experiment, model_validation  # heavy
     from cosim.evaluation.simulate import Task, scenario_of
-    from cosim.plant import strategy
+    from nmfd.controllers import strategy
     from nmfd.runs import run_folder
 
     manifest = run_folder.read_manifest(target / "manifest.json") if (target / "manifest.json").is_file() else None
@@ -161,7 +161,7 @@ def compare(
         out, _ = _experiment([task], out)
     result = experiment.read_run(out, controller, seed)
     scenario = scenario_of(task)
-    scenario = replace(scenario, network=strategy.planning_of(scenario, controller, model).network)
+    scenario = replace(scenario, network=strategy.parse(controller).planning(scenario, model).network)
     rows = model_validation.write_comparison(out, scenario, result)
     click.echo(model_validation.error_table(rows))
     name = run_folder.run_name(controller, seed)

@@ -1,7 +1,6 @@
 """Closed-loop runs in SUMO, side by side: a run folder with table, records and pictures."""
 
 import hashlib
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -17,15 +16,13 @@ from cosim.plant import incidents
 from cosim.plant.feasible import check_strategy
 from cosim.plant.launch import own_files, own_vehicles
 from cosim.plant.settings import FILES, PRESSURES, Settings, settings
-from cosim.plant.strategy import configured, parse
 from cosim.sumo import outputs
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import check_adjacency, load_city
 from cosim.sumo.signals import HELD, read_signals
 from cosim.sumo.xml_files import read_xml
-from nmfd.controllers import registry
+from nmfd.controllers.strategy import parse
 from nmfd.metrics import COUNTED, percent_change
-from nmfd.model.planning import planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.runs import run_folder
 from nmfd.runs.files import file_hash, read_table, write_table
@@ -39,7 +36,6 @@ from nmfd.types import Result
 Outcomes = Iterator[tuple[Task, Result | Failure]]
 MINUTE = 60.0
 # Of loading runs: whether they guide routes, and so depend on the drivers' own split ratios.
-LOADING = {"probing-pc": False, "probing-pcrg": True, "route-guidance": True}
 CAPTION = (
     "TTS: total time spent, running and waiting to be inserted, mean over seeds ± 95 % interval; change: of the mean "
     "TTS against {against}; removed: taken out before the last edge of their route, in TTS as if they were there to "
@@ -157,35 +153,11 @@ def label(task: Task) -> str:
 
 
 def dependencies(name: str, scenario: Scenario, policy: Path | None = None) -> dict:
-    """What the runs of a controller depend on, besides the city and its demand, which all runs share.
-
-    Its own options, its policy or plan, the regional model and the library that computes with it. No control depends
-    on none of these, and loading runs only on their options and the split ratios that they start from. Raises
-    InputError for a controller that cannot be made.
-    """
-    controller, variant = parse(name).controller, configured(name, scenario.controller_options)
-    registry.verify(variant, scenario, policy=policy)
-    if controller == REFERENCE:
-        return {}
-    tables = scenario.controller_options
-    options = {**tables.get(controller, {}), **tables.get(variant, {})}
-    if controller in LOADING:  # its model only says what `cosim compare` predicts with
-        options = {key: value for key, value in options.items() if key != "model"}
-        splits = scenario.network.nominal_splits if LOADING[controller] else np.empty(0)
-        return {"options": options, "splits_hash": hashlib.sha256(splits.round(9).tobytes()).hexdigest()[:16]}
-    path = registry.policy_path(variant, scenario, policy)
-    if registry.is_own(controller):
-        variant, scenario = registry.configured_own(controller, scenario)
-        options = scenario.controller_options.get(variant, {})
-    network = planning_model(scenario, variant).network
-    model = json.dumps([network.hash, scenario.integrator, scenario.substeps, scenario.protected])
-    return {
-        "options": options,
-        "policy_hash": None,
-        **registry.fingerprint(controller, path),
-        "model_hash": hashlib.sha256(model.encode()).hexdigest()[:16],
-        "torch": metadata.version("torch"),
-    }
+    """Return what the runs of a strategy depend on besides the city and the demand. Raise InputError."""
+    strategy = parse(name)
+    strategy.make(scenario, policy)  # a mistake is reported before anything runs
+    result = strategy.fingerprint(scenario, policy)
+    return result | {"torch": metadata.version("torch")} if "model_hash" in result else result
 
 
 def shared_configuration(tasks: Sequence[Task]) -> tuple[dict, dict]:
@@ -202,7 +174,7 @@ def shared_configuration(tasks: Sequence[Task]) -> tuple[dict, dict]:
     city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
     check_adjacency(city, scenario.network)
     own_vehicles(scenario, chosen, city)
-    used = {parse(name).overrides.get("signals", chosen.signals) for name in controllers}
+    used = {parse(name).city.get("signals", chosen.signals) for name in controllers}
     everywhere = not used.isdisjoint(PRESSURES)
     simple, _ = read_signals(city, own_files(scenario, chosen.additional), HELD)
     incidents.check(scenario.ordered_faults, city, "faults", [signal.id for signal in simple] if everywhere else ())
@@ -274,7 +246,7 @@ def _outcomes(todo: Sequence[Task], workers: int, fresh: bool, tally: Tally) -> 
 
 def _apart(task: Task) -> str:
     """The controller of the user's own, which has a process to itself, "" for others."""
-    return task.controller if registry.runs_apart(task.controller) else ""
+    return task.controller if parse(task.controller).controller.own else ""
 
 
 def read_run(folder: Path, controller: str, seed: int) -> Result:

@@ -14,8 +14,8 @@ import pandas as pd
 from jaxtyping import Int
 
 from cosim.evaluation import experiment, signal_reasons, statistics
-from cosim.plant.strategy import metered, model_free
 from nmfd.arrays import PerRegion
+from nmfd.controllers.strategy import ALONE, parse
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import run_folder
 from nmfd.studies.benchmark import REFERENCE
@@ -126,7 +126,7 @@ def at(level: float, folder: Path, network: RegionalModel, rows: pd.DataFrame) -
 
 def _metered(folder: Path, name: str) -> bool:
     """Whether trips could be made to wait in the runs of a strategy: by its name, or everywhere in this city."""
-    if metered(name):
+    if parse(name).metered:
         return True
     return bool(run_folder.read_manifest(folder / "manifest.json")["configuration"].get("sumo", {}).get("metering"))
 
@@ -156,7 +156,7 @@ def at_a_glance(level: float, folder: Path, network: RegionalModel, rows: pd.Dat
             ("drivers were guided to other routes", done.guided > 0),
             ("trips waited outside for room", done.waited >= A_WAIT),
         )
-        if there and not model_free(name)
+        if there and parse(name).controller.name != ALONE
     ]
     means = f", because {' and '.join(acts)}" if acts else ""
     first = statistics.than(shown)
@@ -199,7 +199,7 @@ def verdict(
     spread = f"± {pair.percent_half:.1f} over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed, no proof"
     other = "" if against == REFERENCE else f" against {against}"
     size = f"{pair.percent:+.1f} % in total time spent{other} {spread}"
-    unmodelled = model_free(name)
+    unmodelled = parse(name).controller.name == ALONE
     if pair.percent < 0 and (pair.excludes_zero or pair.seeds == 1):
         return f"gains ({size})" + ("" if unmodelled else f"; {done}")
     kind = "loses" if pair.excludes_zero or pair.seeds == 1 else "gains nothing that stands out from the seeds"

@@ -50,7 +50,7 @@ PATHS = ("recipe", "net", "regions")  # keys of [sumo] in network.toml
 class Loading:
     """levels: multiples of the scenario's demand; seeds: of the runs at every level
     guided: with route guidance, first towards the drivers' own split ratios, then probing; else without
-    options: of the strategies (cosim.plant.strategy.OPTIONS), of a city that has, say, max-pressure signals
+    options: words of the strategies (nmfd.controllers.strategy), of a city that has, say, max-pressure signals
     network: the folder whose network.toml is written; None for the scenario's own or, if guided, the one where
         controllers that guide look for their model (nmfd.model.planning.guided_model)
     iterations: of the fit

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from cosim.evaluation import experiment
 from cosim.evaluation.identify import observed
 from cosim.evaluation.results import Finished
-from cosim.plant.strategy import planning_of
 from nmfd.arrays import PerRegion
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
@@ -75,7 +75,7 @@ def prediction_errors(found: Finished, model: Path | None = None) -> list[ModelE
             level.demand,
             controller,
             found.scenario,
-            planning_of(found.scenario, controller, model).network,
+            parse(controller).planning(found.scenario, model).network,
             [experiment.read_run(level.folder, controller, seed) for seed in rows["seed"]],
         )
         for level in found.levels

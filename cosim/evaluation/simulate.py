@@ -13,12 +13,11 @@ from cosim.plant.observer import Observer
 from cosim.plant.plant import SumoPlant
 from cosim.plant.record import Record, settled
 from cosim.plant.settings import settings
-from cosim.plant.strategy import Strategy, configured, parse, planning_of
 from cosim.sumo.outputs import check_whole
 from cosim.sumo.session import Window
 from nmfd import closed_loop, metrics
 from nmfd.api import load_scenario
-from nmfd.controllers import registry
+from nmfd.controllers.strategy import Strategy, parse
 from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import Scenario, with_demand, with_faults
 from nmfd.quantities import variables
@@ -64,7 +63,7 @@ FACTS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """scenario: its folder; controller: a strategy (cosim.plant.strategy); policy: of a DPC controller, instead of the
+    """scenario: its folder; controller: the name of a strategy (nmfd.controllers.strategy); policy: of a DPC controller, instead of the
     scenario's own; steps: control intervals, all if None; demand_factor: multiplies all flows;
     options: of the controller, instead of those of the scenario; sumo_output: kind (cosim.sumo.outputs) and file of
     SUMO's own outputs; faults: besides those of the scenario; time_limit: of a controller of the user's own
@@ -93,7 +92,7 @@ def scenario_of(task: Task) -> Scenario:
     if not task.options:
         return scenario
     tables = scenario.controller_options
-    table = configured(task.controller, tables)
+    table = parse(task.controller).table(scenario)
     return replace(scenario, controller_options={**tables, table: {**tables.get(table, {}), **dict(task.options)}})
 
 
@@ -109,21 +108,19 @@ def simulate(
     """
     begin = time.perf_counter()
     scenario, strategy = scenario_of(task), parse(task.controller)
-    variant = configured(task.controller, scenario.controller_options)
-    controller = registry.make(variant, scenario, policy=task.policy)
     result = drive(
         scenario,
         strategy,
-        controller,
+        strategy.make(scenario, task.policy),
         seed=task.seed,
         progress=progress,
         begin=begin,
         outputs=dict(task.sumo_output),
-        planning=planning_of(scenario, task.controller),
+        planning=strategy.planning(scenario),
         observer=observer,
         window=window,
     )
-    outside = registry.outside_training(variant, scenario, task.demand_factor, file=task.policy)
+    outside = strategy.outside_training(scenario, task.demand_factor, task.policy)
     return result.assign(outside_training=outside)
 
 
@@ -152,7 +149,7 @@ def drive(
         files = {kind: stack.enter_context(atomic(path)) for kind, path in (outputs or {}).items()}
         plant = SumoPlant(
             scenario,
-            overrides=settings(scenario).changed(**strategy.overrides),
+            overrides=settings(scenario).changed(**strategy.city),
             outputs=files,
             planning=planning,
             observer=observer,

@@ -24,10 +24,9 @@ import pandas as pd
 from cosim.evaluation import experiment, scores
 from cosim.evaluation.scores import SCORE
 from cosim.evaluation.simulate import Task, scenario_of
-from cosim.plant.strategy import configured, parse
 from nmfd.api import load_scenario
-from nmfd.controllers import registry
 from nmfd.controllers.dpc import training
+from nmfd.controllers.strategy import CONTROLLERS, parse
 from nmfd.errors import InputError
 from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_table
@@ -94,7 +93,7 @@ class Tuning:
     @property
     def trains(self) -> bool:
         """Whether every candidate is a policy of its own."""
-        return parse(self.controller).controller in training.NAMES
+        return parse(self.controller).controller.options is training.Training
 
     @property
     def configuration(self) -> dict[str, object]:
@@ -122,7 +121,7 @@ class Tuning:
         """Option and value at `point`, the shares of the ranges."""
         found: dict[str, object] = {}
         lists: dict[str, dict[int, float]] = {}
-        whole = _whole_options(parse(self.controller).controller)
+        whole = _whole_options(parse(self.controller).controller.name)
         for knob, share in zip(self.knobs, point, strict=True):
             (key, index), value = knob.place, float(f"{knob.value(float(share)):.6g}")
             if index is None:
@@ -136,7 +135,7 @@ class Tuning:
 
     def numbers(self, key: str) -> tuple[float, ...]:
         """The numbers of a list as the scenario has them, or its default: those without a range stay so."""
-        value = _own(self).get(key, _default(parse(self.controller).controller, key))
+        value = _own(self).get(key, _default(parse(self.controller).controller.name, key))
         return tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else ()
 
     def plan(self, candidate: int, options: tuple[tuple[str, object], ...]) -> list[tuple[Path, Task]]:
@@ -192,11 +191,10 @@ def check(order: Tuning) -> None:
             )
     for point in ([0.0] * len(names), [1.0] * len(names)):
         scenario = scenario_of(order.plan(0, order.options(point))[0][1])
-        variant = configured(order.controller, scenario.controller_options)
         if order.trains:
-            training.settings(scenario, variant)
+            training.settings(scenario, parse(order.controller))
         else:
-            registry.verify(variant, scenario)
+            parse(order.controller).make(scenario)
 
 
 def tune(
@@ -313,7 +311,7 @@ def _search(order: Tuning) -> cma.CMAEvolutionStrategy:
 
 def _start(order: Tuning) -> list[float]:
     """The options of the scenario as shares of the ranges; the middle for those that it leaves to the controller."""
-    controller, own, point = parse(order.controller).controller, _own(order), []
+    controller, own, point = parse(order.controller).controller.name, _own(order), []
     for knob in order.knobs:
         key, index = knob.place
         value = own.get(key, _default(controller, key))
@@ -325,23 +323,21 @@ def _start(order: Tuning) -> list[float]:
 
 def _own(order: Tuning) -> dict[str, Any]:
     """The options that the scenario gives the controller."""
-    tables = load_scenario(order.scenario).controller_options
-    return {
-        **tables.get(parse(order.controller).controller, {}),
-        **tables.get(configured(order.controller, tables), {}),
-    }
+    scenario, strategy = load_scenario(order.scenario), parse(order.controller)
+    tables = scenario.controller_options
+    return {**tables.get(strategy.controller.name, {}), **tables.get(strategy.table(scenario), {})}
 
 
 def _default(controller: str, key: str) -> object:
     """Of an option that is declared, else None."""
-    declared = registry.declarations().get(controller)
+    declared = CONTROLLERS[controller].options if controller in CONTROLLERS else None
     field = declared.model_fields.get(key) if declared else None
     return None if field is None or field.is_required() else field.default
 
 
 def _whole_options(controller: str) -> set[str]:
     """The options that are whole numbers."""
-    declared = registry.declarations().get(controller)
+    declared = CONTROLLERS[controller].options if controller in CONTROLLERS else None
     return {key for key, field in declared.model_fields.items() if field.annotation is int} if declared else set()
 
 
@@ -420,9 +416,8 @@ def train_policy(task: tuple[Tuning, int, tuple[tuple[str, object], ...]]) -> No
     """That of one candidate: (order, its number, its options)."""
     order, candidate, options = task
     scenario = scenario_of(order.plan(candidate, options)[0][1])
-    variant = configured(order.controller, scenario.controller_options)
     file = order.policy(candidate)
     assert file is not None
     file.parent.mkdir(parents=True, exist_ok=True)
-    training.train(scenario, variant, seed=order.search_seed, out=file)
+    training.train(scenario, parse(order.controller), seed=order.search_seed, out=file)
     files.write_text(file.with_name("trained"), "")  # the policy is there long before its training is finished

@@ -3,8 +3,8 @@
 from cosim.plant.launch import own_files
 from cosim.plant.programmes import CitySignals, city_signals
 from cosim.plant.settings import ESTIMATE, FIXED, PRESSURES, Settings, scenario_file, settings
-from cosim.plant.strategy import parse
 from cosim.sumo.net import City
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 
@@ -12,7 +12,7 @@ from nmfd.model.scenario import Scenario
 def check_strategy(name: str, scenario: Scenario, city: City) -> None:
     """InputError, in a line that begins with the strategy, unless it can run in this city."""
     try:
-        chosen = settings(scenario).changed(**parse(name).overrides)
+        chosen = settings(scenario).changed(**parse(name).city)
         check_settings(scenario, chosen)
         if chosen.signals != FIXED:
             signals_of(city, scenario, chosen)

@@ -41,7 +41,7 @@ class GatewaySignal:
         mode: str,
         start: float,
     ):
-        """mode: HOLD_BACK or REDISTRIBUTE of cosim.plant.strategy"""
+        """mode: HOLD_BACK or REDISTRIBUTE of cosim.plant.settings"""
         self.signal, self.phases = programme.signal, programme.phases
         self._states = [phase.state for phase in programme.phases]
         self._original = [phase.duration for phase in programme.phases]

@@ -18,9 +18,9 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from cosim.evaluation import explain, statistics
 from cosim.evaluation.results import Finished, Level
 from cosim.evaluation.simulate import FACTS
-from cosim.plant.strategy import planning_of
 from cosim.report import card, pictures, replay, summary_text
 from cosim.view.page import style
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.metrics import SUMMARY
 from nmfd.model import authority
@@ -232,7 +232,7 @@ def _models(run: Finished) -> list[str]:
     networks = {run.scenario.network.folder: run.scenario.network}
     for name in dict.fromkeys(run.rows["controller"]):
         with suppress(InputError):  # a model that is gone by now
-            network = planning_of(run.scenario, name).network
+            network = parse(name).planning(run.scenario).network
             networks.setdefault(network.folder, network)
     lines: list[str] = []
     kinds: list[str] = []

@@ -1,12 +1,12 @@
-"""What comes with the package, as (name, line) rows: from the files themselves and the registry."""
+"""What comes with the package, as (name, line) rows: from the files themselves and the controllers."""
 
 import re
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
-from nmfd.controllers import registry
 from nmfd.controllers.dpc.policy_file import read_policy_file
+from nmfd.controllers.strategy import CONTROLLERS
 from nmfd.model.regional_model import NetworkTable
 from nmfd.model.scenario import ScenarioTable, read_tables
 from nmfd.runs import config, shipped
@@ -61,7 +61,7 @@ def policies() -> Rows:
 
 def controllers() -> Rows:
     """What they do."""
-    yield from registry.texts().items()
+    yield from ((kind.name, kind.text) for kind in CONTROLLERS.values())
 
 
 def _about(file: Path) -> str:

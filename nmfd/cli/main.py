@@ -15,11 +15,11 @@ from nmfd.cli.options import (
     POLICIES,
     SCENARIO,
     SEED,
-    controller_names,
     controllers_option,
     out_option,
     policy_files,
     quoted,
+    strategies_in,
 )
 from nmfd.cli.progress import progress_line, resumable
 from nmfd.cli.studies import bound, robustness
@@ -69,8 +69,8 @@ def benchmark(
       nmfd benchmark economic_mpc --controllers no-control,dpc-pc \\
           --seeds 5 --plant acyclic --workers 2 --policy dpc-pc=mine.pt --out runs/mine
     """
-    names = controller_names(controllers, scenario, policies=policies)
-    files = policy_files(policies, names)
+    strategies = strategies_in(controllers, scenario)
+    files = policy_files(policies, strategies)
 
     from nmfd.api import load_scenario  # heavy
     from nmfd.runs.files import default_folder
@@ -80,7 +80,7 @@ def benchmark(
     loaded = load_scenario(scenario)
     out = default_folder(loaded.name) if out is None else out
     with resumable("benchmark", out, "runs.csv"):
-        rows = study.benchmark(loaded, names, range(seeds), plant, out=out, policies=files, workers=workers)
+        rows = study.benchmark(loaded, strategies, range(seeds), plant, out=out, policies=files, workers=workers)
     click.echo(f"{loaded.name}, {plant} plant, {loaded.steps} control intervals of {loaded.step:g} s")
     click.echo(study.summary_table(rows))
     click.echo(f"Written to {out}")
@@ -136,13 +136,15 @@ def train(
     """
     from nmfd.api import load_scenario  # heavy
     from nmfd.controllers.dpc import rollout, training
+    from nmfd.controllers.strategy import parse
     from nmfd.runs import shipped
 
     loaded = load_scenario(scenario)
     device = training.available(device)
-    chosen = training.settings(loaded, controller, steps)  # complains of the name before a file is named after it
+    strategy = parse(controller)
+    chosen = training.settings(loaded, strategy, steps)  # complains of the name before a file is named after it
     if not anyway:
-        model = training.check(loaded, controller)
+        model = training.check(loaded, strategy)
         for name, doubts in zip(model.region_names, model.doubts, strict=False):
             if doubts:
                 click.echo(f"nmfd: the model of region {name} is doubtful: {'; '.join(doubts)}", err=True)
@@ -177,7 +179,7 @@ def train(
 
             training.train(
                 loaded,
-                controller,
+                strategy,
                 seed=seed,
                 out=file,
                 steps=steps,

@@ -1,13 +1,17 @@
 """Command-line values that several commands of `nmfd` share."""
 
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from nmfd.cli.declared import declared
 from nmfd.errors import InputError, did_you_mean
+
+if TYPE_CHECKING:
+    from nmfd.controllers.strategy import Strategy
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -15,7 +19,7 @@ SEED = click.IntRange(0, 2**31 - 1)  # SUMO's are 32 bits long
 
 SCENARIO = click.argument("scenario", type=FOLDER)
 STEPS = declared("nmfd.model.scenario:ScenarioTable", "steps", instead="the scenario's")
-ADAM_STEPS = declared("nmfd.controllers.dpc.options:Training", "steps", instead="what scenario.toml says, else {}")
+ADAM_STEPS = declared("nmfd.controllers.dpc.training:Training", "steps", instead="what scenario.toml says, else {}")
 POLICIES = click.option(
     "--policy",
     "policies",
@@ -36,35 +40,20 @@ def out_option(kind: str = "<time>", text: str = "The run folder.") -> Callable[
     return click.option("--out", type=FOLDER, metavar="DIR", help=f"{text} [default: runs/<scenario>-{kind}]")
 
 
-def controller_names(
-    controllers: str,
-    scenario: Path | None = None,
-    *,
-    policies: Sequence[str] = (),
-    check: Callable[[str], object] | None = None,
-    ready: Callable[..., Iterable[str]] | None = None,
-    where: str = "--controllers",
-) -> list[str]:
-    """The controllers in a list separated by commas, patterns replaced (nmfd.controllers.names). InputError.
+def strategies_in(
+    controllers: str, scenario: Path, *, regional: bool = True, where: str = "--controllers"
+) -> "list[Strategy]":
+    """Return the strategies in a list separated by commas, patterns replaced. Raise InputError."""
+    from nmfd.api import load_scenario  # heavy
+    from nmfd.controllers.strategy import parse_many
 
-    scenario: of whose controllers a pattern speaks, besides those with a file in `policies`, NAME=FILE
-    check: raises InputError for an unknown name; ready: the names for a scenario, or without one where that is None;
-    those of the regional controllers if None
-    """
-    from nmfd.controllers import names, registry  # heavy
-
-    def there() -> list[str]:
-        from nmfd.api import load_scenario
-
-        known = (ready or registry.ready)(*([] if scenario is None else [load_scenario(scenario)]))
-        return list(dict.fromkeys([*known, *(option.partition("=")[0] for option in policies)]))
-
-    return names.chosen(controllers, check or registry.check, there, where)
+    return parse_many(controllers, load_scenario(scenario), regional=regional, where=where)
 
 
-def policy_files(options: tuple[str, ...], names: list[str]) -> dict[str, Path]:
+def policy_files(options: tuple[str, ...], strategies: "Sequence[Strategy]") -> dict[str, Path]:
     """NAME=FILE options as a table. InputError for another form, or a controller that is not run."""
     files: dict[str, Path] = {}
+    names = [strategy.name for strategy in strategies]
     for option in options:
         name, equals, file = option.partition("=")
         if not equals or not file:

@@ -12,10 +12,10 @@ from nmfd.cli.options import (
     FILE,
     POLICIES,
     SCENARIO,
-    controller_names,
     controllers_option,
     out_option,
     policy_files,
+    strategies_in,
 )
 from nmfd.cli.progress import progress_line, resumable
 from nmfd.errors import InputError
@@ -49,8 +49,8 @@ def robustness(
     Example:
       nmfd robustness economic_mpc --controllers pi-gating,dpc-pcrg,dpc-pcrg-robust --out runs/robust
     """
-    names = controller_names(controllers, scenario, policies=policies)
-    files = policy_files(policies, names)
+    strategies = strategies_in(controllers, scenario)
+    files = policy_files(policies, strategies)
 
     from nmfd.api import load_scenario  # heavy
     from nmfd.runs.files import default_folder
@@ -62,7 +62,7 @@ def robustness(
     with resumable("robustness", out, "runs.csv"):
         rows = method.robustness(
             loaded,
-            names,
+            strategies,
             sigmas,
             scenarios,
             where=where,
@@ -105,7 +105,7 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int, 
     from nmfd.studies import bound as method
 
     method.check(controller)
-    names = None if starts is None else controller_names(starts, scenario, where="--from")
+    begin = None if starts is None else strategies_in(starts, scenario, where="--from")
     loaded = load_scenario(scenario)
     file = out or shipped.beside(
         shipped.found(scenario, shipped.SCENARIO), f"{controller}.npz", "--out FILE", scenario=True
@@ -113,7 +113,7 @@ def bound(scenario: Path, controller: str, starts: str | None, iterations: int, 
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder for the plan; make it or choose another --out")
     with progress_line(controller) as progress:
-        plan = method.compute(loaded, controller, starts=names, iterations=iterations, progress=progress)
+        plan = method.compute(loaded, controller, starts=begin, iterations=iterations, progress=progress)
     open_loop.write(plan, loaded, file)
     for name, total in sorted(plan.totals.items(), key=lambda item: item[1]):
         click.echo(f"from {name}: {total:.5g} veh s" + (" (kept)" if name == plan.start else ""))

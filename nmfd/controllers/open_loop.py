@@ -1,4 +1,4 @@
-"""Plans fixed in advance as controllers: what `nmfd bound` has found, knowing all demand."""
+"""Open-loop controllers that replay a plan, and the plan files that `nmfd bound` writes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -9,21 +9,21 @@ import numpy as np
 from nmfd.arrays import PairsOverTime, TurnsOverTime
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
-from nmfd.runs.files import atomic, check_file
+from nmfd.runs.files import atomic
 from nmfd.types import Controls, Observation
 
-NAMES = {"bound-pc": False, "bound-pcrg": True}  # whether routes are guided too
+NAMES = {"bound-pc": False, "bound-pcrg": True}  # controller -> with route guidance
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
     """Controls of all T intervals, fixed in advance.
 
-    perimeter: (T, R, R) [-], [k, i, h] = u_ih
-    splits: (T, R, R, R) [-], [k, i, h, j] = theta_ihj; None without route guidance
-    start: the name of the start that it was descended from
-    totals: start -> total time spent [veh s] that its descent ended at
-    iterations: Adam steps done
+    perimeter: u_ih (-, (T, R, R) [k, i, h])
+    splits: theta_ihj (-, (T, R, R, R) [k, i, h, j]); None without route guidance
+    start: name of the initial plan of the best descent
+    totals: initial plan -> total time spent at the end of its descent (veh s)
+    iterations: number of Adam steps
     """
 
     perimeter: PairsOverTime
@@ -34,7 +34,7 @@ class Plan:
 
 
 class OpenLoop:
-    """A plan as a controller (nmfd.types.Controller): what is measured changes nothing."""
+    """Open-loop controller that replays a plan, whatever is measured."""
 
     def __init__(self, plan: Plan):
         self.name, self._plan = "bound-pc" if plan.splits is None else "bound-pcrg", plan
@@ -51,12 +51,12 @@ class OpenLoop:
 
 
 def model_hash(scenario: Scenario) -> str:
-    """A fingerprint of all that a plan depends on: Scenario.hash without controllers and observation noise."""
+    """Return the hash of all that a plan depends on: Scenario.hash without controllers and observation noise."""
     return replace(scenario, controller_options={}, protected=(), measurement_std=0.0).hash
 
 
 def write(plan: Plan, scenario: Scenario, path: Path) -> None:
-    """`plan` as an .npz file without pickles, with the fingerprint of its scenario; atomically."""
+    """Write `plan` and the hash of its scenario to an .npz file."""
     splits = {} if plan.splits is None else {"splits": plan.splits}
     with atomic(path) as temporary:
         np.savez_compressed(
@@ -73,10 +73,9 @@ def write(plan: Plan, scenario: Scenario, path: Path) -> None:
 
 
 def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
-    """What `write` wrote; InputError if it is none, of another scenario, or of the other action set."""
-    check_file(path, "compute one with 'nmfd bound'")
+    """Read a plan. Raise InputError if it is of another scenario or of the other set of controls."""
     try:
-        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:  # NumPy leaves others open
+        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             content = {name: file[name] for name in file.files}
         plan = Plan(
             perimeter=content["perimeter"],
@@ -100,5 +99,5 @@ def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
 
 
 def load(path: Path, scenario: Scenario, *, guidance: bool) -> OpenLoop:
-    """The plan in `path` as the controller "bound-pc" or "bound-pcrg"; InputError as `read`."""
+    """Return the plan in `path` as a controller. Raise InputError as `read`."""
     return OpenLoop(read(path, scenario, guidance=guidance))

@@ -1,14 +1,13 @@
-"""What a controller is made from: its belief about the city, which is not the city.
+"""Planning model of a controller: its belief about the city, which may differ from the simulated city.
 
-A `Scenario` is what happens. A `PlanningModel` is what somebody who plans ahead knows of it: a regional model, a
-forecast of the demand, bounds and options. It shares no array with the scenario: what a controller does to it changes
-nobody else's result.
+It shares no array with the scenario, so that a controller cannot change the plant.
 """
 
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool
@@ -18,10 +17,10 @@ from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel, check_step, load_network
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config
-from nmfd.runs.config import Settings, Text, setting
+from nmfd.runs.config import Problem, Settings, Text, setting
 
-GUIDED = "guided"  # in a network's folder: that of the same city's model with guided drivers
-GUIDING = ("mpc-pcrg", "dpc-pcrg")  # beginnings of the names of the controllers that plan with it
+GUIDED = "guided"  # subfolder of a network with the model of the same city with guided drivers
+GUIDING = ("mpc-pcrg", "dpc-pcrg")  # prefixes of the controllers that plan with it
 
 
 class PlanningOptions(Settings):
@@ -36,18 +35,18 @@ class PlanningOptions(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class PlanningModel:
-    """What a controller, a filter or a supervisor knows before a run begins.
+    """Regional model, forecast and options that a controller, filter or supervisor has before a run.
 
     name: of the scenario
-    network: the regional model that is believed in; the city may follow another one, or none
-    step: control interval [s]
+    network: regional model; the city may follow another one, or none
+    step: control interval (s)
     steps: T
-    forecast: (T, R, R) [veh/s], [k, i, j] = vehicles expected to start in i bound for j, during interval k
-    measurement_std: of the Gaussian noise that is expected on every observed x_ij [veh]
-    integrator, substeps: of the regional model, as of nmfd.model.scenario.Scenario
-    protected: the regions that gating protects
+    forecast: demand from i to j in interval k (veh/s, (T, R, R) [k, i, j])
+    measurement_std: standard deviation of the noise on every observed x_ij (veh)
+    integrator, substeps: of the regional model
+    protected: regions that gating protects
     controller_options: controller name -> its table in [controllers]
-    initial: (R, R) [veh], [i, j] = vehicles in i bound for j when a run begins; None: nobody
+    initial: vehicles in i bound for j at the start (veh, (R, R)); None for an empty city
     folder: of the scenario, or None
     """
 
@@ -66,32 +65,56 @@ class PlanningModel:
 
     @property
     def destinations(self) -> Bool[np.ndarray, " R"]:
-        """(R,): whether anybody is bound for a region."""
+        """Regions that are the destination of any trip, (R,)."""
         vehicles = self.forecast.sum(axis=(0, 1))
         return (vehicles if self.initial is None else vehicles + self.initial.sum(axis=0)) > 0
 
     @property
     def where(self) -> str:
-        """The file that error messages name."""
+        """File that error messages name."""
         return "scenario.toml" if self.folder is None else str(self.folder / "scenario.toml")
 
 
-def planning_model(scenario: Scenario, controller: str = "") -> PlanningModel:
-    """What `controller` is made from in `scenario`.
+class Options(Settings):
+    """Options of a controller; this class declares none."""
 
-    Its regional model is the network that the controller's option `model` names, or else, where it guides routes, the
-    one in the folder GUIDED of the scenario's network, if there is one, or else the scenario's own: drivers who are
-    guided, or who reroute by themselves, make another model of the same city. A controller "NAME+..." is NAME with the
-    options of [controllers."NAME+..."] over those of [controllers.NAME]. Raises InputError.
+    def misfit(self, planning: PlanningModel) -> Problem | None:
+        """Return what does not fit the planning model, or None."""
+        return None
+
+
+Declared = TypeVar("Declared", bound=Options)
+
+
+def options(declaration: type[Declared], planning: PlanningModel, name: str, table: str = "") -> Declared:
+    """Return the checked options of controller `name`.
+
+    table: name of the table in error messages, if not `name`
+    Raises: InputError
     """
-    name, tables = controller.partition("+")[0], scenario.controller_options
-    options = {**tables.get(name, {}), **tables.get(controller, {})}
-    if "model" in options and scenario.folder is not None:
-        where, prefix = scenario.folder / "scenario.toml", f"controllers.{controller}."
-        model = config.checked(PlanningOptions, {"model": options.pop("model")}, where, prefix).model
+    prefix = f"controllers.{table or name}."
+    checked = config.checked(declaration, planning.controller_options.get(name, {}), planning.where, prefix)
+    if problem := checked.misfit(planning):
+        raise config.error(planning.where, prefix + problem.key, str(problem))
+    return checked
+
+
+def planning_model(scenario: Scenario, controller: str = "", table: str = "") -> PlanningModel:
+    """Return the planning model of `controller`.
+
+    Its network is the option `model`, else the guided model of the city if the controller guides routes, else the
+    scenario's. The options of [controllers.TABLE] go over those of [controllers.CONTROLLER].
+
+    Raises: InputError
+    """
+    table, tables = table or controller, scenario.controller_options
+    merged = {**tables.get(controller, {}), **tables.get(table, {})}
+    if "model" in merged and scenario.folder is not None:
+        where, prefix = scenario.folder / "scenario.toml", f"controllers.{table}."
+        model = config.checked(PlanningOptions, {"model": merged.pop("model")}, where, prefix).model
         assert model is not None  # TOML has no null
         network = other_model(scenario, scenario.folder / model, f"{where}: {prefix}model")
-    elif name.startswith(GUIDING) and (folder := guided_model(scenario.network)) is not None:
+    elif controller.startswith(GUIDING) and (folder := guided_model(scenario.network)) is not None:
         network = other_model(scenario, folder)
     else:
         network = copy.deepcopy(scenario.network)
@@ -107,19 +130,20 @@ def planning_model(scenario: Scenario, controller: str = "") -> PlanningModel:
         protected=scenario.protected,
         initial=copy.copy(scenario.initial),
         folder=scenario.folder,
-        controller_options=copy.deepcopy({**tables, name: options} if name else dict(tables)),
+        controller_options=copy.deepcopy({**tables, controller: merged} if controller else dict(tables)),
     )
 
 
 def with_model(planning: PlanningModel, scenario: Scenario, folder: Path) -> PlanningModel:
-    """`planning` with the regional model in `folder`, of the city of `scenario`. Raises InputError."""
+    """Return `planning` with the regional model in `folder`. Raise InputError if it is of another city."""
     return replace(planning, network=other_model(scenario, folder))
 
 
 def other_model(scenario: Scenario, folder: Path, where: str = "") -> RegionalModel:
-    """The regional model in `folder`, of the same city as that of `scenario`.
+    """Return the regional model in `folder`, of the scenario's city.
 
-    where: who names it, for the InputError
+    where: file and key that name the folder, for errors
+    Raises: InputError
     """
     model = load_network(folder)
     if not np.array_equal(model.adjacency, scenario.network.adjacency):
@@ -132,6 +156,6 @@ def other_model(scenario: Scenario, folder: Path, where: str = "") -> RegionalMo
 
 
 def guided_model(network: RegionalModel) -> Path | None:
-    """The folder of the same city's model with guided drivers, if there is one beside that of the drivers' own."""
+    """Return the folder of the city's model with guided drivers, if there is one."""
     folder = None if network.folder is None else network.folder / GUIDED
     return folder if folder is not None and (folder / "network.toml").is_file() else None

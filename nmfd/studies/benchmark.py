@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from scipy.special import stdtrit
 
 from nmfd import closed_loop, faults
-from nmfd.controllers import registry
+from nmfd.controllers.strategy import Strategy
 from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario, perturbed
@@ -50,11 +50,18 @@ def compared_with(controllers: Iterable[str]) -> str:
 
 
 def closed_loop_of(
-    name: str, seed: int, *, scenario: Scenario, plant: str, policy: Path | None = None, noise: Noise | None = None
+    strategy: Strategy,
+    seed: int,
+    *,
+    scenario: Scenario,
+    plant: str,
+    policy: Path | None = None,
+    noise: Noise | None = None,
 ) -> Result:
-    """Run the controller `name`, which is made for `scenario`, in the scenario with `noise`."""
-    controller, actual = registry.make(name, scenario, policy=policy), with_noise(scenario, noise, seed)
-    return closed_loop.run(PLANTS[plant](actual), controller, actual, seed=seed).assign(controller=name, plant=plant)
+    """Run the controller of `strategy`, which is made for `scenario`, in the scenario with `noise`."""
+    controller, actual = strategy.make(scenario, policy), with_noise(scenario, noise, seed)
+    result = closed_loop.run(PLANTS[plant](actual), controller, actual, seed=seed)
+    return result.assign(controller=strategy.name, plant=plant)
 
 
 def with_noise(scenario: Scenario, noise: Noise | None, seed: int) -> Scenario:
@@ -64,7 +71,7 @@ def with_noise(scenario: Scenario, noise: Noise | None, seed: int) -> Scenario:
 
 def benchmark(
     scenario: Scenario,
-    controllers: Sequence[str],
+    strategies: Sequence[Strategy],
     seeds: Sequence[int],
     plant: str,
     *,
@@ -79,17 +86,17 @@ def benchmark(
         InputError: a controller cannot be made
     """
     policies = policies or {}
-    key = key_of(scenario, controllers, plant, policies)
+    key = key_of(scenario, strategies, plant, policies)
     runs = [
         Run(
-            run_name(name, seed),
-            key(name),
-            partial(closed_loop_of, name, seed, scenario=scenario, plant=plant, policy=policies.get(name)),
+            run_name(strategy.name, seed),
+            key(strategy.name),
+            partial(closed_loop_of, strategy, seed, scenario=scenario, plant=plant, policy=policies.get(strategy.name)),
         )
-        for name in controllers
+        for strategy in strategies
         for seed in seeds
     ]
-    rows = run_many(runs, out, **processes(controllers, workers), progress=progress)
+    rows = run_many(runs, out, **processes(strategies, workers), progress=progress)
     done = rows[rows["failure"] == ""]
     names = [run_name(name, seed) for name, seed in zip(done["controller"], done["seed"], strict=True)]
     if names:
@@ -97,14 +104,14 @@ def benchmark(
     return rows
 
 
-def processes(controllers: Sequence[str], workers: int) -> dict:
+def processes(strategies: Sequence[Strategy], workers: int) -> dict:
     """Return the options of `run_many`: this process for one worker, a new one for each run of a user's controller."""
-    own = any(map(registry.is_own, controllers))
+    own = any(strategy.controller.own for strategy in strategies)
     return {"workers": workers if own or workers > 1 else 0, "fresh": own}
 
 
 def key_of(
-    scenario: Scenario, controllers: Sequence[str], plant: str, policies: Mapping[str, Path]
+    scenario: Scenario, strategies: Sequence[Strategy], plant: str, policies: Mapping[str, Path]
 ) -> Callable[[str], dict]:
     """Return the function that gives everything the runs of a controller depend on.
 
@@ -113,9 +120,10 @@ def key_of(
     """
     faults.without_city(scenario.ordered_faults, f"{scenario.name}: faults")
     own = {}
-    for name in controllers:
-        registry.verify(name, scenario, policy=policies.get(name))
-        own[name] = registry.fingerprint(name, registry.policy_path(name, scenario, policies.get(name)))
+    for strategy in strategies:
+        policy = policies.get(strategy.name)
+        strategy.make(scenario, policy)
+        own[strategy.name] = strategy.fingerprint(scenario, policy)
     shared = {
         "scenario": scenario.name,
         "scenario_hash": scenario.hash,

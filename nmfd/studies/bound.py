@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 
 from nmfd import closed_loop
-from nmfd.controllers import registry
 from nmfd.controllers.open_loop import NAMES, Plan
+from nmfd.controllers.strategy import Strategy, parse
 from nmfd.errors import InputError
 from nmfd.model import dynamics
 from nmfd.model.plant import NmfdPlant
@@ -38,35 +38,36 @@ def compute(
     scenario: Scenario,
     name: str,
     *,
-    starts: Sequence[str] | None = None,
+    starts: Sequence[Strategy] | None = None,
     iterations: int = ITERATIONS,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Plan:
     """The bound `name` ("bound-pc" or "bound-pcrg"), from neutral starts and the closed loops of `starts`.
 
-    starts: controllers with the same action set or a smaller one; default PI gating and the scenario's own policies
+    starts: strategies with the same action set or a smaller one; default PI gating and the scenario's own policies
     """
     check(name)
     guidance = NAMES[name]
     begin = neutral_starts(scenario.network, scenario.steps, guidance=guidance)
-    for controller in _usual_starts(scenario, guidance) if starts is None else starts:
+    for strategy in _usual_starts(scenario, guidance) if starts is None else starts:
         trajectory = closed_loop.run(
             NmfdPlant(scenario),
-            registry.make(controller, scenario),
+            strategy.make(scenario),
             scenario,
             seed=0,
-            progress=progress and (lambda done, total, name=controller: progress(done, total, f"closed loop {name}")),
+            progress=progress
+            and (lambda done, total, name=strategy.name: progress(done, total, f"closed loop {name}")),
         )
         if not guidance and not np.array_equal(trajectory.splits[0], scenario.network.nominal_splits):
-            raise InputError(f"--from: {controller} guides routes, which {name} may not; omit it")
-        begin[controller] = trajectory.perimeter, trajectory.splits
+            raise InputError(f"--from: {strategy.name} guides routes, which {name} may not; omit it")
+        begin[strategy.name] = trajectory.perimeter, trajectory.splits
     return solve(scenario, begin, guidance=guidance, iterations=iterations, progress=progress)
 
 
-def _usual_starts(scenario: Scenario, guidance: bool) -> list[str]:
+def _usual_starts(scenario: Scenario, guidance: bool) -> list[Strategy]:
     candidates = (["pi-gating"] if scenario.protected else []) + ["dpc-pc"] + (["dpc-pcrg"] if guidance else [])
     return [
-        name
+        parse(name)
         for name in candidates
         if not name.startswith("dpc") or (scenario.folder is not None and (scenario.folder / f"{name}.pt").is_file())
     ]

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmfd.controllers.strategy import Strategy, parse
 from nmfd.metrics import percent_change, summary
 from nmfd.model.scenario import Scenario
 from nmfd.runs.progress import Progress
@@ -30,7 +31,7 @@ CAPTION = (
 
 
 def run_one(
-    name: str, seed: int, *, scenario: Scenario, plant: str, noise: Noise, policy: Path | None = None
+    strategy: Strategy, seed: int, *, scenario: Scenario, plant: str, noise: Noise, policy: Path | None = None
 ) -> Result:
     """Run one closed loop in perturbed demand; return its figures, without arrays.
 
@@ -38,7 +39,7 @@ def run_one(
     """
     import xarray
 
-    row = summary(closed_loop_of(name, seed, scenario=scenario, plant=plant, policy=policy, noise=noise))
+    row = summary(closed_loop_of(strategy, seed, scenario=scenario, plant=plant, policy=policy, noise=noise))
     actual = with_noise(scenario, noise, seed)
     facts = {"sigma_veh_per_s": noise.sigma, "trips_veh": float(actual.step * actual.demand.sum())}
     return Result(xarray.Dataset(attrs=facts | {column: row[column] for column in KEPT}))
@@ -46,7 +47,7 @@ def run_one(
 
 def robustness(
     scenario: Scenario,
-    controllers: Sequence[str],
+    strategies: Sequence[Strategy],
     sigmas: Sequence[float],
     scenarios: int,
     *,
@@ -64,28 +65,29 @@ def robustness(
     Raises:
         InputError: a controller cannot be made
     """
-    policies, names = policies or {}, [REFERENCE, *(name for name in controllers if name != REFERENCE)]
-    key = key_of(scenario, names, plant, policies)
+    policies, others = policies or {}, [strategy for strategy in strategies if strategy.name != REFERENCE]
+    strategies = [parse(REFERENCE), *others]
+    key = key_of(scenario, strategies, plant, policies)
     runs = [
         Run(
-            run_name(name, number),
-            {**key(name), "noise": [sigma, where]},
+            run_name(strategy.name, number),
+            {**key(strategy.name), "noise": [sigma, where]},
             partial(
                 run_one,
-                name,
+                strategy,
                 number,
                 scenario=scenario,
                 plant=plant,
                 noise=Noise(sigma, where),
-                policy=policies.get(name),
+                policy=policies.get(strategy.name),
             ),
             folder=f"sigma-{sigma:g}",
         )
         for sigma in sigmas
         for number in range(scenarios)
-        for name in names
+        for strategy in strategies
     ]
-    rows = run_many(runs, out, **processes(names, workers), progress=progress)
+    rows = run_many(runs, out, **processes(strategies, workers), progress=progress)
     if (rows["failure"] == "").any():
         draw(out, rows)
     return rows

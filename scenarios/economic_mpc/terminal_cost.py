@@ -22,14 +22,13 @@ from jaxtyping import Float
 from nmfd import closed_loop
 from nmfd.api import load_scenario
 from nmfd.arrays import StatesOverTime
-from nmfd.controllers import registry
 from nmfd.controllers.dpc.policy import DpcController, Policy
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.dpc.rollout import Demands, Rollout
 from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.controllers.mpc.terminal import LATE, OFFSET, Terminal, clock, write
-from nmfd.controllers.no_control import NoControl
-from nmfd.controllers.pi_gating import PiGating
+from nmfd.controllers.rules import NoControl, PiGating
+from nmfd.controllers.strategy import TERMINAL, parse
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
@@ -57,14 +56,14 @@ def learn(
     policy: Path | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Terminal:
-    """Learn the terminal cost of `controller`, one of registry.TERMINAL; the same seed gives the same numbers.
+    """Learn the terminal cost of `controller`, a key of TERMINAL; the same seed gives the same numbers.
 
     samples: states per round; steps: Adam steps per round; policy: file of the DPC policy that takes over after the
     horizon, the scenario's own if None
     """
-    follows, guidance = registry.TERMINAL[controller], registry.guides(controller)
+    follows, guidance = parse(TERMINAL[controller]), parse(controller).guides
     planning = planning_model(scenario, controller)
-    file = registry.policy_path(follows, scenario, policy)
+    file = follows.file(scenario, policy)
     assert file is not None  # every DPC controller has one
     with one_thread():
         torch.manual_seed(seed)
@@ -177,7 +176,7 @@ def _fitted(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("controller", choices=list(registry.TERMINAL))
+    parser.add_argument("controller", choices=list(TERMINAL))
     parser.add_argument("--seed", type=int, default=0)
     options, folder = parser.parse_args(), Path(__file__).parent
     learned = learn(load_scenario(folder), options.controller, seed=options.seed)

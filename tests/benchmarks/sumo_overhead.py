@@ -23,8 +23,8 @@ import torch
 from cosim.plant.plant import SumoPlant
 from cosim.sumo.session import Session
 from nmfd import closed_loop
+from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
-from nmfd.controllers import registry
 from nmfd.model.scenario import Scenario
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "grid7_peak"
@@ -67,7 +67,7 @@ def closed(scenario: Scenario, controller: str, seed: int, folder: Path) -> tupl
     plant = SumoPlant(scenario)
     Session.__init__, Session.set_signal_state = start, show
     try:
-        closed_loop.run(plant, registry.make(controller, scenario), scenario, seed=seed)
+        closed_loop.run(plant, make_controller(controller, scenario), scenario, seed=seed)
         plant.session.close()
         wall, cpu = time.perf_counter() - begin[0], _cpu(resource.RUSAGE_SELF) - begin[1]
         written = Path(command[command.index("--tripinfo-output") + 1])

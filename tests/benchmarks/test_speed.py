@@ -12,13 +12,13 @@ import plain
 import pytest
 import torch
 
+from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
-from nmfd.controllers import registry
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.controllers.mpc.ipopt import Ipopt
-from nmfd.controllers.no_control import NoControl
+from nmfd.controllers.rules import NoControl
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
@@ -109,7 +109,7 @@ def test_the_plain_model_is_the_model():
 def test_plain_dpc_decides_the_same(seen, guidance):
     name = "dpc-pcrg" if guidance else "dpc-pc"
     policy, _ = load_policy(SCENARIO.folder / f"{name}.pt", SCENARIO.network)
-    controls = registry.make(name, SCENARIO).act(seen[2])
+    controls = make_controller(name, SCENARIO).act(seen[2])
     perimeter, splits = plain.dpc(policy)(seen[2].accumulation)
     np.testing.assert_allclose(controls.perimeter, perimeter, atol=1e-6)
     if guidance:
@@ -161,7 +161,7 @@ class TestDpc:
         benchmark(plain.dpc(policy), seen[2].accumulation)
 
     def test_ours(self, benchmark, seen, guidance):
-        benchmark(registry.make(f"dpc-pc{'rg' * guidance}", SCENARIO).act, seen[2])
+        benchmark(make_controller(f"dpc-pc{'rg' * guidance}", SCENARIO).act, seen[2])
 
 
 @pytest.mark.benchmark(group="closed loop without control, 240 intervals of 7 regions")

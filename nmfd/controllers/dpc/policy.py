@@ -7,6 +7,7 @@ As in Tumu et al.: an MLP backbone with one decoder for the perimeter (scaled si
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -14,11 +15,11 @@ from jaxtyping import Float, Int
 from torch import nn
 
 from nmfd.arrays import Adjacency
-from nmfd.controllers.dpc.options import Activation
 from nmfd.model.regional_model import RegionalModel
 from nmfd.tensors import PerPair, PerRegion, PerTurn
 from nmfd.types import Controls, Observation, Status
 
+Activation = Literal["gelu", "relu", "tanh", "soft-exponential"]
 FEATURES = 6  # of a boundary, that a local policy sees
 Memory = Float[torch.Tensor, "*#B N R"]  # N numbers per region
 
@@ -189,7 +190,6 @@ class DpcController:
     def __init__(self, policy: Policy):
         self._policy = policy.eval()
         self.name = "dpc-pcrg" if policy.architecture.guidance else "dpc-pc"
-        self.fault: str | None = None  # injected (nmfd.faults)
         self._onward = policy.onward.numpy() if policy.architecture.listed else None
         self._u_max = self._full(policy.u_max * policy.adjacency.numpy())
         self.reset()
@@ -208,8 +208,6 @@ class DpcController:
                 for asked in (self._policy.prices(x), self._policy.metering(x))
             )
         perimeter = perimeter.numpy()
-        if self.fault == "policy-nan":
-            perimeter = np.full_like(perimeter, np.nan)
         if splits is not None:
             splits = splits.numpy().astype(float)
             sums = splits.sum(axis=1, keepdims=True)

@@ -33,16 +33,14 @@ class Rollout:
         dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
         detour_cost: float = 0.0,
-        swing_cost: float = 0.0,
     ):
-        """detour_cost: what a vehicle loses that is guided off the drivers' own split ratios [s]
-        swing_cost: of opening or closing the gates between two regions, whole and in one interval [veh s]"""
+        """detour_cost: what a vehicle loses that is guided off the drivers' own split ratios [s]"""
 
         def tensor(values: Any) -> torch.Tensor:
             return torch.tensor(values, dtype=dtype, device=device)
 
         network = planning.network
-        self.detour_cost, self.swing_cost = detour_cost, swing_cost
+        self.detour_cost = detour_cost
         self.planning, self.dtype, self.device = planning, dtype, torch.device(device)
         self.parameters = self._nominal = dynamics.parameters(network, dtype=dtype, device=device)
         self.demand = tensor(planning.forecast)
@@ -170,21 +168,12 @@ class Rollout:
     def total_time_spent(
         self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None
     ) -> Levels:
-        """TTS (B,) [veh s] of rollouts from x (B, R, R) under `policy`, with detours and swings; arguments as `states`."""
-        return self.cost(policy, *self.states(policy, x, demand, generator, step))
-
-    def cost(self, policy: Policy, exact: Demands, seen: Demands, waiting: Float[torch.Tensor, "T B"]) -> Levels:
-        """What the states that `states` returns cost, with detours and swings (B,) [veh s]."""
+        """Return the TTS (veh s, (B,)) of rollouts from x under `policy`, with detours; arguments as `states`."""
+        exact, seen, waiting = self.states(policy, x, demand, generator, step)
         vehicles = exact.sum((0, -2, -1)) + waiting.sum(0)
         if self.detour_cost and policy.architecture.guidance:
             vehicles = vehicles + self.detour_cost * self._diverted(exact, policy(seen)[1]).sum((0, -2, -1))
-        swings = self.swing_cost * self._swings(policy(seen)[0]) if self.swing_cost else 0.0
-        return self.planning.step * vehicles + swings
-
-    def _swings(self, perimeter: Float[torch.Tensor, "T B R R"]) -> Levels:
-        """How often gates were opened or closed (B,) [-], counted in whole swings of all gates between two regions."""
-        network = self.planning.network
-        return perimeter.diff(dim=0).abs().sum((0, -2, -1)) / (network.u_max - network.u_min)
+        return self.planning.step * vehicles
 
     def _diverted(self, x: PerPair, splits: PerTurn) -> PerPair:
         """Vehicles (..., R, R) [veh/s] that leave a region another way than by the drivers' own split ratios."""

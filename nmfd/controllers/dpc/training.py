@@ -1,6 +1,6 @@
-"""Training of DPC policies: roll the regional model out under the policy and descend the total time spent.
+"""Training of DPC policies: roll out the regional model under the policy and descend the total time spent.
 
-Random initial states and demand keep gradients alive (a rollout that gridlocks has none) and the best policy by
+Random initial states and demand keep gradients alive: a rollout that gridlocks has none. The policy with the best
 validation on the scenario itself is kept. The same seed gives the same weights.
 """
 
@@ -9,78 +9,154 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field, model_validator
 
 from nmfd.controllers.dpc.compact import CompactPolicy
-from nmfd.controllers.dpc.options import Training
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint, new_policy, read_file
 from nmfd.controllers.dpc.rollout import Rollout, compiled_step
-from nmfd.controllers.options import options
-from nmfd.controllers.pi_gating import PiGating
+from nmfd.controllers.rules import PiGating
 from nmfd.errors import InputError, RunFailed
 from nmfd.model.authority import NO_GATEWAY
-from nmfd.model.planning import planning_model
+from nmfd.model.planning import Options, PlanningModel, options, planning_model
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
-from nmfd.runs.files import atomic, locked, sweep
-from nmfd.runs.workers import reached
+from nmfd.runs.config import Flow, Numbers, Problem, Share, setting, whole
+from nmfd.runs.files import atomic
 from nmfd.threads import one_thread
 
-VALIDATE_EVERY = 20  # Adam steps
+if TYPE_CHECKING:
+    from nmfd.controllers.strategy import Strategy
+
+BATCH = 16  # rollouts per Adam step
+DEMAND_SPREAD = 0.2  # every flow is scaled by a factor drawn from 1 - this to 1 + this
+RANDOM_START_SHARE = 0.5  # of the rollouts start from a random state at a random time
+VALIDATION_PERIOD = 20  # Adam steps
+VALIDATION_ROLLOUTS = 16  # perturbed rollouts in a validation, if training perturbs demand or model
 WORTH_COMPILING = 200  # Adam steps
-# Of the first policy from a gate: Adam steps, states in each, learning rate; width of the gate and the fullest region,
-# as a share of the set point; share of u where there is no gate.
-GATE_STEPS, GATE_BATCH, GATE_RATE, GATE_WIDTH, GATE_FULLEST, OPENED = 1000, 256, 2e-3, 0.05, 2.5, 0.95
-WEAK, OPEN, RARE = 0.1, 3.0, 1e-3  # of the first policy from no control: factor of weights, logit of u, least theta
-VALIDATIONS = 16  # perturbed scenarios in a validation, if training perturbs the demand
-NAMES = {"dpc-pc": False, "dpc-pcrg": True}
+# First policy from a gate: Adam steps, states in each, learning rate; width of the gate and largest accumulation, as a
+# share of the set point; opening without a gate.
+GATE_STEPS, GATE_BATCH, GATE_RATE, GATE_WIDTH, GATE_FULLEST, GATE_OPEN = 1000, 256, 2e-3, 0.05, 2.5, 0.95
+# First policy from no control: factor of the weights, logit of u, least theta.
+NO_CONTROL_WEIGHT, NO_CONTROL_LOGIT, NO_CONTROL_SPLIT = 0.1, 3.0, 1e-3
 
 
-def settings(scenario: Scenario, controller: str, steps: int | None = None) -> Training:
-    """The training settings of `controller` in `scenario`, checked; `steps` overrides.
+class Training(Options):
+    """Options of a DPC policy and of its training, `nmfd train SCENARIO --controller NAME`."""
 
-    controller: one of NAMES, or "NAME+..." if the scenario has a table of that name (planning_model)
-    """
-    name, variant, _ = controller.partition("+")
-    if name not in NAMES:
-        raise InputError(f"--controller: {controller!r} cannot be trained; choose one of {', '.join(NAMES)}")
-    if variant and controller not in scenario.controller_options:
+    local: bool = setting(
+        "one small network for every boundary, whose inputs are the regions around it: perimeter control of many "
+        "regions, also by a policy that was trained in another city",
+        False,
+    )
+    compact: bool = setting(
+        "a policy of a few readable numbers instead of a network: gates of the protected regions, and prices of the "
+        "ways through crowded regions that guide drivers; trained on the CPU",
+        False,
+    )
+    numbers: Annotated[Numbers, Field(min_length=8, max_length=11)] | None = setting(
+        "initial numbers of a compact policy: set_point, gain, relief, price, price_from, elsewhere, elsewhere_from, "
+        "metering, integral (0), metering_protected (0), metering_gain (1); see nmfd/controllers/dpc/compact.py",
+        None,
+        unit="-",
+    )
+    metering: bool = setting(
+        "a compact policy makes trips wait while regions are full; for cities with +metering", False
+    )
+    descend: bool = setting("false leaves a compact policy at its initial numbers, such as those of cosim tune", True)
+    steps: int = whole("Adam steps", 400, low=1, high=10**7)
+    learning_rate: float = setting(
+        "initial learning rate of Adam; falls to a tenth along a cosine", 1e-3, unit="-", gt=0.0, le=1.0
+    )
+    demand_low: float = setting(
+        "least factor of all demand; one factor is drawn per rollout", 1.0, unit="-", gt=0.0, le=1.0
+    )
+    demand_high: float = setting("largest factor of all demand", 1.0, unit="-", ge=1.0, le=100.0)
+    noise: Flow = setting(
+        "largest standard deviation of the Gaussian noise on the demand of the pairs with demand; every rollout draws "
+        "its own from 0 to this",
+        0.0,
+    )
+    mfd_spread: Share = setting("standard deviation of the logarithm of the MFD of every region, per rollout", 0.0)
+    mfd_scale: float = setting(
+        "factor of the accumulation axes of the MFDs; below 1 for a city that may lock before its mean outflow falls",
+        1.0,
+        unit="-",
+        ge=0.1,
+        le=1.0,
+    )
+    detour_cost: float = setting(
+        "time that a vehicle loses off the nominal split ratios, in the objective", 0.0, unit="s", ge=0.0, le=1e6
+    )
+    from_no_control: bool = setting("the initial policy is nearly no control", False)
+    from_gating: bool = setting(
+        "the initial policy is nearly a gate at the set point of pi-gating, which descent does not find by itself "
+        "where the regional model locks",
+        False,
+    )
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Training":
+        if self.from_gating and self.from_no_control:
+            raise Problem("from_gating", "a policy cannot begin as a gate and as no control; omit one")
+        if self.compact and (self.local or self.from_gating or self.from_no_control):
+            raise Problem("compact", "begins with its numbers; omit local, from_gating, from_no_control")
+        if self.numbers and not (self.compact and min(self.numbers) >= 0.0):
+            raise Problem("numbers", "expected 8 to 11 numbers >= 0 of a compact policy; add compact = true")
+        if (self.metering or not self.descend) and not self.compact:
+            raise Problem("metering" if self.metering else "descend", "only for compact policies; add compact = true")
+        return self
+
+    def misfit(self, planning: PlanningModel) -> Problem | None:
+        """Return a gate without a protected region as a problem."""
+        if not (self.from_gating or self.compact) or planning.protected:
+            return None
+        key = "compact" if self.compact else "from_gating"
+        return Problem(key, "expected a scenario with protected regions; name them, or omit it")
+
+    @property
+    def levels(self) -> tuple[float, float]:
+        """Range of the factor of all demand."""
+        return self.demand_low, self.demand_high
+
+
+def settings(scenario: Scenario, strategy: "Strategy", steps: int | None = None) -> Training:
+    """Return the training settings of a strategy; `steps` overrides. Raise InputError."""
+    kind, table = strategy.controller, strategy.table(scenario)
+    if kind.options is not Training:
+        raise InputError(f"--controller: {strategy.name!r} cannot be trained; choose dpc-pc or dpc-pcrg")
+    if table != strategy.name:
         raise InputError(
-            f'--controller: {controller!r} needs a table [controllers."{controller}"] in {scenario.folder}/'
-            f"scenario.toml that says what is different from {name}; add one, or train {name}"
+            f'--controller: {strategy.name!r} needs a table [controllers."{strategy.name}"] in {scenario.folder}/'
+            f"scenario.toml with what is different from {kind.name}; add one, or train {kind.name}"
         )
-    chosen = options(Training, planning_model(scenario, controller), name, controller)
-    if chosen.local and NAMES[name]:
+    setup = options(Training, planning_model(scenario, kind.name, table), kind.name, table)
+    if setup.local and kind.guides:
         raise InputError(
-            f"{scenario.folder}/scenario.toml: controllers.{controller}.local: a local policy guides no routes; train "
-            f"{name.replace('pcrg', 'pc')}, or omit it"
+            f"{scenario.folder}/scenario.toml: controllers.{table}.local: a local policy guides no routes; train "
+            "dpc-pc, or omit it"
         )
-    if not chosen.descend and steps is not None:
-        raise InputError(
-            f"--steps: {controller} stays as it begins (descend = false in {scenario.folder}/scenario.toml); omit one "
-            "of them"
-        )
-    return chosen if steps is None else chosen.changed(steps=steps)
+    return setup if steps is None else setup.changed(steps=steps)
 
 
-def check(scenario: Scenario, controller: str) -> RegionalModel:
-    """The regional model on which `controller` is trained. InputError where training would be for nothing: no gateway
-    of the city can be controlled, or the MFDs are placeholders that no run has measured."""
-    city, believed = scenario.network, planning_model(scenario, controller).network
+def check(scenario: Scenario, strategy: "Strategy") -> RegionalModel:
+    """Return the model to train on. Raise InputError if no gateway can be controlled or MFDs are placeholders."""
+    city = scenario.network
+    believed = planning_model(scenario, strategy.controller.name, strategy.table(scenario)).network
     if city.controllable is not None and not city.controllable.any():
         raise InputError(
-            f"{_file(city)}: controllable: is 0 at every boundary: {NO_GATEWAY}; --anyway trains {controller} all the "
-            "same"
+            f"{_file(city)}: controllable: is 0 at every boundary: {NO_GATEWAY}; --anyway trains {strategy.name} all "
+            "the same"
         )
     if believed.placeholder:
         raise InputError(
-            f"{_file(believed)}: placeholder: is true: its MFDs are guesses from lanes and speed limits, and a policy "
-            f"would learn these; run 'cosim identify {os.path.dirname(_file(city)) or 'NETWORK'}' first, or set it to "
-            f"false once you have put in MFDs of your own; --anyway trains {controller} all the same"
+            f"{_file(believed)}: placeholder: is true: its MFDs are guesses from lanes and speed limits; a policy "
+            f"would learn them; run 'cosim identify {os.path.dirname(_file(city)) or 'NETWORK'}' first, or set it to "
+            f"false after putting in your own MFDs; --anyway trains {strategy.name} all the same"
         )
     return believed
 
@@ -90,7 +166,7 @@ def _file(network: RegionalModel) -> str:
 
 
 def available(device: str) -> str:
-    """ "cpu" or "cuda", with "auto" the GPU where there is one. InputError for a GPU that is not there."""
+    """Return "cpu" or "cuda"; "auto" is the GPU if there is one. Raise InputError for a missing GPU."""
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device: cuda asked for, but PyTorch finds no GPU here; choose cpu or auto")
     return "cuda" if device == "auto" and torch.cuda.is_available() else device.replace("auto", "cpu")
@@ -98,7 +174,7 @@ def available(device: str) -> str:
 
 def train(
     scenario: Scenario,
-    controller: str,
+    strategy: "Strategy",
     *,
     seed: int,
     out: Path,
@@ -110,122 +186,114 @@ def train(
     progress: Callable[[int, int, str], None] | None = None,
     log: Callable[[int, float, float], object] | None = None,
 ) -> Path:
-    """Train `controller`, one that `settings` knows, on the regional model and write the policy to `out`.
+    """Train the policy of `strategy` on the regional model and write it to `out`.
 
-    `out` holds the best policy so far after every validation; `out`.resume beside it holds what `resume` needs and
-    goes when the training is complete. `progress(done, steps, note)` is called after every step, `log(done,
-    TTS in training, TTS in validation)` [veh s] after every validation, also for those from before `resume`. `compiled`
-    makes a step about twice as fast, after up to a minute or two of compilation; the weights differ by rounding.
-    `anyway`: even where `check` refuses.
+    `out` holds the best policy after every validation. `out`.resume holds the state that `resume` continues from.
+
+    compiled: compile the step, about twice as fast after a minute or two; the weights differ by rounding
+    anyway: train even if `check` raises
+    progress: called with (done, steps, note) after every step
+    log: called with (done, TTS in training, TTS in validation) (veh s) after every validation
     """
     with one_thread():
-        chosen = settings(scenario, controller, steps)
+        setup = settings(scenario, strategy, steps)
         if not anyway:
-            check(scenario, controller)
-        planning = planning_model(scenario, controller)
-        steps = chosen.steps if chosen.descend else 0
+            check(scenario, strategy)
+        planning = planning_model(scenario, strategy.controller.name, strategy.table(scenario))
+        steps = setup.steps if setup.descend else 0
         configuration = {
-            "controller": controller,
+            "controller": strategy.name,
             "scenario": planning.name,
             "seed": seed,
             "compiled": compiled,
-            **vars(chosen),
+            **vars(setup),
             "steps": steps,
         }
         torch.manual_seed(seed)
         generator = torch.Generator().manual_seed(seed)
-        guidance = NAMES[controller.partition("+")[0]]
         architecture = Architecture(
-            width=chosen.width,
-            layers=chosen.layers,
-            activation=chosen.activation,
-            guidance=guidance,
-            local=chosen.local,
-            compact=planning.protected if chosen.compact else (),
-            metering=chosen.metering,
+            guidance=strategy.controller.guides,
+            local=setup.local,
+            compact=planning.protected if setup.compact else (),
+            metering=setup.metering,
         )
         policy = new_policy(planning.network, architecture)
-        if chosen.numbers and isinstance(policy, CompactPolicy):
-            policy.begin_with(chosen.numbers)
-        if chosen.from_no_control:
+        if setup.numbers and isinstance(policy, CompactPolicy):
+            policy.begin_with(setup.numbers)
+        if setup.from_no_control:
             begin_as_no_control(policy, planning.network)
-        device = "cpu" if chosen.compact else device
+        device = "cpu" if setup.compact else device
         policy = policy.to(device)
-        rollout = Rollout(planning, device=device, detour_cost=chosen.detour_cost, swing_cost=chosen.swing_cost)
-        if chosen.from_gating and not resume:
+        rollout = Rollout(planning, device=device, detour_cost=setup.detour_cost)
+        if setup.from_gating and not resume:
             begin_as_gate(policy, rollout, generator)
         advance = compiled_step(rollout.step) if compiled else rollout.step
-        optimizer = torch.optim.Adam(policy.parameters(), lr=chosen.learning_rate)
+        optimizer = torch.optim.Adam(policy.parameters(), lr=setup.learning_rate)
         first, best, history = 0, float("inf"), list[list[float]]()
         state_file = out.with_name(out.name + ".resume")
-        with locked(out.with_name(f".{out.name}.lock"), out):
-            sweep(out.parent, {out.stem, state_file.stem})
-            if resume:
-                first, best, history = _restore(state_file, configuration, policy, optimizer, generator)
-                for done, trained, score in history:
-                    if log:
-                        log(int(done), trained, score)
-            for step in range(first, steps):
-                for group in optimizer.param_groups:
-                    cosine = 0.5 * (1.0 + math.cos(math.pi * step / steps))
-                    group["lr"] = chosen.learning_rate * (0.1 + 0.9 * cosine)
-                rollout.draw_model(chosen.batch, chosen.mfd_spread, generator, chosen.mfd_scale)
-                x, demand = rollout.random_start(
-                    chosen.batch, chosen.demand_spread, chosen.initial_share, generator, chosen.levels
-                )
-                demand = rollout.perturb(demand, torch.rand(chosen.batch, generator=generator), chosen.noise, generator)
-                # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
-                loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
-                optimizer.zero_grad()
-                loss.backward()
-                if architecture.guidance and chosen.alternating and not chosen.compact:
-                    # Not by requires_grad, which would compile the step once for each decoder.
-                    for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
-                        weights.grad = None
-                torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
-                optimizer.step()
-                if isinstance(policy, CompactPolicy):
-                    policy.bound()
-                last = step + 1 == steps
-                if (step + 1) % VALIDATE_EVERY == 0 or last:
-                    score = validate(policy, rollout, seed, chosen)
-                    history.append([step + 1, math.exp(loss.item()), score])
-                    if log:
-                        log(step + 1, history[-1][1], score)
-                    if score < best:
-                        best = score
-                        _keep(policy, rollout, configuration, best, out)
-                    if not last:
-                        write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
-                reached((step + 1) / steps)
-                if progress:
-                    progress(step + 1, steps, f"best {best:.4g} veh s")
-            if not steps:  # as it begins
-                best = validate(policy, rollout, seed, chosen)
+        if resume:
+            first, best, history = _restore(state_file, configuration, policy, optimizer, generator)
+            for done, trained, score in history:
                 if log:
-                    log(0, best, best)
-                if progress:
-                    progress(1, 1, f"as it begins {best:.4g} veh s")
-                _keep(policy, rollout, configuration, best, out)
-            if not math.isfinite(best):
-                raise RunFailed(f"{controller}: every validation of {steps} steps diverged; lower the learning rate")
-            state_file.unlink(missing_ok=True)
+                    log(int(done), trained, score)
+        for step in range(first, steps):
+            for group in optimizer.param_groups:
+                cosine = 0.5 * (1.0 + math.cos(math.pi * step / steps))
+                group["lr"] = setup.learning_rate * (0.1 + 0.9 * cosine)
+            rollout.draw_model(BATCH, setup.mfd_spread, generator, setup.mfd_scale)
+            x, demand = rollout.random_start(BATCH, DEMAND_SPREAD, RANDOM_START_SHARE, generator, setup.levels)
+            demand = rollout.perturb(demand, torch.rand(BATCH, generator=generator), setup.noise, generator)
+            # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
+            loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            if architecture.guidance and not setup.compact:
+                # The decoders are trained in turn. Not by requires_grad, which would compile the step once for each.
+                for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
+                    weights.grad = None
+            torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+            optimizer.step()
+            if isinstance(policy, CompactPolicy):
+                policy.bound()
+            last = step + 1 == steps
+            if (step + 1) % VALIDATION_PERIOD == 0 or last:
+                score = validate(policy, rollout, seed, setup)
+                history.append([step + 1, math.exp(loss.item()), score])
+                if log:
+                    log(step + 1, history[-1][1], score)
+                if score < best:
+                    best = score
+                    _keep(policy, planning.network, configuration, best, out)
+                if not last:
+                    write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
+            if progress:
+                progress(step + 1, steps, f"best {best:.4g} veh s")
+        if not steps:  # the initial policy
+            best = validate(policy, rollout, seed, setup)
+            if log:
+                log(0, best, best)
+            if progress:
+                progress(1, 1, f"initial policy {best:.4g} veh s")
+            _keep(policy, planning.network, configuration, best, out)
+        if not math.isfinite(best):
+            raise RunFailed(f"{strategy.name}: every validation of {steps} steps diverged; lower the learning rate")
+        state_file.unlink(missing_ok=True)
         return out
 
 
 def begin_as_no_control(policy: Policy, network: RegionalModel) -> None:
-    """Let `policy` hardly depend on the state, with nearly open gateways and nearly the drivers' own split ratios."""
+    """Make `policy` nearly independent of the state, with open gateways and nominal split ratios."""
     with torch.no_grad():
-        policy.perimeter_decoder.weight.mul_(WEAK)
-        policy.perimeter_decoder.bias.fill_(OPEN)
+        policy.perimeter_decoder.weight.mul_(NO_CONTROL_WEIGHT)
+        policy.perimeter_decoder.bias.fill_(NO_CONTROL_LOGIT)
         if policy.architecture.guidance:
             own = torch.tensor(network.nominal_splits[np.arange(network.regions)[:, None], policy.onward.numpy()])
-            policy.splits_decoder.weight.mul_(WEAK)
-            policy.splits_decoder.bias.copy_(own.clamp(min=RARE).log().flatten())
+            policy.splits_decoder.weight.mul_(NO_CONTROL_WEIGHT)
+            policy.splits_decoder.bias.copy_(own.clamp(min=NO_CONTROL_SPLIT).log().flatten())
 
 
 def begin_as_gate(policy: Policy, rollout: Rollout, generator: torch.Generator) -> None:
-    """Let `policy` close the entries of every region that pi-gating holds as this fills, half at its set point."""
+    """Fit `policy` to gates that close the entries of protected regions as these fill, half at the set point."""
     network, gate = rollout.planning.network, PiGating(rollout.planning)
     protected = gate.regions.tolist()
     set_point = torch.tensor(gate.set_point, dtype=rollout.dtype, device=rollout.device)
@@ -235,7 +303,7 @@ def begin_as_gate(policy: Policy, rollout: Rollout, generator: torch.Generator) 
         x, _ = rollout.random_start(GATE_BATCH, 0.0, 1.0, generator)
         full = torch.rand(GATE_BATCH, len(protected), generator=generator).to(x) * GATE_FULLEST * set_point
         x[:, protected] *= (full / x[:, protected].sum(-1).clamp(min=1.0)).unsqueeze(-1)
-        wanted = torch.full_like(x, OPENED)
+        wanted = torch.full_like(x, GATE_OPEN)
         wanted[:, :, protected] = torch.sigmoid((set_point - full) / (GATE_WIDTH * set_point)).unsqueeze(1)
         share = (policy(x)[0] - network.u_min) / (network.u_max - network.u_min)
         loss = torch.nn.functional.binary_cross_entropy(share.clamp(0.0, 1.0), wanted, weight=counts)
@@ -244,20 +312,20 @@ def begin_as_gate(policy: Policy, rollout: Rollout, generator: torch.Generator) 
         optimizer.step()
 
 
-def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> float:
-    """TTS of the scenario itself from its own start, the geometric mean of two noise draws [veh s].
+def validate(policy: Policy, rollout: Rollout, seed: int, setup: Training) -> float:
+    """Return the TTS (veh s) of the scenario itself, the geometric mean of two noise draws.
 
-    If training perturbs demand or model: also of VALIDATIONS perturbed ones, whose sigma rises to that of `chosen`.
+    If training perturbs demand or model, also of VALIDATION_ROLLOUTS perturbed rollouts of increasing sigma.
     """
     generator = torch.Generator().manual_seed(seed)
-    perturbed = chosen.noise or chosen.mfd_spread or chosen.demand_low < chosen.demand_high
-    count = 2 + (VALIDATIONS if perturbed else 0)
-    rollout.draw_model(count, chosen.mfd_spread, generator, chosen.mfd_scale)
-    level = torch.linspace(0.0, 1.0, count // 2).repeat_interleave(2)  # in twos: one of each kind of noise
+    perturbed = setup.noise or setup.mfd_spread or setup.demand_low < setup.demand_high
+    count = 2 + (VALIDATION_ROLLOUTS if perturbed else 0)
+    rollout.draw_model(count, setup.mfd_spread, generator, setup.mfd_scale)
+    level = torch.linspace(0.0, 1.0, count // 2).repeat_interleave(2)
     nominal = rollout.demand.unsqueeze(1).expand(-1, count, -1, -1)
-    demand = rollout.perturb(nominal, level, chosen.noise, generator)
-    if chosen.demand_low < chosen.demand_high:
-        low, high = chosen.levels
+    demand = rollout.perturb(nominal, level, setup.noise, generator)
+    if setup.demand_low < setup.demand_high:
+        low, high = setup.levels
         demand = (
             demand * (low + (high - low) * level[torch.randperm(count, generator=generator)]).to(demand)[:, None, None]
         )
@@ -266,9 +334,9 @@ def validate(policy: Policy, rollout: Rollout, seed: int, chosen: Training) -> f
     return torch.log(total).mean().exp().item()
 
 
-def _keep(policy: Policy, rollout: Rollout, configuration: Mapping[str, Any], score: float, out: Path) -> None:
-    """Write the policy to `out`, with its `score` in validation [veh s]."""
-    write(checkpoint(policy, rollout.planning.network, {**configuration, "validation_veh_s": score}), out)
+def _keep(policy: Policy, network: RegionalModel, configuration: Mapping[str, Any], score: float, out: Path) -> None:
+    """Write the policy to `out`, with its `score` in validation (veh s)."""
+    write(checkpoint(policy, network, {**configuration, "validation_veh_s": score}), out)
 
 
 def _state(
@@ -298,30 +366,22 @@ def _restore(
     optimizer: torch.optim.Optimizer,
     generator: torch.Generator,
 ) -> tuple[int, float, list[list[float]]]:
-    state = read_file(
-        state_file, "nothing to resume; train without --resume", "is damaged; remove it and train without --resume"
-    )
-    try:
-        there = dict(state["configuration"])
-        for key, value in configuration.items():
-            if there.get(key) != value:
-                raise InputError(
-                    f"{state_file}: {key}: was {there.get(key)!r}, now {value!r}; resume with the same settings or "
-                    "train without --resume"
-                )
-        policy.load_state_dict(state["policy"])
-        optimizer.load_state_dict(state["optimizer"])
-        generator.set_state(state["generator"])
-        return int(state["step"]), float(state["best"]), list(state["history"])
-    except InputError:
-        raise
-    except Exception:
-        raise InputError(f"{state_file}: is damaged; remove it and train without --resume") from None
+    state = read_file(state_file, "nothing to resume; train without --resume")
+    for key, value in configuration.items():
+        if state["configuration"].get(key) != value:
+            raise InputError(
+                f"{state_file}: {key}: was {state['configuration'].get(key)!r}, now {value!r}; resume with the same "
+                "settings or train without --resume"
+            )
+    policy.load_state_dict(state["policy"])
+    optimizer.load_state_dict(state["optimizer"])
+    generator.set_state(state["generator"])
+    return int(state["step"]), float(state["best"]), list(state["history"])
 
 
 def write(content: dict, path: Path) -> None:
-    """A checkpoint, or what a training needs to go on: the same content, the same bytes."""
-    buffer = io.BytesIO()  # given a path, torch would write its name into the file: never the same bytes twice
+    """Write a checkpoint or the state of a training; the same content gives the same bytes."""
+    buffer = io.BytesIO()  # given a path, torch would write its name into the file
     torch.save(content, buffer)
     with atomic(path) as temporary:
         temporary.write_bytes(buffer.getvalue())

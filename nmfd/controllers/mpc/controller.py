@@ -24,14 +24,14 @@ from nmfd.controllers.mpc.edge_model import Decision, Demands, PerCell, Plan, Tu
 from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.mpc.projected_gradient import AT_REST, TIME_LIMIT, Late, Minimum, minimise
 from nmfd.controllers.mpc.terminal import Terminal, read
-from nmfd.controllers.options import Options, options
-from nmfd.controllers.pi_gating import PiGating
+from nmfd.controllers.rules import PiGating
 from nmfd.errors import InputError
-from nmfd.model.planning import PlanningModel
+from nmfd.model.planning import Options, PlanningModel, options
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.config import Problem, setting, whole
 from nmfd.types import Controls, Observation, Status
 
+MAX_ITERATIONS = 1000  # of the solver, per decision
 ROUNDING = 0.005  # of the smallest jam accumulation: over which the solver sees the kink of the MFD there rounded off
 # The solver stops when, to first order, no admissible plan can save more than this share of the total time spent. A
 # tenth changes the benchmark's total time spent by less than 1 %, either way. At its limits it may stop at ACCEPTABLE.
@@ -60,14 +60,6 @@ class Mpc(Options):
     solver: Literal["projected-gradient", "ipopt"] = setting(
         "ipopt: the published formulation by CasADi and IPOPT, two orders of magnitude slower: the reference",
         "projected-gradient",
-    )
-    max_iterations: int = whole("of the solver, per decision", 1000)
-    time_limit: float | None = setting(
-        "deadline of a decision; without one, the control interval: a later answer is of no use. What is later all the "
-        "same is late in the books",
-        None,
-        unit="s",
-        gt=0.0,
     )
 
     @model_validator(mode="after")
@@ -180,7 +172,7 @@ class EconomicMpc:
         self.admissible = Admissible(network, self._model, guidance=guidance)
         self._open = self.admissible.open(self._moves)
         self._gating = PiGating(planning) if planning.protected else None
-        self.deadline = self.options.time_limit or planning.step  # s, per decision
+        self.deadline = planning.step  # s: a later answer is of no use
         self._ipopt, self._tolerance = None, TOLERANCE if terminal is None else COARSE
         if terminal is not None and self.options.solver == "ipopt":
             raise InputError(
@@ -192,10 +184,9 @@ class EconomicMpc:
                 planning,
                 guidance=guidance,
                 horizon=horizon,
-                iterations=self.options.max_iterations,
+                iterations=MAX_ITERATIONS,
                 seconds=IN_TIME * self.deadline,
             )
-        self.fault: str | None = None  # injected (nmfd.faults)
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
@@ -277,25 +268,16 @@ class EconomicMpc:
 
         deadline: by time.perf_counter [s]. Raises Late.
         """
-        if self.fault == "solver-fails":
-            raise FloatingPointError("ordered")
-        if self.fault == "solver-late":
-            return Minimum(point=plan, value=np.inf, gap=np.inf, evaluations=0, reason=TIME_LIMIT)
-        objective = (
-            _diverging
-            if self.fault == "solver-diverges"
-            else partial(self._rounded, start, demand, deadline=deadline, beyond=self._beyond)
-        )
-        if self._ipopt is not None and self.fault is None:
+        if self._ipopt is not None:
             return self._by_ipopt(self._ipopt, start, demand)
         return minimise(
-            objective,
+            partial(self._rounded, start, demand, deadline=deadline, beyond=self._beyond),
             self.admissible.project,
             self.admissible.gap,
             plan,
             metric=(self._affected(start, demand, plan, deadline=deadline) + FEW) ** 2,
             tolerance=self._tolerance,
-            iterations=self.options.max_iterations,
+            iterations=MAX_ITERATIONS,
             seconds=deadline - time.perf_counter(),
         )
 
@@ -310,10 +292,6 @@ class EconomicMpc:
         plan = self.admissible.project(np.stack(rows[: self._moves]))
         value, gradient = self._rounded(start, demand, plan)
         return Minimum(point=plan, value=value, gap=self.admissible.gap(plan, gradient), evaluations=1, reason=reason)
-
-
-def _diverging(plan: Plan) -> tuple[float, Plan]:
-    return np.nan, np.full_like(plan, np.nan)
 
 
 def load(path: Path, planning: PlanningModel, *, guidance: bool) -> EconomicMpc:

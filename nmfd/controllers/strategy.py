@@ -1,0 +1,417 @@
+"""Strategies: a controller and what else the city does, parsed once from a name such as pi-gating+guided+max-pressure.
+
+dpc-pc+max-pressure      max-pressure at all signals, DPC limits the green of the gateways
+no-control+rerouting-30  no control, 30 % of the drivers reroute; `rerouting-30` for short
+mine.py:Gate+actuated    a controller of the user's own (nmfd.controllers.custom), actuated signals elsewhere
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nmfd.controllers import custom, open_loop
+from nmfd.controllers.dpc import policy_file, training
+from nmfd.controllers.excitation import Probing
+from nmfd.controllers.mpc import controller as mpc
+from nmfd.controllers.rules import Gating, Greedy, NoControl, PiGating, RouteGuidance, SetPoint
+from nmfd.errors import InputError, did_you_mean
+from nmfd.model.planning import (
+    Options,
+    PlanningModel,
+    PlanningOptions,
+    guided_model,
+    options,
+    planning_model,
+    with_model,
+)
+from nmfd.model.scenario import Scenario
+from nmfd.runs import config, shipped
+from nmfd.runs.files import file_hash
+from nmfd.types import Controller
+
+ALONE = "no-control"  # the controller of a name that consists of city words
+OWN = "own"  # table in [controllers] with the tables of the user's own controllers
+POLICY, PLAN, VALUE = ("policy", ".pt"), ("plan", ".npz"), ("value function", ".npz")  # files that controllers read
+MAKE_FILE = {POLICY: "nmfd train", PLAN: "nmfd bound", VALUE: "scenarios/economic_mpc/terminal_cost.py"}
+TERMINAL = {"mpc-pc-terminal": "dpc-pc", "mpc-pcrg-terminal": "dpc-pcrg"}  # MPC -> policy of its value function
+MODEL_FREE = ("no-control", "route-guidance", "probing-pc", "probing-pcrg")  # use no regional model
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerType:
+    """A built-in controller, or a class of the user's own.
+
+    name: "pi-gating", "mine.py:Gate"; text: one line for help
+    make: (planning), (file, planning) -> controller; a plan takes (file, scenario)
+    guides: whether it may guide routes; reads: the kind of file that it needs; options: their declaration
+    own: whether it is the user's
+    """
+
+    name: str
+    text: str = ""
+    make: Callable[..., Controller] | None = None
+    guides: bool = False
+    reads: tuple[str, str] | None = None
+    options: type[Options] = Options
+    own: bool = False
+
+
+def _pair(name: str, text: str, make: Callable, **more: Any) -> list[ControllerType]:
+    """Return a controller without ("pc" in its name) and with route guidance ("pcrg")."""
+    variants = ((False, "pc", "perimeter control"), (True, "pcrg", "perimeter control and route guidance"))
+    return [
+        ControllerType(
+            name=name.format(end), text=f"{text}, {acts}", make=partial(make, guidance=guides), guides=guides, **more
+        )
+        for guides, end, acts in variants
+    ]
+
+
+CONTROLLERS: Mapping[str, ControllerType] = {
+    kind.name: kind
+    for kind in (
+        ControllerType(name="no-control", text="open perimeter, no guidance: the reference", make=NoControl),
+        ControllerType(name="route-guidance", text="guidance by travel times alone", make=RouteGuidance, guides=True),
+        ControllerType(name="pi-gating", text="PI control of the protected regions", make=PiGating, options=Gating),
+        ControllerType(name="greedy", text="bang-bang control by the more congested of two regions", make=Greedy),
+        *_pair("mpc-{}", "economic MPC", mpc.EconomicMpc, options=mpc.Mpc),
+        *_pair("mpc-{}-terminal", "economic MPC with terminal cost", mpc.load, reads=VALUE, options=mpc.Mpc),
+        *_pair("probing-{}", "random excitation for cosim identify", Probing, options=SetPoint),
+        *_pair("dpc-{}", "trained policy", policy_file.load, reads=POLICY, options=training.Training),
+        *_pair("bound-{}", "best plan with all demand known (nmfd bound)", open_loop.load, reads=PLAN),
+    )
+}
+
+# Word of a strategy -> key of [sumo], value, text.
+CITY_WORDS: Mapping[str, tuple[str, Any, str]] = {
+    "webster": ("signals", "webster", "fixed-time signals, optimised for the scenario's demand"),
+    "actuated": ("signals", "actuated", "signals that extend green while vehicles arrive"),
+    "max-pressure": ("signals", "max-pressure", "max-pressure control of all signals"),
+    "max-pressure-cyclic": ("signals", "max-pressure-cyclic", "max-pressure with the stages in their order"),
+    "hold-back": ("actuation", "hold-back", "green taken from a gateway is red for all"),
+    "redistribute": ("actuation", "redistribute", "green taken from a gateway goes to the other movements"),
+    "estimate": ("measurement", "estimate", "the controller sees estimates from detectors and probe vehicles"),
+    "metering": ("metering", True, "trips wait outside while their region is full, or as the controller commands"),
+    "guided": ("guided", True, "drivers are guided by travel times"),
+}
+# Word-N -> key of [sumo], least N, largest N, unit, text.
+CITY_NUMBERS: Mapping[str, tuple[str, int, int, str, str]] = {
+    "rerouting": ("rerouting", 1, 100, "percent", "N percent of the drivers reroute by themselves"),
+    "compliance": ("compliance", 0, 100, "percent", "N percent of the drivers follow the guidance"),
+    "queue-override": ("queue_override", 1, 100, "percent", "a gateway opens while its road is N percent full"),
+    "metering": ("metering_level", 1, 1000, "percent", "metering at N percent of the critical accumulation"),
+    "guidance-period": ("guidance_period", 1, 3600, "seconds", "drivers are guided again every N seconds"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Strategy:
+    """A controller and the settings of the city that go with it.
+
+    name: as the user wrote it
+    city: key of [sumo] (cosim.plant.settings.Settings) -> value, instead of the scenario's
+    words: the city's part of the name
+    instance: the controller itself, if the user gave an object
+    """
+
+    name: str
+    controller: ControllerType
+    city: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    words: tuple[str, ...] = ()
+    instance: Controller | None = field(default=None, hash=False)
+
+    @property
+    def guides(self) -> bool:
+        """True if routes may be guided, by the controller or by travel times."""
+        return bool(self.city.get("guided")) or self.controller.guides
+
+    @property
+    def metered(self) -> bool:
+        """True if trips may wait outside."""
+        return bool(self.city.get("metering"))
+
+    def regional(self) -> "Strategy":
+        """Return the strategy itself. Raise InputError if it has words for a city in SUMO."""
+        if self.words:
+            raise InputError(
+                f"strategy {self.name!r}: +{'+'.join(self.words)} needs a city in SUMO (cosim); on the regional model "
+                f"use {self.controller.name}"
+            )
+        return self
+
+    def table(self, scenario: Scenario) -> str:
+        """Return the name of its table in [controllers]: the one with most of the strategy's words.
+
+        Raises: InputError if several tables fit equally well
+        """
+        name = self.controller.name
+        if self.controller.own:
+            return str(getattr(custom.load(name), "name", name)) if self.instance is None else name
+        fitting = {table: _split(table)[1] for table in scenario.controller_options if _split(table)[0] == name}
+        fitting = {table: words for table, words in fitting.items() if set(words) <= set(self.words)}
+        most = max(map(len, fitting.values()), default=0)
+        best = [table for table, words in fitting.items() if len(words) == most and words]
+        if len(best) > 1:
+            raise InputError(
+                f"scenario.toml: strategy {self.name!r}: the tables "
+                + " and ".join(f'[controllers."{table}"]' for table in best)
+                + f' fit it equally well; add a table [controllers."{self.name}"]'
+            )
+        return best[0] if best else name
+
+    def make(self, scenario: Scenario, policy: Path | None = None) -> Controller:
+        """Return a controller for `scenario`, which shares no array with it.
+
+        policy: file of a policy, plan or value function instead of the scenario's
+        Raises: InputError
+        """
+        file, kind = self.file(scenario, policy), self.controller
+        if self.instance is not None:
+            return self.instance
+        if kind.own:
+            return custom.OwnController(kind.name, self._planning(scenario), scenario.network)
+        assert kind.make is not None
+        if kind.reads == PLAN:
+            return kind.make(file, scenario)
+        planning = self._planning(scenario)
+        return kind.make(planning) if file is None else kind.make(file, planning)
+
+    def planning(self, scenario: Scenario, model: Path | None = None) -> PlanningModel:
+        """Return the planning model that predicts the runs of the strategy.
+
+        That of the controller, or, if routes are guided without a plan, the city's model with guided drivers.
+        model: folder of a network instead
+        Raises: InputError
+        """
+        if model is not None:
+            return with_model(planning_model(scenario), scenario, model)
+        planned, guided = self._planning(scenario), guided_model(scenario.network)
+        if planned.network.folder == scenario.network.folder and self.guides and guided is not None:
+            return with_model(planned, scenario, guided)
+        return planned
+
+    def _planning(self, scenario: Scenario) -> PlanningModel:
+        if self.instance is not None:
+            return planning_model(scenario)
+        table = self.table(scenario)
+        if self.controller.own:
+            tables = scenario.controller_options
+            return planning_model(replace(scenario, controller_options={**tables, **tables.get(OWN, {})}), table)
+        return planning_model(scenario, self.controller.name, table)
+
+    def file(self, scenario: Scenario, policy: Path | None = None) -> Path | None:
+        """Return the policy, plan or value function that `make` reads: `policy`, or the scenario's; None without.
+
+        Raises: InputError for a missing file, or a `policy` without use
+        """
+        name = self.controller.name
+        if self.controller.reads is None:
+            if policy is not None:
+                raise InputError(f"{policy}: controller {name} reads no policy; omit it")
+            return None
+        text, suffix = self.controller.reads
+        if policy is None and scenario.folder is None:
+            raise InputError(f"controller {name}: scenario {scenario.name} has no folder with policies; give a file")
+        path = (
+            (scenario.folder or Path()) / (self.table(scenario) + suffix)
+            if policy is None
+            else shipped.found(policy, shipped.SCENARIO)
+        )
+        if not path.is_file():
+            raise InputError(f"{path}: no such {text} for {name}; make one with {MAKE_FILE[self.controller.reads]}")
+        return path
+
+    def fingerprint(self, scenario: Scenario, policy: Path | None = None) -> dict[str, Any]:
+        """Return what its runs depend on besides the city and the demand: options, files and regional model.
+
+        Raises: InputError
+        """
+        name = self.controller.name
+        if name == ALONE:
+            return {}
+        if self.instance is not None:
+            return {"object": name}
+        tables, table, file = scenario.controller_options, self.table(scenario), self.file(scenario, policy)
+        tables = tables.get(OWN, {}) if self.controller.own else tables
+        setup = {**tables.get(name, {}), **tables.get(table, {})}
+        setup.pop("model", None)  # its hash counts
+        if name in MODEL_FREE:
+            splits = scenario.network.nominal_splits if self.controller.guides else np.empty(0)
+            return {"options": setup, "splits_hash": hashlib.sha256(splits.round(9).tobytes()).hexdigest()[:16]}
+        network = self._planning(scenario).network
+        model = json.dumps([network.hash, scenario.integrator, scenario.substeps, scenario.protected])
+        return {
+            "options": setup,
+            **({} if file is None else {"policy_hash": file_hash(file)}),
+            **(custom.fingerprint(name) if self.controller.own else {}),
+            "model_hash": hashlib.sha256(model.encode()).hexdigest()[:16],
+        }
+
+    def outside_training(self, scenario: Scenario, level: float, policy: Path | None = None) -> str:
+        """Return a sentence if `level` times the demand is outside the training range of its policy, else ""."""
+        if self.controller.reads != POLICY:
+            return ""
+        file = self.file(scenario, policy)
+        assert file is not None
+        return policy_file.outside_training(policy_file.read_policy_file(file), level)
+
+
+def parse(controller: str | Controller, city: str = "") -> Strategy:
+    """Return the strategy CONTROLLER+WORD+..., or that of a controller object with the words of `city`.
+
+    Raises: InputError for unknown or contradictory words
+
+    >>> strategy = parse("pi-gating+max-pressure")
+    >>> strategy.controller.name, strategy.city["signals"]
+    ('pi-gating', 'max-pressure')
+    """
+    if isinstance(controller, str):
+        name = f"{controller}+{city}" if city else controller
+        first, words = _split(name)
+        instance = None
+        if _city_setting(first) is not None:
+            first, words = ALONE, [first, *words]
+        own = custom.FILE_AND_CLASS.fullmatch(first) is not None
+        kind = ControllerType(name=first, own=True, guides=True) if own else CONTROLLERS.get(first)
+        if kind is None:
+            raise _unknown(name, first, controllers=True)
+    else:
+        for method in ("reset", "act"):
+            if not callable(getattr(controller, method, None)):
+                raise InputError(
+                    f"controller: expected a name or an object with reset and act, got {controller!r} without {method}"
+                )
+        first, instance = getattr(controller, "name", type(controller).__name__), controller
+        name, words = (f"{first}+{city}", city.split("+")) if city else (first, [])
+        kind = ControllerType(name=first, own=True)
+    settings: dict[str, Any] = {"gateways_fixed": first != ALONE}
+    by_key: dict[str, str] = {}
+    for word in words:
+        setting = _city_setting(word)
+        if setting is None:
+            raise _unknown(name, word, controllers=False)
+        key, value = setting
+        if word == "guided" and kind.guides and not kind.own:
+            raise InputError(f"strategy {name!r}: {first} guides routes itself; omit {word}")
+        if key in by_key:
+            raise InputError(f"strategy {name!r}: {by_key[key]} and {word} exclude each other; omit one of them")
+        by_key[key], settings[key] = word, value
+    if "metering_level" in settings:
+        settings["metering"] = True
+    return Strategy(name=name, controller=kind, city=settings, words=tuple(words), instance=instance)
+
+
+def parse_many(
+    names: str | Sequence[str], scenario: Scenario, *, regional: bool = False, where: str = "controllers"
+) -> list[Strategy]:
+    """Return the strategies of names and patterns (*, ?, [...]), as a sequence or separated by commas.
+
+    A pattern stands for all `ready` strategies that match and are not named besides.
+    regional: for the regional model, without words for a city
+    Raises: InputError for an unknown or repeated name, none at all, or a pattern without a match
+    """
+    given = [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
+    if not any(given):
+        raise InputError(f"{where}: expected at least one controller, got none; name one, such as no-control")
+    plain = [name for name in given if not _is_pattern(name)]
+    if repeated := [name for n, name in enumerate(plain) if name in plain[:n]]:
+        raise InputError(f"{where}: {repeated[0]} is there twice; name every controller once")
+    result: dict[str, Strategy] = {}
+    for name in given:
+        if not _is_pattern(name):
+            result[name] = parse(name).regional() if regional else parse(name)
+            continue
+        known = [strategy for strategy in ready(scenario) if not (regional and strategy.words)]
+        matching = [strategy for strategy in known if fnmatchcase(strategy.name, name)]
+        if not matching:
+            raise InputError(
+                f"{where}: no controller here matches {name!r}; choose from {', '.join(s.name for s in known)}, and "
+                "others once their policies are trained"
+            )
+        result |= {strategy.name: strategy for strategy in matching if strategy.name not in (*plain, *result)}
+    return list(result.values())
+
+
+def ready(scenario: Scenario) -> list[Strategy]:
+    """Return the strategies that can be made for `scenario`: built-in ones, with tables or policies, signals alone."""
+    files = sorted(scenario.folder.glob("*+*.pt")) if scenario.folder else []
+    variants = dict.fromkeys([*(file.stem for file in files), *scenario.controller_options])
+    signals = [word for word, (key, _, _) in CITY_WORDS.items() if key == "signals"]
+    result = []
+    for name in (*CONTROLLERS, *(name for name in variants if "+" in name), *signals):
+        try:
+            strategy = parse(name)
+            strategy.file(scenario)
+        except InputError:  # no such file, or no strategy of this version
+            continue
+        result.append(strategy)
+    return result
+
+
+def check_tables(scenario: Scenario) -> None:
+    """Raise InputError for a wrong option in any table of [controllers], used or not."""
+    planning = planning_model(scenario)
+    for table, content in scenario.controller_options.items():
+        if table == OWN:
+            continue
+        try:
+            kind = parse(table).controller
+        except InputError as error:
+            raise config.error(planning.where, f"controllers.{table}", str(error)) from None
+        if kind.own:
+            raise config.error(
+                planning.where, f"controllers.{table}", f"a controller of your own has its table in [controllers.{OWN}]"
+            )
+        merged = {**scenario.controller_options.get(kind.name, {}), **content}
+        model = {"model": merged.pop("model")} if "model" in merged else {}
+        config.checked(PlanningOptions, model, planning.where, f"controllers.{table}.")
+        options(kind.options, replace(planning, controller_options={kind.name: merged}), kind.name, table)
+
+
+def city_words() -> list[tuple[str, str]]:
+    """Return every word for the city with its text."""
+    return [
+        *((f"+{word}", text) for word, (_, _, text) in CITY_WORDS.items()),
+        *((f"+{word}-N", text) for word, (*_, text) in CITY_NUMBERS.items()),
+    ]
+
+
+def _split(name: str) -> tuple[str, list[str]]:
+    """Return the controller and the words of a name; the path of a user's own controller may contain +."""
+    head, dot, tail = name.rpartition(".py:")
+    cls, *words = tail.split("+")
+    return head + dot + cls, words
+
+
+def _city_setting(word: str) -> tuple[str, Any] | None:
+    """Return key and value of [sumo] for a word, None if there is no such word."""
+    if word in CITY_WORDS:
+        return CITY_WORDS[word][:2]
+    stem, _, digits = word.rpartition("-")
+    if stem in CITY_NUMBERS and digits.isdecimal() and digits == str(int(digits)):
+        key, least, largest, unit, _ = CITY_NUMBERS[stem]
+        if least <= int(digits) <= largest:
+            return key, int(digits) / 100 if unit == "percent" else float(digits)
+    return None
+
+
+def _is_pattern(name: str) -> bool:
+    return any(sign in name for sign in "*?[") and custom.FILE_AND_CLASS.fullmatch(name) is None
+
+
+def _unknown(name: str, word: str, *, controllers: bool) -> InputError:
+    where = f"controller {name!r}" if word == name else f"strategy {name!r}: {word!r}"
+    words = [*CITY_WORDS, *(f"{stem}-N" for stem in CITY_NUMBERS)]
+    hint = did_you_mean(word, [*(CONTROLLERS if controllers else ()), *words])
+    ranges = ", ".join(
+        f"{stem}-N from {low} to {high} {unit}" for stem, (_, low, high, unit, _) in CITY_NUMBERS.items()
+    )
+    first = f"{', '.join(CONTROLLERS)} or file.py:Class, with words joined by +: " if controllers else ""
+    return InputError(f"{where} is unknown{hint}; choose from {first}{', '.join(words)} (whole numbers, {ranges})")
