@@ -9,7 +9,7 @@ import numpy as np
 from nmfd import faults
 from nmfd.arrays import PerPair
 from nmfd.model.scenario import Scenario
-from nmfd.threads import one_thread
+from nmfd.tensors import one_thread
 from nmfd.types import Controller, Controls, Observation, Plant, Result, State, Status
 
 

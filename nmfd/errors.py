@@ -1,7 +1,8 @@
-"""The errors that end a command in one line."""
+"""Errors that end a command in one line."""
 
 import difflib
 from collections.abc import Iterable
+from importlib.util import find_spec
 
 
 class InputError(ValueError):
@@ -17,6 +18,14 @@ class RunFailed(Exception):
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
-    """ "; did you mean ...?" with the one of `choices` that is written most like `word`; "" if none is."""
+    """Return "; did you mean ...?" with the most similar of `choices`; "" if none is similar."""
     close = difflib.get_close_matches(word, list(choices), n=1)
     return f"; did you mean {close[0]}?" if close else ""
+
+
+def need(what: str, extra: str, *modules: str) -> None:
+    """Check that the `modules` of an extra of pyproject.toml, which `what` needs, are installed. Raises InputError."""
+    if missing := [module for module in modules if find_spec(module) is None]:
+        raise InputError(
+            f"{what}: needs {', '.join(missing)}; install the extra {extra} with: pip install -e '.[{extra}]'"
+        )

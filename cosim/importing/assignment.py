@@ -28,7 +28,7 @@ import sumo
 from cosim.importing.baseline import Tell, run_sumo
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.errors import InputError
-from nmfd.runs.scratch import Scratch
+from nmfd.runs.files import temporary_folder
 
 PERIOD = 300  # s, over which the times of the streets are averaged
 ASKED = 2000  # drivers from whom the gap is estimated, at most
@@ -101,7 +101,7 @@ def assign(
     iteration; mesoscopic: in this model only; options: names and values of duaIterate.py's own.
     Raises InputError with SUMO's own words if it refuses. The same seed gives the same routes.
     """
-    with Scratch("cosim-") as folder:
+    with temporary_folder() as folder:
         root = ElementTree.Element("routes")
         root.extend(elements)
         _step(folder, 0).mkdir()
@@ -219,7 +219,7 @@ def relative_gap(
 
     (sum of the times on their routes - sum of those on the ways that are fastest then) / the latter sum. Both are
     duarouter's, for their departures. elements: as in `assign`."""
-    with Scratch("cosim-") as folder:
+    with temporary_folder() as folder:
         vehicles = [n for n, element in enumerate(elements) if element.tag == "vehicle"]
         order = np.random.default_rng([seed, 0x676170]).permutation(len(vehicles))
         left_out = {vehicles[n] for n in order[ASKED:]}

@@ -18,7 +18,7 @@ from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.arrays import PerRegion, PerTurn
 from nmfd.errors import InputError
-from nmfd.runs.scratch import Scratch
+from nmfd.runs.files import temporary_folder
 
 INTERVAL = 300.0  # s, of the densities
 STEP = re.compile(r"Step #([\d.]+)")
@@ -141,7 +141,7 @@ def run_baseline(
     reached: now and then with SUMO's time [s]. Raises InputError with SUMO's own words if it refuses."""
     # A vehicle that a rerouter gives another route makes SUMO fail when it writes the times of the edges it has left.
     rerouted = any(next(read_xml(path).iter("routeProbReroute"), None) is not None for path in additional)
-    with Scratch("cosim-") as folder:
+    with temporary_folder() as folder:
         edges = folder / "edges.xml"
         (folder / "measure.add.xml").write_text(
             f'<additional><edgeData id="all" freq="{INTERVAL:g}" file="{edges}" excludeEmpty="true"/></additional>',

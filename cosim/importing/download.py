@@ -15,7 +15,7 @@ from typing import IO
 from cosim.importing.catalogue import CITIES, Published
 from nmfd.errors import InputError, did_you_mean
 from nmfd.runs import files
-from nmfd.runs.scratch import Scratch
+from nmfd.runs.files import temporary_folder
 
 RECORD = "SHA256SUMS"  # beside the cities: a line per address, as sha256sum writes them
 PATIENCE = 60.0  # s without a byte
@@ -35,7 +35,7 @@ def get(name: str, out: Path, tell: Callable[[str], None] = lambda stage: None) 
         raise InputError(f"--out: {out} exists; choose another folder, or remove it")
     record = out.parent / RECORD
     expected = city.sha256 or _recorded(record).get(city.address)
-    with Scratch("cosim-") as fetched:
+    with temporary_folder() as fetched:
         archive = fetched / "archive"
         found = _fetch(name, city, archive, tell)
         if expected not in (None, found):
@@ -57,7 +57,7 @@ def get(name: str, out: Path, tell: Callable[[str], None] = lambda stage: None) 
         )
         tell("unpacking")
         out.parent.mkdir(parents=True, exist_ok=True)
-        with Scratch(f".{out.name}-", where=out.parent) as scratch:
+        with temporary_folder(f".{out.name}-", where=out.parent) as scratch:
             count = _unpack(name, city, archive, scratch / "city")
             (scratch / "city" / "NOTICE.cosim.txt").write_text(notice, encoding="utf-8")
             os.replace(scratch / "city", out)

@@ -22,7 +22,7 @@ from cosim.sumo.net import City, load_city
 from nmfd.errors import InputError
 from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs.scratch import LOCK, Scratch
+from nmfd.runs.files import temporary_folder
 
 LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
 STANDING = 2.0  # times as long as at the speed limits: the vehicles on a few streets queue there
@@ -234,7 +234,7 @@ def _folders(order: ImportOptions) -> Iterator[tuple[Path, Path]]:
         made: list[tuple[Path, Path]] = []
         for folder in (order.out, order.scenario):
             folder.parent.mkdir(parents=True, exist_ok=True)
-            made.append((stack.enter_context(Scratch(f".{folder.name}-", where=folder.parent)), folder))
+            made.append((stack.enter_context(temporary_folder(f".{folder.name}-", where=folder.parent)), folder))
         yield made[0][0], made[1][0]
         for temporary, folder in made:
             folder.mkdir(exist_ok=True)
@@ -245,8 +245,7 @@ def _folders(order: ImportOptions) -> Iterator[tuple[Path, Path]]:
             if folder == order.out:  # the model of guided drivers in other regions
                 (folder / GUIDED / "network.toml").unlink(missing_ok=True)
             for file in sorted(temporary.iterdir(), key=lambda file: (file.suffix == ".toml", file.name)):
-                if file.name != LOCK:
-                    os.replace(file, folder / file.name)
+                os.replace(file, folder / file.name)
 
 
 def _probe(
@@ -260,7 +259,7 @@ def _probe(
 
     def probe(times: float, mesoscopic: bool) -> level.Loaded:
         vehicles, factor = (peaks.at(times)[0], 1.0) if order.peak else (traffic, scale * times)
-        with Scratch("cosim-") as folder:
+        with temporary_folder() as folder:
             files = written.write_traffic(folder, vehicles)
             trials = Trials(streets, case, model.clock(case, streets, vehicles), folder, files)
             run = trials.run(

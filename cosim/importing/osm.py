@@ -18,7 +18,7 @@ import sumo
 from cosim.importing.baseline import run_sumo
 from cosim.importing.case import SumoInput, read_sumo_input, root_of
 from nmfd.errors import InputError
-from nmfd.runs.scratch import Scratch
+from nmfd.runs.files import temporary_folder
 
 RECOMMENDED = (
     "--geometry.remove",
@@ -56,7 +56,7 @@ def sumo_input(source: Path | Box, tell: Callable[[str], None], *, left_hand: bo
             raise InputError(f"--left-hand: {source} says itself where it drives; omit it")
         yield read_sumo_input(source)
         return
-    with Scratch("cosim-") as folder:
+    with temporary_folder() as folder:
         if not isinstance(source, Path):
             tell("fetching OpenStreetMap")
             source = fetched(source, folder)

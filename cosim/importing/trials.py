@@ -13,7 +13,7 @@ from cosim.importing.demand import Traffic, wrapped
 from cosim.importing.generated import morning_peak
 from cosim.importing.streets import Streets
 from cosim.sumo.recorded_trips import MESOSCOPIC, draw, read_recorded_trips, write_recorded_trips
-from nmfd.runs.scratch import Scratch
+from nmfd.runs.files import temporary_folder
 
 MINUTE = 60.0
 JITTER = 10.0  # s: what seeds differ in, as in the scenario that is written
@@ -54,7 +54,7 @@ class Trials:
         reached: is called now and then with the share that is done [-]."""
         begin, length = self._clock.begin, self._clock.end - self._clock.begin
         if (key := (factor, mesoscopic, seed)) not in self._known:
-            with Scratch("cosim-") as folder:
+            with temporary_folder() as folder:
                 routes, vehicles = self._vehicles(folder, factor, seed)
                 self._known[key] = run_baseline(
                     self._streets,
@@ -151,7 +151,7 @@ class Peaks:
         """Only cars drive in the assignment: what runs in the background is left out of it."""
         clock = model.clock(self._case, self._streets, traffic)
         others = [element for element in traffic.shared if element.tag not in TYPES]
-        with Scratch("cosim-") as folder:
+        with temporary_folder() as folder:
             additional: list[Path] = []
             if others:
                 additional = [folder / "city.add.xml"]

@@ -1,5 +1,6 @@
 """What SUMO is started with: the vehicles of a run, the files beside them, and the command line."""
 
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -28,7 +29,6 @@ from cosim.sumo.turning_flows import PLANNING_SEEDS, own_flows, turning_flows
 from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
-from nmfd.runs.scratch import Scratch
 
 # Equipped drivers take the fastest route by the mean speeds of the last 180 s (SUMO's default): when they depart, which
 # needs their route to be read no earlier, and every minute from then on, as drivers with navigation do.
@@ -79,16 +79,17 @@ class Launch:
         """outputs: kind (cosim.sumo.outputs) -> file; layout: of the loops, if states are estimated"""
         self._scenario, self._settings, self._city, self._signals = scenario, chosen, city, signals
         self._layout, self._outputs, self._window = layout, outputs, window
-        self._scratch = Scratch("cosim-")
+        self._scratch = tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True)
+        self._folder = Path(self._scratch.name)
         self._originals: RecordedTrips | None = None
         self.vehicles: list[str] = []
         self.held: HeldTrips | None = None
-        self.trip_file = outputs.get("tripinfo", self._scratch.path / "tripinfo.xml")
+        self.trip_file = outputs.get("tripinfo", self._folder / "tripinfo.xml")
 
     def start(self, seed: int) -> Session:
         """A simulation whose trips, drivers and reroutes all follow from `seed`."""
         scenario, chosen = self._scenario, self._settings
-        routes = self._scratch.path / "trips.rou.xml"
+        routes = self._folder / "trips.rou.xml"
         self.vehicles = self._write_vehicles(routes, seed)
         return Session(
             self._city.net_file,
@@ -108,7 +109,7 @@ class Launch:
 
     def close(self) -> None:
         """Remove the scratch folder."""
-        self._scratch.close()
+        self._scratch.cleanup()
 
     def _options(self) -> list[str]:
         """SUMO's, besides those that every session has."""
@@ -131,7 +132,7 @@ class Launch:
 
     def _additional(self) -> list[Path]:
         """SUMO's additional files, in the order in which it reads them: of several programmes the last one runs."""
-        scenario, chosen, folder = self._scenario, self._settings, self._scratch.path
+        scenario, chosen, folder = self._scenario, self._settings, self._folder
         files = own_files(scenario, chosen.additional)
         files += write_signal_programmes(folder, self._city, scenario, chosen, self._signals, self._planning_trips())
         if chosen.measurement == ESTIMATE:

@@ -20,7 +20,7 @@ from cosim.sumo.signals import HELD, Signal, read_signals, write_programmes
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
-from nmfd.runs.scratch import Scratch
+from nmfd.runs.files import temporary_folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +92,7 @@ def optimised_plans(
         return [cycles, offsets]
     shipped.made(folder)
     unified = ("-u", "-y", "3", "-p", "webster", "--skip", ",".join(others))
-    with Scratch("cosim-") as scratch:
+    with temporary_folder() as scratch:
         (scratch / "routes.xml").write_bytes(routes)
         for tool, target, options in (
             ("tlsCycleAdaptation.py", cycles, unified),

@@ -18,7 +18,6 @@ from cosim.sumo.build import ensure_built
 from nmfd.api import load_scenario
 from nmfd.arrays import Positions
 from nmfd.errors import InputError
-from nmfd.html import html_table
 from nmfd.model.regional_model import RegionalModel, load_network
 from nmfd.model.scenario import Scenario
 
@@ -99,24 +98,7 @@ class City:
         return f"<City {self.name}: {len(self.regions)} regions, {len(self.gateways)} gateways>"
 
     def _repr_html_(self) -> str:
-        """The regions, for notebooks."""
-        headings = ["region", "lane-km", "signals", "gateways", "controlled", "critical [veh]", "max outflow [veh/s]"]
-        return html_table(
-            headings,
-            [
-                [
-                    f"{row.region} {row.title}",
-                    f"{row.lane_km:.1f}",
-                    row.signals,
-                    row.gateways,
-                    row.controlled_gateways,
-                    f"{row.critical_veh:,.0f}",
-                    f"{row.max_outflow_veh_s:.3g}",
-                ]
-                for row in self.regions.rename(columns={"name": "title"}).itertuples(index=False)
-            ],
-            repr(self)[1:-1],
-        )
+        return self.regions.to_html(index=False)
 
     @cached_property
     def _city(self) -> net.City:

@@ -25,7 +25,7 @@ from nmfd.errors import InputError
 from nmfd.metrics import SUMMARY
 from nmfd.model import authority
 from nmfd.runs import files
-from nmfd.runs.scratch import Scratch
+from nmfd.runs.files import temporary_folder
 from nmfd.studies import fit_quality
 
 PIXELS = 150.0  # per inch, of the pictures (nmfd.studies.plots.save)
@@ -192,7 +192,7 @@ def _run(run: Finished) -> dict:
     first = summary_text.opening(
         run.scenario.name, configuration["steps"], configuration["step_s"], len(run.levels), rows
     )
-    with Scratch("cosim-") as folder:
+    with temporary_folder() as folder:
         if len(run.levels) > 1:
             pictures.demand_levels(folder / "demand.png", rows)
         shown = _pictures(folder, (("demand", caption),))
@@ -264,7 +264,7 @@ def _level(run: Finished, level: Level, reference: str | None) -> dict:
     outcome, how = statistics.shown(statistics.statistics(rows, reference), reference)
     title = f"Demand times {level.demand:g}"
     signals, reasons = explain.at(level.demand, level.folder, run.scenario.network, rows)
-    with Scratch("cosim-") as folder:
+    with temporary_folder() as folder:
         pictures.draw(level.folder, run.scenario, run.city, rows, folder)
         pictures.draw_more(folder, run.scenario, level.folder, rows)
         drawn = [(heading, _pictures(folder, chosen, f"{title}. ")) for heading, chosen in PICTURES]

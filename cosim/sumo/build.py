@@ -20,8 +20,7 @@ from cosim.sumo.recipe import CityTable, RecipeTable
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import config, shipped
-from nmfd.runs.files import atomic
-from nmfd.runs.scratch import Scratch
+from nmfd.runs.files import atomic, temporary_folder
 
 # (lanes, movements, every movement has lanes of its own) -> lanes of each movement, numbered from the right
 LANES = {
@@ -280,7 +279,7 @@ def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
     """The bytes of net.xml and regions.csv; the same recipe gives the same bytes. InputError if netconvert fails."""
     *plain, region_of = _plain_xml(recipe)
     signals = recipe.table.signals
-    with Scratch("cosim-") as folder:
+    with temporary_folder() as folder:
         options = []
         for kind, content in zip(("node", "edge", "connection"), plain, strict=True):
             (folder / f"{kind}.xml").write_text(content, encoding="utf-8")

@@ -18,8 +18,7 @@ from nmfd.arrays import PairsOverTime, StatesOverTime, TurnsOverTime
 from nmfd.model import dynamics
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
-from nmfd.tensors import PerPair
-from nmfd.threads import one_thread
+from nmfd.tensors import PerPair, one_thread
 
 HORIZON = 10  # control intervals
 ITERATIONS = 600

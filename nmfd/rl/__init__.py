@@ -7,9 +7,10 @@
 Importing this module registers nmfd/Hexagon7-v0 and nmfd/Scenario-v0 (scenario="FOLDER") for gymnasium.make.
 """
 
+from importlib.util import find_spec
 from typing import Any
 
-from nmfd.extras import need, there
+from nmfd.errors import need
 
 __all__ = ["Interface", "RegionalEnv", "RegionsEnv"]
 
@@ -23,7 +24,7 @@ def __getattr__(name: str) -> Any:
     return getattr(env, name)
 
 
-if there("gymnasium"):
+if find_spec("gymnasium"):
     import gymnasium  # of the extra
 
     gymnasium.register(id="nmfd/Scenario-v0", entry_point="nmfd.rl.env:RegionalEnv")

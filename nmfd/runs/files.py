@@ -7,6 +7,7 @@ import os
 import platform
 import re
 import stat
+import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -88,6 +89,13 @@ def _holder(lock: Path) -> str:
         stream.seek(1)
         text = stream.read(200)
     return text.decode(errors="replace") or "another process"
+
+
+@contextmanager
+def temporary_folder(prefix: str = "cosim-", where: Path | None = None) -> Iterator[Path]:
+    """Yield a new folder in `where`, or in the system's place for such folders, and remove it at the end."""
+    with tempfile.TemporaryDirectory(prefix=prefix, dir=where, ignore_cleanup_errors=True) as name:
+        yield Path(name)
 
 
 def write_text(path: Path, text: str) -> None:

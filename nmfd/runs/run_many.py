@@ -29,8 +29,7 @@ from filelock import FileLock, Timeout
 from pebble import ProcessExpired, ProcessPool
 
 from nmfd import __version__
-from nmfd.errors import InputError, RunFailed
-from nmfd.extras import need
+from nmfd.errors import InputError, RunFailed, need
 from nmfd.metrics import summary
 from nmfd.runs.files import write_table, write_text
 from nmfd.runs.progress import Progress, watched

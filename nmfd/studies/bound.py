@@ -21,7 +21,7 @@ from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.studies.settings import Bound
-from nmfd.threads import one_thread
+from nmfd.tensors import one_thread
 
 ITERATIONS = Bound().iterations
 LEARNING_RATE = 0.15  # of Adam, on logits; falls along a cosine

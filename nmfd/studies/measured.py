@@ -19,7 +19,6 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 
 from nmfd.arrays import Adjacency, Points
 from nmfd.errors import InputError
-from nmfd.html import html_table
 from nmfd.model import detector_tables, mfd
 from nmfd.model.detector_tables import SPEEDS
 from nmfd.model.regional_model import NetworkTable, RegionalModel, load_network, network_toml, schema_line
@@ -99,24 +98,6 @@ class Identified:
         """A row per region, day and interval: density_veh_km, flow_veh_h of a lane, reporting (share of the monitored
         lane-km), accumulation_veh, production_veh_km_h, outflow_veh_s."""
         return self.intervals
-
-    def _repr_html_(self) -> str:
-        """The fit, for notebooks."""
-        return html_table(
-            ["region", "critical [veh]", "max outflow [veh/s]", "R2", "spread", "doubts"],
-            [
-                [
-                    fit.name,
-                    f"{fit.critical_veh:,.0f}",
-                    f"{fit.max_outflow_veh_s:.3g}",
-                    f"{fit.r2:.2f}",
-                    f"{100 * fit.spread:.0f} %",
-                    "; ".join(fit.doubts),
-                ]
-                for fit in self.fits
-            ],
-            UNSAID,
-        )
 
 
 def identify(

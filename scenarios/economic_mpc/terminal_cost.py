@@ -32,7 +32,7 @@ from nmfd.controllers.strategy import TERMINAL, parse
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
-from nmfd.threads import one_thread
+from nmfd.tensors import one_thread
 from nmfd.types import Controller
 
 ROLLOUTS = 128  # at a time

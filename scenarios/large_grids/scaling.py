@@ -25,7 +25,7 @@ from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
 from nmfd.studies import plots
-from nmfd.threads import one_thread
+from nmfd.tensors import one_thread
 
 SPREAD = 0.2  # each region's speed and size is drawn from 1 +- SPREAD times the benchmark's
 STEP_S, STEPS, TIME_LIMIT_S = 30.0, 10, 600.0

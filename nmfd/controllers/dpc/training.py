@@ -27,7 +27,7 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.config import Flow, Numbers, Problem, Share, setting, whole
 from nmfd.runs.files import atomic
-from nmfd.threads import one_thread
+from nmfd.tensors import one_thread
 
 if TYPE_CHECKING:
     from nmfd.controllers.strategy import Strategy
