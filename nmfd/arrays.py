@@ -1,8 +1,7 @@
-"""The shapes of NumPy arrays, for annotations: what is in them, in which unit, is said where they are used.
+"""Shapes of NumPy arrays for annotations; content and unit are documented at their use.
 
-R regions, T control intervals, S = T + 1 states. One letter is one number within a call, or within one object. Checked
-while testing, where tests/conftest.py asks for it (jaxtyping and beartype); otherwise these say what is meant, and cost
-nothing. Those of torch are in nmfd.tensors.
+R regions, T control intervals, S = T + 1 states. One letter is one number within a call, or within one object. Tests
+check them (tests/conftest.py, jaxtyping and beartype); elsewhere they cost nothing. nmfd.tensors has those of torch.
 """
 
 import numpy as np

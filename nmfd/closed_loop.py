@@ -1,4 +1,4 @@
-"""The one closed loop: every plant and every controller meet here."""
+"""The closed loop of any plant and any controller."""
 
 import time
 from collections.abc import Callable
@@ -24,12 +24,13 @@ def run(
 ) -> Result:
     """Drive `plant` with `controller` for `scenario.steps` control intervals.
 
-    The controller is given what the plant's own instruments tell, or, of a plant that has none, every x_ij with
-    Gaussian noise of `scenario.measurement_std`, drawn from `seed`; the result holds this and the exact state. What
-    goes to and fro is copied: a controller that writes into what it is given, or into what it returned, changes
-    nothing. `progress(done, steps)` is called after every interval. The faults that the scenario orders are injected
-    (nmfd.faults). What was wrong with an observation, or what the plant could not do in an interval, is in the status
-    of that decision; so is that it came after the control interval, or the controller's `deadline` [s] if it has one.
+    The controller gets the estimate of the plant's own instruments, or, without any, every x_ij with Gaussian noise of
+    `scenario.measurement_std`, drawn from `seed`; the result has both this and the exact state. Observations and
+    controls are copied: a controller may write into either. The faults of the scenario are injected (nmfd.faults). The
+    status of a decision tells of a faulty observation, a command that the plant could not execute, and a decision after
+    the control interval or the controller's `deadline` (s).
+
+    progress: is called with the intervals done and `scenario.steps` after every interval
     """
     network = scenario.network
     opened = np.where(network.adjacency, network.u_max, 0.0)
@@ -43,14 +44,14 @@ def run(
     for k in range(scenario.steps):
         given = observed.copy()
         before = time.perf_counter()
-        decided = supervised.act(given, problem)
+        command = supervised.act(given, problem)
         decision_time.append(time.perf_counter() - before)
-        decided = _copied(decided)
+        command = _copied(command)
         if decision_time[-1] > deadline:
-            decided = _booked(decided, Status.LATE, f"later than its deadline of {deadline:g} s")
-        states.append(plant.step(decided))
+            command = _with_status(command, Status.LATE, f"later than its deadline of {deadline:g} s")
+        states.append(plant.step(command))
         fault = states[-1].problem
-        controls.append(_booked(decided, Status.PLANT_FAULT, fault) if fault else decided)
+        controls.append(_with_status(command, Status.PLANT_FAULT, fault) if fault else command)
         observed, problem = sensors.observe(states[-1], plant.observe())
         observations.append(observed)
         if progress:
@@ -80,44 +81,44 @@ def run(
 
 
 class _Sensors:
-    """What is between the state and the controller: instruments or noise, and the faults of the sensors."""
+    """Sensors between the state and the controller: instruments or noise, and their faults."""
 
     def __init__(self, scenario: Scenario, seed: int):
         self._faulty = faults.Sensors(scenario.ordered_faults, seed)
         self._std, self._random = scenario.measurement_std, noise_of(seed)
         self.estimated = False
 
-    def observe(self, state: State, told: Observation | None) -> tuple[Observation, str]:
-        """The observation as it arrives, and what is wrong with it, "" if nothing is. told: by the plant's own."""
+    def observe(self, state: State, estimate: Observation | None) -> tuple[Observation, str]:
+        """Return the observation and its problem, "" if none. estimate: of the plant's own instruments."""
         noise = self._std * self._random.standard_normal(state.accumulation.shape)
-        self.estimated = told is not None
-        return self._faulty.see(noisy(state, noise) if told is None else told, estimated=self.estimated)
+        self.estimated = estimate is not None
+        return self._faulty.see(noisy(state, noise) if estimate is None else estimate, estimated=self.estimated)
 
 
 def noise_of(seed: int) -> np.random.Generator:
-    """What the measurement noise of a run is drawn from."""
+    """Return the random generator of the measurement noise of a run."""
     return np.random.default_rng([seed, 0x6E6F6973])
 
 
 def noisy(state: State, noise: PerPair) -> Observation:
-    """The state as it is measured with `noise` (R, R) [veh] on the accumulation."""
+    """Return the measurement of the state with `noise` (R, R) [veh] on the accumulation."""
     return Observation(step=state.step, time=state.time, accumulation=state.accumulation + noise, backlog=state.backlog)
 
 
 def _deadline(controller: Controller, step: float) -> float:
-    """Of its decisions [s]: what it says itself, at most the control interval."""
+    """Return the decision deadline (s): the controller's own, capped at the control interval."""
     own = getattr(controller, "deadline", None)
     return min(own, step) if isinstance(own, int | float) and own > 0 else step
 
 
 def _copied(controls: Controls) -> Controls:
-    """With arrays of its own: a controller may go on writing into those that it returned."""
+    """Return a copy with its own arrays: the controller may write into those that it returned."""
     splits, prices, metering = (
-        None if asked is None else np.array(asked) for asked in (controls.splits, controls.prices, controls.metering)
+        None if values is None else np.array(values) for values in (controls.splits, controls.prices, controls.metering)
     )
     return replace(controls, perimeter=np.array(controls.perimeter), splits=splits, prices=prices, metering=metering)
 
 
-def _booked(controls: Controls, status: Status, note: str) -> Controls:
-    """With what else was not as it should be: what the plant could not do, or a decision that came late."""
+def _with_status(controls: Controls, status: Status, note: str) -> Controls:
+    """Return the controls with another status and note."""
     return replace(controls, status=controls.status | status, note="; ".join(filter(None, (controls.note, note))))

@@ -1,21 +1,21 @@
-"""The vehicle ledger: who entered has ended their trip or is inside. Always on, in every plant, at every step."""
+"""Vehicle ledger: entered = ended + inside, checked in every plant at every step."""
 
 import math
 
-RELATIVE, ABSOLUTE = 1e-9, 1e-6  # of the vehicles that entered, and veh: what rounding may cost
+TOLERANCE_SHARE, TOLERANCE_VEH = 1e-9, 1e-6  # of the vehicles that entered, and absolute: rounding
 
 
 class LedgerError(RuntimeError):
-    """Vehicles appeared or vanished: the figures of this run cannot be trusted, and it stops."""
+    """Vehicles appeared or vanished: the run stops."""
 
 
 def check(step: int, time: float, *, entered: float, ended: float, inside: float, least: float = 0.0) -> None:
-    """LedgerError unless entered = ended + inside [veh] and no accumulation is negative.
+    """Raise LedgerError unless entered = ended + inside [veh] and no accumulation is negative.
 
-    step: control step; time: at its end [s]; ended: counted on its own, not from the other two; least: the smallest
-    accumulation of any region and destination [veh]
+    step: control step; time: at its end (s); ended: an independent count; least: smallest accumulation of any region
+    and destination [veh]
     """
-    surplus, allowed = inside + ended - entered, ABSOLUTE + RELATIVE * entered
+    surplus, allowed = inside + ended - entered, TOLERANCE_VEH + TOLERANCE_SHARE * entered
     where = f"vehicle ledger broken at control step {step}, {time:g} s"
     if not (math.isfinite(surplus) and abs(surplus) <= allowed):
         raise LedgerError(

@@ -37,14 +37,14 @@ SUMMARY: dict[str, tuple[type, str]] = {
 
 
 def total_time_spent(result: Result) -> float:
-    """dt * sum over k = 0 .. T-1 of all vehicles, running, waiting to enter, and removed before that [veh s].
+    """Return the total time spent [veh s].
 
-    The objective of Tumu et al., with those who wait outside; the state at the end of the horizon is not counted. A
-    vehicle that was removed on its way counts as if it were still there until the end of the horizon, the most that it
-    could have spent: a trip that is not made never counts as less than one that is.
+    dt * sum over k = 0 .. T-1 of all vehicles: running, waiting to enter, and removed before. It is the objective of
+    Tumu et al., with vehicles that wait outside; the final state does not count. A removed vehicle counts until the end
+    of the horizon, so that a trip that is not made never counts less than one that is.
 
         >>> run = nmfd.run("economic_mpc", "no-control", steps=2)
-        >>> bool(total_time_spent(run) == run.step * run.accumulation[:2].sum())  # nobody waits or was removed
+        >>> bool(total_time_spent(run) == run.step * run.accumulation[:2].sum())  # no vehicle waits or was removed
         True
     """
     vehicles = result.accumulation[:-1].sum() + result.backlog[:-1].sum() + result.removed[:-1].sum()
@@ -52,7 +52,7 @@ def total_time_spent(result: Result) -> float:
 
 
 def percent_change(value: float, reference: float) -> float:
-    """How far `value` is above `reference` [%]; NaN, not defined, where that is 0.
+    """Return the change from `reference` to `value` [%]; NaN if `reference` is 0.
 
     >>> percent_change(150.0, 100.0)
     50.0
@@ -61,11 +61,11 @@ def percent_change(value: float, reference: float) -> float:
 
 
 def gini(values: PerRegion, weights: PerRegion) -> float:
-    """Gini coefficient of `values` (N,), none below 0, each that of `weights` (N,) people:
+    """Return the Gini coefficient of `values` (N,) >= 0, each of `weights` (N,) people:
 
         G = sum_ij w_i w_j |v_i - v_j| / (2 W sum_i w_i v_i), W = sum_i w_i
 
-    0 where all have the same, nearly 1 where few have everything; NaN of nobody.
+    0 if all have the same, nearly 1 if few have everything; NaN without people.
 
         >>> float(gini(np.array([0.0, 100.0]), np.array([1.0, 1.0])))
         0.5

@@ -1,4 +1,4 @@
-"""What plants, controllers and the closed loop hand to one another."""
+"""Types that plants, controllers and the closed loop exchange, and the result of a run."""
 
 import os
 from collections.abc import Mapping
@@ -19,15 +19,14 @@ if TYPE_CHECKING:
 
 
 class Status(Flag):
-    """What was not as it should be with one decision: OK, or several of these together. `Controls.note` says why.
+    """Status of one decision: OK, or a combination of these. `Controls.note` gives the reason.
 
-    SOLVER_FAILURE: what computes the controls gave no answer that it vouches for: a solver that failed, diverged or
-        stopped short of its tolerance, a policy or controller whose numbers are none
-    FALLBACK: the controls are not those of the controller that was asked for, but of something behind it
-    SENSOR_FAULT: the controller was given a wrong, late or incomplete observation
-    PLANT_FAULT: the city could not do what was commanded, or was not whole, during the interval
-    LATE: the decision took longer than the control interval, or than the controller's own `deadline` [s], by the clock
-        of the closed loop. The only part of a run's file that depends on wall time
+    SOLVER_FAILURE: the solver failed, diverged or stopped short of its tolerance; or the numbers of a policy or
+        controller are not finite
+    FALLBACK: the controls are those of a fallback, not of the controller
+    SENSOR_FAULT: the observation was wrong, late or incomplete
+    PLANT_FAULT: the city could not execute the command, or was not whole, during the interval
+    LATE: the decision took longer than the control interval, or than the controller's own `deadline` (s)
 
         >>> Status.FALLBACK in (Status.SOLVER_FAILURE | Status.FALLBACK)
         True
@@ -43,16 +42,16 @@ class Status(Flag):
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """What a plant is in at the start of control interval `step`: the truth, which only tables and pictures see.
+    """True state of a plant at the start of control interval `step`; controllers get an Observation instead.
 
     step: k = 0, 1, ...
-    time: seconds since the start [s]
+    time: since the start (s)
     accumulation: (R, R) [veh], [i, j] = in region i bound for j
     backlog: (R, R) [veh], [i, j] = waiting outside the network to enter region i, bound for j; zero in the NMFD
-    completed: trips that reached their end since the start [veh]
-    removed: (R, R) [veh], [i, j] = taken out in i, or before they entered it, on their way to j, since the start: by
-        whatever removes vehicles from a simulation; zero if None, as in the NMFD
-    problem: what the plant could not do in the interval that has just ended, "" if nothing
+    completed: completed trips since the start [veh]
+    removed: (R, R) [veh], [i, j] = removed from the simulation in i, or before they entered it, on their way to j,
+        since the start; None for zero, as in the NMFD
+    problem: the part of the last command that the plant could not execute, "" if none
     """
 
     step: int
@@ -65,16 +64,16 @@ class State:
 
     @property
     def unfinished(self) -> PerPair:
-        """(R, R) [veh]: those that spend time: running, waiting to enter, and removed (nmfd.metrics)."""
+        """Return the vehicles (R, R) that spend time: running, waiting to enter, and removed (nmfd.metrics)."""
         spending = self.accumulation + self.backlog
         return spending if self.removed is None else spending + self.removed
 
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """What a controller is given at the start of control interval `step`: with noise, with faults, or an estimate.
+    """Input of a controller at the start of control interval `step`: with noise, with faults, or an estimate.
 
-    step, time: as of the State
+    step, time: those of the State
     accumulation: (R, R) [veh], [i, j] = in region i bound for j
     backlog: (R, R) [veh], [i, j] = waiting outside the network to enter region i, bound for j
     """
@@ -85,7 +84,7 @@ class Observation:
     backlog: PerPair
 
     def copy(self) -> "Observation":
-        """The same with arrays of its own."""
+        """Return a copy with its own arrays."""
         return Observation(
             step=self.step, time=self.time, accumulation=self.accumulation.copy(), backlog=self.backlog.copy()
         )
@@ -93,18 +92,18 @@ class Observation:
 
 @dataclass(frozen=True, kw_only=True)
 class Controls:
-    """What a controller asks for during one control interval.
+    """Command of a controller for one control interval.
 
     perimeter: (R, R) [-], [i, h] = u_ih, share of the desired transfer flow from i to h that may pass;
         ignored where h is not adjacent to i
     splits: (R, R, R) [-], [i, h, j] = theta_ihj, share of the vehicles in i bound for j that head for h;
-        None without route guidance: drivers keep the routes they have (in the regional model the nominal splits)
-    prices: (R,) [-], by how much longer than it is guided drivers who are bound for elsewhere are told that a way
-        through region i takes: 1 for twice as long. In a city they are how `splits` come about: drivers are guided by
-        these travel times, and shares are not commanded besides. The regional model takes `splits`. None: no prices
-    metering: (R,) [veh/s], the most trips that may begin in region i; who is due beyond that waits outside, in the
-        backlog. Only cities with `+metering` can do that. None: nobody is made to wait
-    status: OK, or what these controls are instead; note: the same in words, "" if OK
+        None without route guidance: drivers keep their routes (in the regional model the nominal splits)
+    prices: (R,) [-], added share of the travel time through region i that guided drivers bound for other regions see:
+        1 for twice as long. In a city, guidance by these travel times replaces `splits`; the regional model takes
+        `splits`. None: no prices
+    metering: (R,) [veh/s], largest rate of trips that may begin in region i; further trips wait outside, in the
+        backlog. Only cities with `+metering` obey it. None: no limit
+    status: OK, or the reasons why these are other controls; note: the same in words, "" if OK
     """
 
     perimeter: PerPair
@@ -117,32 +116,32 @@ class Controls:
 
 @runtime_checkable
 class Plant(Protocol):
-    """A city, regional or microscopic. `step` is one control interval."""
+    """City, regional or microscopic. `step` is one control interval."""
 
     def reset(self, seed: int) -> State:
         """Start again from the beginning."""
 
     def step(self, controls: Controls) -> State:
-        """Apply `controls` for one control interval; the state at its end."""
+        """Apply `controls` for one control interval; return the state at its end."""
 
     def observe(self) -> Observation | None:
-        """What the plant's own instruments tell now; None where it has none, and the state itself is measured."""
+        """Return the estimate of the plant's own instruments; None without any: the state is measured with noise."""
 
     def close(self) -> None:
-        """Release what the plant holds; nothing may be called afterwards but `reset`."""
+        """Release all resources; only `reset` may be called afterwards."""
 
 
 @runtime_checkable
 class Controller(Protocol):
-    """Anything that turns observations into controls."""
+    """Function from observations to controls, with a state of its own."""
 
     name: str
 
     def reset(self, seed: int = 0) -> None:
-        """Forget everything of an earlier run; what the controller draws by lot follows from `seed`."""
+        """Start a new run; all random draws of the controller follow from `seed`."""
 
     def act(self, observation: Observation) -> Controls:
-        """The controls of the interval that begins now. The arrays of `observation` are the controller's own."""
+        """Return the controls of the interval that begins now. The controller may change the arrays of `observation`."""
 
 
 VARIABLES: dict[str, Quantity] = {
