@@ -11,9 +11,10 @@ imported when they are first used.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from cosim import api as api
     from cosim.api import read_run, run, run_tasks
     from cosim.evaluation.experiment import overview
     from cosim.evaluation.simulate import Result, Task
@@ -47,7 +48,9 @@ _PLACES = {
 }
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
+    if name == "api":
+        return import_module("cosim.api")
     if name not in _PLACES:
         raise AttributeError(f"module 'cosim' has no attribute {name!r}")
     module, _, attribute = _PLACES[name].rpartition(".")

@@ -1,6 +1,6 @@
 """`python -m cosim` is the command `cosim`."""
 
-from cosim.cli.main import main
+from cosim.cli import main
 
 if __name__ == "__main__":
     main()

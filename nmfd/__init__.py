@@ -15,6 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from nmfd import api as api
     from nmfd.api import benchmark, controller, identify, load_scenario, run, train
     from nmfd.errors import InputError
     from nmfd.metrics import summary, total_time_spent
@@ -66,6 +67,8 @@ _MODULE_OF = {name: module for module, names in _MODULES.items() for name in nam
 
 
 def __getattr__(name: str) -> Any:
+    if name == "api":
+        return import_module("nmfd.api")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'nmfd' has no attribute {name!r}")
     return getattr(import_module(f"nmfd.{_MODULE_OF[name]}"), name)

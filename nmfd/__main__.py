@@ -1,6 +1,6 @@
 """`python -m nmfd` is the command `nmfd`."""
 
-from nmfd.cli.main import main
+from nmfd.cli import main
 
 if __name__ == "__main__":
     main()

@@ -1,22 +1,31 @@
 """What the command line `nmfd` does, as functions of a few arguments; exported by the package `nmfd`."""
 
+import re
+import textwrap
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nmfd import closed_loop
-from nmfd.controllers.dpc import training
-from nmfd.controllers.strategy import check_tables, parse, parse_many
+from nmfd.controllers import open_loop
+from nmfd.controllers.dpc import rollout, training
+from nmfd.controllers.strategy import CONTROLLERS, check_tables, parse, parse_many
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario, with_demand
-from nmfd.runs import config
-from nmfd.runs.files import default_folder
+from nmfd.runs import config, shipped
+from nmfd.runs.files import default_folder, file_name
 from nmfd.runs.progress import Progress, watched
+from nmfd.runs.run_many import raise_failures as raise_failures
 from nmfd.studies import benchmark as benchmark_study
+from nmfd.studies import bound as bound_study
 from nmfd.studies import measured
-from nmfd.studies.benchmark import PLANTS
+from nmfd.studies import robustness as robustness_study
+from nmfd.studies.benchmark import PLANTS, draw_scenario
+from nmfd.studies.benchmark import summary_table as summary_table
 from nmfd.studies.measured import Identified
-from nmfd.studies.settings import Measured
+from nmfd.studies.robustness import improvement_table as improvement_table
+from nmfd.studies.settings import Measured, Robustness
 from nmfd.types import Controller, Plant, Result
 
 if TYPE_CHECKING:
@@ -24,12 +33,16 @@ if TYPE_CHECKING:
 
 
 def load_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None) -> Scenario:
-    """Read the scenario in `folder`, or a shipped one by its name, and check its options. Raises InputError.
-
-    settings: dotted key -> value instead of that in the file, such as {"steps": 12, "controllers.pi-gating.kp": 2.0}
+    """Read a scenario and its network, and check the options of its controllers.
 
         >>> nmfd.load_scenario("economic_mpc").network.region_names
         ('north-west', 'north-east', 'west', 'centre', 'east', 'south-west', 'south-east')
+
+    folder: folder of a scenario.toml, or the name of a shipped scenario (`nmfd show`)
+    settings: changes by dotted key, such as {"steps": 12, "controllers.pi-gating.kp": 2.0}
+
+    Raises:
+        InputError: if a file, key or value is wrong
     """
     scenario = read_scenario(folder, settings)
     check_tables(scenario)
@@ -132,33 +145,151 @@ def benchmark(
     )
 
 
+def robustness(
+    scenario: Scenario | Path | str,
+    controllers: str | Sequence[str],
+    *,
+    sigmas: Sequence[float] = Robustness().sigmas,
+    scenarios: int = 20,
+    out: Path | str | None = None,
+    workers: int = 1,
+    progress: Progress = None,
+) -> "pd.DataFrame":
+    """Run controllers against perturbed demand in a folder, draw the improvement, and return one row per run.
+
+    sigmas: standard deviations of the demand noise (veh/s)
+    scenarios: noise draws for every sigma
+    out, workers, progress: see `benchmark`
+    """
+    scenario = _loaded(scenario)
+    return robustness_study.robustness(
+        scenario,
+        parse_many(controllers, scenario, regional=True),
+        sigmas,
+        scenarios,
+        where="pairs",
+        out=default_folder(scenario.name) if out is None else Path(out),
+        workers=workers,
+        progress=progress,
+    )
+
+
 def train(
     scenario: Scenario | Path | str,
     controller: str,
     *,
-    out: Path | str,
+    out: Path | str | None = None,
     seed: int = 0,
     steps: int | None = None,
+    device: str = "cpu",
     resume: bool = False,
     anyway: bool = False,
     progress: Progress = None,
 ) -> Path:
-    """`nmfd train` on the CPU: train the DPC policy `controller` and write it to the file `out`, which is returned.
+    """Train a DPC policy and return its file.
 
-    steps: Adam steps; what scenario.toml says, else 400, if None; anyway: even on placeholder MFDs, or where no gateway
-    can be controlled; progress: as in `benchmark`. Raises InputError.
+    out: policy file, SCENARIO/NAME.pt if None
+    steps: Adam steps; those of scenario.toml, else 400, if None
+    device: "cpu", which gives the same weights every time, "cuda" or "auto"
+    resume: continue an interrupted training
+    anyway: train even on placeholder MFDs or if no gateway can be controlled
+    progress: see `benchmark`
     """
+    scenario, device = _loaded(scenario), training.available(device)
+    strategy = parse(controller)
+    chosen = training.settings(scenario, strategy, steps)
+    file = _file(scenario, f"{controller}.pt", out)
+    compiled = chosen.descend and chosen.steps >= training.WORTH_COMPILING and rollout.can_compile(device)
     with watched(controller, progress) as show:
-        return training.train(
-            _loaded(scenario),
-            parse(controller),
+        training.train(
+            scenario,
+            strategy,
             seed=seed,
-            out=Path(out),
+            out=file,
             steps=steps,
             resume=resume,
+            device=device,
+            compiled=compiled,
             anyway=anyway,
             progress=show,
         )
+    return file
+
+
+def bound(
+    scenario: Scenario | Path | str,
+    controller: str,
+    *,
+    out: Path | str | None = None,
+    iterations: int = bound_study.ITERATIONS,
+    progress: Progress = None,
+) -> str:
+    """Optimise the controls of "bound-pc" or "bound-pcrg" for known demand; return a report.
+
+    out: plan file, SCENARIO/NAME.npz if None
+    iterations: Adam steps
+    """
+    bound_study.check(controller)
+    scenario = _loaded(scenario)
+    file = _file(scenario, f"{controller}.npz", out)
+    with watched(controller, progress) as show:
+        plan = bound_study.compute(scenario, controller, iterations=iterations, progress=show)
+    open_loop.write(plan, scenario, file)
+    totals = sorted(plan.totals.items(), key=lambda item: item[1])
+    lines = [f"from {name}: {total:.5g} veh s" + (" (kept)" if name == plan.start else "") for name, total in totals]
+    return "\n".join([*lines, f"{plan.iterations} Adam steps", f"Written to {file}"])
+
+
+def show(scenario: Scenario | Path | str, *, out: Path | str | None = None) -> str:
+    """Draw demand, region map and MFDs of a scenario; return a summary with the files."""
+    scenario = _loaded(scenario)
+    folder = Path("runs") / f"{file_name(scenario.name)}-show" if out is None else Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    files = draw_scenario(folder, scenario)
+    total = scenario.step * scenario.demand.sum()
+    return "\n".join(
+        [
+            f"{scenario.name}: {scenario.network.regions} regions, {total:,.0f} trips between "
+            f"{int((scenario.demand.sum(axis=0) > 0).sum())} pairs, peak {scenario.demand.sum(axis=(1, 2)).max():.3g} "
+            f"veh/s, {scenario.steps} control intervals of {scenario.step:g} s",
+            *(f"Written to {file}" for file in files),
+        ]
+    )
+
+
+def catalogue() -> str:
+    """List the shipped scenarios, networks and policies, and all controllers, one line each."""
+    scenarios, networks = shipped.folders(shipped.SCENARIO), shipped.folders(shipped.NETWORK)
+    sections = {
+        "Scenarios": {folder.name: _first_sentence(folder / "scenario.toml") for folder in scenarios},
+        "Networks": {folder.name: _first_sentence(folder / "network.toml") for folder in networks},
+        "Policies": {
+            f"{folder.name}/{file.name}": "" for folder in scenarios for file in sorted(folder.glob("dpc-*.pt"))
+        },
+        "Controllers": {kind.name: kind.text for kind in CONTROLLERS.values()},
+    }
+    width = max(len(name) for rows in sections.values() for name in rows)
+    return "\n\n".join(
+        "\n".join([title, *(f"  {name:{width}}  {text}".rstrip() for name, text in rows.items())])
+        for title, rows in sections.items()
+    )
+
+
+def _first_sentence(file: Path) -> str:
+    """Return the first sentence of the comment at the top of a TOML file."""
+    lines = takewhile(lambda line: line.startswith("#"), file.read_text(encoding="utf-8").splitlines())
+    words = " ".join(line.lstrip("# ") for line in lines if not line.startswith("#:"))
+    return textwrap.shorten(re.split(r"\.\s+(?=[A-Z\d])", words)[0].rstrip("."), 90, placeholder=" ...")
+
+
+def _file(scenario: Scenario, name: str, out: Path | str | None) -> Path:
+    """Return the file that `out` names, or `name` in the scenario's folder; check that its folder exists."""
+    if out is None and scenario.folder is None:
+        raise InputError(f"{name}: expected a file to write to; give out")
+    file = Path(out) if out is not None else shipped.beside(scenario.folder, name, "--out FILE", scenario=True)
+    if not file.parent.is_dir():
+        raise InputError(f"{file.parent}: no such folder; make it or choose another --out")
+    return file
 
 
 def identify(

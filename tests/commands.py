@@ -8,8 +8,8 @@ from functools import partial
 
 from click.testing import CliRunner, Result
 
-from cosim.cli.main import main as main_of_cosim
-from nmfd.cli.main import main as main_of_nmfd
+from cosim.cli import main as main_of_cosim
+from nmfd.cli import main as main_of_nmfd
 
 MAINS = {"nmfd": main_of_nmfd, "cosim": main_of_cosim}
 

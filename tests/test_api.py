@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 import cosim
 import nmfd
-from nmfd.cli.main import main
+from nmfd.cli import main
 from nmfd.runs import run_folder
 
 ROOT = Path(__file__).parents[1]

@@ -14,7 +14,7 @@ import torch
 from commands import nmfd
 from PIL import Image
 
-from cosim.cli.main import main
+from cosim.cli import main
 from nmfd import closed_loop
 from nmfd.cli.declared import Declared, shown
 from nmfd.controllers.dpc import rollout, training

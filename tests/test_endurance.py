@@ -10,7 +10,7 @@ import tiny
 import tiny_city
 from click.testing import CliRunner
 
-from cosim.cli.main import main
+from cosim.cli import main
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from nmfd.api import controller as make_controller

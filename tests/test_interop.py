@@ -10,8 +10,8 @@ import pytest
 import tiny
 from click.testing import CliRunner
 
-import cosim.cli.main
-import nmfd.cli.main
+import cosim.cli
+import nmfd.cli
 from nmfd.runs import run_folder
 
 ROOT = Path(__file__).parents[1]
@@ -23,7 +23,7 @@ def peak(tmp_path_factory):
 
 
 def cosim_run(*arguments):
-    return CliRunner().invoke(cosim.cli.main.main, ["run", *(str(a) for a in arguments)])
+    return CliRunner().invoke(cosim.cli, ["run", *(str(a) for a in arguments)])
 
 
 @pytest.mark.slow
@@ -67,7 +67,7 @@ def test_outputs_from_python(peak, tmp_path):
 def test_parquet_of_a_benchmark(tmp_path):
     scenario, out = tiny.write(tmp_path), tmp_path / "out"
     done = CliRunner().invoke(
-        nmfd.cli.main.main,
+        nmfd.cli,
         ["benchmark", str(scenario), "--controllers", "no-control,pi-gating", "--parquet", "--out", str(out)],
     )
     assert done.exit_code == 0, done.output

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from nmfd import ledger
 from nmfd.api import load_scenario
-from nmfd.cli.main import main
+from nmfd.cli import main
 from nmfd.model import acyclic, dynamics
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.runs import run_folder

@@ -15,7 +15,6 @@ from cosim.importing.case import seconds
 from cosim.sumo.net import load_city
 from cosim.sumo.recorded_trips import read_recorded_trips
 from nmfd.api import load_scenario
-from nmfd.cli.options import policy_files
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
@@ -191,7 +190,6 @@ def read_originals_of(path: Path):
 def test_texts_of_the_command_line(text):
     for load in (
         parse,
-        lambda value: policy_files((value,), ["a"]),
         lambda value: seconds(value, "--begin"),
         bound.check,
     ):

@@ -10,7 +10,7 @@ import tiny
 from click.testing import CliRunner
 from commands import nmfd as command
 
-import cosim.cli.main
+import cosim.cli
 import nmfd
 from nmfd.controllers import template
 from nmfd.controllers.strategy import parse
@@ -81,7 +81,7 @@ def test_sumo_takes_it(place):
     (place / "mine.py").write_text(GOOD)
     copies.peak(place)
     done = CliRunner().invoke(
-        cosim.cli.main.main,
+        cosim.cli,
         ["run", "scenarios/peak", "--controller", "mine.py:Mine+max-pressure", "--steps", "2", "--out", "out"],
     )
     assert done.exit_code == 0 and "mine.py:Mine+max-pressure" in done.output, done.output

@@ -10,11 +10,11 @@ import tiny
 import tiny_city
 from click.testing import CliRunner
 
-import cosim.cli.main
-import nmfd.cli.main
+import cosim.cli
+import nmfd.cli
 
 ROOT = Path(__file__).parents[1]
-MAINS = {"nmfd": nmfd.cli.main.main, "cosim": cosim.cli.main.main}
+MAINS = {"nmfd": nmfd.cli, "cosim": cosim.cli}
 
 
 def here(program, *arguments):

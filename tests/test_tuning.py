@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 from trajectories import in_city
 
-from cosim.cli.main import main
+from cosim.cli import main
 from cosim.evaluation import experiment, statistics, tuning
 from nmfd.errors import InputError
 from nmfd.runs import config

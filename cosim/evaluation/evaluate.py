@@ -33,6 +33,7 @@ class Evaluation:
     seeds: Sequence[int]
     out: Path
     levels: tuple[float, ...] = (1.0,)
+    settings: tuple[tuple[str, object], ...] = ()
     steps: int | None = None
     policies: Mapping[str, Path] = field(default_factory=dict)
     time_limit: float | None = None
@@ -45,6 +46,7 @@ class Evaluation:
                 experiment.level_folder(self.out, level),
                 Task(
                     scenario=self.scenario,
+                    settings=self.settings,
                     controller=name,
                     seed=seed,
                     policy=self.policies.get(name),
@@ -90,7 +92,7 @@ def evaluate(
     rows, table = kept_runs(evaluation), pd.DataFrame()
     if len(rows):
         table = statistics.write_tables(out, rows, evaluation.reference)
-        scenario = load_scenario(evaluation.scenario)
+        scenario = load_scenario(evaluation.scenario, dict(evaluation.settings))
         why = explain.text(level_folders(out), scenario.network, kept_runs(evaluation))
         remarks = "".join(f"- {line}\n" for line in experiment.remarks(rows))
         files.write_text(

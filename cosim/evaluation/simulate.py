@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from cosim.evaluation import estimation_errors, run_metrics
 from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
@@ -75,6 +76,7 @@ class Task:
     policy: Path | None = None
     steps: int | None = None
     demand_factor: float = 1.0
+    settings: tuple[tuple[str, Any], ...] = ()
     options: tuple[tuple[str, object], ...] = ()
     sumo_output: tuple[tuple[str, Path], ...] = ()
     faults: tuple[str, ...] = ()
@@ -87,7 +89,7 @@ class Task:
 
 def scenario_of(task: Task) -> Scenario:
     """The scenario with the horizon and demand of `task`. Raises InputError."""
-    scenario = with_faults(load_scenario(task.scenario), task.faults)
+    scenario = with_faults(load_scenario(task.scenario, dict(task.settings)), task.faults)
     scenario = with_demand(scenario, steps=task.steps, factor=task.demand_factor)
     if not task.options:
         return scenario

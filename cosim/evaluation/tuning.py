@@ -87,6 +87,7 @@ class Tuning:
     levels: tuple[float, ...] = (1.0,)
     search_seed: int = 0
     population: int | None = None
+    settings: tuple[tuple[str, object], ...] = ()
     steps: int | None = None
     first_step: float = FIRST_STEP
 
@@ -145,6 +146,7 @@ class Tuning:
                 experiment.level_folder(self.folder(candidate), level),
                 Task(
                     scenario=self.scenario,
+                    settings=self.settings,
                     controller=self.controller,
                     seed=seed,
                     policy=self.policy(candidate),

@@ -1,0 +1,293 @@
+"""Command line `cosim`: it parses options and calls cosim.api."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+import cosim
+import nmfd
+from nmfd.cli import (
+    CONTROLLERS,
+    COUNT,
+    FILE,
+    FOLDER,
+    POLICIES,
+    SCENARIO,
+    SEED,
+    WORKERS,
+    Commands,
+    listed,
+    out_option,
+    seed_option,
+)
+from nmfd.errors import InputError
+
+LEVEL = click.FloatRange(0.0, 10.0, min_open=True)
+CONTROLLER = click.option(
+    "--controller",
+    required=True,
+    metavar="NAME[+...]",
+    help="Controller of `nmfd show` or FILE:Class, and what else the city does, joined by +: actuated, max-pressure or "
+    "max-pressure-cyclic signals, rerouting-N, guided, compliance-N (percent of drivers), guidance-period-N (s), "
+    "metering, redistribute, estimate.",
+)
+AGAINST = click.option("--against", metavar="NAME[+...]", help="Second controller, on the same trips.")
+STEPS = click.option("--steps", type=COUNT, help="Control intervals. [default: the scenario's]")
+DEMAND = click.option("--demand", type=LEVEL, default=1.0, show_default=True, help="Factor on the demand.")
+LEVELS = click.option(
+    "--demand", "levels", type=listed(LEVEL), default="1", show_default=True, help="Factors on the demand."
+)
+
+
+@click.group(
+    name="cosim",
+    cls=Commands,
+    sections={
+        "First steps": ("demo", "run", "watch"),
+        "Studies": ("evaluate", "compare", "report", "tune"),
+        "A city of your own": ("get", "import", "identify"),
+    },
+)
+@click.version_option(nmfd.__version__)
+def main() -> None:
+    """Perimeter control in a SUMO city. Begin with `cosim demo`."""
+
+
+@main.command()
+@click.option("--out", type=FOLDER, default="runs/demo", show_default=True, metavar="DIR", help="Run folder.")
+def demo(out: Path) -> None:
+    """Run a small city with and without gates; write a page.
+
+    Takes half a minute and opens the page in a browser, if there is a screen.
+
+    \b
+    Example:
+      cosim demo
+    """
+    click.echo(cosim.api.demo(out))
+
+
+@main.command()
+@SCENARIO
+@CONTROLLER
+@AGAINST
+@seed_option(text="Seed of trips, drivers and guidance.")
+@STEPS
+@DEMAND
+@click.option("--policy", type=FILE, metavar="FILE", help="Policy file of --controller. [default: SCENARIO/NAME.pt]")
+@click.option(
+    "--sumo-output",
+    type=listed(click.Choice(["tripinfo", "summary", "edgedata", "emission"])),
+    metavar="A,B,...",
+    help="SUMO's own outputs: tripinfo, summary, edgedata, emission (large).",
+)
+@out_option("runs/SCENARIO-TIME")
+def run(scenario: Path, controller: str, against: str | None, **options: Any) -> None:
+    """Run one controller, or two on the same trips.
+
+    SCENARIO is a shipped name (`nmfd show`) or a folder with a scenario.toml, on a network that SUMO can simulate.
+    Prints a table and writes results, tables and figures.
+
+    \b
+    Examples:
+      cosim run grid7_peak --controller dpc-pcrg --against no-control
+      cosim run grid7_peak --controller pi-gating+max-pressure --seed 3 --out runs/gating
+      cosim run grid7_peak --controller pi-gating --set controllers.pi-gating.kp=2 --set sumo.min_green=8
+    """
+    click.echo(cosim.api.run_controllers(scenario, [controller, *([against] if against else [])], **options))
+
+
+@main.command()
+@SCENARIO
+@CONTROLLER
+@AGAINST
+@seed_option(text="Seed of trips, drivers and guidance.")
+@DEMAND
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of the page. [default: any that is free]")
+@click.option("--gui", is_flag=True, help="Open sumo-gui instead of a page, with one run.")
+def watch(scenario: Path, controller: str, against: str | None, gui: bool, **options: Any) -> None:
+    """Watch runs on a live page with map and curves.
+
+    The page pauses the runs and sets their pace. Nothing is written.
+
+    \b
+    Examples:
+      cosim watch grid7_peak --controller pi-gating --against no-control
+      cosim watch grid7_peak --controller pi-gating --gui
+    """
+    if gui and against:
+        raise InputError("--gui: shows one run; omit --against")
+    click.echo(cosim.api.watch(scenario, [controller, *([against] if against else [])], gui=gui, **options))
+
+
+@main.command()
+@SCENARIO
+@CONTROLLERS
+@click.option("--seeds", type=COUNT, default=10, show_default=True, help="Runs per controller and demand level.")
+@click.option(
+    "--first-seed",
+    type=SEED,
+    default=2000,
+    show_default=True,
+    help="First seed; development uses seeds below 2000.",
+)
+@LEVELS
+@STEPS
+@POLICIES
+@WORKERS
+@click.option("--scheduler", metavar="ADDRESS", help="Dask scheduler that does the runs, such as tls://host:8786.")
+@out_option("runs/SCENARIO-evaluate")
+def evaluate(scenario: Path, controllers: tuple[str, ...], seeds: int, first_seed: int, **options: Any) -> None:
+    """Compare controllers over seeds and demand levels.
+
+    Writes tables and figures; several demand levels give the frontier up to which every controller serves all trips.
+    With the same --out, only runs that are not in it yet are done.
+
+    \b
+    Examples:
+      cosim evaluate grid7_peak --controllers no-control,pi-gating,dpc-pc --workers 4
+      cosim evaluate grid7_peak --controllers no-control,dpc-pc --demand 0.8,1.0,1.3 --out runs/levels
+    """
+    click.echo(cosim.api.evaluate(scenario, controllers, seeds=range(first_seed, first_seed + seeds), **options))
+
+
+@main.command()
+@click.argument("folder", type=FOLDER, metavar="RUN")
+@click.option("--controller", metavar="NAME[+...]", help="Controller of one run. [default: all runs of the folder]")
+@click.option("--seed", type=SEED, help="Seed of that run. [default: 0]")
+@click.option("--model", type=FOLDER, metavar="DIR", help="Network that predicts. [default: the controller's model]")
+def compare(folder: Path, **options: Any) -> None:
+    """Compare finished runs with the regional model.
+
+    RUN is a folder of `cosim run` or `cosim evaluate`. The regional model gets the recorded departures and controls.
+    Tables and figures go into RUN.
+
+    \b
+    Examples:
+      cosim compare runs/gating --controller pi-gating --seed 3
+      cosim compare runs/grid7_peak-evaluate
+    """
+    click.echo(cosim.api.compare(folder, **options))
+
+
+@main.command()
+@click.argument("folders", type=FOLDER, metavar="RUN...", nargs=-1, required=True)
+@click.option("--seed", type=SEED, help="Seed of the runs on the map. [default: the first of both]")
+@click.option("--out", type=FILE, metavar="FILE", help="Page. [default: report.html in the first RUN]")
+def report(folders: tuple[Path, ...], **options: Any) -> None:
+    """Write one HTML page about finished runs.
+
+    RUN is a folder of `cosim run` or `cosim evaluate`. The page needs no network.
+
+    \b
+    Examples:
+      cosim report runs/grid7_peak-evaluate
+      cosim report runs/monday runs/tuesday --out both.html
+    """
+    click.echo(f"Written to {cosim.api.report(folders, **options)}: open it in a browser")
+
+
+@main.command()
+@SCENARIO
+@CONTROLLER
+@click.option(
+    "--option",
+    "knobs",
+    required=True,
+    multiple=True,
+    metavar="KEY=LOW:HIGH",
+    help="Option of the controller and its range; KEY[0], KEY[1] for numbers of a list. May be repeated.",
+)
+@click.option("--candidates", type=COUNT, default=40, show_default=True, help="Candidates, the scenario's own first.")
+@click.option("--seeds", type=COUNT, default=2, show_default=True, help="Runs per candidate and level, from seed 1000.")
+@LEVELS
+@WORKERS
+@out_option("runs/SCENARIO-tune")
+def tune(scenario: Path, controller: str, **options: Any) -> None:
+    """Search the options of a controller by CMA-ES.
+
+    Minimises the geometric mean of the total time spent over seeds and demand levels. Writes tune.csv, and tune.toml
+    with the best options. The same command continues, also with more --candidates.
+
+    \b
+    Examples:
+      cosim tune grid7_peak --controller pi-gating --option kp=0.1:10 --option ki=0.001:0.1
+      cosim tune grid7_peak --controller dpc-pcrg+max-pressure --option mfd_scale=0.6:1
+    """
+    click.echo(cosim.api.tune(scenario, controller, **options))
+
+
+@main.command()
+@click.argument("name", required=False)
+def get(name: str | None) -> None:
+    """Download a published SUMO city; without NAME list them.
+
+    The city goes to cities/NAME, with its licence.
+
+    \b
+    Examples:
+      cosim get
+      cosim get cologne8
+    """
+    click.echo(cosim.api.get(name))
+
+
+@main.command(name="import")
+@click.argument("source", type=FILE, required=False, metavar="SUMOCFG|NET|OSM")
+@click.option("--bbox", metavar="W,S,E,N", help="Box of OpenStreetMap in degrees to download, instead of a file.")
+@click.option("--left-hand", is_flag=True, help="OpenStreetMap: traffic drives on the left.")
+@click.option("--regions", required=True, metavar="N|CSV", help="Number of regions to find, or a table edge,region.")
+@click.option("--routes", type=FILE, multiple=True, metavar="FILE", help="Vehicles, trips or flows. May be repeated.")
+@click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak for a city without demand.")
+@click.option("--level", type=LEVEL, default=1.0, show_default=True, help="Factor on the vehicles, or on the peak.")
+@click.option("--mesoscopic", is_flag=True, help="Simulate with SUMO's queue model.")
+@click.option("--begin", metavar="TIME", help="Start in s or h:m:s. [default: the sumocfg's]")
+@click.option("--end", metavar="TIME", help="End of departures in s or h:m:s. [default: the sumocfg's]")
+@seed_option()
+@click.option("--out", type=FOLDER, required=True, metavar="DIR", help="Network folder, such as networks/mycity.")
+@click.option("--force", is_flag=True, help="Replace an existing network and scenario.")
+def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
+    """Make a network and a scenario of any SUMO city.
+
+    Finds regions and gateways and counts demand by pair of regions. Vehicles keep routes, departures and types. The
+    scenario goes to scenarios/NAME beside the folder of networks.
+
+    \b
+    Examples:
+      cosim import city.sumocfg --regions 5 --out networks/mycity
+      cosim import city.net.xml.gz --regions 6 --demand peak --out networks/mycity
+      cosim import --bbox 11.32,44.48,11.36,44.50 --regions 4 --demand peak --out networks/mycity
+    """
+    if (source is None) == (bbox is None):
+        raise InputError("cosim import: expected either a file or --bbox; give one of them")
+    click.echo(cosim.api.import_city(bbox if source is None else source, **options))
+
+
+@main.command()
+@SCENARIO
+@click.option("--levels", type=listed(LEVEL), default="0.6,0.8,1", show_default=True, help="Factors on the demand.")
+@click.option("--seeds", type=COUNT, default=2, show_default=True, help="Loading runs per level, from seed 1000.")
+@click.option(
+    "--with",
+    "city",
+    metavar="A+...",
+    help="What the city does in the loading runs: own, guided, max-pressure, rerouting-30, ... [default: own, then "
+    "guided, a model each]",
+)
+@click.option("--network", type=FOLDER, metavar="DIR", help="Folder of the model. [default: the scenario's network]")
+@click.option("--runs", type=FOLDER, multiple=True, metavar="DIR", help="Finished runs to fit as well.")
+@WORKERS
+@out_option("runs/SCENARIO-identify", "Folder of loading runs, samples and figures.")
+def identify(scenario: Path, **options: Any) -> None:
+    """Fit the regional model of a SUMO city.
+
+    Loads the city with multiples of its demand, without control and with probing gates, and writes network.toml.
+    Policies trained on the network before do not fit the new one. SCENARIO may be the folder of an imported network.
+
+    \b
+    Examples:
+      cosim identify networks/mycity
+      cosim identify grid7_peak --with guided+max-pressure --network networks/grid7_max_pressure
+    """
+    click.echo(cosim.api.identify(scenario, **options))

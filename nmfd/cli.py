@@ -1,0 +1,313 @@
+"""Command line `nmfd`: it parses options and calls nmfd.api; cosim.cli takes the shared options from here."""
+
+import shlex
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import click
+
+import nmfd
+from nmfd.errors import InputError, RunFailed
+
+FOLDER = click.Path(path_type=Path, file_okay=False)
+FILE = click.Path(path_type=Path, dir_okay=False)
+COUNT = click.IntRange(1, 10**6)
+SEED = click.IntRange(0, 2**31 - 1)  # SUMO's seeds have 32 bits
+
+
+class Commands(click.Group):
+    """Command group with sections in its help that ends user errors and Ctrl-C in one line on stderr."""
+
+    def __init__(self, *args: Any, sections: Mapping[str, Sequence[str]], **options: Any):
+        super().__init__(*args, **options)
+        self.sections = sections
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands section by section, in the order of use."""
+        width = max(map(len, self.commands))
+        for title, names in self.sections.items():
+            with formatter.section(title):
+                rows = [(f"{name:{width}}", self.commands[name].get_short_help_str(60)) for name in names]
+                formatter.write_dl(rows)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command; exit with 2 after a user error, 1 after failed runs, 130 after Ctrl-C."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as stop:
+            text, status = ": ".join(["interrupted", *filter(None, [str(stop)])]), 130
+        except RunFailed as failure:
+            text, status = f"error: {failure}", 1
+        except (InputError, OSError) as error:
+            text, status = f"error: {error}", 2
+        click.echo(f"{self.name}: {' '.join(text.split())}", err=True)
+        ctx.exit(status)
+
+
+def combined(*decorators: Callable) -> Callable:
+    """Return one decorator that applies several, so that their options appear in this order."""
+
+    def decorate(command: Callable) -> Callable:
+        for decorator in reversed(decorators):
+            command = decorator(command)
+        return command
+
+    return decorate
+
+
+def listed(kind: click.ParamType) -> Callable[[str], tuple]:
+    """Return a parser of values of a kind that are separated by commas."""
+
+    def parse(text: str) -> tuple:
+        return tuple(kind.convert(word.strip(), None, None) for word in text.split(","))
+
+    parse.__name__ = "A,B,..."
+    return parse
+
+
+def parsed_settings(_ctx: click.Context, _param: click.Parameter, values: Sequence[str]) -> dict[str, Any]:
+    """Parse KEY=VALUE; a value that is not TOML is text."""
+    settings = {}
+    for text in values:
+        key, equals, value = text.partition("=")
+        if not key.strip() or not equals:
+            raise click.BadParameter(f"expected KEY=VALUE, such as steps=12, got {text!r} instead")
+        try:
+            settings[key.strip()] = tomllib.loads(f"value = {value}")["value"]
+        except tomllib.TOMLDecodeError:
+            settings[key.strip()] = value.strip()
+    return settings
+
+
+def parsed_policies(_ctx: click.Context, _param: click.Parameter, values: Sequence[str]) -> dict[str, Path]:
+    """Parse NAME=FILE."""
+    policies = {}
+    for text in values:
+        name, equals, file = text.partition("=")
+        if not name or not equals or not file:
+            raise click.BadParameter(f"expected NAME=FILE, such as dpc-pc=mine.pt, got {text!r} instead")
+        policies[name] = Path(file)
+    return policies
+
+
+SET = click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    callback=parsed_settings,
+    help="Change a setting of the scenario, such as steps=12 or controllers.pi-gating.kp=2. May be repeated.",
+)
+SCENARIO = combined(click.argument("scenario", type=click.Path(path_type=Path)), SET)
+CONTROLLERS = click.option(
+    "--controllers",
+    type=listed(click.STRING),
+    required=True,
+    metavar="A,B,...",
+    help="Controllers, such as no-control,pi-gating or 'dpc-*' in quotes; `nmfd show` lists them.",
+)
+POLICIES = click.option(
+    "--policy",
+    "policies",
+    multiple=True,
+    metavar="NAME=FILE",
+    callback=parsed_policies,
+    help="Policy or plan file of a controller. May be repeated. [default: SCENARIO/NAME.pt or .npz]",
+)
+WORKERS = click.option("--workers", type=COUNT, default=1, show_default=True, help="Runs at a time.")
+
+
+def seed_option(default: int = 0, text: str = "Random seed.") -> Callable:
+    """Return the option --seed."""
+    return click.option("--seed", type=SEED, default=default, show_default=True, help=text)
+
+
+def out_option(default: str, text: str = "Run folder; finished runs in it are kept.") -> Callable:
+    """Return the option --out of a folder; `default` says where results go without it."""
+    return click.option("--out", type=FOLDER, metavar="DIR", help=f"{text} [default: {default}]")
+
+
+@click.group(
+    name="nmfd",
+    cls=Commands,
+    sections={
+        "Commands in the order of use": ("show", "benchmark", "robustness"),
+        "Controllers": ("train", "bound", "new-controller"),
+        "Networks from measured data": ("identify",),
+    },
+)
+@click.version_option(nmfd.__version__)
+def main() -> None:
+    """Perimeter control and route guidance on the regional traffic model (NMFD).
+
+    Begin with `nmfd show`, then `nmfd benchmark economic_mpc --controllers no-control,pi-gating`.
+    """
+
+
+@main.command()
+@click.argument("scenario", type=click.Path(path_type=Path), required=False)
+@SET
+@out_option("runs/SCENARIO-show", "Folder of the figures.")
+def show(scenario: Path | None, settings: dict, out: Path | None) -> None:
+    """Draw a scenario; without SCENARIO list what is shipped.
+
+    Draws demand, region map and MFDs. The list names scenarios, networks, policies and controllers.
+
+    \b
+    Examples:
+      nmfd show
+      nmfd show economic_mpc --out figures
+    """
+    if scenario is None:
+        click.echo(nmfd.api.catalogue())
+    else:
+        click.echo(nmfd.api.show(nmfd.load_scenario(scenario, settings), out=out))
+
+
+@main.command()
+@SCENARIO
+@CONTROLLERS
+@click.option("--seeds", type=COUNT, default=1, show_default=True, help="Runs with seeds 0 to N - 1.")
+@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", show_default=True, help="Plant model.")
+@POLICIES
+@WORKERS
+@out_option("runs/SCENARIO-TIME")
+def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
+    """Run controllers on a regional model and compare them.
+
+    SCENARIO is a shipped name or a folder with a scenario.toml. The run folder holds tables, results and figures; with
+    the same --out, only runs that are not in it yet are done.
+
+    \b
+    Examples:
+      nmfd benchmark economic_mpc --controllers no-control,pi-gating
+      nmfd benchmark economic_mpc --controllers no-control,dpc-pc --seeds 5 --set controllers.dpc-pc.seed=1
+    """
+    loaded = nmfd.load_scenario(scenario, settings)
+    out = out or nmfd.api.default_folder(loaded.name)
+    rows = nmfd.api.benchmark(loaded, out=out, **options)
+    click.echo(f"{nmfd.api.summary_table(rows)}\nWritten to {out}")
+    nmfd.api.raise_failures(rows)
+
+
+@main.command()
+@SCENARIO
+@CONTROLLERS
+@click.option(
+    "--sigmas",
+    type=listed(click.FloatRange(0.0)),
+    default="0,0.25,0.5,0.75,1,1.5,2,3,5",
+    show_default=True,
+    help="Standard deviations of the demand noise (veh/s).",
+)
+@click.option("--scenarios", type=COUNT, default=20, show_default=True, help="Noise draws for every sigma.")
+@WORKERS
+@out_option("runs/SCENARIO-TIME")
+def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
+    """Run controllers against perturbed demand.
+
+    Controllers expect the scenario's demand; the plant gets max(0, demand + noise), drawn for every pair of regions and
+    control interval. Prints and draws the improvement over no-control.
+
+    \b
+    Example:
+      nmfd robustness economic_mpc --controllers pi-gating,dpc-pcrg --out runs/robust
+    """
+    loaded = nmfd.load_scenario(scenario, settings)
+    out = out or nmfd.api.default_folder(loaded.name)
+    rows = nmfd.api.robustness(loaded, out=out, **options)
+    click.echo(f"{nmfd.api.improvement_table(rows)}\nWritten to {out}")
+    nmfd.api.raise_failures(rows)
+
+
+@main.command()
+@SCENARIO
+@click.option("--controller", required=True, metavar="NAME", help="dpc-pc or dpc-pcrg.")
+@seed_option(text="Seed of the initial weights and the training states.")
+@click.option("--steps", type=COUNT, help="Adam steps. [default: the scenario's, else 400]")
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
+@click.option("--resume", is_flag=True, help="Continue an interrupted training.")
+@click.option("--out", type=FILE, metavar="FILE", help="Policy file. [default: SCENARIO/NAME.pt]")
+def train(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
+    """Train a DPC policy on a scenario.
+
+    The policy file always holds the policy that is best in validation; Ctrl-C keeps it, and --resume continues.
+
+    \b
+    Examples:
+      nmfd train economic_mpc --controller dpc-pcrg
+      nmfd train economic_mpc --controller dpc-pc --steps 200 --out mine.pt
+    """
+    click.echo(f"Written to {nmfd.api.train(nmfd.load_scenario(scenario, settings), controller, **options)}")
+
+
+@main.command()
+@SCENARIO
+@click.option("--controller", required=True, metavar="NAME", help="bound-pc or bound-pcrg.")
+@click.option("--out", type=FILE, metavar="FILE", help="Plan file. [default: SCENARIO/NAME.npz]")
+def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
+    """Optimise the controls for known demand, as a bound.
+
+    `nmfd benchmark --controllers bound-pc,bound-pcrg` replays the plan.
+
+    \b
+    Example:
+      nmfd bound economic_mpc --controller bound-pcrg
+    """
+    click.echo(nmfd.api.bound(nmfd.load_scenario(scenario, settings), controller, **options))
+
+
+@main.command(name="new-controller")
+@click.argument("file", type=FILE)
+def new_controller(file: Path) -> None:
+    """Write a commented template of a controller.
+
+    Every command takes it as FILE:Class. Packages can offer controllers by entry points of the group nmfd.controllers.
+
+    \b
+    Example:
+      nmfd new-controller mine.py
+      nmfd benchmark economic_mpc --controllers no-control,mine.py:MyController
+    """
+    if file.suffix != ".py":
+        raise InputError(f"{file}: expected a name that ends in .py, such as {file.with_suffix('.py')}")
+    if file.exists():
+        raise InputError(f"{file}: exists; choose another name")
+    text = resources.files("nmfd.controllers").joinpath("template.py").read_text(encoding="utf-8")
+    file.write_text(text.replace("FILE", str(file)), encoding="utf-8")
+    click.echo(
+        f"Written to {file}; try it with: nmfd benchmark economic_mpc "
+        f"--controllers no-control,{shlex.quote(str(file))}:MyController"
+    )
+
+
+@main.command()
+@click.argument("counts", type=FILE)
+@click.option(
+    "--detectors",
+    type=FILE,
+    metavar="CSV",
+    help="Table with detid, length (km of its link), and lanes, linkid, pos, long, lat (or x, y in m), region.",
+)
+@click.option("--regions", type=FILE, metavar="CSV", help="Table detid,region, if no other table has the region.")
+@click.option("--about", type=FILE, metavar="CSV", help="Table of regions: region, lane_km, trip_length, x, y (m).")
+@click.option("--adjacency", type=FILE, metavar="CSV|TOML", help="Table region,neighbour, or a network.toml.")
+@click.option("--trip-length", type=float, metavar="M", help="Mean trip length in a region. [default: from its size]")
+@click.option("--city", metavar="NAME", help="City, if the tables hold several.")
+@click.option("--skip-bad", is_flag=True, help="Leave out rows with a missing or impossible number, and count them.")
+@click.option("--out", type=FOLDER, required=True, metavar="DIR", help="Folder of the network, a new one.")
+def identify(counts: Path, out: Path, **options: Any) -> None:
+    """Fit a network to counts and occupancies of detectors.
+
+    COUNTS has the columns of UTD19 (utd19.ethz.ch): day, interval (s since midnight), detid, flow (veh/h per lane), occ
+    (share of the time); error, city, region if known. Writes network.toml, and mfd.png and identify.txt about the fit.
+
+    \b
+    Example:
+      nmfd identify counts.csv --detectors detectors.csv --regions regions.csv --trip-length 1500 --out networks/mine
+    """
+    click.echo(nmfd.api.identify(counts, out=out, **options).text)
+    click.echo(f"Written to {out}: see network.toml, mfd.png and identify.txt")
