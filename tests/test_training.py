@@ -15,45 +15,32 @@ from nmfd.controllers.dpc import training
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.dpc.rollout import Rollout
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError, RunFailed
 from nmfd.model.planning import planning_model
 
 # One value that is no default for every setting, and one beyond each end of what is allowed.
 CHOSEN = {
-    "width": 8,
-    "layers": 1,
-    "activation": "relu",
     "steps": 3,
-    "batch": 4,
     "learning_rate": 0.25,
-    "alternating": False,
-    "demand_spread": 0.5,
     "demand_low": 0.75,
     "demand_high": 1.5,
-    "initial_share": 0.25,
     "noise": 0.125,
     "mfd_spread": 0.375,
     "mfd_scale": 0.875,
     "detour_cost": 20.0,
-    "swing_cost": 3.0,
     "from_no_control": True,
     "local": True,
 }
 BEYOND = {
-    "width": (0, 10**9),
-    "layers": (0, 10**9),
     "steps": (0, 10**9),
-    "batch": (0, 10**9),
     "learning_rate": (0.0, 1.1),
-    "demand_spread": (-0.1, 1.1),
     "demand_low": (0.0, 1.1),
     "demand_high": (0.9, 101.0),
-    "initial_share": (-0.1, 1.1),
     "noise": (-0.1, 1e7),
     "mfd_spread": (-0.1, 1.1),
     "mfd_scale": (0.05, 1.1),
     "detour_cost": (-0.1, 1e7),
-    "swing_cost": (-0.1, 1e10),
 }
 
 
@@ -74,18 +61,18 @@ def made(scenario, *, guidance=False):
 
 def test_every_setting_is_taken_over(scenario):
     wanted = replace(scenario, controller_options={"dpc-pc": CHOSEN})
-    assert training.settings(wanted, "dpc-pc").model_dump() == {**training.Training().model_dump(), **CHOSEN}
-    assert training.settings(wanted, "dpc-pc", steps=7).steps == 7
-    assert training.settings(wanted, "dpc-pc").levels == (0.75, 1.5)
+    assert training.settings(wanted, parse("dpc-pc")).model_dump() == {**training.Training().model_dump(), **CHOSEN}
+    assert training.settings(wanted, parse("dpc-pc"), steps=7).steps == 7
+    assert training.settings(wanted, parse("dpc-pc")).levels == (0.75, 1.5)
     gate = replace(scenario, controller_options={"dpc-pc": {"from_gating": True}})
-    assert training.settings(gate, "dpc-pc").from_gating
-    assert training.settings(scenario, "dpc-pc") == training.Training()
+    assert training.settings(gate, parse("dpc-pc")).from_gating
+    assert training.settings(scenario, parse("dpc-pc")) == training.Training()
 
 
 @pytest.mark.parametrize("key, value", [(key, value) for key, ends in BEYOND.items() for value in ends])
 def test_what_is_out_of_range_is_refused(scenario, key, value):
     with pytest.raises(Exception, match=rf"dpc-pc\.{key}: ") as caught:
-        training.settings(replace(scenario, controller_options={"dpc-pc": {key: value}}), "dpc-pc")
+        training.settings(replace(scenario, controller_options={"dpc-pc": {key: value}}), parse("dpc-pc"))
     assert "\n" not in str(caught.value)
 
 
@@ -305,35 +292,37 @@ def steps(monkeypatch):
 
 
 def test_the_learning_rate_falls_to_a_tenth_along_a_cosine(tmp_path, scenario, steps):
-    chosen = replace(scenario, controller_options={"dpc-pc": {"learning_rate": 0.5, "batch": 2, "width": 4}})
-    training.train(chosen, "dpc-pc", seed=0, out=tmp_path / "p.pt", steps=4)
+    chosen = replace(
+        scenario,
+        controller_options={
+            "dpc-pc": {
+                "learning_rate": 0.5,
+            }
+        },
+    )
+    training.train(chosen, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=4)
     expected = [0.5 * (0.1 + 0.45 * (1.0 + math.cos(math.pi * k / 4))) for k in range(4)]
     assert [rate for rate, _, _ in steps] == pytest.approx(expected)
     assert expected[0] == 0.5 and expected[2] == pytest.approx(0.275)
     assert max(norm for _, _, norm in steps) <= 1.0 + 1e-5  # clipped
 
 
-@pytest.mark.parametrize("alternating", [True, False])
-def test_decoders_are_trained_in_turn(tmp_path, scenario, steps, alternating):
+def test_decoders_are_trained_in_turn(tmp_path, scenario, steps):
     """First the perimeter's, then that of the split ratios; the backbone always."""
-    options = {"alternating": alternating, "batch": 2, "width": 4}
-    training.train(
-        replace(scenario, controller_options={"dpc-pcrg": options}), "dpc-pcrg", seed=0, out=tmp_path / "p.pt", steps=2
-    )
+    training.train(scenario, parse("dpc-pcrg"), seed=0, out=tmp_path / "p.pt", steps=2)
     names = [name for name, _ in made(scenario, guidance=True).named_parameters()]
     for (_, given, _), left in zip(steps, ("splits_decoder", "perimeter_decoder"), strict=True):
         for name, has in zip(names, given, strict=True):
-            assert has == (not (alternating and name.startswith(left))), name
+            assert has == (not name.startswith(left)), name
 
 
-def test_the_best_validation_is_kept_and_told(tmp_path, scenario, monkeypatch):
+def test_the_best_validation_is_kept(tmp_path, scenario, monkeypatch):
     scores, logged, notes = iter([7.0, 5.0, 6.0]), [], []
-    monkeypatch.setattr(training, "VALIDATE_EVERY", 2)
+    monkeypatch.setattr(training, "VALIDATION_PERIOD", 2)
     monkeypatch.setattr(training, "validate", lambda *_: next(scores))
-    options = {"batch": 2, "width": 4}
     out = training.train(
-        replace(scenario, controller_options={"dpc-pc": options}),
-        "dpc-pc",
+        scenario,
+        parse("dpc-pc"),
         seed=3,
         out=tmp_path / "p.pt",
         steps=5,
@@ -350,38 +339,34 @@ def test_the_best_validation_is_kept_and_told(tmp_path, scenario, monkeypatch):
     ]
     configuration = torch.load(out, weights_only=True)["configuration"]
     assert configuration["validation_veh_s"] == 5.0
-    assert {key: configuration[key] for key in ("controller", "scenario", "seed", "compiled", "steps", "batch")} == {
+    assert {key: configuration[key] for key in ("controller", "scenario", "seed", "compiled", "steps")} == {
         "controller": "dpc-pc",
         "scenario": "tiny",
         "seed": 3,
         "compiled": False,
         "steps": 5,
-        "batch": 2,
     }
 
 
-def test_a_training_that_diverges_says_so(tmp_path, scenario, monkeypatch):
+def test_a_training_that_diverges_is_an_error(tmp_path, scenario, monkeypatch):
     monkeypatch.setattr(training, "validate", lambda *_: math.nan)
-    options = {"batch": 2, "width": 4}
     with pytest.raises(RunFailed, match="dpc-pc: every validation of 2 steps diverged; lower the learning rate"):
-        training.train(
-            replace(scenario, controller_options={"dpc-pc": options}), "dpc-pc", seed=0, out=tmp_path / "p.pt", steps=2
-        )
+        training.train(scenario, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=2)
 
 
 def test_what_cannot_be_trained_is_named(scenario):
-    with pytest.raises(InputError, match="'pi-gating' cannot be trained; choose one of dpc-pc"):
-        training.settings(scenario, "pi-gating")
+    with pytest.raises(InputError, match="'pi-gating' cannot be trained; choose dpc-pc"):
+        training.settings(scenario, parse("pi-gating"))
     with pytest.raises(InputError, match=r"'dpc-pc\+webster' needs a table .*dpc-pc\+webster"):
-        training.settings(scenario, "dpc-pc+webster")
+        training.settings(scenario, parse("dpc-pc+webster"))
 
 
 def test_a_wrong_setting_names_the_table_of_its_variant(scenario):
-    tables = {"dpc-pc": {"width": 8}, "dpc-pc+webster": {"batch": 0}}
-    with pytest.raises(InputError, match=r"controllers\.dpc-pc\+webster\.batch: "):
-        training.settings(replace(scenario, controller_options=tables), "dpc-pc+webster")
-    with pytest.raises(InputError, match=r"controllers\.dpc-pc\.width: "):
-        training.settings(replace(scenario, controller_options={"dpc-pc": {"width": 0}}), "dpc-pc")
+    tables = {"dpc-pc": {"steps": 8}, "dpc-pc+webster": {"noise": -1.0}}
+    with pytest.raises(InputError, match=r"controllers\.dpc-pc\+webster\.noise: "):
+        training.settings(replace(scenario, controller_options=tables), parse("dpc-pc+webster"))
+    with pytest.raises(InputError, match=r"controllers\.dpc-pc\.steps: "):
+        training.settings(replace(scenario, controller_options={"dpc-pc": {"steps": 0}}), parse("dpc-pc"))
 
 
 def test_the_model_that_a_controller_is_trained_on_must_be_measured(scenario):
@@ -389,25 +374,25 @@ def test_the_model_that_a_controller_is_trained_on_must_be_measured(scenario):
     own = replace(scenario.network, placeholder=True)
     city = replace(scenario, network=own)
     with pytest.raises(InputError, match="placeholder: is true.*--anyway trains dpc-pc all the same"):
-        training.check(city, "dpc-pc")
-    believed = training.check(scenario, "dpc-pc")
+        training.check(city, parse("dpc-pc"))
+    believed = training.check(scenario, parse("dpc-pc"))
     assert believed is not scenario.network and believed.hash == scenario.network.hash
     shut = replace(scenario.network, controllable=np.zeros_like(scenario.network.adjacency, dtype=float))
     with pytest.raises(InputError, match="controllable: is 0 at every boundary.*dpc-pcrg all the same"):
-        training.check(replace(scenario, network=shut), "dpc-pcrg")
+        training.check(replace(scenario, network=shut), parse("dpc-pcrg"))
 
 
 def test_nothing_is_trained_on_a_guess_unless_anyway(scenario, tmp_path):
     city = replace(scenario, network=replace(scenario.network, placeholder=True))
     with pytest.raises(InputError, match="placeholder: is true"):
-        training.train(city, "dpc-pc", seed=0, out=tmp_path / "a.pt", steps=1)
-    assert training.train(city, "dpc-pc", seed=0, out=tmp_path / "a.pt", steps=1, anyway=True).is_file()
+        training.train(city, parse("dpc-pc"), seed=0, out=tmp_path / "a.pt", steps=1)
+    assert training.train(city, parse("dpc-pc"), seed=0, out=tmp_path / "a.pt", steps=1, anyway=True).is_file()
 
 
 def test_a_policy_that_begins_as_no_control_is_nearly_that_after_a_step(scenario, tmp_path):
-    table = {"from_no_control": True, "width": 8, "batch": 2, "learning_rate": 1e-6}
+    table = {"from_no_control": True, "learning_rate": 1e-6}
     chosen = replace(scenario, controller_options={"dpc-pcrg": table})
-    file = training.train(chosen, "dpc-pcrg", seed=0, out=tmp_path / "a.pt", steps=1)
+    file = training.train(chosen, parse("dpc-pcrg"), seed=0, out=tmp_path / "a.pt", steps=1)
     perimeter, splits = load_policy(file, scenario.network)[0](torch.rand(2, 2, generator=torch.manual_seed(0)) * 100.0)
     assert perimeter[0, 1] > 0.8 and np.allclose(splits.detach(), scenario.network.nominal_splits, atol=0.05)
 
@@ -420,6 +405,6 @@ def test_a_model_of_its_own_counts(tmp_path):
     with (folder / "scenario.toml").open("a") as stream:
         stream.write('\n[controllers.dpc-pc]\nmodel = "../guessed"\n')
     scenario = load_scenario(folder)
-    training.check(scenario, "dpc-pcrg")
+    training.check(scenario, parse("dpc-pcrg"))
     with pytest.raises(InputError, match="guessed/network.toml: placeholder"):
-        training.check(scenario, "dpc-pc")
+        training.check(scenario, parse("dpc-pc"))
