@@ -106,7 +106,7 @@ def test_wrong_names_and_missing_plans(folder, tmp_path):
         (["bound", folder, "--controller", "bound-pc", "--out", tmp_path / "a" / "b.npz"], "no such folder"),
         (
             ["benchmark", folder, "--controllers", "bound-pc", "--out", tmp_path / "out"],
-            f"compute one with: nmfd bound {folder} --controller bound-pc",
+            f"make one with: nmfd bound {folder} --controller bound-pc",
         ),
     ):
         result = nmfd(*arguments)

@@ -162,7 +162,7 @@ def test_a_fingerprint_changes_with_what_the_runs_depend_on(scenario):
 
 
 def test_a_missing_policy_is_named(scenario):
-    with pytest.raises(InputError, match=r"dpc-pc\.pt: no such policy for dpc-pc; make one with nmfd train"):
+    with pytest.raises(InputError, match=r"dpc-pc\.pt: no such policy for dpc-pc; make one with: nmfd train"):
         parse("dpc-pc").make(scenario)
     with pytest.raises(InputError, match="controller greedy reads no policy"):
         parse("greedy").make(scenario, tiny)

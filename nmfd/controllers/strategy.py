@@ -39,7 +39,11 @@ from nmfd.types import Controller
 ALONE = "no-control"  # the controller of a name that consists of city words
 OWN = "own"  # table in [controllers] with the tables of the user's own controllers
 POLICY, PLAN, VALUE = ("policy", ".pt"), ("plan", ".npz"), ("value function", ".npz")  # files that controllers read
-MAKE_FILE = {POLICY: "nmfd train", PLAN: "nmfd bound", VALUE: "scenarios/economic_mpc/terminal_cost.py"}
+MAKE_FILE = {
+    POLICY: "nmfd train {folder} --controller {name}",
+    PLAN: "nmfd bound {folder} --controller {name}",
+    VALUE: "python scenarios/economic_mpc/terminal_cost.py {name}",
+}
 TERMINAL = {"mpc-pc-terminal": "dpc-pc", "mpc-pcrg-terminal": "dpc-pcrg"}  # MPC -> policy of its value function
 MODEL_FREE = ("no-control", "route-guidance", "probing-pc", "probing-pcrg")  # use no regional model
 
@@ -225,7 +229,8 @@ class Strategy:
             else shipped.found(policy, shipped.SCENARIO)
         )
         if not path.is_file():
-            raise InputError(f"{path}: no such {text} for {name}; make one with {MAKE_FILE[self.controller.reads]}")
+            command = MAKE_FILE[self.controller.reads].format(folder=scenario.folder, name=self.table(scenario))
+            raise InputError(f"{path}: no such {text} for {name}; make one with: {command}")
         return path
 
     def fingerprint(self, scenario: Scenario, policy: Path | None = None) -> dict[str, Any]:
