@@ -196,7 +196,7 @@ def test_an_empty_region_keeps_its_model_in_identification(scenario, result):
     assert static.mfds[0] == network.mfds[0] and static.mfds[3] != network.mfds[3]
     assert 0 in nearly_empty(samples_of(network, [alone])) and 3 not in nearly_empty(samples_of(network, [alone]))
     table = fit_table(static, region_fits(static, samples_of(network, [alone])))
-    assert f"nearly empty in all loading runs: 0 {network.region_names[0]}" in table
+    assert "few samples" in table
     fitted = replace(static, exit_rates=np.full((7, 7), 2.0), storage=np.full(7, 10.0))
     kept = as_it_was(static, fitted, [0])
     assert (kept.exit_rates[0] == 1.0).all() and kept.storage[0] == network.mfds[0].jam

@@ -9,9 +9,9 @@ region i, destination j); its flows run along a list of moves from cell to cell:
     dx_ogij/dt = sum_f u_gi m_ofgij - sum_{h in N_i - {o, g}} u_ih m_ogihj       g in N_i, o != i, j != i
     m_ogihj = theta_ogihj q_i(x_i) x_ogij
 
-After Tumu et al. (see `dynamics`), with the slips of the published text corrected: u_ih stands in every outflow;
-theta_ogihj is theta_ihj with h = g and h = o removed and renormalised over what is left (if nothing is, the least-bad
-next region is taken and counted); the sum that translates back keeps o = j and g = j where i = j.
+After Tumu et al. (see `dynamics`), with three corrections of the published text: u_ih limits every outflow; theta_ogihj
+is theta_ihj without h = g and h = o, renormalised (if nothing is left, the least-bad next region is taken and counted);
+the sum that translates back keeps o = j and g = j where i = j.
 """
 
 from dataclasses import dataclass
@@ -23,9 +23,7 @@ from nmfd.arrays import PerPair, PerRegion, PerTurn
 from nmfd.model.dynamics import SCHEMES
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
-# Less than this share of theta left after removing h = g and h = o counts as nothing: what remains is then the
-# rounding of an optimiser or a softmax, and scaling it up to 1 would make a route of noise.
-LEAST_SHARE = 1e-6
+LEAST_SHARE = 1e-6  # of theta left without h = g and h = o: less is the rounding of an optimiser, not a route
 
 PerCell = Float[np.ndarray, " C"]
 PerMove = Float[np.ndarray, " M"]
@@ -37,13 +35,13 @@ MoveMask = Bool[np.ndarray, " M"]
 
 @dataclass(frozen=True, kw_only=True)
 class Acyclic:
-    """The cells x_ogij and the moves between them, for one network.
+    """Cells x_ogij and the moves between them, for one network.
 
-    origin, previous, region, destination: (C,) int, the o, g, i, j of every cell; o = g = i where the trip starts
-    start: (R, R) int, [i, j] = the cell x_iiij in which demand d_ij appears
-    move_from, move_to: (M,) int, cells; move_next: (M,) int, the h of every move
-    move_onward: (M,) bool, false where the move turns back because the cell is a dead end
-    fallback: (C,) int, the least-bad move of every cell; -1 where the trip ends
+    origin, previous, region, destination: (C,) int, o, g, i, j of each cell; o = g = i where the trip starts
+    start: (R, R) int, [i, j]: the cell x_iiij that demand d_ij enters
+    move_from, move_to: (M,) int, cells; move_next: (M,) int, h of each move
+    move_onward: (M,) bool, false if the move turns back in a dead end
+    fallback: (C,) int, least-bad move of each cell; -1 where the trip ends
     a, b, c, jam: (R,) of the MFDs
     exit_rates: (C,) [-]; capacity: (R, R) [veh/s] under u = 1, or None; storage: (R,) [veh] or None
     """
@@ -68,7 +66,7 @@ class Acyclic:
 
 
 def build(network: RegionalModel) -> Acyclic:
-    """All cells that can be reached from x_iiij, and their moves."""
+    """Return all cells reachable from x_iiij, and their moves."""
     neighbours = [np.flatnonzero(row) for row in network.adjacency]
     cells: dict[tuple[int, int, int, int], int] = {}
     for i in range(network.regions):
@@ -77,12 +75,12 @@ def build(network: RegionalModel) -> Acyclic:
     start = np.arange(network.regions**2).reshape(network.regions, network.regions)
     queue, fallback = list(cells), {}
     moves: list[tuple[int, int, int, bool]] = []
-    for cell in queue:  # grows while it is walked
+    for cell in queue:  # grows during the loop
         o, g, i, j = cell
         if i == j:
             continue
         allowed = [h for h in neighbours[i] if h not in (o, g)]
-        # In a dead end there is no way on: turning back is then the least bad, and counted like every forced move.
+        # In a dead end turning back is the least-bad move, counted like every forced move.
         options = allowed or list(neighbours[i])
         best = min(options, key=lambda h: (not network.split_mask[i, h, j], network.hops[h, j], h))
         for h in allowed or [best]:
@@ -116,10 +114,9 @@ def build(network: RegionalModel) -> Acyclic:
 
 
 def shares(model: Acyclic, splits: PerTurn) -> tuple[PerMove, CellMask]:
-    """theta_ogihj of every move (M,) [-], and which cells are forced (C,) bool.
+    """Return theta_ogihj of each move (M,) [-], and the forced cells (C,) bool.
 
-    splits: (R, R, R) [-], [i, h, j] = theta_ihj. A cell is forced if theta leaves it nothing but its origin and its
-    previous region: it takes its least-bad move.
+    A cell is forced to its least-bad move if theta, splits (R, R, R) [-], leads only to its origin or previous region.
     """
     region, destination = model.region[model.move_from], model.destination[model.move_from]
     weight = splits[region, model.move_next, destination] * model.move_onward
@@ -131,14 +128,14 @@ def shares(model: Acyclic, splits: PerTurn) -> tuple[PerMove, CellMask]:
 
 
 def rate(model: Acyclic, x: PerCell) -> PerRegion:
-    """q_i [1/s] (R,) of the state x (C,) [veh], with x_i the sum of all x_ogij in i."""
+    """Return q_i (R,) [1/s] of the state x (C,) [veh]."""
     accumulation = np.bincount(model.region, x, minlength=len(model.jam))
     body = np.minimum(accumulation, model.jam)
     return ((model.a * body + model.b) * body + model.c) * model.jam / np.maximum(accumulation, model.jam)
 
 
 def derivative(model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, theta: PerMove) -> PerCell:
-    """dx/dt (C,) [veh/s] of x (C,) [veh] under demand (R, R) [veh/s], perimeter (R, R) [-] and theta (M,) [-]."""
+    """Return dx/dt (C,) [veh/s] of x (C,) [veh]; demand (R, R) [veh/s], perimeter (R, R) [-], theta (M,) [-]."""
     leaving = model.exit_rates * rate(model, x)[model.region] * x
     passing = transfers(model, x, leaving, perimeter, theta)
     change = -np.where(model.region == model.destination, leaving, 0.0)
@@ -149,7 +146,7 @@ def derivative(model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, 
 
 
 def transfers(model: Acyclic, x: PerCell, leaving: PerCell, perimeter: PerPair, theta: PerMove) -> PerMove:
-    """The flow of every move (M,) [veh/s], of those `leaving` (C,) [veh/s]; capacities as in dynamics.passing."""
+    """Return the flow of each move (M,) [veh/s] from `leaving` (C,) [veh/s]; capacities as in dynamics.passing."""
     wish, here = theta * leaving[model.move_from], model.region[model.move_from]
     if model.capacity is None:
         return perimeter[here, model.move_next] * wish
@@ -158,40 +155,6 @@ def transfers(model: Acyclic, x: PerCell, leaving: PerCell, perimeter: PerPair, 
     room = np.maximum(1.0 - np.bincount(model.region, x, minlength=regions) / model.storage, LEAST_ROOM)
     limit = perimeter * model.capacity * room + LEAST_LIMIT
     return (1.0 + (wish_of_pair / limit) ** SHARPNESS)[here, model.move_next] ** (-1.0 / SHARPNESS) * wish
-
-
-def euler(model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, theta: PerMove, step: float) -> PerCell:
-    """x after `step` [s] by forward Euler; keeps x >= 0 where step * q <= 1 and demand >= 0."""
-    return x + step * derivative(model, x, demand, perimeter, theta)
-
-
-def rk4(model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, theta: PerMove, step: float) -> PerCell:
-    """x after `step` [s] by the classical fourth-order Runge-Kutta scheme."""
-    k1 = derivative(model, x, demand, perimeter, theta)
-    k2 = derivative(model, x + 0.5 * step * k1, demand, perimeter, theta)
-    k3 = derivative(model, x + 0.5 * step * k2, demand, perimeter, theta)
-    k4 = derivative(model, x + step * k3, demand, perimeter, theta)
-    return x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-
-
-INTEGRATORS = {"euler": euler, "rk4": rk4}
-
-
-def advance(
-    model: Acyclic,
-    x: PerCell,
-    demand: PerPair,
-    perimeter: PerPair,
-    theta: PerMove,
-    step: float,
-    *,
-    integrator: str = "euler",
-    substeps: int = 1,
-) -> PerCell:
-    """x after one control interval of `step` [s], in `substeps` equal steps under constant controls and demand."""
-    for _ in range(substeps):
-        x = INTEGRATORS[integrator](model, x, demand, perimeter, theta, step / substeps)
-    return x
 
 
 def advance_counted(
@@ -205,7 +168,7 @@ def advance_counted(
     integrator: str = "euler",
     substeps: int = 1,
 ) -> tuple[PerCell, float]:
-    """As `advance`, and the trips [veh] that ended meanwhile, by the same scheme: for the ledger."""
+    """Return x after one control interval of `step` [s] under constant inputs, and the completed trips [veh]."""
     step, ended, ends = step / substeps, 0.0, model.region == model.destination
     for _ in range(substeps):
         slope, total = np.zeros_like(x), np.zeros_like(x)
@@ -220,7 +183,7 @@ def advance_counted(
 
 
 def translate(model: Acyclic, x: PerCell) -> PerPair:
-    """x_ij = sum over o, g of x_ogij (R, R) [veh]; o = j and g = j stay in for i = j, the trips inside a region."""
+    """Return x_ij = sum over o, g of x_ogij (R, R) [veh], including o = j and g = j for i = j."""
     regions = len(model.jam)
     flat = np.bincount(model.region * regions + model.destination, x, minlength=regions**2)
     return flat.reshape(regions, regions)

@@ -4,14 +4,14 @@ After Tumu, Shaw Cortez, Drgona, Vrabie and Glavaski, "Differentiable Predictive
 Networks", and the multi-region models with perimeter control of Geroliminis, Haddad and Ramezani (2013). Regions
 i, j, h; x_i = sum_j x_ij; N_i the regions adjacent to i:
 
-    q_i    = g_i(x_i) / x_i = a x_i^2 + b x_i + c      as a polynomial: nothing is divided, nothing undefined at x = 0
+    q_i    = g_i(x_i) / x_i = a x_i^2 + b x_i + c      polynomial, defined at x = 0
     m_ii   = q_i x_ii                                  trips that end in i
     m_ihj  = theta_ihj q_i x_ij                        j != i, h in N_i
     dx_ii/dt = d_ii - m_ii + sum_{h in N_i} u_hi m_hii
     dx_ij/dt = d_ij - sum_{h in N_i} u_ih m_ihj + sum_{h in N_i, h != j} u_hi m_hij        j != i
 
-Twins, which say what they add: `dynamics_casadi` (for IPOPT), `acyclic` (no vehicle turns back), and
-nmfd.controllers.mpc.edge_model (as a list of edges, with adjoint gradients).
+Twins: `dynamics_casadi` (for IPOPT), `acyclic` (no vehicle turns back), nmfd.controllers.mpc.edge_model (as edges, with
+adjoint gradients).
 
 Shapes: `...` is any batch. x (..., R, R) [veh], [i, j] in region i bound for j; demand (..., R, R) [veh/s];
 perimeter (..., R, R) [-], [i, h]; splits (..., R, R, R) [-], [i, h, j].
@@ -28,7 +28,7 @@ from nmfd.tensors import PerPair, PerRegion, PerRollout, PerTurn
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
-    """The network as tensors. a, b, c, jam: (R,) of the MFDs; adjacency, off_diagonal: (R, R), 0 or 1.
+    """Network parameters as tensors. a, b, c, jam: (R,) of the MFDs; adjacency, off_diagonal: (R, R), 0 or 1.
 
     exit_rates: (R, R) [-] or None; capacity: (R, R) [veh/s] under u = 1, or None; storage: (R,) [veh]
     """
@@ -47,7 +47,7 @@ class Parameters:
 def parameters(
     network: RegionalModel, *, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu"
 ) -> Parameters:
-    """The network as tensors of `dtype` on `device`."""
+    """Return the parameters of `network` as tensors."""
 
     def tensor(values: Any) -> Any:
         return None if values is None else torch.tensor(values, dtype=dtype, device=device)
@@ -69,16 +69,16 @@ def parameters(
 
 
 def rate(p: Parameters, accumulation: PerRegion) -> PerRegion:
-    """q_i = g_i(min(x_i, jam_i)) / x_i [1/s], of accumulation (..., R) [veh]; no division by zero at x = 0."""
+    """Return q_i = g_i(min(x_i, jam_i)) / x_i (..., R) [1/s] of accumulation (..., R) [veh]."""
     body = torch.minimum(accumulation, p.jam)
     return ((p.a * body + p.b) * body + p.c) * p.jam / torch.maximum(accumulation, p.jam)
 
 
 def flows(p: Parameters, x: PerPair, perimeter: PerPair, splits: PerTurn) -> tuple[PerRegion, PerTurn]:
-    """Trip completions m_ii (..., R) and transfer flows (..., R, R, R) [veh/s].
+    """Return trip completions m_ii (..., R) and transfer flows (..., R, R, R) [veh/s].
 
-    As published, u_ih m_ihj. Not published: with exit rates k_ij, m_ihj = k_ij theta_ihj q_i x_ij, and likewise m_ii;
-    with capacities, u_ih is replaced by `passing`.
+    As published, u_ih m_ihj. Extensions: exit rates k_ij multiply m_ihj and m_ii; with capacities, `passing` replaces
+    u_ih.
     """
     accumulation = x.sum(-1)
     leaving = rate(p, accumulation).unsqueeze(-1) * x
@@ -93,10 +93,10 @@ def flows(p: Parameters, x: PerPair, perimeter: PerPair, splits: PerTurn) -> tup
 
 
 def passing(p: Parameters, wish: PerPair, perimeter: PerPair, accumulation: PerRegion) -> PerPair:
-    """The share of `wish` (..., R, R) [veh/s], from i to h, that passes a boundary with a capacity (..., R, R) [-].
+    """Return the share (..., R, R) [-] of the desired flow `wish` (..., R, R) [veh/s] that passes each boundary.
 
-    The limit is u_ih times the capacity times the room in h, 1 - x_h / storage_h (boundary capacity that falls with the
-    receiving accumulation, as in Geroliminis, Haddad and Ramezani, 2013), accumulation (..., R) [veh].
+    The limit is u_ih times capacity times the room in h, 1 - x_h / storage_h (as in Geroliminis, Haddad and Ramezani,
+    2013), accumulation (..., R) [veh].
     """
     room = (1.0 - accumulation / p.storage).clamp(min=LEAST_ROOM)
     limit = perimeter * p.capacity * room.unsqueeze(-2)
@@ -104,10 +104,9 @@ def passing(p: Parameters, wish: PerPair, perimeter: PerPair, accumulation: PerR
 
 
 def admitted(backlog: PerPair, demand: PerPair, metering: PerRegion | None, step: float) -> tuple[PerPair, PerPair]:
-    """The demand (..., R, R) [veh/s] that may enter within `step` [s], and the backlog (..., R, R) [veh] after it.
+    """Return the demand (..., R, R) [veh/s] admitted within `step` [s], and the backlog (..., R, R) [veh] after it.
 
-    metering: (..., R) [veh/s], the most trips that may begin in each region, in equal shares of all who wait for the
-        same; None for all, of whom nobody waits if nobody did
+    metering: (..., R) [veh/s], largest departure rate of each region, shared in proportion; None: no limit
     """
     if metering is None:
         return demand + backlog / step, torch.zeros_like(backlog)
@@ -117,18 +116,18 @@ def admitted(backlog: PerPair, demand: PerPair, metering: PerRegion | None, step
 
 
 def derivative(p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn) -> PerPair:
-    """dx_ij/dt (..., R, R) [veh/s]."""
+    """Return dx_ij/dt (..., R, R) [veh/s]."""
     completions, transfers = flows(p, x, perimeter, splits)
     return demand - torch.diag_embed(completions) - transfers.sum(-2) + transfers.sum(-3)
 
 
 def euler(p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float) -> PerPair:
-    """x after `step` [s] by forward Euler; keeps x >= 0 where step * q <= 1 and demand >= 0."""
+    """Return x after `step` [s] by forward Euler; x stays >= 0 if step * q <= 1 and demand >= 0."""
     return x + step * derivative(p, x, demand, perimeter, splits)
 
 
 def rk4(p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float) -> PerPair:
-    """x after `step` [s] by the classical fourth-order Runge-Kutta scheme."""
+    """Return x after `step` [s] by the classical fourth-order Runge-Kutta scheme."""
     k1 = derivative(p, x, demand, perimeter, splits)
     k2 = derivative(p, x + 0.5 * step * k1, demand, perimeter, splits)
     k3 = derivative(p, x + 0.5 * step * k2, demand, perimeter, splits)
@@ -137,7 +136,7 @@ def rk4(p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: 
 
 
 INTEGRATORS = {"euler": euler, "rk4": rk4}
-# Weights of the slopes of each, and where each slope is taken, in steps along the slope before it.
+# Weights of the slopes, and the point of each slope in steps along the previous one.
 SCHEMES = {"euler": ((1.0,), (0.0,)), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0))}
 
 
@@ -152,7 +151,7 @@ def advance(
     integrator: str = "euler",
     substeps: int = 1,
 ) -> PerPair:
-    """x after one control interval of `step` [s], in `substeps` equal steps under constant controls and demand."""
+    """Return x after one control interval of `step` [s], in `substeps` equal steps under constant inputs."""
     for _ in range(substeps):
         x = INTEGRATORS[integrator](p, x, demand, perimeter, splits, step / substeps)
     return x
@@ -169,7 +168,7 @@ def advance_counted(
     integrator: str = "euler",
     substeps: int = 1,
 ) -> tuple[PerPair, PerRollout]:
-    """As `advance`, and the trips (...) [veh] that ended meanwhile, by the same scheme: for the ledger."""
+    """Return `advance` and the trips (...) [veh] completed meanwhile, for the ledger."""
     step, ended = step / substeps, torch.zeros(x.shape[:-2], dtype=x.dtype)
     for _ in range(substeps):
         slope, total, completed = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(ended)

@@ -2,7 +2,7 @@
 
 The same names and equations on SX, MX or DM matrices, without a batch: x (R, R) [veh], [i, j] in region i bound for j;
 demand (R, R) [veh/s]; perimeter (R, R) [-], [i, h]; splits: a sequence of R matrices (R, R) [-], splits[i][h, j].
-Structural zeros are kept: what x, perimeter or splits leave out of their sparsity costs nothing.
+Structural zeros of x, perimeter and splits are kept.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ Turns: TypeAlias = Sequence[Matrix]  # R of them
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
-    """The network as CasADi constants. a, b, c, jam: (R, 1) of the MFDs; adjacency: (R, R), 1 or structural zero.
+    """Parameters as CasADi constants. a, b, c, jam: (R, 1) of the MFDs; adjacency: (R, R), 1 or structural zero.
 
     exit_rates: (R, R) [-] or None; capacity: (R, R) [veh/s] under u = 1, or None; storage: (1, R) [veh]
     """
@@ -37,7 +37,7 @@ class Parameters:
 
 
 def parameters(network: RegionalModel) -> Parameters:
-    """The network as constants."""
+    """Return the parameters of `network`."""
 
     def column(name: str) -> ca.DM:
         return ca.DM([getattr(m, name) for m in network.mfds])
@@ -58,18 +58,18 @@ def parameters(network: RegionalModel) -> Parameters:
 
 
 def splits_list(splits: PerTurn) -> list[ca.DM]:
-    """theta (R, R, R) [i, h, j] as the R sparse matrices [h, j] that this module takes."""
+    """Return theta (R, R, R) [i, h, j] as R sparse matrices [h, j]."""
     return [ca.sparsify(ca.DM(rows)) for rows in splits]
 
 
 def rate(p: Parameters, accumulation: Matrix) -> Matrix:
-    """q_i = g_i(min(x_i, jam_i)) / x_i [1/s], of accumulation (R, 1) [veh]; no division by zero at x = 0."""
+    """Return q_i = g_i(min(x_i, jam_i)) / x_i (R, 1) [1/s] of accumulation (R, 1) [veh]."""
     body = ca.fmin(accumulation, p.jam)
     return ((p.a * body + p.b) * body + p.c) * p.jam / (accumulation + p.jam - body)
 
 
 def flows(p: Parameters, x: Matrix, perimeter: Matrix, splits: Turns) -> tuple[Matrix, list[Matrix]]:
-    """Trip completions m_ii (R, 1) and transfer flows [veh/s], R matrices (R, R) [h, j]; options as in `dynamics`."""
+    """Return trip completions m_ii (R, 1) and transfer flows [veh/s], R matrices (R, R) [h, j]."""
     regions, accumulation = x.shape[0], ca.sum2(x)
     leaving = ca.repmat(rate(p, accumulation), 1, regions) * x
     if p.exit_rates is not None:
@@ -86,14 +86,14 @@ def flows(p: Parameters, x: Matrix, perimeter: Matrix, splits: Turns) -> tuple[M
 
 
 def passing(p: Parameters, wish: Matrix, perimeter: Matrix, accumulation: Matrix) -> Matrix:
-    """The share of `wish` (R, R) [veh/s], from i to h, that passes a boundary with a capacity (R, R) [-]."""
+    """Return the share (R, R) [-] of the desired flow `wish` (R, R) [veh/s] that passes each boundary."""
     room = ca.fmax(1.0 - accumulation.T / p.storage, LEAST_ROOM)
     limit = perimeter * p.capacity * ca.repmat(room, wish.shape[0], 1)
     return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
 
 
 def derivative(p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns) -> Matrix:
-    """dx_ij/dt (R, R) [veh/s]."""
+    """Return dx_ij/dt (R, R) [veh/s]."""
     completions, transfers = flows(p, x, perimeter, splits)
     leaving = ca.vertcat(*(ca.sum1(transfer) for transfer in transfers))
     entering = sum(transfers[1:], transfers[0])
@@ -101,12 +101,12 @@ def derivative(p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, spli
 
 
 def euler(p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns, step: float) -> Matrix:
-    """x after `step` [s] by forward Euler; keeps x >= 0 where step * q <= 1 and demand >= 0."""
+    """Return x after `step` [s] by forward Euler."""
     return x + step * derivative(p, x, demand, perimeter, splits)
 
 
 def rk4(p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns, step: float) -> Matrix:
-    """x after `step` [s] by the classical fourth-order Runge-Kutta scheme."""
+    """Return x after `step` [s] by the classical fourth-order Runge-Kutta scheme."""
     k1 = derivative(p, x, demand, perimeter, splits)
     k2 = derivative(p, x + 0.5 * step * k1, demand, perimeter, splits)
     k3 = derivative(p, x + 0.5 * step * k2, demand, perimeter, splits)
@@ -128,7 +128,7 @@ def advance(
     integrator: str = "euler",
     substeps: int = 1,
 ) -> Matrix:
-    """x after one control interval of `step` [s], in `substeps` equal steps under constant controls and demand."""
+    """Return x after one control interval of `step` [s], in `substeps` equal steps under constant inputs."""
     for _ in range(substeps):
         x = INTEGRATORS[integrator](p, x, demand, perimeter, splits, step / substeps)
     return x

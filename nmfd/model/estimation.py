@@ -1,23 +1,20 @@
-"""Estimates of x_ij from loop detectors, boundary counts and probe vehicles: an extended Kalman filter on the NMFD.
+"""Estimation of x_ij from loop detectors, boundary counts and probe vehicles: an extended Kalman filter on the NMFD.
 
 After Saeedmanesh, Kouvelas and Geroliminis, "An extended Kalman filter approach for real-time state estimation in
 multi-region MFD urban networks", Transportation Research C 132 (2021); joint estimation of state and model parameters
 as in Wang and Papageorgiou, "Real-time freeway traffic state estimation based on extended Kalman filter",
 Transportation Research B 39 (2005).
 
-State: x (R, R) [veh] and, per region, three relative errors that wander about zero: of the outflow of the MFD (the
-model is wrong), of the forecast demand (it is not that day's, or vehicles cannot enter), and of the expansion of the
-loop detectors (those links are not the average link). What is measured during a control interval is predicted together
-with the state at its end: the mean accumulations, the vehicles over the boundaries, and what the probes do. The
-covariance follows from counting vehicles: every flow is Poisson, and a probe that moves is one of the vehicles that
-move. So a probe that was seen before is little news; that it left, or that another one set out, is.
+State: x (R, R) [veh] and, per region, three relative errors around zero: of the outflow of the MFD, of the forecast
+demand, and of the expansion of the loop detectors. The readings of a control interval (mean accumulations, boundary
+counts, probes) are predicted together with the state at its end. The covariance follows from counting vehicles: every
+flow is Poisson, and a probe that moves is one of the vehicles that move.
 
-Bounds: no cell can hold fewer vehicles than the probes seen in it. An estimate below is projected on the bounds in the
-metric of its covariance (Simon, "Kalman filtering with state constraints", IET Control Theory and Applications 4,
-2010), which moves what correlates with it, where clipping would invent vehicles.
+Bounds: no cell holds fewer vehicles than its probes. An estimate below is projected on the bounds in the metric of its
+covariance (Simon, "Kalman filtering with state constraints", IET Control Theory and Applications 4, 2010).
 
-Integrated by forward Euler in the scenario's substeps. The Jacobian is taken by forward differences, all in one batch:
-R^2 rollouts of one interval, which is a few milliseconds for 7 regions and not meant for hundreds.
+Integrated by forward Euler in the scenario's substeps. The Jacobian is taken by forward differences in one batch of R^2
+rollouts: a few milliseconds for 7 regions, not meant for hundreds.
 """
 
 from dataclasses import dataclass
@@ -35,28 +32,27 @@ from nmfd.types import Controls
 
 Vector = Float[np.ndarray, " N"]
 Square = Float[np.ndarray, "N N"]
-# The three relative errors: standard deviation [-] (of the expansion it is `Instruments.detector_error`), and the time
-# after which they are forgotten [s]: queues come and go in a quarter of an hour, which links are busy changes slowly.
+# Relative errors: memory [s] and standard deviation [-] (of the expansion: `Instruments.detector_error`).
 MEMORY, EXPANSION_MEMORY = 900.0, 3600.0
 OUTFLOW_ERROR, DEMAND_ERROR = 0.3, 0.3
-# Of every single flow, and of every way out of a cell as a share of what leaves it: drivers take other ways, and trips
-# are not exponential. As long as MEMORY too, but not worth a state each: white noise that sums up to the same.
+# Relative error of each flow, and of each turn as a share of what leaves the cell, with the memory MEMORY: modelled as
+# white noise with the same sum instead of a state each.
 FLOW_ERROR, STRAY = 0.2, 0.02
-COUNT_ERROR = 0.3  # [-], of vehicles over a boundary, expanded from one counted gateway to all alike
-FLOOR = 0.01  # [veh^2], variance of a reading that would be exact
-DIFFERENCE = 1e-5  # of the Jacobian [veh], [-]
+COUNT_ERROR = 0.3  # [-], of crossings expanded from one counted gateway to all
+FLOOR = 0.01  # [veh^2], variance of an exact reading
+DIFFERENCE = 1e-5  # of the Jacobian [veh] or [-]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Instruments:
-    """What is known of the instruments.
+    """Coverage and errors of the instruments.
 
-    detector_share: (R,) [-], share of the lane length of the region that loop detectors stand for; 0: none there
-    detector_error, detector_noise: (R,) [-], standard deviations of the relative error of the expanded accumulation, of
-        the part that lasts and of that which is another one in every interval
-    counted_share: (R, R) [-], [i, h] = share of the lanes over that boundary that are counted
+    detector_share: (R,) [-], share of the lane length of each region covered by loop detectors
+    detector_error, detector_noise: (R,) [-], standard deviations of the lasting and of the white relative error of the
+        expanded accumulation
+    counted_share: (R, R) [-], [i, h]: share of the lanes over that boundary that are counted
     counted_gateways: (R, R), their number
-    probe_share: of all vehicles [-]
+    probe_share: share of all vehicles [-]
     """
 
     detector_share: PerRegion
@@ -69,12 +65,12 @@ class Instruments:
 
 @dataclass(frozen=True, kw_only=True)
 class Readings:
-    """What was measured in one control interval; NaN where nothing was.
+    """Measurements of one control interval; NaN where there is none.
 
     accumulation: (R,) [veh], mean over the interval, expanded from the detectors to the region
     crossings: (R, R) [veh], [i, h], counted during the interval, expanded to all gateways
-    probes: (R, R) [veh], [i, j] = in region i bound for j at the end of the interval; not expanded
-    probe_departures: (R, R) [veh], [i, j] = set out during the interval; not expanded
+    probes: (R, R) [veh], [i, j]: in region i bound for j at the end of the interval; not expanded
+    probe_departures: (R, R) [veh], [i, j]: departed during the interval; not expanded
     """
 
     accumulation: PerRegion
@@ -85,10 +81,12 @@ class Readings:
 
 @dataclass(frozen=True, kw_only=True)
 class Belief:
-    """mean: (3 R + R^2,), the relative errors of outflow, demand and expansion, and x by rows; covariance of it
-    probes: (R, R) [veh], where they were last seen
-    surprise: normalised squared innovation of the last update, over the number of readings that were uncertain: 1 on
-        average if the covariances are right; NaN without a reading
+    """Mean and covariance of the state.
+
+    mean: (3 R + R^2,), relative errors of outflow, demand and expansion, and x by rows
+    probes: (R, R) [veh], at their last reading
+    surprise: normalised squared innovation of the last update per uncertain reading: 1 on average if the covariances
+        are right; NaN without a reading
     """
 
     mean: Vector
@@ -98,7 +96,7 @@ class Belief:
 
 
 class Estimator:
-    """The filter along one run: `step` once per control interval. `accumulation` (R, R) [veh] is the estimate."""
+    """Filter along one run: call `step` once per control interval."""
 
     def __init__(self, planning: PlanningModel, instruments: Instruments):
         self._planning, self._instruments = planning, instruments
@@ -106,21 +104,21 @@ class Estimator:
         self.reset()
 
     def reset(self) -> None:
-        """Begin with an empty network."""
+        """Return to an empty network."""
         self._k, self._seen = 0, list[np.ndarray]()
         self.belief = self._model.empty()
 
     @property
     def accumulation(self) -> PerPair:
-        """(R, R) [veh]."""
+        """Estimate of x_ij (R, R) [veh]."""
         regions = self._planning.network.regions
         return self.belief.mean[3 * regions :].reshape(regions, regions).copy()
 
     def step(self, controls: Controls, readings: Readings) -> PerPair:
-        """The estimate at the end of the interval under `controls`; the forecast is the scenario's demand."""
+        """Return the estimate (R, R) [veh] at the end of the interval under `controls`."""
         demand = self._planning.forecast[min(self._k, self._planning.steps - 1)]
         splits = self._planning.network.nominal_splits if controls.splits is None else controls.splits
-        # A detector that shows to the last digit what it showed twice before is stuck.
+        # A detector with three identical readings is stuck.
         self._seen = [*self._seen[-2:], readings.accumulation]
         stuck = np.ptp(self._seen, axis=0) == 0 if len(self._seen) == 3 else np.zeros(len(demand), dtype=bool)
         loops = np.where(stuck & (readings.accumulation > 0), np.nan, readings.accumulation)
@@ -130,10 +128,10 @@ class Estimator:
 
 
 class _Model:
-    """Prediction and update. In torch: its threads are limited where runs stand side by side, NumPy's are not.
+    """Prediction and update, in torch, whose threads can be limited.
 
     Z = (3 relative errors, x | mean accumulations (R,), crossings (E,), probes (R^2,), departures of probes (R^2,)):
-    the state at the end of an interval, and what is measured of it, jointly Gaussian. E: the boundaries (i, h).
+    state at the end of an interval and readings, jointly Gaussian. E: the boundaries (i, h).
     """
 
     def __init__(self, planning: PlanningModel, instruments: Instruments):
@@ -160,11 +158,11 @@ class _Model:
         memory = torch.tensor([MEMORY, MEMORY, EXPANSION_MEMORY], dtype=torch.float64)
         self._kept = torch.exp(-self._step / memory).repeat_interleave(regions)
         kept = np.exp(-self._step / MEMORY)
-        self._lasting = float((1.0 + kept) / (1.0 - kept))  # variance of white noise over that of what lasts
+        self._lasting = float((1.0 + kept) / (1.0 - kept))  # variance of white over lasting noise
         self._turns = np.argwhere(network.split_mask)
         self._from = torch.from_numpy(
             np.concatenate(
-                [  # the cell, of every event but departures
+                [  # cell of each event but departures
                     self._turns[:, 0] * regions + self._turns[:, 2],
                     np.arange(regions) * (regions + 1),
                 ]
@@ -175,9 +173,10 @@ class _Model:
         self._half = vehicle[cells : cells + regions]
 
     def _effects(self) -> tuple[np.ndarray, np.ndarray]:
-        """(first part, events), (second part, events): what one vehicle changes in (x | mean accumulations, crossings),
-        and a probe besides in (probes, departures), by a turn (i, h, j), the end of a trip in i, a departure from i for
-        j, in this order."""
+        """Return changes per event (rows, events) of (x | mean accumulations, crossings), and of (probes, departures).
+
+        Events: turns (i, h, j), completed trips in i, departures from i for j, in this order.
+        """
         regions, cells = self._regions, np.arange(self._cells)
         here, onward, bound = self._turns.T
         number, turns = np.arange(len(here)), len(here)
@@ -189,12 +188,12 @@ class _Model:
         crossing, departure = np.zeros((len(self._boundaries), place.shape[1])), np.zeros_like(place)
         crossing[:, :turns] = (self._turns[None, :, :2] == self._boundaries[:, None]).all(axis=2)
         departure[cells, turns + regions + cells] = 1.0
-        # An event is in the middle of the interval on average, and so counts half in the mean.
+        # An event in the middle of the interval, on average, counts half in the mean.
         half = 0.5 * place.reshape(regions, regions, -1).sum(axis=1)
         return np.concatenate([place, half, crossing]), np.concatenate([place, departure])
 
     def empty(self) -> Belief:
-        """Of a city without vehicles."""
+        """Return the belief of an empty network."""
         mean, variance = np.zeros(self._states), torch.full((self._cells,), FLOOR, dtype=torch.float64)
         return Belief(
             mean=mean,
@@ -206,7 +205,7 @@ class _Model:
     def advance(
         self, belief: Belief, demand: PerPair, perimeter: PerPair, splits: PerTurn, readings: Readings, loops: PerRegion
     ) -> Belief:
-        """The belief one control interval later. loops: (R,) [veh], the accumulations that are to be trusted."""
+        """Return the belief one control interval later; loops: (R,) [veh], valid detector readings."""
         z, covariance, leaving = self._predicted(belief, demand, perimeter, splits)
         mean, posterior, surprise = z[: self._states], covariance[: self._states, : self._states], np.nan
         reading, expected, noise = self._readings(z, leaving, readings, loops)
@@ -217,11 +216,11 @@ class _Model:
             towards = ahead[:, : self._states]
             root = torch.linalg.cholesky(spread)
             innovation = torch.from_numpy((reading - expected)[there])[:, None]
-            # With S = L L' the spread of the readings: L^-1 of what they say, and of what the state has to do with it.
+            # With S = L L' the covariance of the readings: L^-1 of innovation and cross-covariance.
             whitened = torch.linalg.solve_triangular(root, torch.cat([towards, innovation], dim=1), upper=False)
             mean = mean + (whitened[:, :-1].T @ whitened[:, -1]).numpy()
             posterior = posterior - whitened[:, :-1].T @ whitened[:, :-1]
-            measured = there < len(reading) - self._cells  # the last ones are not: see `_readings`
+            measured = there < len(reading) - self._cells  # the last ones are pseudo-readings
             uncertain = (spread.diagonal().numpy() > 10.0 * FLOOR)[measured].sum()
             surprise = float((whitened[measured, -1] ** 2).sum()) / max(int(uncertain), 1)
         posterior = (0.5 * (posterior + posterior.T)).numpy()
@@ -235,9 +234,9 @@ class _Model:
     def _predicted(
         self, belief: Belief, demand: PerPair, perimeter: PerPair, splits: PerTurn
     ) -> tuple[np.ndarray, torch.Tensor, np.ndarray]:
-        """Z (size,), its covariance, and what leaves every cell (R^2,) [veh]."""
+        """Return Z (size,), its covariance, and the vehicles that leave each cell (R^2,) [veh]."""
         mean, errors, first = torch.from_numpy(belief.mean), self._x.start, self._expansion.start
-        # Of the flows: all inputs but the expansion.
+        # Flows depend on all inputs but the expansion.
         inputs = torch.cat([torch.arange(first), torch.arange(errors, self._states)])
         points = mean[inputs].repeat(len(inputs) + 1, 1)
         points[1:] += DIFFERENCE * torch.eye(len(inputs), dtype=torch.float64)
@@ -256,14 +255,14 @@ class _Model:
     def _rollout(
         self, points: torch.Tensor, probes: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """All of Z but the relative errors at `points` (B, 2 R + R^2); and the events of the first one, (events,)
-        [veh], of all vehicles and of probes."""
+        """Return Z without the relative errors at `points` (B, 2 R + R^2), and the events (events,) [veh] of the first
+        point, of all vehicles and of probes."""
         regions, batch = self._regions, len(points)
         duration = self._step / self._substeps
         controls = [torch.tensor(given, dtype=torch.float64) for given in (perimeter, splits)]
         x = points[:, 2 * regions :].reshape(batch, regions, regions)
         outflow, wish = (1.0 + points[:, : 2 * regions].reshape(batch, 2, regions)).clamp(min=0.0).unbind(1)
-        outflow = outflow.minimum(1.0 / (duration * self._fastest))  # no more leave than there are
+        outflow = outflow.minimum(1.0 / (duration * self._fastest))  # at most all vehicles leave
         entering = duration * torch.from_numpy(demand) * wish[:, :, None]
         n = torch.from_numpy(probes).expand(batch, -1, -1)
         mean, crossings = torch.zeros_like(outflow), torch.zeros_like(x)
@@ -295,8 +294,8 @@ class _Model:
     def _flow_noise(
         self, belief: Belief, moves: torch.Tensor, seen: torch.Tensor, leaving: torch.Tensor
     ) -> torch.Tensor:
-        """The covariance of Z without its relative errors that comes from the flows (events,) [veh] of which `seen` are
-        probes: whole vehicles, so Poisson, and other flows than modelled, for probes and others alike."""
+        """Return the covariance of Z, without relative errors, due to the flows (events,) [veh], `seen` of probes:
+        Poisson counts and errors of the modelled flows."""
         x, turns = torch.from_numpy(belief.mean[self._x]), len(self._turns)
         cell = self._from[:turns]
         error = FLOW_ERROR * moves
@@ -310,15 +309,15 @@ class _Model:
             torch.zeros(shape, dtype=x.dtype).index_put_(index[:2], value * weight[index[2]], accumulate=True)
             for (shape, index, value), weight in zip(self._pairs, weights, strict=True)
         ]
-        # When in the interval an event was also moves the mean: evenly distributed, a variance of 1/12 of its effect.
+        # The time of an event, uniform in the interval, adds 1/12 of its squared effect to the mean.
         parts[0].diagonal()[self._cells : self._cells + self._regions] += self._half**2 @ moves / 3.0
         return torch.cat([torch.cat(parts[:2], dim=1), torch.cat([parts[1].T, parts[2]], dim=1)])
 
     def _readings(self, z: np.ndarray, leaving: np.ndarray, readings: Readings, loops: np.ndarray) -> tuple:
-        """All readings (m,), NaN where there is none, their expectation and the variance of their own noise (m,).
+        """Return the readings (m,), NaN where there is none, their expectation and their noise variance (m,).
 
-        The last R^2 are no measurements, but keep a wrong model from going astray: that the probes are a share of the
-        vehicles. A draw of probes lasts until they leave, MEMORY at most, so the longer, the less it counts each time.
+        The last R^2 are pseudo-readings against model drift: probes are a fixed share of the vehicles. The same probes
+        count less each time, because they stay until they leave, MEMORY at most.
         """
         known = self._instruments
         here, to = self._boundaries.T
@@ -332,7 +331,7 @@ class _Model:
         kept = np.minimum(np.exp(-leaving / there), np.exp(-self._step / MEMORY))
         thinning = p * (1.0 - p) * there * (1.0 + kept) / (1.0 - kept) + FLOOR
         parts = (
-            # a share of the links sees a share of the vehicles; the lasting part of the error is a state
+            # the lasting part of the error is a state
             (
                 loops,
                 (1.0 + expansion) * mean,
@@ -350,7 +349,7 @@ class _Model:
         return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
     def _rows(self, z: np.ndarray, matrix: torch.Tensor) -> torch.Tensor:
-        """(m, n): how the readings change with Z, times a matrix (size, n)."""
+        """Return the Jacobian of the readings by Z times a matrix (size, n): (m, n)."""
         expansion, mean = (torch.from_numpy(z[part])[:, None] for part in (self._expansion, self._mean))
         loops = (1.0 + expansion) * matrix[self._mean] + mean * matrix[self._expansion]
         share = matrix[self._probes] - self._probe_share * matrix[self._x]
@@ -358,27 +357,26 @@ class _Model:
 
 
 def _pairs(left: torch.Tensor, right: torch.Tensor) -> tuple:
-    """What of left (m, events) meets what of right (n, events) in one event, for the sums left diag(w) right' (m, n):
-    their shape, (row, column, event), product."""
+    """Return shape, (row, column, event) and product of the non-zeros of left diag(w) right' (m, n)."""
     product = left[:, None] * right[None]
     index = product.nonzero(as_tuple=True)
     return product.shape[:2], index, product[index]
 
 
 def _moved(share: tensors.PerPair, completions: tensors.PerRegion, transfers: tensors.PerTurn) -> tensors.PerPair:
-    """Net change (B, R, R) of what is `share` of the vehicles of every cell."""
+    """Return the net change (B, R, R) of the `share` of the vehicles of each cell."""
     out = share.unsqueeze(2) * transfers
     return out.sum(1) - out.sum(2) - torch.diag_embed(torch.diagonal(share, dim1=1, dim2=2) * completions)
 
 
 def bounded(mean: Vector, covariance: Square, lower: Vector) -> Vector:
-    """The point nearest to `mean` (n,), in the metric of `covariance` (n, n), that is nowhere below `lower` (n,).
+    """Return the point nearest to `mean` (n,) in the metric of `covariance` (n, n) that is >= `lower` (n,).
 
-    It is mean + C y with multipliers y >= 0 of the bounds: a non-negative least-squares problem in y.
+    It is mean + C y with multipliers y >= 0: a non-negative least-squares problem in y.
     """
     below = lower - mean
     if (below <= 0).all():
         return mean
     root = np.linalg.cholesky(covariance + (1e-6 + 1e-9 * np.trace(covariance)) * np.eye(len(mean)))
     multipliers, _ = nnls(root.T, np.linalg.solve(root, below), maxiter=30 * len(mean))
-    return np.maximum(mean + covariance @ multipliers, lower)  # beyond the bounds only what the jitter leaves
+    return np.maximum(mean + covariance @ multipliers, lower)  # the jitter leaves small violations

@@ -1,8 +1,7 @@
 """The outflow MFD of a region: g(x) = a x^3 + b x^2 + c x, constant beyond the jam accumulation.
 
-The tail is not published. The benchmark's cubic has its least outflow per vehicle at 10,019 vehicles and rises beyond:
-at 13,000 it would discharge 5.4 veh/s, and a jammed region would cure itself. With g(jam) beyond the jam accumulation
-the published figures hang together.
+The tail is not published. The benchmark's cubic rises again beyond 10,019 vehicles: a jammed region would recover by
+itself. With g(jam) beyond the jam accumulation the published figures are consistent.
 """
 
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ Samples = Real[np.ndarray, " N"]
 
 @dataclass(frozen=True, kw_only=True)
 class Mfd:
-    """Outflow against accumulation of one region.
+    """Outflow of one region against its accumulation.
 
     a [veh^-2 s^-1], b [veh^-1 s^-1], c [s^-1]: coefficients of the cubic.
     jam [veh]: the accumulation beyond which the outflow stays at g(jam); infinity for a bare cubic.
@@ -24,7 +23,7 @@ class Mfd:
         >>> curve = Mfd(a=4.133e-11, b=-8.282e-7, c=0.0042, jam=10000.0)  # the benchmark's
         >>> round(curve.critical), round(curve.capacity, 2)
         (3402, 6.33)
-        >>> round(float(curve.outflow(8000.0)), 2)  # more vehicles bring less
+        >>> round(float(curve.outflow(8000.0)), 2)  # beyond the critical accumulation
         1.76
     """
 
@@ -34,34 +33,34 @@ class Mfd:
     jam: float
 
     def rate(self, accumulation: Values | float) -> Values:
-        """Outflow per vehicle q(x) = g(x)/x [1/s] of `accumulation` (...) [veh]; c at x = 0."""
+        """Return the outflow per vehicle q(x) = g(x)/x [1/s] of `accumulation` (...) [veh]; c at x = 0."""
         x = np.asarray(accumulation, dtype=float)
         body = np.minimum(x, self.jam)
         q = (self.a * body + self.b) * body + self.c
         return np.where(x > self.jam, q * self.jam / np.maximum(x, self.jam), q) if np.isfinite(self.jam) else q
 
     def outflow(self, accumulation: Values | float) -> Values:
-        """g(x) [veh/s] of `accumulation` (...) [veh]."""
+        """Return g(x) [veh/s] of `accumulation` (...) [veh]."""
         return self.rate(accumulation) * np.asarray(accumulation, dtype=float)
 
     @property
     def critical(self) -> float:
-        """The accumulation of maximum outflow [veh]."""
+        """Accumulation of maximum outflow [veh]."""
         grid = np.linspace(0.0, self.jam if np.isfinite(self.jam) else -self.c / self.b * 2, 20001)
         return float(grid[np.argmax(self.outflow(grid))])
 
     def reaching(self, share: float) -> float:
-        """The smallest accumulation with `share` of the maximum outflow [veh]; the critical one for 1."""
+        """Return the smallest accumulation [veh] with `share` of the maximum outflow."""
         grid = np.linspace(0.0, self.critical, 20001)
         return float(grid[np.argmax(self.outflow(grid) >= share * self.capacity * (1.0 - 1e-12))])
 
     @property
     def capacity(self) -> float:
-        """The maximum outflow [veh/s]."""
+        """Maximum outflow [veh/s]."""
         return float(self.outflow(self.critical))
 
     def problem(self) -> str | None:
-        """Why this is no MFD, or None: it must start with positive slope and stay positive up to the jam."""
+        """Return why this is no MFD, or None: the slope at 0 and the outflow up to the jam must be positive."""
         if not self.c > 0:
             return f"c must be positive (the free-flow slope), got {self.c:g}"
         if not self.jam > 0:
@@ -78,12 +77,11 @@ class Mfd:
 
 
 def fit(accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bins: int = 24) -> Mfd:
-    """The curve closest to samples (n,) [veh], (n,) [veh/s] that is safe to use: least squares over bin medians.
+    """Fit a curve to samples (n,) [veh], (n,) [veh/s] by least squares over the medians of bins of accumulation.
 
-    The rate q(x) = a x^2 + b x + c is kept positive and falling up to the jam accumulation and at most `max_rate`
-    [1/s] (the inverse of the integration step). The jam accumulation is that of the best fit, at most the largest
-    sample: where there is no data the outflow stays constant. Every bin of accumulation counts alike, so that the
-    many samples of an empty city do not decide. Raises ValueError without samples.
+    The rate q(x) = a x^2 + b x + c is positive, falling up to the jam accumulation and at most `max_rate` [1/s] (the
+    inverse of the integration step). The jam accumulation is at most the largest sample: beyond the data the outflow
+    is constant. Raises ValueError without samples.
     """
     x, g = np.asarray(accumulation, dtype=float), np.asarray(outflow, dtype=float)
     good = np.isfinite(x) & np.isfinite(g) & (x > 0)
@@ -101,8 +99,8 @@ def fit(accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bi
 
 
 def _fit_cubic(x: np.ndarray, g: np.ndarray, jam: float, max_rate: float) -> Mfd:
-    """The best curve with a given jam accumulation."""
-    from scipy.optimize import minimize  # slow to import, and only identification needs it
+    """Fit a curve with a given jam accumulation."""
+    from scipy.optimize import minimize  # slow to import
 
     # Scaled: g = (A y^2 + B y + C) y with y = x / jam, at most 1. Falling: B <= 0 and 2 A + B <= 0 (q' is linear).
     # Positive at the jam: A + B + C >= floor.

@@ -1,17 +1,17 @@
-"""The regional plants: the NMFD itself and its acyclic variant."""
+"""Regional plants: the NMFD and its acyclic variant, in float64 (nmfd.types.Plant)."""
 
 import numpy as np
 import torch
 
-from nmfd import ledger, tensors
-from nmfd.arrays import PerRegion
+from nmfd import ledger
+from nmfd.arrays import PerPair, PerTurn
 from nmfd.model import acyclic, dynamics
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
 
 
 class NmfdPlant:
-    """The regional model as a plant (nmfd.types.Plant), in float64.
+    """The regional model as a plant; deterministic, so that seeds change nothing.
 
     >>> scenario = nmfd.load_scenario("economic_mpc")
     >>> plant, network = nmfd.NmfdPlant(scenario), scenario.network
@@ -23,149 +23,96 @@ class NmfdPlant:
 
     def __init__(self, scenario: Scenario):
         self._scenario = scenario
-        self._parameters = dynamics.parameters(scenario.network)
-        self._demand = torch.from_numpy(scenario.demand)
+        self._scheme = {"integrator": scenario.integrator, "substeps": scenario.substeps}
+        self._build()
 
     def reset(self, seed: int) -> State:
-        """As the scenario begins; the model is deterministic, `seed` changes nothing."""
-        self._x = torch.from_numpy(self._scenario.start)
-        self._k, self._entered, self._ended = 0, float(self._x.sum()), 0.0
-        self._backlog = torch.zeros_like(self._x)
+        """Return to the start of the scenario."""
+        self._k, self._entered, self._ended = 0, float(self._scenario.start.sum()), 0.0
+        self._backlog = torch.zeros(self._scenario.demand.shape[1:], dtype=torch.float64)
+        self._begin(self._scenario.start)
         return self._state()
 
     def step(self, controls: Controls) -> State:
-        """One control interval. LedgerError if vehicles appear or vanish."""
-        demand, self._backlog = _admitted(self._backlog, self._demand[self._k], controls, self._scenario.step)
-        splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
-        self._x, ended = dynamics.advance_counted(
-            self._parameters,
-            self._x,
-            demand,
-            torch.from_numpy(controls.perimeter),
-            torch.from_numpy(splits),
-            self._scenario.step,
-            integrator=self._scenario.integrator,
-            substeps=self._scenario.substeps,
+        """Advance by one control interval. Raises LedgerError if vehicles appear or vanish."""
+        metering = None if controls.metering is None else torch.from_numpy(controls.metering)
+        demand, self._backlog = dynamics.admitted(
+            self._backlog, torch.from_numpy(self._scenario.demand[self._k]), metering, self._scenario.step
         )
+        splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
+        ended = self._advance(demand.numpy(), controls.perimeter, splits)
         self._entered += float(demand.sum()) * self._scenario.step
-        self._ended += float(ended)
+        self._ended += ended
         self._k += 1
+        state = self._state()
         ledger.check(
-            self._k,
-            self._k * self._scenario.step,
+            state.step,
+            state.time,
             entered=self._entered,
             ended=self._ended,
             inside=float(self._x.sum()),
             least=float(self._x.min()),
         )
-        return self._state()
+        return state
 
     def observe(self) -> Observation | None:
-        return None
+        """Return None: controllers observe the state with noise."""
 
     def close(self) -> None:
-        pass
+        """Do nothing."""
 
     def _state(self) -> State:
-        x = self._x.numpy()
         return State(
             step=self._k,
             time=self._k * self._scenario.step,
-            accumulation=x,
+            accumulation=self._accumulation(),
             backlog=self._backlog.numpy().copy(),
             completed=self._ended,
         )
 
+    def _build(self) -> None:
+        self._parameters = dynamics.parameters(self._scenario.network)
 
-class AcyclicPlant:
-    """The acyclic regional model as a plant (nmfd.types.Plant), in float64."""
+    def _begin(self, start: PerPair) -> None:
+        self._x = torch.from_numpy(start)
 
-    def __init__(self, scenario: Scenario):
-        self._scenario = scenario
-        self._model = acyclic.build(scenario.network)
+    def _accumulation(self) -> PerPair:
+        return self._x.numpy()
 
-    def reset(self, seed: int) -> State:
-        """As the scenario begins, with the trips of all who are inside beginning where they are; the model is
-        deterministic, `seed` changes nothing."""
-        self._x = np.zeros(len(self._model.region))
-        self._x[self._model.start] = self._scenario.start
-        self._k, self._entered, self._ended, self._forced = 0, float(self._x.sum()), 0.0, 0.0
-        self._backlog = torch.zeros(2 * (self._scenario.network.regions,), dtype=torch.float64)
-        return self._state()
-
-    @property
-    def state(self) -> acyclic.PerCell:
-        """x_ogij (C,) [veh], in the cells of `nmfd.model.acyclic.build`."""
-        return self._x.copy()
-
-    def by_origin(self) -> PerRegion:
-        """(R,) [veh], by the region where they began."""
-        return np.bincount(self._model.origin, self._x, self._scenario.network.regions)
-
-    @property
-    def forced_moves(self) -> float:
-        """Vehicles since the reset [veh] whose region theta left them no way on, sent to the least-bad next region.
-
-        Taken at the rate of the beginning of each control interval.
-        """
-        return self._forced
-
-    def step(self, controls: Controls) -> State:
-        """One control interval. LedgerError if vehicles appear or vanish."""
-        scenario, model = self._scenario, self._model
-        entering, self._backlog = _admitted(
-            self._backlog, torch.from_numpy(scenario.demand[self._k]), controls, scenario.step
+    def _advance(self, demand: PerPair, perimeter: PerPair, splits: PerTurn) -> float:
+        """Advance `_x` by one control interval; return the completed trips [veh]."""
+        controls = (torch.from_numpy(values) for values in (demand, perimeter, splits))
+        self._x, ended = dynamics.advance_counted(
+            self._parameters, self._x, *controls, self._scenario.step, **self._scheme
         )
-        demand = entering.numpy()
-        splits = scenario.network.nominal_splits if controls.splits is None else controls.splits
+        return float(ended)
+
+
+class AcyclicPlant(NmfdPlant):
+    """The acyclic regional model as a plant.
+
+    forced_moves: vehicles since the reset [veh] without an allowed next region, sent to the least-bad one, counted at
+        the rate at the beginning of each control interval
+    """
+
+    forced_moves: float
+
+    def _build(self) -> None:
+        self._model = acyclic.build(self._scenario.network)
+
+    def _begin(self, start: PerPair) -> None:
+        self._x, self.forced_moves = np.zeros(len(self._model.region)), 0.0
+        self._x[self._model.start] = start
+
+    def _accumulation(self) -> PerPair:
+        return acyclic.translate(self._model, self._x)
+
+    def _advance(self, demand: PerPair, perimeter: PerPair, splits: PerTurn) -> float:
+        model, step = self._model, self._scenario.step
         theta, forced = acyclic.shares(model, splits)
         if forced.any():
             leaving = model.exit_rates * acyclic.rate(model, self._x)[model.region] * self._x
-            passing = acyclic.transfers(model, self._x, leaving, controls.perimeter, theta)
-            self._forced += scenario.step * float(passing[model.fallback[forced]].sum())
-        self._x, ended = acyclic.advance_counted(
-            model,
-            self._x,
-            demand,
-            controls.perimeter,
-            theta,
-            scenario.step,
-            integrator=scenario.integrator,
-            substeps=scenario.substeps,
-        )
-        self._entered += float(demand.sum()) * scenario.step
-        self._ended += ended
-        self._k += 1
-        ledger.check(
-            self._k,
-            self._k * scenario.step,
-            entered=self._entered,
-            ended=self._ended,
-            inside=float(self._x.sum()),
-            least=float(self._x.min()),
-        )
-        return self._state()
-
-    def observe(self) -> Observation | None:
-        return None
-
-    def close(self) -> None:
-        pass
-
-    def _state(self) -> State:
-        x = acyclic.translate(self._model, self._x)
-        return State(
-            step=self._k,
-            time=self._k * self._scenario.step,
-            accumulation=x,
-            backlog=self._backlog.numpy().copy(),
-            completed=self._ended,
-        )
-
-
-def _admitted(
-    backlog: tensors.PerPair, demand: tensors.PerPair, controls: Controls, step: float
-) -> tuple[tensors.PerPair, tensors.PerPair]:
-    """As dynamics.admitted, by what `controls` meter."""
-    metering = None if controls.metering is None else torch.from_numpy(controls.metering)
-    return dynamics.admitted(backlog, demand, metering, step)
+            passing = acyclic.transfers(model, self._x, leaving, perimeter, theta)
+            self.forced_moves += step * float(passing[model.fallback[forced]].sum())
+        self._x, ended = acyclic.advance_counted(model, self._x, demand, perimeter, theta, step, **self._scheme)
+        return ended
