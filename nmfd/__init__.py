@@ -6,9 +6,9 @@
     result = nmfd.run(scenario, "dpc-pcrg", seed=1)
     print(nmfd.summary(result)["total_time_spent_veh_s"])
 
-`run` is one closed loop, `benchmark` many with a run folder, `train` makes a DPC policy, `controller` gives a
-controller by name. A controller of your own is any object with `reset` and `act` (see `Controller`; `nmfd
-new-controller` writes a template). Names here are imported when they are first used.
+`run` is one closed loop, `benchmark` many with a run folder; `train` makes a DPC policy, `controller` a controller by
+name. Any object with `reset` and `act` is a controller (see `Controller`; `nmfd new-controller` writes a template).
+Names here are imported at their first use.
 """
 
 from importlib import import_module

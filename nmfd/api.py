@@ -1,4 +1,4 @@
-"""What the command line `nmfd` does, as functions of a few arguments; exported by the package `nmfd`."""
+"""Functions behind the commands of `nmfd`; exported by the package `nmfd`."""
 
 import re
 import textwrap
@@ -50,15 +50,16 @@ def load_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
 
 
 def controller(name: str, scenario: Scenario | Path | str, *, policy: Path | str | None = None) -> Controller:
-    """The controller `name` for `scenario`, with `reset` and `act`.
+    """Return the controller `name` for `scenario`, with `reset` and `act`.
 
     name: as on the command line: "pi-gating", "dpc-pcrg", ..., or "path/to/file.py:Class"
     policy: the file of a policy or plan, if not SCENARIO/NAME.pt or .npz
 
-        >>> nmfd.controller("pi-gating", "economic_mpc").regions  # that it protects
+        >>> nmfd.controller("pi-gating", "economic_mpc").regions  # protected ones
         array([3])
 
-    Raises InputError for an unknown name, a wrong option, or a policy that is missing or made for another network.
+    Raises:
+        InputError: an unknown name, a wrong option, or a policy that is missing or made for another network
     """
     return parse(name).make(_loaded(scenario), None if policy is None else Path(policy))
 
@@ -73,24 +74,24 @@ def run(
     policy: Path | str | None = None,
     progress: Progress = None,
 ) -> Result:
-    """One closed loop on a regional model.
+    """Run one closed loop on a regional model.
 
-        >>> trajectory = nmfd.run("economic_mpc", "pi-gating", steps=20)
-        >>> trajectory.accumulation.shape  # states, regions, destinations
+        >>> result = nmfd.run("economic_mpc", "pi-gating", steps=20)
+        >>> result.accumulation.shape  # states, regions, destinations
         (21, 7, 7)
-        >>> bool(trajectory.observed[20].sum() == trajectory.accumulation[20].sum())  # observed with noise
+        >>> bool(result.observed[20].sum() == result.accumulation[20].sum())  # observed with noise
         False
 
-    scenario: a name of `nmfd list`, the folder of a scenario.toml, or what load_scenario made of it
+    scenario: a name of `nmfd show`, the folder of a scenario.toml, or a Scenario
     controller: a name as on the command line, or an object with `reset` and `act` (nmfd.Controller)
     seed: of the measurement noise
-    plant: "nmfd", "acyclic", or an object with `reset`, `step`, `completed` and `close` (nmfd.Plant)
+    plant: "nmfd", "acyclic", or an object (nmfd.Plant)
     steps: control intervals; the scenario's if None
     policy: as in `nmfd.controller`
-    progress: None for a bar in a notebook or on a terminal, False for none, or your own, which is called as
-        progress(done, steps) after every control interval
+    progress: None for a bar on a terminal or in a notebook, False for none, or a function of the steps done and all
+        steps
 
-    The same seed gives the same trajectory (but for wall times). Raises InputError.
+    The same seed gives the same result but for wall times (Result.without_times). Raises InputError.
     """
     strategy, scenario = parse(controller).regional(), _loaded(scenario)
     if steps is not None:
@@ -306,15 +307,17 @@ def identify(
     force: bool = False,
     **settings: float,
 ) -> Identified:
-    """`nmfd identify`: measured counts and occupancies -> MFDs per region, and a network.toml in the folder `out`.
+    """Fit MFDs per region to measured counts and occupancies; write network.toml in the folder `out`.
 
-        found = nmfd.identify("counts.csv", detectors="detectors.csv", regions="regions.csv", trip_length=1500.0,
-                              out="networks/mine")
-        print(found.text), found.network.mfds, found.to_frame()
+        identified = nmfd.identify("counts.csv", detectors="detectors.csv", regions="regions.csv", trip_length=1500.0,
+                                   out="networks/mine")
+        print(identified.text), identified.network.mfds, identified.to_frame()
 
-    counts, detectors, regions, about: tables as UTD19 has them (nmfd.model.detector_tables); adjacency: a table
-    region,neighbour or the network.toml of the same regions; settings: vehicle_length, trip_length [m], least_share [-]
-    of nmfd.studies.settings.Measured. Raises InputError.
+    counts, detectors, regions, about: tables like those of UTD19 (nmfd.model.detector_tables)
+    adjacency: a table region,neighbour or the network.toml of the same regions
+    settings: vehicle_length, trip_length [m], least_share [-] of nmfd.studies.settings.Measured
+
+    Raises InputError.
     """
     given = {"detectors": detectors, "regions": regions, "about": about, "adjacency": adjacency}
     return measured.identify(
@@ -332,7 +335,7 @@ def identify(
 
 
 def _check_plant(plant: str, more: str = "") -> None:
-    """InputError for an unknown name; more: what else is allowed."""
+    """Raise InputError for an unknown name; more: other allowed values."""
     if plant not in PLANTS:
         raise InputError(
             f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from {', '.join(PLANTS)}{more}"

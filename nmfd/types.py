@@ -141,7 +141,7 @@ class Controller(Protocol):
         """Start a new run; all random draws of the controller follow from `seed`."""
 
     def act(self, observation: Observation) -> Controls:
-        """Return the controls of the interval that begins now. The controller may change the arrays of `observation`."""
+        """Return the controls of the interval that begins now; `observation` is the controller's own copy."""
 
 
 VARIABLES: dict[str, Quantity] = {

@@ -1,4 +1,4 @@
-"""Scenarios and networks that come with the package: named without a path from any folder, read and never written.
+"""Scenarios and networks of the package: found by name from any folder, never written to.
 
 In a checkout they are its folders scenarios and networks, in an installed package those in nmfd/data; the same relative
 paths lead from one to another in both.
@@ -13,27 +13,30 @@ import platformdirs
 
 from nmfd.errors import InputError, did_you_mean
 
-SCENARIO, NETWORK = "scenario", "network"  # kinds: of folders in a folder of that name + "s", with NAME.toml in each
-CACHE = "COSIM_CACHE"  # environment variable: where what is built of cities that come with the package is kept
+SCENARIO, NETWORK = "scenario", "network"  # kinds of folders: in folders of that name + "s", with NAME.toml in each
+CACHE = "COSIM_CACHE"  # environment variable: folder for the files that are built of installed cities
 _HERE = Path(str(resources.files("nmfd")))
 _DATA = _HERE / "data"  # as pyproject.toml maps it
 
 
 def root() -> Path:
-    """The folder with the folders scenarios and networks."""
+    """Return the folder with the folders scenarios and networks."""
     return _DATA if _DATA.is_dir() else _HERE.parent
 
 
 def folders(kind: str) -> list[Path]:
-    """Those of a kind, by name."""
+    """Return the folders of a kind, by name."""
     return sorted(file.parent for file in (root() / f"{kind}s").glob(f"[!.]*/{kind}.toml"))
 
 
 def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
-    """The folder of one of these kinds, or the file, `name`: a path, from `beside` if given; where there is none, what
-    comes with the package under this name, or beneath it (as grid7_peak/dpc-pc.pt).
+    """Return the folder of one of these kinds, or the file, `name`.
 
-    A path that leads nowhere stays as it is: whoever reads it says so. InputError for a mere word that names nothing.
+    name: a path, from `beside` if given, or the name of a folder of the package, or a path below it
+        (grid7_peak/dpc-pc.pt). A path to nothing is returned unchanged
+
+    Raises:
+        InputError: a single word that names nothing
     """
     path, word = Path(name) if beside is None else beside / name, Path(name)
     if os.path.isfile(path) or any(os.path.exists(path / f"{kind}.toml") for kind in kinds):
@@ -53,20 +56,22 @@ def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
     ]
     raise InputError(
         f"{name}: no such folder here, and no {' or '.join(kinds)} of that name comes with the package"
-        f"{did_you_mean(str(name), near)}; `nmfd list` shows those that do"
+        f"{did_you_mean(str(name), near)}; `nmfd show` lists them"
     )
 
 
 def installed(path: Path) -> bool:
-    """Whether `path` lies in the data of an installed package, which are not the user's to write."""
+    """Return True if `path` lies in the data of an installed package, which the user may not write to."""
     return path.resolve().is_relative_to(_DATA.resolve())
 
 
 def beside(folder: Path, file: str, option: str, *, scenario: bool = False) -> Path:
-    """Where a `file` goes that is kept in `folder` unless the user says otherwise. InputError for the installed
-    package, and for a folder that cannot be written to.
+    """Return the path of `file` in `folder`.
 
-    option: with which they say so; scenario: whether one of their own can be based on that in `folder` instead
+    option: names another place; scenario: True if the user's own scenario may be based on `folder` instead
+
+    Raises:
+        InputError: the folder cannot be written to, or is of the installed package
     """
     remedy = f"give {option}"
     if scenario:
@@ -79,8 +84,10 @@ def beside(folder: Path, file: str, option: str, *, scenario: bool = False) -> P
 
 
 def build_folder(folder: Path) -> Path:
-    """Where what is built of the city in `folder` is kept, not yet there perhaps: in build beside it, or, of the
-    installed package or where nothing can be written, in the user's cache ($COSIM_CACHE)."""
+    """Return the folder for files that are built of the city in `folder`; it may not exist yet.
+
+    It is `folder`/build, or, if that cannot be written to, one in the user's cache ($COSIM_CACHE).
+    """
     if not installed(folder) and os.access(folder, os.W_OK):
         return folder / "build"
     where = os.environ.get(CACHE) or platformdirs.user_cache_dir("perimeter-cosim", appauthor=False)
@@ -89,12 +96,12 @@ def build_folder(folder: Path) -> Path:
 
 
 def made(folder: Path) -> Path:
-    """`folder`, a `build_folder`, made if it is not there. InputError if it cannot be."""
+    """Make a `build_folder` and return it. Raises InputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            f"{folder}: what is built of a city cannot be kept there ({error.strerror}); name a folder that can be "
+            f"{folder}: files built of a city cannot be kept there ({error.strerror}); name a folder that can be "
             f"written to in the environment variable {CACHE}"
         ) from None
     return folder

@@ -11,12 +11,12 @@ NUMBER = re.compile(r"[-+]?\d.*|-|nan|")  # also with a unit, an interval or a s
 
 
 def text_table(rows: Sequence[Mapping[str, object]], caption: str = "") -> str:
-    """The rows, each with the same headings: columns of numbers to the right, of words to the left; then `caption`."""
+    """Return rows with the same headings as text, numbers aligned to the right, and the `caption` below."""
     return text_columns(list(rows[0]) if rows else [], [list(row.values()) for row in rows], caption)
 
 
 def text_columns(headings: Sequence[str], lines: Iterable[Iterable[object]], caption: str = "") -> str:
-    """As `text_table`, from the cells of each line."""
+    """Return headings and lines of cells as text, as `text_table`."""
     cells = [[str(cell) for cell in line] for line in (headings, *lines)]
     sides = ["right" if all(map(NUMBER.fullmatch, column[1:])) else "left" for column in zip(*cells, strict=True)]
     # headings as a line: tabulate makes columns wider than their headings
@@ -25,14 +25,14 @@ def text_columns(headings: Sequence[str], lines: Iterable[Iterable[object]], cap
 
 
 def markdown_table(headings: Sequence[str], lines: Iterable[Iterable[object]]) -> str:
-    """The cells of each line in markdown; columns are not padded, so that one line more changes no other."""
+    """Return headings and lines of cells in markdown; without padding, so that a new line changes no other."""
     cells = [[str(cell).replace("|", "\\|") for cell in line] for line in (headings, *lines)]
     cells.insert(1, ["---"] * len(headings))
     return "\n".join(f"| {' | '.join(line)} |" for line in cells)
 
 
 def wrapped(caption: str) -> list[str]:
-    """Lines of at most WIDTH characters; those of an indented line are indented, too."""
+    """Return the caption in lines of at most WIDTH characters, with the indentation of its lines."""
     return [
         part
         for line in caption.splitlines()
