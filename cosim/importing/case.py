@@ -1,12 +1,19 @@
-"""What the user gives: a sumocfg with all it names, or a bare network."""
+"""Sources of an import: a sumocfg with all it names, a bare network, OpenStreetMap as a file or a box."""
 
 import math
 import os
 import re
+import subprocess
+import sys
+import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
+
+import sumo
 
 from cosim.sumo.xml_files import BROKEN, opened, read_xml
 from nmfd.errors import InputError
@@ -19,24 +26,45 @@ FILES = {
     "begin": ("begin", "b"),
     "end": ("end", "e"),
 }
-FOREVER = 1e9  # s; a later end is none
+ENDLESS_S = 1e9  # a later end is none
 TAKEN = ("step-length", "time-to-teleport", "scale", "mesosim")
-# Options that change what is written or shown, or how fast, but not what drives: all others are worth a word.
+# Options that change what is written or shown, or how fast, but not the traffic.
 IDLE = re.compile(
     r".*output.*|.*log.*|.*threads|(verbose|no-warnings|quit|start|delay|seed|random|precision|version|remote|xml|gui|"
     r"window|tracker|breakpoints|print|human|save|summary|tripinfo|vehroute|fcd|netstate|statistic|queue|emission|"
     r"device\.emissions|link|save-|load|osg|demo|game|language|registry|meso-).*"
 )
+STEP = re.compile(r"Step #([\d.]+)")
+# As SUMO's documentation recommends: sumo.dlr.de/docs/Networks/Import/OpenStreetMap.html. OpenStreetMap does not say
+# what signals show: they come out actuated.
+NETCONVERT = (
+    "--geometry.remove --ramps.guess --junctions.join --tls.guess-signals --tls.discard-simple --tls.join "
+    "--tls.default-type actuated --keep-edges.by-vclass passenger --remove-edges.isolated "
+    "--no-turnarounds.except-deadend --no-warnings"
+).split()
+LICENCE = (
+    "The streets are those of OpenStreetMap: (c) OpenStreetMap contributors, Open Database License 1.0\n"
+    "(SPDX ODbL-1.0, https://opendatacommons.org/licenses/odbl/1-0/), https://www.openstreetmap.org/copyright\n"
+)
+SERVERS = "hpi,oapi,pcoffee"  # osmGet.py's names of public ones
+SERVER_TIME_LIMIT_S = 600.0
+Box = tuple[float, float, float, float]  # west, south, east, north [degrees]
+
+
+class Progress(Protocol):
+    """Callback with the current stage and its finished share [-]."""
+
+    def __call__(self, stage: str, share: float = 0.0) -> None: ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class SumoInput:
     """A simulation as its owner set it up.
 
-    source: the file that was given; net; routes and additional in SUMO's order
-    begin, end: [s]; end is None where it is open
+    source: the given file; net; routes and additional in SUMO's order
+    begin, end: [s]; end is None if it is open
     options: all other options of the sumocfg
-    notice: what the licence of its data wants to be said; "" where nothing is known
+    notice: required by the licence of the data
     """
 
     source: Path
@@ -50,7 +78,7 @@ class SumoInput:
 
     @property
     def scale(self) -> float:
-        """What SUMO multiplies the vehicles by. Raises InputError."""
+        """SUMO's factor of the demand [-]. Raises InputError."""
         text = self.options.get("scale", "1")
         try:
             value = float(text)
@@ -62,23 +90,23 @@ class SumoInput:
 
     @property
     def step_length(self) -> float:
-        """[s] of SUMO's own steps. Raises InputError."""
+        """Length of SUMO's steps [s]. Raises InputError."""
         return seconds(self.options.get("step-length", "1"), f"{self.source}: step-length")
 
     @property
     def time_to_teleport(self) -> float:
-        """[s], -1 for never. Raises InputError."""
+        """Waiting time before a teleport [s], -1 for never. Raises InputError."""
         given = seconds(self.options.get("time-to-teleport", "300"), f"{self.source}: time-to-teleport")
         return given if given > 0 else -1.0
 
     @property
     def mesoscopic(self) -> bool:
-        """Whether it runs SUMO's queue model."""
+        """True if SUMO's queue model is set."""
         return self.options.get("mesosim", "false").lower() in ("true", "1", "yes", "on", "x")
 
     @property
     def left_out(self) -> list[str]:
-        """Options that are not taken over although they may change what drives, as NAME = VALUE."""
+        """Options that may change the traffic and are not taken over, as NAME = VALUE."""
         return [
             f"{name} = {value}"
             for name, value in sorted(self.options.items())
@@ -86,10 +114,40 @@ class SumoInput:
         ]
 
 
+@contextmanager
+def sumo_input(source: Path | Box, progress: Progress, *, left_hand: bool = False) -> Iterator[SumoInput]:
+    """Provide the simulation of a source; a network that is built for it goes at the end of the block.
+
+    Args:
+        source: a sumocfg, a net.xml(.gz), a file of OpenStreetMap, or a box of it.
+        left_hand: of OpenStreetMap, which does not say on which side of its streets vehicles drive.
+
+    Raises:
+        InputError: for a source that cannot be read, or no answer for a box.
+    """
+    if isinstance(source, Path) and source.suffix == ".pbf":
+        osm = source.stem.removesuffix(".osm")
+        raise InputError(f"{source}: convert pbf first: osmium cat {source.name} -o {osm}.osm")
+    if isinstance(source, Path) and _root(source).tag != "osm":
+        if left_hand:
+            raise InputError(f"--left-hand: {source} says itself on which side vehicles drive; omit it")
+        yield read_sumo_input(source)
+        return
+    with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as folder:
+        if not isinstance(source, Path):
+            progress("fetching OpenStreetMap")
+            source = fetch_osm(source, Path(folder))
+        progress("netconvert")
+        yield SumoInput(source=source, net=_converted(source, Path(folder), left_hand), notice=LICENCE)
+
+
 def read_sumo_input(path: Path) -> SumoInput:
-    """Read a sumocfg, or take a net.xml(.gz) as a case without demand. Raises InputError, also for a file it names
-    that is missing."""
-    root = root_of(path)
+    """Read a sumocfg, or take a net.xml(.gz) as a simulation without demand.
+
+    Raises:
+        InputError: for a file of another kind, or a missing file it names.
+    """
+    root = _root(path)
     if root.tag == "net":
         return SumoInput(source=path, net=path)
     if root.tag not in ("configuration", "sumoConfiguration"):
@@ -113,26 +171,27 @@ def read_sumo_input(path: Path) -> SumoInput:
         routes=_files(path, "route-files", options["route-files"]),
         additional=_files(path, "additional-files", options["additional-files"]),
         begin=seconds(options["begin"] or "0", f"{path}: begin"),
-        end=end if 0 < end < FOREVER else None,
+        end=end if 0 < end < ENDLESS_S else None,
         options=given,
     )
 
 
 def _files(config: Path, key: str, value: str) -> tuple[Path, ...]:
-    """Files separated by commas, as seen from the sumocfg; ${NAME} stands for a variable of the environment."""
-    found = []
+    """Resolve a comma-separated list of files of a sumocfg; ${NAME} is a variable of the environment."""
     value = re.sub(r"\$\{(\w+)\}", lambda name: os.environ.get(name[1], name[0]), value)
-    for name in value.replace(";", ",").split(","):
-        if name := name.strip():
-            file = config.parent / name
-            if not file.is_file():
-                raise InputError(f"{config}: {key}: no such file: {file}; correct the name or add the file")
-            found.append(file)
-    return tuple(found)
+    files = tuple(config.parent / name.strip() for name in re.split("[,;]", value) if name.strip())
+    for file in files:
+        if not file.is_file():
+            raise InputError(f"{config}: {key}: no such file: {file}; correct the name or add the file")
+    return files
 
 
 def seconds(text: str, where: str) -> float:
-    """A SUMO time, in seconds or as [days:]hours:minutes:seconds, in seconds. InputError names `where`."""
+    """Convert a SUMO time, in seconds or as [days:]hours:minutes:seconds, to seconds.
+
+    Args:
+        where: file and key that an InputError names.
+    """
     try:
         parts = [float(part) for part in text.split(":")]
         if not 1 <= len(parts) <= 4 or len(parts) == 2 or not all(map(math.isfinite, parts)):
@@ -143,8 +202,102 @@ def seconds(text: str, where: str) -> float:
     return -size if text.startswith("-") else size
 
 
-def root_of(path: Path) -> ElementTree.Element:
-    """The root element of an XML file, with its attributes only. Raises InputError."""
+def parse_box(text: str) -> Box:
+    """Parse --bbox. Raises InputError."""
+    try:
+        west, south, east, north = (float(part) for part in text.split(","))
+    except ValueError:
+        west = south = east = north = 0.0
+    if not (-180.0 <= west < east <= 180.0 and -90.0 <= south < north <= 90.0):
+        raise InputError(
+            f"--bbox: expected west,south,east,north in degrees, such as 11.32,44.48,11.36,44.50, got {text!r} instead"
+        )
+    return west, south, east, north
+
+
+def fetch_osm(box: Box, folder: Path) -> Path:
+    """Fetch the streets within a box by SUMO's osmGet.py from a public server. Raises InputError."""
+    where = ",".join(f"{value:g}" for value in box)
+    program = [sys.executable, str(Path(sumo.SUMO_HOME) / "tools" / "osmGet.py")]
+    road_types = '{"highway": ["."]}'
+    options = ["--output-dir", str(folder), "--prefix", "osm", "--gzip", "--url", SERVERS, "--retries", "2"]
+    try:
+        done = subprocess.run(
+            [*program, f"--bbox={where}", *options, "--road-types", road_types],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            stdin=subprocess.DEVNULL,
+            timeout=SERVER_TIME_LIMIT_S,
+            check=False,
+            env=os.environ | {"SUMO_HOME": sumo.SUMO_HOME},
+        )
+        reason = (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
+    except subprocess.TimeoutExpired:
+        reason = f"no answer in {SERVER_TIME_LIMIT_S:g} s"
+    file = folder / "osm_bbox.osm.xml.gz"
+    if reason or not file.exists():
+        raise InputError(
+            f"--bbox: {where}: osmGet.py got nothing from OpenStreetMap ({reason}); without internet access give a "
+            "file of the area, exported at https://www.openstreetmap.org/export"
+        )
+    return file
+
+
+def _converted(osm: Path, folder: Path, left_hand: bool) -> Path:
+    """Build the network of a file of OpenStreetMap. Raises InputError with netconvert's own words."""
+    if "," in str(osm):
+        raise InputError(f"{osm}: SUMO reads no file with a comma in its path; rename it")
+    net = folder / "osm.net.xml"
+    types = Path(sumo.SUMO_HOME) / "data" / "typemap" / "osmNetconvert.typ.xml"
+    options = {"osm-files": osm.resolve(), "type-files": types, "output-file": net}
+    run_sumo("netconvert", options, *NETCONVERT, *(["--lefthand"] if left_hand else []), where=str(osm))
+    net.write_bytes(re.sub(rb"<!--.*?-->\s*", b"", net.read_bytes(), count=1, flags=re.DOTALL))  # date and folder
+    return net
+
+
+def run_sumo(
+    program: str,
+    options: Mapping[str, object],
+    *flags: str,
+    where: str,
+    reached: Callable[[float], None] = lambda time: None,
+) -> None:
+    """Run one of SUMO's programs.
+
+    Args:
+        options: name without dashes -> value.
+        where: file that an InputError names.
+        reached: called with the times of SUMO's step log [s].
+
+    Raises:
+        InputError: with the first error line of the program.
+    """
+    arguments = [text for name, value in options.items() for text in (f"--{name}", str(value))]
+    lines = []
+    with subprocess.Popen(
+        [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, *flags],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as process:
+        assert process.stdout is not None  # it is a pipe
+        try:
+            for line in process.stdout:  # universal newlines: the step log ends its lines with \r
+                if step := STEP.match(line):
+                    reached(float(step[1]))
+                else:
+                    lines.append(line)
+        except BaseException:
+            process.kill()
+            raise
+    if process.returncode:
+        errors = [line for line in lines if "rror" in line] or ["no reason given"]
+        raise InputError(f"{where}: {program} cannot run it: {' '.join(errors[0].split())}; correct the input")
+
+
+def _root(path: Path) -> ElementTree.Element:
+    """Read the root element of an XML file, with its attributes only. Raises InputError."""
     try:
         with opened(path) as stream:
             _, element = next(iter(ElementTree.iterparse(stream, events=("start",))))

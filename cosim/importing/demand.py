@@ -1,4 +1,4 @@
-"""What drives in the city: its private vehicles one by one, and all that is left alone."""
+"""Traffic of a city: its private vehicles one by one, and all that runs beside them unchanged."""
 
 import re
 from collections import Counter
@@ -12,8 +12,6 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from cosim.importing.case import SumoInput, seconds
-from cosim.importing.harmless import silent, softened
-from cosim.importing.od import Cell, read_od, relations, trips
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import PerTrip, TripNumbers
 from cosim.sumo.recorded_trips import BOUND
@@ -22,21 +20,27 @@ from nmfd.errors import InputError
 
 DRIVERS = ("vehicle", "trip", "flow")
 OTHERS = ("person", "personFlow", "container", "containerFlow")
-DROPPED = ("poly", "poi", "edgeData", "laneData", "timedEvent", "vTypeProbe")  # only draw or write
+DROPPED = ("poly", "poi", "edgeData", "laneData", "timedEvent", "vTypeProbe", "interval")  # no traffic
+WRITERS = ("Detector", "Loop", "calibrator", "routeProbe")  # ends of names of elements that write files
+WRITING = ("file", "has.ssm.device", "device.toc.file")  # parameters that only make SUMO write files
+SAFE_SPEEDS = ("max", "random", "0", "0.0", "0.00")  # departure speeds that can wait for a green
 FLOW = ("begin", "end", "number", "period", "vehsPerHour", "perHour", "probability")
 ENDS = {"from": ("fromTaz", "fromJunction"), "to": ("toTaz", "toJunction")}
-What = TypeVar("What")
-OPEN_END = 3600.0  # s, of a flow that never ends in a simulation that never ends
+Option = TypeVar("Option")
+ENDLESS_FLOW_S = 3600.0  # length of a flow without an end in a simulation without an end
+Kept = tuple[float, int, int, bool, Element]  # departure [s], first and last edge, has a route, vehicle
 
 
 @dataclass(frozen=True, kw_only=True)
 class Traffic:
-    """vehicles: the demand, `vehicle` and `trip` elements by departure
+    """Traffic of a city.
+
+    vehicles: the demand, N `vehicle` and `trip` elements by departure
     depart: (N,) [s]; origin, destination: (N,) edges, numbers of Streets
-    background: public transport, persons and whatever departs at no fixed time, by begin
-    shared: what these refer to, and the contents of the additional files: types, routes, stops, programmes
+    background: public transport, persons, and vehicles without a fixed departure
+    shared: types, routes, stops, programmes and other contents of the additional files
     switched: signals whose programme a timetable (WAUT) changes
-    notes: what was found and left out, in words -> how often
+    notes: what was changed or left out -> count
     """
 
     vehicles: tuple[Element, ...]
@@ -49,13 +53,15 @@ class Traffic:
     notes: Mapping[str, int] = field(default_factory=dict)
 
 
-def read_traffic(
-    case: SumoInput, streets: Streets, seed: int, od: Sequence[Path] = (), zones: Sequence[Path] = ()
-) -> Traffic:
-    """All route and additional files of the case, and the OD matrices `od` between TAZ of these or of `zones`. Flows
-    and matrices become single vehicles, and TAZ and junctions the edges drawn for them (by `seed`); all else stays as
-    it is. Raises InputError for a file that is no XML, a broken time, and matrices beside vehicles."""
-    return _Reader(case, streets, np.random.default_rng([seed, 0x696D70])).read(od, zones)
+def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
+    """Read all route and additional files of a case.
+
+    Flows become single vehicles; TAZ and junctions become edges that are drawn for them by `seed`.
+
+    Raises:
+        InputError: for a file that is no XML, a broken time or number, and an id that two vehicles have.
+    """
+    return _Reader(case, streets, np.random.default_rng([seed, 0x696D70])).read()
 
 
 class _Reader:
@@ -67,29 +73,27 @@ class _Reader:
         self._zones: dict[str, dict[str, list[tuple[str, float]]]] = {}
         self._notes: Counter[str] = Counter()
 
-    def read(self, od: Sequence[Path], zones: Sequence[Path]) -> Traffic:
+    def read(self) -> Traffic:
         drivers: list[tuple[Element, Path]] = []
         shared: list[Element] = []
-        others: list[Element] = []
+        background: list[Element] = []
         switched: set[str] = set()
-        cells: list[Cell] = []
-        for path in zones:
-            self._learn(read_xml(path), path)
         for path in (*self._case.additional, *self._case.routes):
-            for element in map(silent, read_xml(path)):
+            for element in map(_silent, read_xml(path)):
                 if element.tag in DRIVERS:
                     drivers.append((element, path))
                 elif element.tag in OTHERS:
-                    others.append(element)
-                elif element.tag == "interval":
-                    cells += relations(wrapped([element], "data"), path)
+                    background.append(element)
                 elif element.tag not in DROPPED:
                     self._learn(element, path)
                     switched |= {name for e in element.iter("wautJunction") if (name := e.get("junctionID"))}
                     shared.append(element)
-        vehicles, background = [], others
+        vehicles = []
         for element, path in drivers:
-            if softened(element):
+            # SUMO deletes a vehicle that cannot stop from its departure speed at a signal whose programme never gives
+            # it green; a signal that is switched from outside has no programme that does.
+            if element.get("departSpeed", "max") not in SAFE_SPEEDS:
+                element.set("departSpeed", "max")
                 self._notes["fixed speeds at the departure, made the highest safe ones"] += 1
             if element.get("line") or self._classes.get(element.get("type", ""), "passenger") in BOUND:
                 background.append(element)
@@ -98,29 +102,10 @@ class _Reader:
                 vehicles += [(single, path) for single in self._expand(element, path)]
             else:
                 vehicles.append((element, path))
-        vehicles += self._from_matrices(cells, od, len(vehicles))
         return self._checked(vehicles, background, shared, switched)
 
-    def _from_matrices(self, cells: list[Cell], od: Sequence[Path], vehicles: int) -> list[tuple[Element, Path]]:
-        """Trips of the matrices, those of the case's own files only where it has no vehicles."""
-        if vehicles and od:
-            raise InputError(
-                f"--od: {self._case.source} has {vehicles:,} vehicles of its own; omit --od, or give the network alone"
-            )
-        if vehicles and cells:
-            self._notes["relations between zones, left out: there are vehicles"] = len(cells)
-            return []
-        cells = cells + [cell for path in od for cell in read_od(path)]
-        for cell in cells:
-            for name in (cell.origin, cell.destination):
-                if name not in (self._zones if cell.zones else self._streets.number):
-                    kind, remedy = ("TAZ", "define it in a file for --zones") if cell.zones else ("edge", "correct it")
-                    raise InputError(f"{cell.where}: {kind} {name!r} is unknown; {remedy}")
-        made = trips(cells, self._random, self._classes.keys(), self._notes.__setitem__) if cells else []
-        return [(trip, self._case.source) for trip in made]
-
     def _learn(self, element: Element, path: Path) -> None:
-        """Types, routes and zones that vehicles refer to."""
+        """Store types, routes and zones that vehicles refer to. Raises InputError."""
         try:
             self._learn_one(element)
         except Missing as error:
@@ -154,11 +139,11 @@ class _Reader:
             }
 
     def _likeliest(self, distribution: Element) -> list[str]:
-        """The edges of the route in a distribution that is driven most."""
+        """Return the edges of the most probable route in a distribution."""
         return max(self._distribution(distribution), key=lambda route: route[0], default=(0.0, []))[1]
 
     def _distribution(self, distribution: Element) -> list[tuple[float, list[str]]]:
-        """(probability, edges) of every route in a distribution."""
+        """Return (probability, edges) of every route in a distribution."""
         routes = [
             (float(r.get("probability", 1.0)), r.get("edges", "").split() or self._routes.get(r.get("refId", ""), []))
             for r in distribution.iter("route")
@@ -168,11 +153,11 @@ class _Reader:
         return routes + [(p, self._routes.get(name, [])) for p, name in zip(shares, names, strict=False)]
 
     def _expand(self, flow: Element, path: Path) -> list[Element]:
-        """The single vehicles of a flow."""
+        """Return the single vehicles of a flow. Raises InputError."""
         where = f"{path}: flow {flow.get('id')}"
         begin = seconds(flow.get("begin", str(self._case.begin)), f"{where}: begin")
         end = seconds(text, f"{where}: end") if (text := flow.get("end")) else None
-        stop = min(end if end is not None else self._case.end or begin + OPEN_END, self._case.end or np.inf)
+        stop = min(end if end is not None else self._case.end or begin + ENDLESS_FLOW_S, self._case.end or np.inf)
         per_hour, period = flow.get("vehsPerHour") or flow.get("perHour"), flow.get("period")
         probability = flow.get("probability")
         try:
@@ -219,9 +204,9 @@ class _Reader:
         shared: Sequence[Element],
         switched: Iterable[str],
     ) -> Traffic:
-        """Only what can be driven from its first to its last edge within the simulation."""
+        """Keep vehicles that can drive from their first to their last edge within the simulation."""
         number = self._streets.number
-        kept: list[tuple[float, int, int, bool, Element]] = []
+        kept: list[Kept] = []
         begin, end = self._case.begin, np.inf if self._case.end is None else self._case.end
         files: dict[str, Path] = {}
         for element, path in vehicles:
@@ -284,7 +269,7 @@ class _Reader:
         )
 
     def _edges(self, element: Element) -> tuple[list[str], bool]:
-        """(the edges of a vehicle's route, True), or (those that a trip must pass, False)."""
+        """Return (edges of a vehicle's route, True), or (edges that a trip must pass, False)."""
         nested = element.find("routeDistribution")
         route = element.find("route") if nested is None else None
         if nested is not None:  # as marouter and duarouter write them: a vehicle keeps the route drawn for it here
@@ -301,16 +286,16 @@ class _Reader:
             return self._routes.get(name, []), True
         for key, alike in ENDS.items():
             if not element.get(key):
-                chosen = self._draw(element, key, alike)
+                edge = self._draw(element, key, alike)
                 for other in alike:
                     element.attrib.pop(other, None)
-                if chosen is None:
+                if edge is None:
                     return [], False
-                element.set(key, chosen)
+                element.set(key, edge)
         return [attribute(element, "from"), *element.get("via", "").split(), attribute(element, "to")], False
 
     def _draw(self, element: Element, key: str, alike: tuple[str, str]) -> str | None:
-        """An edge of the zone, or at the junction, where a trip begins or ends."""
+        """Draw an edge of the zone, or at the junction, where a trip begins or ends."""
         zone, junction = (element.get(name) for name in alike)
         if zone in self._zones:
             options = self._usable(self._zones[zone][key], key)
@@ -320,25 +305,23 @@ class _Reader:
             options = [(self._streets.edges[n], 1.0) for n in np.flatnonzero(at & self._streets.drivable)]
         return self._pick(options)
 
-    def _pick(self, options: Sequence[tuple[What, float]]) -> What | None:
-        """One of (what, weight), drawn by weight; None where there is none."""
+    def _pick(self, options: Sequence[tuple[Option, float]]) -> Option | None:
+        """Draw one of (option, weight) by weight; None without any."""
         weights = np.cumsum([weight for _, weight in options])
         if not options or weights[-1] <= 0:
             return None
         return options[int(np.searchsorted(weights, self._random.random() * weights[-1], side="right"))][0]
 
     def _usable(self, options: list[tuple[str, float]], key: str) -> list[tuple[str, float]]:
-        """Of the edges of a zone those of cars; of these, if there are any, those that are joined to the rest."""
+        """Return the edges of a zone for cars; only those connected to the core, if there are any."""
         number, joined = self._streets.number, self._streets.onward if key == "from" else self._streets.reached
         options = [
             (edge, weight) for edge, weight in options if edge in number and self._streets.drivable[number[edge]]
         ]
         return [option for option in options if joined[number[option[0]]]] or options
 
-    def _reachable(
-        self, kept: list[tuple[float, int, int, bool, Element]]
-    ) -> list[tuple[float, int, int, bool, Element]]:
-        """Without trips whose end cannot be reached from their beginning by any vehicle, or that of cars by cars."""
+    def _reachable(self, kept: list[Kept]) -> list[Kept]:
+        """Leave out trips without a path from their first to their last edge."""
         lost = set()
         for cars in (False, True):
             pairs = {row[1:3] for row in kept if not row[3] and self._is_car(row[4]) == cars}
@@ -355,6 +338,18 @@ def _no_number(element: Element, path: Path, error: ValueError) -> InputError:
     )
 
 
+def _silent(element: Element) -> Element:
+    """Redirect the files that an element writes to nowhere; return it."""
+    for part in element.iter():
+        if part.tag.endswith(WRITERS):
+            for key in {"file", "output"} & set(part.keys()):
+                part.set(key, "NUL")
+        for parameter in part.findall("param"):
+            if parameter.get("key") in WRITING:
+                part.remove(parameter)
+    return element
+
+
 def _begin(element: Element) -> float:
     try:
         return seconds(element.get("depart") or element.get("begin") or "0", "")
@@ -363,7 +358,7 @@ def _begin(element: Element) -> float:
 
 
 def wrapped(elements: Iterable[Element], tag: str) -> Element:
-    """The elements under a common root."""
+    """Put the elements under a common root."""
     root = Element(tag)
     root.extend(elements)
     return root

@@ -1,7 +1,7 @@
-"""A demand for a city that comes without any: a morning peak towards the centre, through traffic and a background.
+"""A demand for a city without any: a morning peak towards the centre, through traffic and a background.
 
-The centre is where the signals are. Everybody takes a fastest way at free flow, with some seconds for every junction
-and more for a signal, as one of DRIVER_CLASSES groups of drivers sees the times.
+The centre is where the signals are. All drivers take a fastest route at free flow, with a delay for every junction and
+a longer one for a signal, as one of DRIVER_CLASSES groups of drivers perceives the times.
 """
 
 from collections.abc import Iterable
@@ -16,19 +16,23 @@ from cosim.importing.streets import Streets
 from cosim.sumo.trips import CLASS_SPREAD, DRIVER_CLASSES, SHORT
 from nmfd.errors import InputError
 
-RAMP_UP, FLAT, RAMP_DOWN = 1800.0, 1800.0, 1800.0  # s
-INWARD, THROUGH = 0.5, 0.25  # shares of the trips; the rest is the background
-BUSY = 3.0e-3  # veh/m of lane that the peak would keep on the streets at free flow, at level 1
-STARTS = 400  # streets where trips begin, at most: bounds the shortest paths to find
-JUNCTION, SIGNAL = 3.0, 10.0  # s that a driver reckons with
-PILOT = 1500  # trips from which the mean trip time is estimated
+RAMP_UP_S, FLAT_S, RAMP_DOWN_S = 1800.0, 1800.0, 1800.0
+INWARD_SHARE, THROUGH_SHARE = 0.5, 0.25  # of the trips; the rest is the background
+PEAK_DENSITY = 3.0e-3  # veh/m of lane that the peak would keep on the streets at free flow, at level 1
+MAX_ORIGINS = 400  # streets where trips begin: bounds the shortest paths to find
+JUNCTION_DELAY_S, SIGNAL_DELAY_S = 3.0, 10.0
+PILOT_TRIPS = 1500  # from which the mean trip time is estimated
 
 
 def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> Traffic:
-    """Trips on the largest part of the network in which every edge can be reached from every other.
+    """Generate trips on the largest part of the network in which every edge can be reached from every other.
 
-    level 1 would keep BUSY vehicles per metre of lane under way if they met no queue; they will. Raises InputError
-    for a network that is too small.
+    Args:
+        level: 1 keeps PEAK_DENSITY under way if vehicles meet no queue.
+        begin: of the peak [s].
+
+    Raises:
+        InputError: for a network that is too small.
     """
     if streets.core.sum() < 4:
         raise InputError(
@@ -38,10 +42,10 @@ def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> 
     random = np.random.default_rng([seed, 0x7065616B])
     ends = _Ends(streets, random)
     ways = _Ways(streets, random)
-    pilot = ways.routes(*ends.draw(PILOT))
+    pilot = ways.routes(*ends.draw(PILOT_TRIPS))
     mean = float(np.mean([ways.time[list(route)].sum() for route in pilot if route]))
-    held = level * BUSY * float(streets.lane_metres[streets.core].sum())
-    count = max(1, round(held / mean * (RAMP_UP / 2 + FLAT + RAMP_DOWN / 2)))
+    inside = level * PEAK_DENSITY * float(streets.lane_metres[streets.core].sum())
+    count = max(1, round(inside / mean * (RAMP_UP_S / 2 + FLAT_S + RAMP_DOWN_S / 2)))
     first, last = ends.draw(count)
     depart = begin + np.sort(_times(random.random(count)))
     routes = ways.routes(first, last)
@@ -62,7 +66,7 @@ def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> 
 
 
 class _Ends:
-    """Where trips begin and end."""
+    """Origins and destinations of trips."""
 
     def __init__(self, streets: Streets, random: np.random.Generator):
         self._random = random
@@ -78,7 +82,7 @@ class _Ends:
         away = streets.centre[self._edges] - middle
         self._distance, self._angle = np.hypot(*away.T), np.arctan2(*away.T[::-1])
         radius = np.sqrt(np.average(self._distance**2, weights=weight))
-        starts = random.choice(len(weight), size=min(STARTS, len(weight)), replace=False, p=weight / weight.sum())
+        starts = random.choice(len(weight), size=min(MAX_ORIGINS, len(weight)), replace=False, p=weight / weight.sum())
         outside = self._distance[starts] > 0.5 * radius
         self._all, self._outer = starts, starts[outside] if outside.sum() >= 2 else starts
         rim = starts[self._distance[starts] >= np.quantile(self._distance[starts], 0.7)]
@@ -87,9 +91,9 @@ class _Ends:
         self._central = weight * np.exp(-0.5 * (self._distance / (0.3 * radius)) ** 2)
 
     def draw(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Edges where `count` trips begin and end."""
+        """Draw the edges where trips begin and end."""
         kind = self._random.random(count)
-        inward, through = kind < INWARD, (kind >= INWARD) & (kind < INWARD + THROUGH)
+        inward, through = kind < INWARD_SHARE, (kind >= INWARD_SHARE) & (kind < INWARD_SHARE + THROUGH_SHARE)
         first = self._random.choice(self._all, size=count)
         last = self._pick(np.arange(len(self._weight)), self._weight, count)
         first[inward] = self._random.choice(self._outer, size=inward.sum())
@@ -103,36 +107,36 @@ class _Ends:
         return self._random.choice(options, size=count, p=weight / weight.sum())
 
     def _opposite(self, n: int) -> int:
-        """A street on the far side of the city."""
+        """Draw a street on the far side of the city."""
         turned = np.cos(self._angle[self._rim] - self._angle[n]) < 0.0
         options = self._rim[turned] if turned.any() else self._rim
         return int(self._pick(options, self._fast[options], 1)[0])
 
 
 class _Ways:
-    """Fastest ways; time (E,) [s] of every edge with the junction before it."""
+    """Fastest routes; time (E,) [s] of every edge with the junction before it."""
 
     def __init__(self, streets: Streets, random: np.random.Generator):
         self._size, self._links, self._random = len(streets.edges), streets.links, random
         signalled = np.array([signal is not None for signal in streets.link_signals])
-        self._turn = np.where(signalled, SIGNAL, JUNCTION)
-        self.time = streets.length / streets.speed + JUNCTION
+        self._turn = np.where(signalled, SIGNAL_DELAY_S, JUNCTION_DELAY_S)
+        self.time = streets.length / streets.speed + JUNCTION_DELAY_S
         self._taste = np.exp(CLASS_SPREAD * random.standard_normal((DRIVER_CLASSES, self._size)))
 
     def routes(self, first: np.ndarray, last: np.ndarray) -> list[tuple[int, ...]]:
-        """The route of every trip; empty where there is none."""
-        found: list[tuple[int, ...]] = [()] * len(first)
+        """Return the route of every trip; empty if there is none."""
+        routes: list[tuple[int, ...]] = [()] * len(first)
         tastes = self._random.integers(DRIVER_CLASSES, size=len(first))
         for taste in range(DRIVER_CLASSES):
             cost = self._turn + (self.time * self._taste[taste])[self._links[:, 1]]
             graph = csr_array((cost, (self._links[:, 0], self._links[:, 1])), shape=(self._size,) * 2)
-            starts = np.unique(first[tastes == taste])
-            for chunk in np.array_split(starts, max(1, len(starts) // 128)):
+            origins = np.unique(first[tastes == taste])
+            for chunk in np.array_split(origins, max(1, len(origins) // 128)):
                 if len(chunk):
                     _, before = dijkstra(graph, indices=chunk, return_predecessors=True)
                     for n in np.flatnonzero((tastes == taste) & np.isin(first, chunk)):
-                        found[n] = _walk(before[np.searchsorted(chunk, first[n])], int(first[n]), int(last[n]))
-        return found
+                        routes[n] = _walk(before[np.searchsorted(chunk, first[n])], int(first[n]), int(last[n]))
+        return routes
 
 
 def _walk(before: np.ndarray, first: int, last: int) -> tuple[int, ...]:
@@ -145,9 +149,9 @@ def _walk(before: np.ndarray, first: int, last: int) -> tuple[int, ...]:
 
 
 def _times(uniform: np.ndarray) -> np.ndarray:
-    """Departures [s] after the beginning, of a trapezoid."""
-    clock = np.linspace(0.0, RAMP_UP + FLAT + RAMP_DOWN, 541)
-    rate = np.minimum(np.minimum(clock / RAMP_UP, 1.0), (clock[-1] - clock) / RAMP_DOWN)
+    """Return departures [s] after the beginning, of a trapezoid, from uniform random numbers."""
+    clock = np.linspace(0.0, RAMP_UP_S + FLAT_S + RAMP_DOWN_S, 541)
+    rate = np.minimum(np.minimum(clock / RAMP_UP_S, 1.0), (clock[-1] - clock) / RAMP_DOWN_S)
     share = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2)])
     return np.interp(uniform, share / share[-1], clock)
 

@@ -1,333 +1,331 @@
-"""`cosim import`: from a sumocfg to networks/NAME and scenarios/NAME."""
+"""`cosim import`: a SUMO city or OpenStreetMap becomes networks/NAME and scenarios/NAME."""
 
+import gzip
 import os
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
+import pandas as pd
 
-from cosim.importing import level, model, osm, quality, verdict, written
-from cosim.importing.assignment import Assigned, Effort, relative_gap
-from cosim.importing.baseline import Baseline, Tell
-from cosim.importing.case import SumoInput, seconds
-from cosim.importing.demand import Traffic, read_traffic
-from cosim.importing.given import read_given
-from cosim.importing.partition import Clustered, Drawn, alternatives, partition
-from cosim.importing.regions import positions
+from cosim.importing import maps, model, quality
+from cosim.importing.assignment import GAP, ITERATIONS, Assigned, assign, relative_gap
+from cosim.importing.baseline import Baseline, averaged_runs
+from cosim.importing.case import Box, Progress, SumoInput, sumo_input
+from cosim.importing.demand import Traffic, read_traffic, wrapped
+from cosim.importing.generated import morning_peak
+from cosim.importing.partition import partition, read_regions
+from cosim.importing.regions import finish
 from cosim.importing.streets import Streets, read_streets
-from cosim.importing.trials import Peaks, Trials, routed
+from cosim.sumo.arrays import EdgeNumbers
 from cosim.sumo.net import City, load_city
+from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
+from nmfd.model import authority
 from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs.files import temporary_folder
+from nmfd.studies import plots
 
-LARGE = 5000  # edges for cars: beyond, the run before the partition is mesoscopic, so that an import takes a minute
-STANDING = 2.0  # times as long as at the speed limits: the vehicles on a few streets queue there
-LITTLE = 0.3  # of the flow over the boundaries passes no signal under control: worth a word
+LARGE_CITY_EDGES = 5000  # for cars: beyond, the run without control is mesoscopic, so that it takes a minute
+LITTLE_CONTROL = 0.3  # share of the boundary flow without a signal that is worth a line
+NET = "city.net.xml.gz"
+FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz", "additional": "city.add.xml.gz"}
+TYPES = ("vType", "vTypeDistribution")
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImportOptions:
-    """What the user asked for.
+def import_city(
+    source: Path | Box,
+    out: Path,
+    scenario: Path,
+    *,
+    regions: int | Path,
+    left_hand: bool = False,
+    routes: Sequence[Path] = (),
+    peak: bool = False,
+    level: float = 1.0,
+    mesoscopic: bool = False,
+    begin: float | None = None,
+    end: float | None = None,
+    seed: int = 0,
+    seeds: int = 3,
+    iterations: int = ITERATIONS,
+    force: bool = False,
+    progress: Progress = lambda stage, share=0.0: None,
+) -> str:
+    """Write the network and the scenario of a city; return a report.
 
-    source: a sumocfg, a net, a file of OpenStreetMap, or a box of it (cosim.importing.osm)
-    left_hand: where it drives, which OpenStreetMap does not say of single streets
-    cut: how to come by regions
-    run: simulate the city without control first
-    peak: generate a morning peak, instead of route files
-    level: times the vehicles, or the usual peak; None for the lowest that congests (cosim.importing.level)
-    mesoscopic: the scenario uses SUMO's queue model
-    begin, end [s]: instead of the sumocfg's
-    od: matrices between the TAZ of the sumocfg or of `zones`
-    effort: of the assignment of a peak; without a run everybody stays on their way at free flow
-    seeds: runs without control whose densities are averaged
+    Args:
+        source: a sumocfg, a net.xml, a file of OpenStreetMap, or a box of it.
+        out, scenario: folders of the network and the scenario.
+        regions: their number, or the user's own table edge,region.
+        left_hand: side of OpenStreetMap's streets.
+        routes: files with vehicles beside those of the sumocfg.
+        peak: generate a morning peak instead.
+        level: multiplies the vehicles or the peak [-].
+        mesoscopic: the scenario uses SUMO's queue model.
+        begin, end: [s], instead of the sumocfg's.
+        seeds: runs without control whose densities are averaged.
+        iterations: of the assignment of the peak.
+        force: replace an existing network and scenario.
+
+    Raises:
+        InputError: for input that cannot be used; nothing is written then.
     """
-
-    source: Path | osm.Box
-    left_hand: bool = False
-    out: Path
-    scenario: Path
-    cut: Clustered | Drawn
-    seed: int = 0
-    run: bool = True
-    peak: bool = False
-    level: float | None = 1.0
-    mesoscopic: bool = False
-    force: bool = False
-    begin: float | None = None
-    end: float | None = None
-    routes: tuple[Path, ...] = ()
-    od: tuple[Path, ...] = ()
-    zones: tuple[Path, ...] = ()
-    effort: Effort = Effort()
-    seeds: int = 3
-
-
-def import_city(order: ImportOptions, tell: Tell = lambda stage, share=0.0: None) -> str:
-    """Write the network and the scenario; returns what was found, for the terminal. Raises InputError, before anything
-    is written. tell: called with what is going on, and the share of it [-] that is done."""
-    _check_free(order)
-    tell("reading")
-    with osm.sumo_input(order.source, tell, left_hand=order.left_hand) as case:
-        return _import(_windowed(case, order), order, tell)
-
-
-def _import(case: SumoInput, order: ImportOptions, tell: Tell) -> str:
-    case = replace(case, routes=(*case.routes, *order.routes))
-    streets = read_streets(case.net, case.additional)
-    if isinstance(order.cut, Drawn):  # mistakes in it are told now, not after the simulations
-        read_given(streets, order.cut.file, order.cut.method)
-    order = replace(order, mesoscopic=order.mesoscopic or case.mesoscopic)
-    scale = 1.0 if order.peak else case.scale
-    traffic = _traffic(case, streets, order)
-    if order.begin is None and not order.peak:
-        case = model.without_idle(case, traffic)
-    mesoscopic = order.mesoscopic or streets.drivable.sum() > LARGE
-    effort = order.effort if order.run else replace(order.effort, iterations=0)
-    peaks = Peaks(streets, case, traffic, seed=order.seed, effort=effort, mesoscopic=mesoscopic, tell=tell)
-    times, congests = order.level or 1.0, True
-    if order.level is None:
-        times, congests = level.congesting(
-            _probe(order, case, streets, traffic, peaks, scale, tell), mesoscopic=mesoscopic, tell=tell
-        )
-    factor, assigned = scale * times, None
-    if order.peak:
-        factor, (traffic, assigned) = 1.0, peaks.at(times)
-    clock = model.clock(case, streets, traffic)
-    with _folders(order) as (net_folder, folder):
-        files = written.write_traffic(folder, traffic)
-        if assigned is not None:
-            written.write_assignment(folder / "assignment.csv", assigned)
-        baseline, gaps = None, []
-        if order.run:
-
-            def judge(edges: Path) -> None:
-                if assigned is not None:
-                    gaps.append(relative_gap(streets.path, routed(traffic), edges, begin=clock.begin, seed=order.seed))
-
-            baseline = Trials(streets, case, clock, folder, files).averaged(
-                factor, mesoscopic, order.seeds, tell, judge
+    _check_free(out, scenario, force)
+    progress("reading")
+    with sumo_input(source, progress, left_hand=left_hand) as case:
+        case = _window(replace(case, routes=(*case.routes, *routes)), begin, end)
+        streets = read_streets(case.net, case.additional)
+        own = None if isinstance(regions, int) else read_regions(streets, regions)
+        traffic = read_traffic(case, streets, seed)
+        mesoscopic = mesoscopic or case.mesoscopic
+        meso = mesoscopic or streets.drivable.sum() > LARGE_CITY_EDGES
+        factor, assigned = case.scale * level, None
+        if peak:
+            traffic, assigned = _peak(case, streets, traffic, level, seed, iterations, meso, progress)
+            factor = 1.0
+        elif not len(traffic.depart):
+            raise InputError(
+                f"{case.source}: names no vehicles for the streets of cars{_notes(traffic)}; give a sumocfg with "
+                "route-files, or add --routes FILE or --demand peak"
             )
-        left = left_alone(streets, traffic)
-        tell("partition")
-        regions, asked, moved = partition(streets, baseline, order.cut, seed=order.seed, left_alone=left)
-        name = order.out.name
-        network = model.network_of(streets, regions, name, baseline)
-        written.write_net(case.net, net_folder / written.NET)
-        written.write_table(net_folder / "regions.csv", ("edge", "region"), zip(streets.edges, regions, strict=True))
-        city = load_city(net_folder / written.NET, net_folder / "regions.csv", network.regions)
-        tell("other numbers of regions")
-        others = (
-            {}
-            if baseline is None
-            else alternatives(streets, baseline, order.cut, regions, seed=order.seed, left_alone=left)
-        )
-        found = quality.tables(streets, regions, network.region_names, city, baseline, left, others)
-        judged = verdict.of_import(network, found.gateways, regions, baseline)
-        network = replace(network, controllable=judged.boundaries.shares)
-        verdict.write_verdict(net_folder, judged)
-        if case.notice:
-            (net_folder / "NOTICE.txt").write_text(case.notice)
-        tell("writing")
-        written.write_network(net_folder, streets, regions, network, found, baseline, case.source.name)
-        demand = model.region_demand(traffic, regions, clock)
-        written.write_demand(folder / "demand.csv", demand)
-        (folder / "scenario.toml").write_text(
-            model.scenario_text(
+        elif begin is None:
+            case = model.without_idle(case, traffic)
+        clock, gaps = model.clock(case, streets, traffic), []
+
+        def inspect(edges: Path) -> None:
+            if assigned is not None:
+                gaps.append(relative_gap(streets.path, _routed(traffic), edges, begin=clock.begin, seed=seed))
+
+        with _folders(out, scenario) as (net_folder, folder):
+            files = _write_traffic(folder, traffic)
+            paths = {key: [folder / name for name in names] for key, names in files.items()}
+            baseline = averaged_runs(
+                streets,
+                routes=paths["routes"],
+                background=paths["background"],
+                additional=paths["additional"],
+                factor=factor,
+                mesoscopic=meso,
+                seeds=seeds,
+                begin=clock.begin,
+                end=clock.end,
+                step_length=model.step_length(case, clock),
+                time_to_teleport=case.time_to_teleport,
+                progress=progress,
+                inspect=inspect,
+            )
+            progress("partition")
+            left = quality.left_alone(streets, traffic.switched)
+            if own is None:
+                labels = partition(streets, baseline, regions, uncontrollable=left)
+            else:
+                labels = finish(streets, own, renumber=False)
+            if labels.max() < 1:
+                raise InputError(
+                    f"{streets.path}: no two regions can be made that can be reached from each other; give a network "
+                    "with more streets, or other regions"
+                )
+            network = model.network_of(streets, labels, out.name, baseline)
+            content = case.net.read_bytes()
+            _zip(net_folder / NET, gzip.decompress(content) if case.net.suffix == ".gz" else content)
+            pd.DataFrame({"edge": streets.edges, "region": labels}).to_csv(net_folder / "regions.csv", index=False)
+            city = load_city(net_folder / NET, net_folder / "regions.csv", network.regions)
+            tables = quality.tables(streets, labels, network.region_names, city, baseline, left)
+            verdict = quality.import_verdict(network, tables.gateways, labels, baseline)
+            network = replace(network, controllable=verdict.boundaries.shares)
+            progress("writing")
+            _write_network(net_folder, streets, labels, network, tables, case)
+            (net_folder / authority.FILE).write_text(verdict.text(), encoding="utf-8")
+            _write_demand(folder / "demand.csv", model.region_demand(traffic, labels, clock))
+            text = model.scenario_text(
                 network,
                 clock,
                 case,
-                name=order.scenario.name,
+                name=scenario.name,
                 files=files,
                 leave=traffic.switched,
-                network_path=os.path.relpath(order.out, order.scenario).replace(os.sep, "/"),
-                protected=_protected(streets, regions, baseline, network),
+                network_path=os.path.relpath(out, scenario).replace(os.sep, "/"),
+                protected=_densest(streets, labels, baseline),
                 factor=factor,
-                mesoscopic=order.mesoscopic,
-            ),
-            encoding="utf-8",
-        )
-        report = _report(order, case, streets, traffic, clock, network, asked, city, found, left, baseline)
-        report += _demand_lines(order, streets, assigned, baseline, gaps)
-        report += "".join(f"\n{sentence}" for sentence in judged.sentences)
-        report += _level_line(order, times if order.peak else factor, congests)
-        if moved and isinstance(order.cut, Drawn):
-            report += (
-                f"\n{moved:,} streets are in other regions than {order.cut.file.name} says: theirs was in "
-                "several pieces, or could not be reached from the rest"
+                mesoscopic=mesoscopic,
             )
-        if scale != 1.0:
-            report += f"\nvehicles times {scale:g}, the scale in {case.source.name}"
-        left_out = [
-            *case.left_out,
-            *([] if case.step_length == model.step_length(case, clock) else [f"step-length = {case.step_length:g}"]),
-        ]
-        if left_out:
-            report += f"\nnot taken over from {case.source.name}: {', '.join(left_out)}"
-        if mesoscopic and order.run:
-            report += "\nsimulated by SUMO's mesoscopic model" + (
-                "" if order.mesoscopic else f": the city has more than {LARGE:,} edges for cars"
-            )
-        (net_folder / "import.txt").write_text(report + "\n", encoding="utf-8")
-    return report
+            (folder / "scenario.toml").write_text(text, encoding="utf-8")
+            report = _report(case, streets, traffic, clock, network, city, tables, left, baseline)
+            report += _assignment_lines(assigned, gaps)
+            if isinstance(regions, int) and network.regions < regions:
+                report.append(
+                    f"fewer regions than the requested {regions}: the others could not be reached or fell apart"
+                )
+            elif own is not None and (moved := _moved(own, labels, streets.drivable & (own >= 0))):
+                report.append(f"{moved:,} streets are in other regions than in {regions}, which must be connected")
+            if meso != mesoscopic:
+                report.append(f"simulated by SUMO's mesoscopic model: more than {LARGE_CITY_EDGES:,} edges for cars")
+            report += verdict.sentences
+            (net_folder / "import.txt").write_text("\n".join(report) + "\n", encoding="utf-8")
+    return "\n".join(report)
 
 
-def _traffic(case: SumoInput, streets: Streets, order: ImportOptions) -> Traffic:
-    """The city's own vehicles, or what its files hold beside a demand that is to be generated."""
-    zones = order.zones
-    if order.od and not zones and isinstance(order.cut, Drawn) and order.cut.method == "taz":
-        zones = (order.cut.file,)
-    traffic = read_traffic(case, streets, order.seed, order.od, zones)
-    if not order.peak:
-        if not len(traffic.depart):
-            raise InputError(
-                f"{case.source}: names no vehicles for the streets of cars{_notes(traffic)}; give a sumocfg with "
-                "route-files, or add --routes FILE, --od FILE or --demand peak"
-            )
-        return traffic
-    if len(traffic.depart):
-        raise InputError(
-            f"--demand: {case.source} has {len(traffic.depart):,} vehicles of its own; omit --demand, or give "
-            "the network alone"
-        )
-    return traffic
-
-
-def left_alone(streets: Streets, traffic: Traffic) -> dict[str, str]:
-    """Signal -> why perimeter control leaves it alone: it holds back at programmes of HELD kinds that always run."""
-    return quality.left_alone(streets) | {signal: "programme follows a timetable" for signal in traffic.switched}
-
-
-def _check_free(order: ImportOptions) -> None:
-    for folder, file, option in ((order.out, "network.toml", "--out"), (order.scenario, "scenario.toml", "--scenario")):
+def _check_free(out: Path, scenario: Path, force: bool) -> None:
+    for folder, file, option in ((out, "network.toml", "--out"), (scenario, "scenario.toml", "--out")):
         if folder.name in ("", "..") or "," in str(folder):
             raise InputError(
-                f"{option}: expected a folder such as {option[2:]}/mycity, without a comma, which SUMO "
-                f"cannot read, got {folder} instead"
+                f"{option}: expected a folder such as networks/mycity, without a comma, got {folder} instead"
             )
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{option}: {folder}: is not a folder; choose another name")
-        if (folder / file).exists() and not order.force:
+        if (folder / file).exists() and not force:
             raise InputError(f"{option}: {folder / file} exists; choose another folder, or --force to replace it")
 
 
-def _windowed(case: SumoInput, order: ImportOptions) -> SumoInput:
-    """The case from --begin to --end, where these are given."""
-    begin = case.begin if order.begin is None else order.begin
-    end = case.end if order.end is None else order.end
-    if begin < 0:
-        where = f"{case.source}: begin" if order.begin is None else "--begin"
-        raise InputError(f"{where}: expected a time from 0 s up, got {begin:g} instead")
-    if end is not None and end <= begin:
-        where = f"{case.source}: end" if order.end is None else "--end"
-        raise InputError(f"{where}: expected a time after the beginning at {begin:g} s, got {end:g} instead")
-    return replace(case, begin=begin, end=end)
+def _window(case: SumoInput, begin: float | None, end: float | None) -> SumoInput:
+    """Apply --begin and --end to a case. Raises InputError."""
+    first, last = case.begin if begin is None else begin, case.end if end is None else end
+    if first < 0:
+        where = f"{case.source}: begin" if begin is None else "--begin"
+        raise InputError(f"{where}: expected a time from 0 s up, got {first:g} instead")
+    if last is not None and last <= first:
+        where = f"{case.source}: end" if end is None else "--end"
+        raise InputError(f"{where}: expected a time after the beginning at {first:g} s, got {last:g} instead")
+    return replace(case, begin=first, end=last)
+
+
+def _peak(
+    case: SumoInput,
+    streets: Streets,
+    beside: Traffic,
+    level: float,
+    seed: int,
+    iterations: int,
+    mesoscopic: bool,
+    progress: Progress,
+) -> tuple[Traffic, Assigned]:
+    """Generate a morning peak beside the city's other traffic, and assign its routes. Only cars drive in that."""
+    if len(beside.depart):
+        raise InputError(
+            f"--demand: {case.source} has {len(beside.depart):,} vehicles of its own; omit --demand, or give the "
+            "network alone"
+        )
+    peak = morning_peak(streets, level=level, begin=case.begin, seed=seed)
+    known = {part.get("id") for element in beside.shared for part in element.iter("vType")}
+    types = tuple(e for e in peak.shared if e.get("id") not in known)  # the city may define a type car
+    notes = {**beside.notes, **peak.notes}
+    traffic = replace(beside, vehicles=peak.vehicles, depart=peak.depart, origin=peak.origin, notes=notes)
+    traffic = replace(traffic, destination=peak.destination, shared=beside.shared + types)
+    clock = model.clock(case, streets, traffic)
+    others = [element for element in traffic.shared if element.tag not in TYPES]
+    with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as folder:
+        additional = [Path(folder) / "city.add.xml"] if others else []
+        for path in additional:
+            ElementTree.ElementTree(wrapped(others, "additional")).write(path)
+        assigned = assign(
+            streets.path.absolute(),
+            _routed(traffic),
+            begin=clock.begin,
+            end=clock.end,
+            seed=seed,
+            iterations=iterations,
+            additional=additional,
+            mesoscopic=mesoscopic,
+            time_to_teleport=case.time_to_teleport,
+            progress=progress,
+        )
+    for vehicle in traffic.vehicles:
+        if (route := vehicle.find("route")) is not None and (name := vehicle.get("id", "")) in assigned.routes:
+            route.set("edges", " ".join(assigned.routes[name]))
+    return traffic, assigned
+
+
+def _routed(traffic: Traffic) -> list[ElementTree.Element]:
+    """Return the vehicles of a generated demand after the types that they need."""
+    return [*(element for element in traffic.shared if element.tag in TYPES), *traffic.vehicles]
 
 
 @contextmanager
-def _folders(order: ImportOptions) -> Iterator[tuple[Path, Path]]:
-    """Temporary folders for network and scenario, which take their places together at the end."""
+def _folders(out: Path, scenario: Path) -> Iterator[tuple[Path, Path]]:
+    """Provide temporary folders for network and scenario, which take their places together at the end."""
     with ExitStack() as stack:
-        made: list[tuple[Path, Path]] = []
-        for folder in (order.out, order.scenario):
+        pairs = []
+        for folder in (out, scenario):
             folder.parent.mkdir(parents=True, exist_ok=True)
-            made.append((stack.enter_context(temporary_folder(f".{folder.name}-", where=folder.parent)), folder))
-        yield made[0][0], made[1][0]
-        for temporary, folder in made:
+            temporary = tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent)
+            pairs.append((Path(stack.enter_context(temporary)), folder))
+        yield pairs[0][0], pairs[1][0]
+        for temporary, folder in pairs:
             folder.mkdir(exist_ok=True)
-            # Without its toml file a folder counts as nothing: it goes first and comes last.
+            # A folder without its toml file counts as empty: that file goes first and comes last.
             for old in folder.glob("*.toml"):
                 if (temporary / old.name).exists():
                     old.unlink()
-            if folder == order.out:  # the model of guided drivers in other regions
+            if folder == out:  # the model of guided drivers in other regions
                 (folder / GUIDED / "network.toml").unlink(missing_ok=True)
             for file in sorted(temporary.iterdir(), key=lambda file: (file.suffix == ".toml", file.name)):
                 os.replace(file, folder / file.name)
 
 
-def _probe(
-    order: ImportOptions, case: SumoInput, streets: Streets, traffic: Traffic, peaks: Peaks, scale: float, tell: Tell
-) -> level.Probe:
-    """Runs of other levels, seen by provisional regions: the user's own, or as many of similar size."""
-    if isinstance(order.cut, Drawn):
-        regions = partition(streets, None, order.cut, seed=order.seed)[0]
-    else:
-        regions = partition(streets, None, replace(order.cut, method="geometric"), seed=order.seed)[0]
-
-    def probe(times: float, mesoscopic: bool) -> level.Loaded:
-        vehicles, factor = (peaks.at(times)[0], 1.0) if order.peak else (traffic, scale * times)
-        with temporary_folder() as folder:
-            files = written.write_traffic(folder, vehicles)
-            trials = Trials(streets, case, model.clock(case, streets, vehicles), folder, files)
-            run = trials.run(
-                factor, mesoscopic, reached=lambda share: tell(f"simulating demand times {times:g}", share)
-            )
-            return level.loaded(run, streets, regions)
-
-    return probe
+def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
+    """Write vehicles, background and what they refer to; return the file names by key of [sumo]."""
+    contents = {
+        "routes": (traffic.vehicles, "routes"),
+        "background": (traffic.background, "routes"),
+        "additional": (traffic.shared, "additional"),
+    }
+    for key, (elements, tag) in contents.items():
+        if len(elements):
+            root = wrapped(elements, tag)
+            ElementTree.indent(root)
+            _zip(folder / FILES[key], ElementTree.tostring(root))
+    return {key: [FILES[key]] if len(elements) else [] for key, (elements, _) in contents.items()}
 
 
-def _demand_lines(
-    order: ImportOptions, streets: Streets, assigned: Assigned | None, baseline: Baseline | None, gaps: Sequence[float]
-) -> str:
-    """How far a generated demand is from an equilibrium, and whether a few streets hold it, for the report. gaps: of
-    the run without control, in which SUMO's model may be another one than in the assignment."""
-    text = ""
-    if assigned is not None:
-        last = assigned.iterations[assigned.best]
-        text = (
-            f"\nroutes by duaIterate.py: relative gap {100 * assigned.iterations[0].gap:.1f} % at free flow, "
-            f"{100 * assigned.gap:.1f} % in iteration {assigned.best + 1} of {len(assigned.iterations)}, "
-            f"{'mesoscopic' if last.mesoscopic else 'car-following'} (assignment.csv)"
-            + "".join(f", {100 * gap:.1f} % in the run without control" for gap in gaps)
-        )
-        if not assigned.reached:
-            text += (
-                f"\nWARNING: the relative gap of {100 * assigned.effort.gap:g} % was not reached: some of what "
-                "rerouting gains here it would gain from drivers who know the city, too; more --iterations, or a "
-                "lower --level"
-            )
-    elif order.peak:
-        text = (
-            "\nWARNING: everybody takes a way that is fastest at free flow: no routes were assigned; omit "
-            "--no-run and --iterations 0 for a demand on which controllers can be compared"
-        )
-    if baseline is not None:
-        half, of = baseline.concentration(streets.drivable)
-        text += (
-            f"\nhalf of all vehicles are on {half:,} of {of:,} edges ({100 * half / max(of, 1):.1f} %) in the "
-            "busiest quarter of an hour"
-        )
-        if half < level.FEW * of and baseline.pace_of_crowded(streets, streets.drivable) > STANDING:
-            text += (
-                "\nWARNING: these are queues on a few streets rather than a congested network: what relieves them "
-                "gains much, for drivers who know the city as well"
-            )
-    return text
+def _write_network(
+    folder: Path,
+    streets: Streets,
+    regions: EdgeNumbers,
+    network: RegionalModel,
+    tables: quality.Tables,
+    case: SumoInput,
+) -> None:
+    """Write network.toml, its tables and its map."""
+    text = model.network_text(network, {"net": NET, "regions": "regions.csv"}, case.source.name)
+    (folder / "network.toml").write_text(text, encoding="utf-8")
+    pd.DataFrame(tables.quality).to_csv(folder / "quality.csv", index=False)
+    pd.DataFrame(tables.gateways).to_csv(folder / "gateways.csv", index=False)
+    if case.notice:
+        (folder / "NOTICE.txt").write_text(case.notice)
+    width, height = np.ptp(streets.centre, axis=0) + 1.0
+    drawing = plots.figure(6.2, float(np.clip(6.2 * height / width, 3.0, 8.0)) + 0.8)
+    ax = drawing.subplots()
+    maps.region_map(ax, streets, regions, network.region_names, network.positions)
+    maps.gateway_marks(ax, streets, tables)
+    drawing.savefig(folder / "map.png", dpi=130, metadata={"Software": None})
 
 
-def _level_line(order: ImportOptions, times: float, congests: bool) -> str:
-    """What came of --level, for the report."""
-    if order.level is not None:
-        return ""
-    if congests:
-        return (
-            f"\nlevel: demand times {times:g} is the lowest tried at which a region comes to its critical "
-            "accumulation without control"
-        )
-    return f"\nlevel: not even demand times {times:g} brings a region to its critical accumulation without control"
+def _write_demand(path: Path, demand: PairsOverTime) -> None:
+    rows = [(k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)]
+    pd.DataFrame(rows, columns=["interval", "from", "to", "veh_s"]).to_csv(path, index=False)
 
 
-def _protected(streets: Streets, regions: np.ndarray, baseline: Baseline | None, network: RegionalModel) -> int:
-    """The densest region; without a run, the one nearest to the middle."""
-    if baseline is not None:
-        load = np.bincount(regions, baseline.density(streets) * streets.lane_metres, network.regions)
-        return int(np.argmax(load / np.bincount(regions, streets.lane_metres, network.regions)))
-    middle = np.average(streets.centre, axis=0, weights=streets.lane_metres)
-    return int(((positions(streets, regions) - middle) ** 2).sum(axis=1).argmin())
+def _zip(path: Path, content: bytes) -> None:
+    """Write a gzip file without a date: the same content gives the same bytes."""
+    with path.open("wb") as stream, gzip.GzipFile(fileobj=stream, mode="wb", filename="", mtime=0) as packed:
+        packed.write(content)
+
+
+def _densest(streets: Streets, regions: np.ndarray, baseline: Baseline) -> int:
+    load = np.bincount(regions, baseline.density(streets) * streets.lane_metres)
+    return int(np.argmax(load / np.bincount(regions, streets.lane_metres)))
+
+
+def _moved(labels: np.ndarray, regions: np.ndarray, members: np.ndarray) -> int:
+    """Count the edges that are not in the region of most edges with the same label."""
+    votes = np.zeros((int(labels.max()) + 1, int(regions.max()) + 1), dtype=int)
+    np.add.at(votes, (labels[members], regions[members]), 1)
+    return int(votes.sum() - votes.max(axis=1).sum())
 
 
 def _notes(traffic: Traffic) -> str:
@@ -335,62 +333,58 @@ def _notes(traffic: Traffic) -> str:
 
 
 def _report(
-    order: ImportOptions,
     case: SumoInput,
     streets: Streets,
     traffic: Traffic,
     clock: model.Clock,
     network: RegionalModel,
-    asked: int,
     city: City,
-    found: quality.Tables,
+    tables: quality.Tables,
     left: Mapping[str, str],
-    baseline: Baseline | None,
-) -> str:
-    """What was found, what was left alone and what cannot be done, in a few lines."""
-    usable, part = streets.drivable.sum(), streets.main_part.sum()
-    signals = set(city.signals.values())
+    baseline: Baseline,
+) -> list[str]:
+    """Return what was imported, left alone and left out, in lines."""
+    usable, detached = streets.drivable.sum(), (streets.drivable & ~streets.main_part).sum()
+    at_gateways = {g["signal"] for g in tables.gateways if g["signal"]}
+    skipped = sorted(signal for signal in left if signal in at_gateways)
+    left_out = list(case.left_out)
+    if case.step_length != model.step_length(case, clock):
+        left_out.append(f"step-length = {case.step_length:g}")
     lines = [
         f"{case.source.name}: {len(streets.edges):,} edges, {usable:,} for cars"
-        + (f" ({usable - part:,} of them cut off from the rest)" if part < usable else "")
+        + (f" ({detached:,} of them cut off from the rest)" if detached else "")
         + (", left-hand traffic" if streets.left_hand else "")
-        + f"; {len(signals):,} signals that cars see; {len(traffic.vehicles):,} vehicles in {clock.steps} intervals of "
-        f"{clock.step:g} s{_notes(traffic)}",
-        f"{network.regions} regions by method {order.cut.method}, seed {order.seed}"
-        + (
-            f"; {asked} were asked for: the others fell apart, or could not be reached from the rest"
-            if network.regions < asked
-            else ""
-        ),
-        quality.text(found),
+        + f"; {len(set(city.signals.values())):,} signals; {len(traffic.vehicles):,} vehicles in {clock.steps} "
+        f"intervals of {clock.step:g} s{_notes(traffic)}",
+        f"{network.regions} regions",
+        quality.quality_table(tables),
+        f"without control: driving takes {baseline.pace(streets):.1f} times as long as at the speed limits; "
+        f"{baseline.teleports} teleports, {baseline.running} vehicles on the road and {baseline.waiting} waiting to "
+        "enter at the end",
     ]
-    at_gateways = {g["signal"] for g in found.gateways if g["signal"]}
-    skipped = sorted(signal for signal in left if signal in at_gateways)
     if skipped:
         lines.append(
             f"left alone at boundaries: {len(skipped)} of {len(at_gateways)} signals, such as {skipped[0]} "
             f"({left[skipped[0]]}); see gateways.csv"
         )
-    if several := sum(len(logics) > 1 for logics in streets.logics.values()):
-        lines.append(f"{several} signals have several programmes: the last that is loaded runs, as in SUMO")
-    if found.uncontrolled > LITTLE:
-        lines.append(
-            f"perimeter control reaches only {100 * (1 - found.uncontrolled):.0f} % of the flow over the "
-            "boundaries: other regions (--regions, --method, your own) may have more signals between them"
-        )
-    if baseline is not None:
-        lines.append(
-            f"without control: driving takes {baseline.pace(streets):.1f} times as long as at the speed limits; "
-            f"{baseline.teleports} teleports, {baseline.running} vehicles on the road and {baseline.waiting} waiting "
-            "to enter at the end"
-        )
-        if baseline.dropped:
-            lines.append(
-                f"{baseline.dropped:,} vehicles never drove: SUMO found no way, or no lane to depart on, for them"
-            )
-    return "\n".join(lines)
+    if tables.uncontrolled > LITTLE_CONTROL:
+        lines.append(f"perimeter control reaches only {100 * (1 - tables.uncontrolled):.0f} % of the boundary flow")
+    if baseline.dropped:
+        lines.append(f"{baseline.dropped:,} vehicles never drove: SUMO found no route or no free lane for them")
+    if case.scale != 1.0:
+        lines.append(f"vehicles times {case.scale:g}, the scale in {case.source.name}")
+    if left_out:
+        lines.append(f"not taken over from {case.source.name}: {', '.join(left_out)}")
+    return lines
 
 
-def parse_time(text: str | None, option: str) -> float | None:
-    """A time of the command line, in seconds or as hours:minutes:seconds."""
-    return None if text is None else seconds(text, option)
+def _assignment_lines(assigned: Assigned | None, gaps: Sequence[float]) -> list[str]:
+    """Return how far a generated demand is from an equilibrium. gaps: in the run without control."""
+    if assigned is None:
+        return []
+    line = f"routes by duaIterate.py: relative gap {100 * assigned.iterations[0].gap:.1f} % at free flow, "
+    line += f"{100 * assigned.gap:.1f} % in iteration {assigned.best + 1} of {len(assigned.iterations)}"
+    line += "".join(f", {100 * gap:.1f} % in the run without control" for gap in gaps)
+    if assigned.gap <= GAP:
+        return [line]
+    return [line, f"WARNING: the relative gap is above {100 * GAP:g} %: rerouting here gains what drivers know already"]

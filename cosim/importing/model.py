@@ -1,4 +1,4 @@
-"""The regional model and the scenario of an imported city, as text for network.toml and scenario.toml."""
+"""Regional model and scenario.toml of an imported city."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -16,21 +16,20 @@ from cosim.sumo.net import JAM_SPACING
 from nmfd.arrays import PairsOverTime
 from nmfd.model.identification import observed_split_ratios
 from nmfd.model.mfd import Mfd
-from nmfd.model.regional_model import RegionalModel, network_toml
+from nmfd.model.model_file import network_toml
+from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.config import quoted
 
-# The shape of the published MFD, g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam, for want of anything measured.
+# Shape of the published MFD until one is measured: g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam.
 ALPHA, BETA = 0.98405, -1.97190
 JAM_SHARE = 0.6  # of the lanes that can fill up
-SIGNAL_DELAY = 0.5  # speed with signals over the speed limit
-DEFAULT_CYCLE = 90.0  # s
-CYCLES = (60.0, 180.0)  # s; shorter cycles are taken several times
-IDLE = 900.0  # s
-RECOVERY = 1800.0  # s after the last departure, for the network to empty
-# A policy that trusts an identified model too much holds vehicles back, or sends them round, for gains that SUMO does
-# not pay (measured on grid7): it starts from no control and must gain in many models at many demand levels. What guides
-# is of the compact kind, whose prices add to guidance by travel times: policies that command shares of their own took
-# 34 % longer than guidance alone in Bologna (scenarios/bologna/reference).
+SIGNAL_SPEED_SHARE = 0.5  # speed with signals over the speed limit
+DEFAULT_CYCLE_S = 90.0
+SHORTEST_STEP_S, LONGEST_STEP_S = 60.0, 180.0  # control intervals; shorter cycles are taken several times
+IDLE_S = 900.0  # before the first departure, at most
+RECOVERY_S = 1800.0  # after the last departure, for the network to empty
+# A policy that relies on one identified model gains there and not in SUMO: it starts from no control and trains on many
+# models and demand levels. With guidance a compact policy adds prices to travel times.
 TRAINING = """
 [controllers.dpc-pc]        # training
 steps = 600
@@ -54,7 +53,7 @@ detour_cost = 600.0         # s per diverted vehicle
 
 @dataclass(frozen=True, kw_only=True)
 class Clock:
-    """begin [s] of SUMO's time; step: control interval [s]; steps: their number."""
+    """Control intervals: begin [s] of SUMO's time, length [s], number."""
 
     begin: float
     step: float
@@ -62,30 +61,30 @@ class Clock:
 
     @property
     def end(self) -> float:
-        """[s] of SUMO's time."""
+        """End of the last control interval [s], in SUMO's time."""
         return self.begin + self.steps * self.step
 
 
 def without_idle(case: SumoInput, traffic: Traffic) -> SumoInput:
-    """The case, which begins later where nobody departs for more than IDLE: at the full IDLE before the first does."""
+    """Begin the case later if its first vehicle departs more than IDLE_S after the beginning."""
     first = traffic.depart[0] if len(traffic.depart) else case.begin
-    return case if first - case.begin <= IDLE else replace(case, begin=float(first // IDLE * IDLE))
+    return case if first - case.begin <= IDLE_S else replace(case, begin=float(first // IDLE_S * IDLE_S))
 
 
 def clock(case: SumoInput, streets: Streets, traffic: Traffic) -> Clock:
-    """Control intervals of the most common signal cycle, until RECOVERY after the last departure."""
-    running = [found[-1] for found in streets.logics.values() if round(found[-1].cycle) > 0]
+    """Return control intervals of the most common signal cycle, until RECOVERY_S after the last departure."""
+    running = [logics[-1] for logics in streets.logics.values() if round(logics[-1].cycle) > 0]
     cycles = Counter(round(logic.cycle) for logic in running if logic.kind == "static")
-    cycle = float(max(sorted(cycles), key=cycles.__getitem__)) if cycles else DEFAULT_CYCLE
-    step = cycle * np.ceil(CYCLES[0] / cycle)
-    if step > CYCLES[1]:
-        step = DEFAULT_CYCLE
+    cycle = float(max(sorted(cycles), key=cycles.__getitem__)) if cycles else DEFAULT_CYCLE_S
+    step = cycle * np.ceil(SHORTEST_STEP_S / cycle)
+    if step > LONGEST_STEP_S:
+        step = DEFAULT_CYCLE_S
     last = traffic.depart[-1] if len(traffic.depart) else case.begin
-    return Clock(begin=case.begin, step=float(step), steps=int(np.ceil((last - case.begin + RECOVERY) / step)))
+    return Clock(begin=case.begin, step=float(step), steps=int(np.ceil((last - case.begin + RECOVERY_S) / step)))
 
 
 def region_demand(traffic: Traffic, regions: EdgeNumbers, clock: Clock) -> PairsOverTime:
-    """(T, R, R) [veh/s]: departures by interval and pair of regions."""
+    """Return the departures (T, R, R) [veh/s] by interval and pair of regions."""
     count = int(regions.max()) + 1
     demand = np.zeros((clock.steps, count, count))
     k = np.minimum(((traffic.depart - clock.begin) / clock.step).astype(int), clock.steps - 1)
@@ -93,8 +92,8 @@ def region_demand(traffic: Traffic, regions: EdgeNumbers, clock: Clock) -> Pairs
     return demand
 
 
-def network_of(streets: Streets, regions: EdgeNumbers, name: str, baseline: Baseline | None) -> RegionalModel:
-    """The regional model: adjacency from the streets, own splits from the baseline, MFDs from lanes and speeds."""
+def network_of(streets: Streets, regions: EdgeNumbers, name: str, baseline: Baseline) -> RegionalModel:
+    """Return the regional model: adjacency from streets, split ratios from the baseline, MFDs from lanes and speeds."""
     network = RegionalModel(
         name=name,
         region_names=names(streets, regions),
@@ -105,30 +104,23 @@ def network_of(streets: Streets, regions: EdgeNumbers, name: str, baseline: Base
         u_max=0.9,
         placeholder=True,
     )
-    if baseline is None:
-        return network
     return replace(network, observed_split_ratios=observed_split_ratios(network, baseline.crossings(regions)))
 
 
-def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline | None) -> tuple[Mfd, ...]:
-    """Free-flow rate: speed limit, halved by signals, over the metres that a visit takes; jam: how many fit in."""
+def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline) -> tuple[Mfd, ...]:
+    """Return MFDs with a free-flow rate from speed limits and metres per visit, and a jam accumulation from lanes."""
     count = int(regions.max()) + 1
     lanes = np.bincount(regions, streets.lane_metres, count)
     speed = np.bincount(regions, streets.lane_metres * streets.speed, count) / np.maximum(lanes, 1.0)
     across = np.array([np.sqrt(np.ptp(streets.centre[regions == r], axis=0).prod()) for r in range(count)])
-    visit = 0.7 * np.maximum(across, 100.0)
-    if baseline is not None:
-        measured = baseline.metres_per_visit(streets, regions)
-        visit = np.where(np.isnan(measured), visit, np.maximum(measured, 50.0))
-    found = []
-    for region in range(count):
-        rate, jam = SIGNAL_DELAY * speed[region] / visit[region], max(JAM_SHARE * lanes[region] / JAM_SPACING, 10.0)
-        found.append(Mfd(a=rate * ALPHA / jam**2, b=rate * BETA / jam, c=rate, jam=jam))
-    return tuple(found)
+    measured = baseline.metres_per_visit(streets, regions)
+    visit = np.where(np.isnan(measured), 0.7 * np.maximum(across, 100.0), np.maximum(measured, 50.0))
+    rate, jam = SIGNAL_SPEED_SHARE * speed / visit, np.maximum(JAM_SHARE * lanes / JAM_SPACING, 10.0)
+    return tuple(Mfd(a=c * ALPHA / n**2, b=c * BETA / n, c=c, jam=n) for c, n in zip(rate, jam, strict=True))
 
 
 def network_text(network: RegionalModel, sumo: Mapping[str, str], source: str) -> str:
-    """The network.toml. sumo: its table [sumo]; source: what was imported."""
+    """Return the network.toml with a table [sumo]; `source` names the imported file."""
     return network_toml(
         network,
         sumo,
@@ -150,7 +142,7 @@ def scenario_text(
     factor: float = 1.0,
     mesoscopic: bool = False,
 ) -> str:
-    """scenario.toml; files: routes, background, additional -> file names beside it."""
+    """Return the scenario.toml; `files` maps routes, background and additional to file names beside it."""
     fastest = max(mfd.c for mfd in network.mfds)
     substeps = int(np.ceil(clock.step / min(30.0, 0.5 / fastest)))
     lines = [
@@ -163,7 +155,9 @@ def scenario_text(
         f"protected = [{protected}]             # the densest region; {network.region_names[protected]}",
         'demand_file = "demand.csv"  # veh/s by interval and pair of regions, counted from the vehicles',
         f"demand_factor = {factor:g}         # vehicles are left out, or drive twice",
-        "forecast_error = 0.0        # standard deviation of the logarithm of forecast over demand",
+        "",
+        "[forecast]",
+        "error = 0.0                 # of the forecast demand, std of its logarithm",
         "",
         "[sumo]",
         f"begin = {clock.begin:.1f}",
@@ -181,6 +175,6 @@ def scenario_text(
 
 
 def step_length(case: SumoInput, clock: Clock) -> float:
-    """[s] The city's own step where the control interval is a multiple of it, else 1 s."""
+    """Return the city's own step [s] if it divides the control interval, else 1 s."""
     own = case.step_length
     return own if 0.0 < own <= 1.0 and abs(clock.step / own - round(clock.step / own)) < 1e-9 else 1.0

@@ -1,112 +1,212 @@
-"""Cutting a city into regions, by one of several methods."""
+"""Regions of similar density by Ward's criterion on the road graph, or the regions of the user's own table.
 
-from collections.abc import Collection
-from contextlib import suppress
+The aims are those of Ji and Geroliminis, "On the spatial partitioning of urban transportation networks" (2012): regions
+that are homogeneous in density, connected and compact. Perimeter control needs more: boundaries at signals. So streets
+that much traffic joins without a controllable signal merge first.
+"""
+
+from collections import Counter
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
+import pandas as pd
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from sklearn.cluster import AgglomerativeClustering
 
 from cosim.importing.baseline import Baseline
-from cosim.importing.blocks import make_blocks
-from cosim.importing.clustering import agglomerate, features
-from cosim.importing.geometric import k_means
-from cosim.importing.given import read_given
-from cosim.importing.refine import best, prices
+from cosim.importing.maps import sampled
 from cosim.importing.regions import finish
-from cosim.importing.streets import Streets
-from cosim.sumo.arrays import EdgeNumbers
+from cosim.importing.streets import Streets, graph
+from cosim.sumo.arrays import EdgeNumbers, PerEdge
 from nmfd.errors import InputError
 
-STARTS = 4  # of k-means, from which the partition is refined
-SIDE_BY_SIDE = 20  # partitions, about, that are compared
+CARRIAGEWAY_DISTANCE_M = 30.0  # between the carriageways of one road, at most
+OPPOSED_COSINE = -0.9  # of the angle between their directions, at most
+CARRIAGEWAY_SHARE = 0.02  # of the network: no block grows beyond this by joining carriageways
+SMOOTHING_ROUNDS = 2  # of averaging densities with the neighbours
+HIGHEST_DENSITY = 0.15  # veh/m of lane; denser counts as this dense
+UNSIGNALLED_SHARE = 0.3  # of the mean region, up to which streets merge over connections without a signal
+SMALLEST_SHARE = 0.4  # of the mean region, in lane metres of the core: smaller clusters dissolve
+MAX_EXTRA_CLUSTERS = 20  # beyond the requested number, among which enough large ones are searched
 
 
 @dataclass(frozen=True, kw_only=True)
-class Clustered:
-    """Into so many regions, by "density": clusters of streets with similar densities without control, or "geometric":
-    k-means on the road graph."""
+class Blocks:
+    """B pieces of the main part of a network that no boundary divides: roads with all carriageways, roundabouts.
 
-    method: Literal["density", "geometric"]
-    regions: int
+    of: (E,) block of an edge, -1 outside the main part
+    weight: (B,) lane metres; core: (B,) those of edges of the strongly connected core
+    position: (B, 2) [m]
+    joins: (B, B) symmetric, number of connections between two blocks
+    """
+
+    of: Int[np.ndarray, " E"]
+    weight: Float[np.ndarray, " B"]
+    core: Float[np.ndarray, " B"]
+    position: Float[np.ndarray, "B 2"]
+    joins: csr_array
+
+    def mean(self, value: PerEdge, weight: PerEdge) -> Float[np.ndarray, " B"]:
+        """Return the weighted mean of a value over the edges of each block."""
+        inside = self.of >= 0
+        total = np.bincount(self.of[inside], (value * weight)[inside], len(self.weight))
+        return total / np.maximum(np.bincount(self.of[inside], weight[inside], len(self.weight)), 1e-9)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Drawn:
-    """As the user's file says, by method: a csv with the columns edge,region, or a SUMO file with a TAZ, or one or more
-    polygons, per region."""
+def read_regions(streets: Streets, path: Path) -> EdgeNumbers:
+    """Read the region of every edge from a table edge,region; -1 for edges it does not name.
 
-    method: Literal["edges", "taz", "polygons"]
-    file: Path
+    Raises:
+        InputError: for an unreadable table, unknown edges, fewer than two regions, or a region without edges for cars.
+    """
+    try:
+        table = pd.read_csv(path, dtype={"edge": str, "region": int}, encoding="utf-8-sig", skipinitialspace=True)
+        edges, regions = table["edge"].str.strip(), table["region"].to_numpy()
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: expected a csv with the columns edge,region ({error}); correct it") from None
+    if unknown := sorted(set(edges) - set(streets.edges)):
+        raise InputError(f"{path}: edge {unknown[0]} is not in {streets.path}; remove it or give its network")
+    if (again := edges[edges.duplicated()]).size:
+        raise InputError(f"{path}: edge {again.iloc[0]} has several rows; leave one")
+    labels = np.full(len(streets.edges), -1)
+    labels[[streets.number[edge] for edge in edges]] = regions
+    used = np.unique(labels[streets.drivable & (labels >= 0)])
+    if regions.min(initial=0) < 0 or len(used) < 2 or len(used) != labels.max() + 1:
+        raise InputError(f"{path}: expected two or more regions 0, 1, ..., each with an edge that cars may use")
+    return labels
 
 
 def partition(
-    streets: Streets, baseline: Baseline | None, cut: Clustered | Drawn, *, seed: int, left_alone: Collection[str] = ()
-) -> tuple[EdgeNumbers, int, int]:
-    """(E,) region of every edge, numbered from 0, how many were asked for, and how many streets are in another one than
-    a file of the user's says.
+    streets: Streets, baseline: Baseline, regions: int, *, uncontrollable: Collection[str] = ()
+) -> EdgeNumbers:
+    """Cluster the streets into regions of similar density without control.
 
-    left_alone: signals that perimeter control cannot use. Regions of the user's own keep their order and edges, but
-    edges without a region get one. Raises InputError where there are no two regions to be had.
+    Args:
+        regions: requested number; fewer result if clusters cannot be reached from each other.
+        uncontrollable: signals that perimeter control cannot use.
+
+    Raises:
+        InputError: if the network has too few streets for the requested regions.
     """
-    if isinstance(cut, Drawn):
-        labels = read_given(streets, cut.file, cut.method)
-        found, regions = finish(streets, labels, renumber=False), int(labels.max()) + 1
-        moved = _moved(labels, found, streets.drivable & (labels >= 0))
-    else:
-        regions, moved = cut.regions, 0
-        blocks = make_blocks(streets)
-        if regions > len(blocks.weight):
-            raise InputError(
-                f"--regions: expected at most {len(blocks.weight)}, the streets of {streets.path}, got {regions} "
-                "instead"
-            )
-        density = np.zeros(len(streets.edges)) if baseline is None else baseline.density(streets)
-        feature = features(blocks, blocks.mean(density, streets.lane_metres))
-        if cut.method == "geometric":
-            feature = feature[:, 1:]
-            starts = []
+    blocks = make_blocks(streets)
+    count = len(blocks.weight)
+    if regions > count:
+        raise InputError(f"--regions: expected at most {count}, the streets of {streets.path}, got {regions} instead")
+    controllable = np.array([signal is not None and signal not in uncontrollable for signal in streets.link_signals])
+    merged = _without_signals(streets, blocks, baseline.moves(), controllable, regions)
+    feature = features(blocks, blocks.mean(baseline.density(streets), streets.lane_metres))
+    weight = np.bincount(merged, blocks.weight)
+    feature = np.stack([np.bincount(merged, blocks.weight * axis) / weight for axis in feature.T], axis=1)[merged]
+    labels = cluster(blocks, feature, regions)
+    return finish(streets, np.where(blocks.of >= 0, labels[blocks.of], -1))
+
+
+def cluster(blocks: Blocks, feature: Float[np.ndarray, "B F"], regions: int) -> Int[np.ndarray, " B"]:
+    """Return the cluster of every block; -1 in clusters that are too small for a region."""
+    least = SMALLEST_SHARE * blocks.core.sum() / regions
+    best, large_of_best = np.zeros(len(feature), dtype=int), 0
+    for count in range(regions, min(regions + MAX_EXTRA_CLUSTERS, len(feature)) + 1):
+        labels = AgglomerativeClustering(n_clusters=count, connectivity=blocks.joins).fit_predict(feature)
+        large = np.bincount(labels, blocks.core) >= least
+        if large_of_best < large.sum() <= regions:
+            best, large_of_best = np.where(large[labels], labels, -1), large.sum()
+        if large_of_best == regions:
+            break
+    return best
+
+
+def features(blocks: Blocks, density: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 3"]:
+    """Return density of the neighbourhood and position of each block, each with variance 1 over the city's lanes."""
+    weight, joins = blocks.weight, (blocks.joins > 0).astype(float)
+    smooth = np.minimum(density, HIGHEST_DENSITY)
+    for _ in range(SMOOTHING_ROUNDS):
+        smooth = (smooth * weight + joins @ (smooth * weight)) / (weight + joins @ weight)
+    place = blocks.position - np.average(blocks.position, axis=0, weights=weight)
+    radius = np.sqrt(np.average((place**2).sum(axis=1), weights=weight))
+    spread = np.sqrt(np.average((smooth - np.average(smooth, weights=weight)) ** 2, weights=weight))
+    return np.column_stack([smooth / max(spread, 1e-9), place / max(radius, 1e-9)])
+
+
+def make_blocks(streets: Streets) -> Blocks:
+    """Group the edges of the main part into blocks."""
+    size, inside = len(streets.edges), streets.main_part
+    rings = [(ring[0], n) for ring in streets.roundabouts for n in ring[1:]]
+    pairs = np.array([*_opposite(streets), *rings], dtype=int).reshape(-1, 2)
+    pairs = pairs[inside[pairs].all(axis=1)]
+    _, label = connected_components(graph(pairs, size), directed=False)
+    label = _merged(label, _beside(streets), streets.lane_metres, CARRIAGEWAY_SHARE * streets.lane_metres.sum())
+    _, number = np.unique(label[inside], return_inverse=True)
+    of = np.full(size, -1)
+    of[inside] = number
+    count, lanes = number.max() + 1, streets.lane_metres[inside]
+    weight = np.bincount(number, lanes, count)
+    middles = [np.bincount(number, axis * lanes, count) / weight for axis in streets.centre[inside].T]
+    ends = of[streets.links[inside[streets.links].all(axis=1)]]
+    ends = ends[ends[:, 0] != ends[:, 1]]
+    both = np.concatenate([ends, ends[:, ::-1]])
+    joins = coo_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
+    joins.sum_duplicates()
+    core = np.bincount(number, lanes * streets.core[inside], count)
+    return Blocks(of=of, weight=weight, core=core, position=np.stack(middles, axis=1), joins=joins)
+
+
+def _without_signals(
+    streets: Streets, blocks: Blocks, moves: Counter[tuple[int, int]], controllable: np.ndarray, regions: int
+) -> np.ndarray:
+    """Return a group (B,) for every block; blocks that much traffic joins without a controllable signal share one."""
+    flow: Counter[tuple[int, int]] = Counter()
+    for (a, b), controlled in zip(streets.links, controllable, strict=True):
+        one, other = sorted((blocks.of[a], blocks.of[b]))
+        if one >= 0 and one != other and not controlled:
+            flow[int(one), int(other)] += moves[int(a), int(b)]
+    pairs = sorted(flow, key=lambda pair: (-flow[pair], pair))
+    limit = UNSIGNALLED_SHARE * blocks.weight.sum() / regions
+    return np.unique(_merged(np.arange(len(blocks.weight)), pairs, blocks.weight, limit), return_inverse=True)[1]
+
+
+def _merged(label: np.ndarray, pairs: Iterable[tuple[int, int]], weight: np.ndarray, limit: float) -> np.ndarray:
+    """Merge the groups of each pair in order, unless the union weighs more than the limit."""
+    label, size = label.copy(), np.bincount(label, weight)
+    group: dict[int, list[int]] = {}
+    for n, name in enumerate(label):
+        group.setdefault(int(name), []).append(n)
+    for a, b in pairs:
+        one, other = int(label[a]), int(label[b])
+        if one != other and size[one] + size[other] <= limit:
+            group[one] += group.pop(other)
+            label[group[one]] = one
+            size[one] += size[other]
+    return label
+
+
+def _beside(streets: Streets) -> np.ndarray:
+    """Return pairs of edges (n, 2): one, and another that runs the opposite way beside most of it."""
+    points, of = sampled(streets.shapes, streets.main_part)
+    first = np.searchsorted(of, of, side="left")
+    last = np.searchsorted(of, of, side="right") - 1
+    place = np.arange(len(of))
+    heading = points[np.minimum(place + 1, last)] - points[np.maximum(place - 1, first)]
+    heading /= np.maximum(np.hypot(*heading.T), 1e-9)[:, None]
+    pairs = cKDTree(points).query_pairs(CARRIAGEWAY_DISTANCE_M, output_type="ndarray")
+    pairs = pairs[(heading[pairs[:, 0]] * heading[pairs[:, 1]]).sum(axis=1) < OPPOSED_COSINE]
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    beside = np.unique(np.column_stack([pairs[:, 0], of[pairs[:, 1]]]), axis=0)  # every point once per other edge
+    edges, votes = np.unique(np.column_stack([of[beside[:, 0]], beside[:, 1]]), axis=0, return_counts=True)
+    return edges[votes > 0.5 * np.bincount(of)[edges[:, 0]]]
+
+
+def _opposite(streets: Streets) -> list[tuple[int, int]]:
+    """Return pairs of edges between the same two junctions in opposite directions, one each."""
+    waiting: dict[tuple[int, int], list[int]] = {}
+    pairs = []
+    for n, (begin, end) in enumerate(streets.junctions):
+        if waiting.get((end, begin)):
+            pairs.append((waiting[end, begin].pop(0), n))
         else:
-            starts = [agglomerate(blocks, feature, regions)]
-        starts += [k_means(blocks, regions, seed + n) for n in range(STARTS)]
-        controlled = np.array(
-            [signal is not None and signal not in left_alone for signal in streets.link_signals], dtype=bool
-        )
-        labels = best(blocks, starts, feature, prices(streets, blocks, controlled, baseline))
-        found = finish(streets, np.where(blocks.of >= 0, labels[blocks.of], -1))
-    if found.max() < 1:
-        raise InputError(
-            f"{streets.path}: no two regions can be made that can be reached from each other; give a network with "
-            "more streets, or other regions"
-        )
-    return found, regions, moved
-
-
-def alternatives(
-    streets: Streets,
-    baseline: Baseline,
-    cut: Clustered | Drawn,
-    regions: EdgeNumbers,
-    *,
-    seed: int,
-    left_alone: Collection[str] = (),
-) -> dict[int, EdgeNumbers]:
-    """How many regions were asked for -> (E,) region of every edge, from 2 to twice as many as in `regions`, by the
-    same method, or "density" beside regions of the user's own; what cannot be had is left out."""
-    method = cut.method if isinstance(cut, Clustered) else "density"
-    found: dict[int, EdgeNumbers] = {}
-    most = 2 * (int(regions.max()) + 1)
-    for number in np.unique(np.linspace(2, most, min(most - 1, SIDE_BY_SIDE)).astype(int)):
-        with suppress(InputError):
-            found[int(number)], *_ = partition(
-                streets, baseline, Clustered(method=method, regions=int(number)), seed=seed, left_alone=left_alone
-            )
-    return found
-
-
-def _moved(labels: np.ndarray, found: np.ndarray, members: np.ndarray) -> int:
-    """How many of some edges are not in the region that most of those with the same label are in."""
-    votes = np.zeros((int(labels.max()) + 1, int(found.max()) + 1), dtype=int)
-    np.add.at(votes, (labels[members], found[members]), 1)
-    return int(votes.sum() - votes.max(axis=1).sum())
+            waiting.setdefault((begin, end), []).append(n)
+    return pairs

@@ -1,4 +1,4 @@
-"""From labels to regions that can be used: connected, reachable from each other, every edge in one, in order."""
+"""Regions made usable: connected, reachable from each other, numbered, with every edge in one."""
 
 import numpy as np
 from jaxtyping import Int
@@ -13,12 +13,11 @@ DIRECTIONS = ("east", "north-east", "north", "north-west", "west", "south-west",
 
 
 def finish(streets: Streets, labels: EdgeNumbers, *, renumber: bool = True) -> EdgeNumbers:
-    """(E,) region of every edge, from `labels` (E,) of the edges for cars, -1 where none is known yet.
+    """Return a region for every edge, from labels of the edges for cars; -1 in `labels` is an unknown region.
 
-    Every region is made connected by the connections between its edges, and all regions can be reached from each
-    other: pieces and regions that fail go to a neighbour, so that fewer regions may be left than were asked for.
-    Numbered from north to south, or with renumber = False in the order of the labels. Edges closed to cars, and parts
-    of the network that nothing joins to the rest, belong to a region that they adjoin, or to the nearest.
+    Regions come out connected, and each can be reached from each. Pieces and regions that fail join a neighbour, so
+    that fewer regions may remain. Edges closed to cars, and detached parts of the network, join an adjoining region or
+    the nearest. Regions are numbered from north to south, or with renumber = False in the order of the labels.
     """
     regions = labels.copy()
     regions[~streets.drivable] = -1
@@ -34,8 +33,7 @@ def finish(streets: Streets, labels: EdgeNumbers, *, renumber: bool = True) -> E
 
 
 def connect(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
-    """Leave of every region in the main part its largest connected piece; the others go to the neighbour that most
-    connections join them to. Edges outside the main part (`regions` anything) stay as they are."""
+    """Keep the largest connected piece of every region in the main part; other pieces join their main neighbour."""
     regions, inside = regions.copy(), streets.main_part
     links = streets.links[inside[streets.links].all(axis=1)]
     for _ in range(len(regions)):
@@ -56,13 +54,13 @@ def connect(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
             if loose[a] and not loose[b]:
                 votes.setdefault(piece[a], {}).setdefault(int(regions[b]), 0)
                 votes[piece[a]][int(regions[b])] += 1
-        for number, found in votes.items():
-            regions[loose & (piece == number)] = max(sorted(found), key=found.__getitem__)
+        for number, by_region in votes.items():
+            regions[loose & (piece == number)] = max(sorted(by_region), key=by_region.__getitem__)
     return regions
 
 
 def digraph(streets: Streets, regions: EdgeNumbers) -> Int[np.ndarray, "R R"]:
-    """(R, R) int: the connections from an edge of region i to one of region h, i != h."""
+    """Count the connections [i, h] from an edge of region i to one of region h, i != h."""
     count = int(regions[streets.drivable].max()) + 1
     crossing = np.zeros((count, count), dtype=int)
     pairs = regions[streets.links]
@@ -72,7 +70,7 @@ def digraph(streets: Streets, regions: EdgeNumbers) -> Int[np.ndarray, "R R"]:
 
 
 def _not_reachable(streets: Streets, regions: np.ndarray) -> int | None:
-    """A region that the largest set of regions, which can all be reached from each other, leaves out."""
+    """Return the smallest region outside the largest set of regions that can be reached from each other."""
     inside = streets.main_part
     used, numbers = np.unique(regions[inside], return_inverse=True)
     if len(used) == 1:
@@ -90,7 +88,7 @@ def _not_reachable(streets: Streets, regions: np.ndarray) -> int | None:
 
 
 def _merged(streets: Streets, regions: np.ndarray, victim: int) -> np.ndarray:
-    """`victim` joined to the neighbour with which it has the most connections."""
+    """Join `victim` to the neighbour with which it has the most connections."""
     pairs = regions[streets.links]
     beyond = np.concatenate([pairs[pairs[:, 0] == victim, 1], pairs[pairs[:, 1] == victim, 0]])
     numbers, count = np.unique(beyond[(beyond != victim) & (beyond >= 0)], return_counts=True)
@@ -98,7 +96,7 @@ def _merged(streets: Streets, regions: np.ndarray, victim: int) -> np.ndarray:
 
 
 def _spread(streets: Streets, regions: np.ndarray, links: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Give the `wanted` edges without a region that of an edge that a link joins them to, else of the nearest."""
+    """Give the `wanted` edges without a region that of a linked edge, else of the nearest."""
     regions, both = regions.copy(), np.concatenate([links, links[:, ::-1]])
     while True:
         reach = both[wanted[both[:, 0]] & (regions[both[:, 0]] < 0) & (regions[both[:, 1]] >= 0)]
@@ -113,7 +111,7 @@ def _spread(streets: Streets, regions: np.ndarray, links: np.ndarray, wanted: np
 
 
 def _numbered(streets: Streets, regions: np.ndarray) -> np.ndarray:
-    """The same regions as 0, 1, ... from north to south, and from west to east where that is a tie."""
+    """Number the regions 0, 1, ... from north to south, ties from west to east."""
     used = np.unique(regions)
     middle = {region: _gravity(streets, regions == region) for region in used}
     order = sorted(used, key=lambda region: (-round(middle[region][1], 1), middle[region][0]))
@@ -122,7 +120,7 @@ def _numbered(streets: Streets, regions: np.ndarray) -> np.ndarray:
 
 
 def positions(streets: Streets, regions: EdgeNumbers) -> Positions:
-    """(R, 2) [m]: where each region's lanes are on average."""
+    """Return the centre of gravity (R, 2) [m] of each region's lanes."""
     return np.array([_gravity(streets, regions == region) for region in range(regions.max() + 1)])
 
 
@@ -132,15 +130,15 @@ def _gravity(streets: Streets, members: np.ndarray) -> np.ndarray:
 
 
 def names(streets: Streets, regions: EdgeNumbers) -> tuple[str, ...]:
-    """A name for each region by its place: centre, north, south-west 2, ..."""
+    """Name each region by its place: centre, north, south-west 2, ..."""
     places, middle = positions(streets, regions), _gravity(streets, regions >= 0)
     radius = np.sqrt(
         (((streets.centre - middle) ** 2).sum(axis=1) * streets.lane_metres).sum() / (streets.lane_metres.sum())
     )
-    found: list[str] = []
+    plain: list[str] = []
     for x, y in places - middle:
         central = np.hypot(x, y) < 0.35 * radius
-        found.append("centre" if central else DIRECTIONS[round(np.arctan2(y, x) / (np.pi / 4)) % 8])
+        plain.append("centre" if central else DIRECTIONS[round(np.arctan2(y, x) / (np.pi / 4)) % 8])
     return tuple(
-        name if found.count(name) == 1 else f"{name} {found[: n + 1].count(name)}" for n, name in enumerate(found)
+        name if plain.count(name) == 1 else f"{name} {plain[: n + 1].count(name)}" for n, name in enumerate(plain)
     )

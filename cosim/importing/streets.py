@@ -1,4 +1,4 @@
-"""The road graph of a SUMO network as arrays, with shapes and signal programmes: what an import needs to know of it."""
+"""Road graph of a SUMO network as arrays, with shapes and signal programmes."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
@@ -21,21 +21,23 @@ from nmfd.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Logic:
-    """A signal programme. kind: SUMO's type, "static" or "actuated" and so on, or "branching" for a static one whose
-    phases do not follow each other in order; cycle [s]; links: their number."""
+    """Signal programme.
+
+    kind: SUMO's type, such as "static", or "branching" for a static one whose phases do not follow in order
+    cycle [s]
+    """
 
     signal: str
     programme: str
     kind: str
     cycle: float
-    links: int
 
 
 @dataclass(frozen=True, kw_only=True)
 class Streets:
-    """E normal edges, sorted by id; those that cars may not use too.
+    """Road graph of E normal edges, sorted by id, including those closed to cars.
 
-    drivable: (E,) bool, at least one lane for cars
+    drivable: (E,) bool, with a lane for cars
     length [m], lanes (those for cars), speed [m/s]: (E,)
     shapes: E arrays (n, 2) [m]; centre: (E, 2) [m], half way along
     junctions: (E, 2), numbers of the junctions where the edge begins and ends; places: junction -> its number
@@ -65,32 +67,32 @@ class Streets:
 
     @cached_property
     def number(self) -> dict[str, int]:
-        """Edge -> its place in `edges`."""
+        """Number of an edge in `edges`."""
         return {edge: n for n, edge in enumerate(self.edges)}
 
     @property
     def lane_metres(self) -> PerEdge:
-        """(E,) [m]: length times lanes for cars."""
+        """Length times lanes for cars (E,) [m]."""
         return self.length * self.lanes
 
     @cached_property
     def main_part(self) -> EdgeMask:
-        """(E,) bool: the drivable edges of the part, connected somehow, with the most lane metres."""
+        """Drivable edges (E,) of the weakly connected part with the most lane metres."""
         return self._largest("weak")
 
     @cached_property
     def core(self) -> EdgeMask:
-        """(E,) bool: the largest set of edges of which each can be reached from each."""
+        """Largest set of edges (E,) of which each can be reached from each."""
         return self._largest("strong")
 
     @cached_property
     def onward(self) -> EdgeMask:
-        """(E,) bool: the edges from which the core can be reached."""
+        """Edges (E,) from which the core can be reached."""
         return self._reached(self.links[:, ::-1])
 
     @cached_property
     def reached(self) -> EdgeMask:
-        """(E,) bool: the edges that can be reached from the core."""
+        """Edges (E,) that can be reached from the core."""
         return self._reached(self.links)
 
     def _reached(self, links: Int[np.ndarray, "L 2"]) -> EdgeMask:
@@ -101,8 +103,7 @@ class Streets:
         return found
 
     def connected(self, pairs: Iterable[tuple[int, int]], *, cars: bool) -> dict[tuple[int, int], bool]:
-        """Whether a way leads from the first edge of each pair to its second, for cars, or else for a vehicle that may
-        use every lane."""
+        """Return pair -> a path leads from its first edge to its second, for cars, or for any vehicle."""
         onward = graph(self.links if cars else self.all_links, len(self.edges))
         wanted: dict[int, list[int]] = {}
         for first, last in sorted(set(pairs)):
@@ -121,12 +122,12 @@ class Streets:
 
 
 def graph(pairs: Int[np.ndarray, "_ 2"], size: int) -> csr_array:
-    """(size, size) with a one for every pair (n, 2)."""
+    """Return a matrix (size, size) with a one for every pair (n, 2)."""
     return csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
 
 
 class _Edge(NamedTuple):
-    """cars: the lanes for them, by index; length [m]; speed [m/s]; shape: (n, 2) [m]; start, end: junctions"""
+    """Edge of the file; cars: indices of the lanes for them; start, end: junctions."""
 
     cars: frozenset[int]
     length: float
@@ -137,7 +138,7 @@ class _Edge(NamedTuple):
 
 
 class _Link(NamedTuple):
-    """A connection from a lane of one edge to a lane of another, and its signal."""
+    """Connection from a lane of one edge to a lane of another, and its signal."""
 
     source: str
     target: str
@@ -149,7 +150,8 @@ class _Link(NamedTuple):
 def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
     """Read a net.xml(.gz), and the signal programmes of additional files, which replace those of the network.
 
-    Raises InputError for a file that is no network, or one without any edge for cars.
+    Raises:
+        InputError: for a file that is no network, or has no edge for cars.
     """
     rows: dict[str, _Edge] = {}
     links: list[_Link] = []
@@ -223,7 +225,6 @@ def _logic(element: ElementTree.Element, path: Path) -> Logic:
         programme=element.get("programID", "0"),
         kind=kind,
         cycle=sum(seconds(phase.get("duration", "0"), where) for phase in phases),
-        links=max((len(phase.get("state", "")) for phase in phases), default=0),
     )
 
 
@@ -271,7 +272,7 @@ def _streets(
 
 
 def _middle(shape: Points) -> Float[np.ndarray, " 2"]:
-    """The point half way along a line (n, 2)."""
+    """Return the point half way along a line (n, 2)."""
     steps = np.hypot(*np.diff(shape, axis=0).T) if len(shape) > 1 else np.zeros(0)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     return np.array([np.interp(along[-1] / 2, along, shape[:, axis]) for axis in (0, 1)]) if along[-1] else shape[0]

@@ -1,0 +1,121 @@
+"""Cities of others, fetched from their owners with their licences: `cosim get`.
+
+Addresses name a version that does not change: a commit of GitHub, or a release of a package that pip downloads.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+import urllib.request
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from nmfd.errors import InputError, did_you_mean
+
+RESCO = "GPL-3.0, by the RESCO benchmark (github.com/Pi-Star-Lab/RESCO); this copy is of the package sumo-rl"
+SERVER_TIME_LIMIT_S = 60.0  # without a byte
+
+
+@dataclass(frozen=True, kw_only=True)
+class Published:
+    """A city as its owner publishes it.
+
+    licence: SPDX id and grantor; source: address of a .zip, or NAME==VERSION of a package
+    folder: the kept part of the archive; start: file to import, with the options of `cosim import` that it needs
+    """
+
+    about: str
+    licence: str
+    source: str
+    folder: str
+    start: str
+
+
+def _github(repository: str, commit: str, **rest: str) -> Published:
+    folder = f"{repository.partition('/')[2]}-{commit}/scenario"
+    return Published(source=f"https://github.com/{repository}/archive/{commit}.zip", folder=folder, **rest)
+
+
+CITIES: Mapping[str, Published] = {
+    "cologne8": Published(
+        about="Cologne, a corridor of 8 signals, 7:00 to 8:00, demand of TAPASCologne",
+        licence=RESCO,
+        source="sumo-rl==1.4.5",
+        folder="sumo_rl/nets/RESCO/cologne8",
+        start="cologne8.sumocfg --regions 3",
+    ),
+    "ingolstadt21": Published(
+        about="Ingolstadt, a corridor of 21 signals, 16:00 to 17:00, from InTAS",
+        licence=RESCO,
+        source="sumo-rl==1.4.5",
+        folder="sumo_rl/nets/RESCO/ingolstadt21",
+        start="ingolstadt21.sumocfg --regions 4",
+    ),
+    "lust": _github(
+        "lcodeca/LuSTScenario",
+        "10e1e42d01a9446c488915b9be936edb9d82b197",
+        about="Luxembourg with the demand of a day (LuST 2.0), SUMO 0.26 to 0.27",
+        licence="MIT, by its authors",
+        start="dua.static.sumocfg --regions 6 --mesoscopic --begin 7:00:00 --end 9:00:00",
+    ),
+    "most": _github(
+        "lcodeca/MoSTScenario",
+        "088f97195e9b4a7e2b17a46d7afd3f84e71c73a1",
+        about="Monaco, 4:00 to 14:00, with public transport and persons (MoST)",
+        licence="GPL-3.0-or-later, by its authors",
+        start="most.sumocfg --regions 4 --begin 7:00:00 --end 9:00:00",
+    ),
+    "intas": _github(
+        "silaslobo/InTAS",
+        "2c11f1582f5badc8dfdce994d6681e9b44d8de1f",
+        about="All of Ingolstadt, a day (InTAS)",
+        licence="GPL-3.0-or-later, by its authors",
+        start="InTAS.sumocfg --regions 5 --mesoscopic --begin 7:00:00 --end 9:00:00",
+    ),
+}
+
+
+def get(name: str, out: Path) -> str:
+    """Fetch a city into a new folder, whole or not at all; return its licence and the next step. Raises InputError."""
+    if name not in CITIES:
+        raise InputError(f"cosim get: expected one of {', '.join(CITIES)}, got {name!r}" + did_you_mean(name, CITIES))
+    if out.exists():
+        raise InputError(f"--out: {out} exists; choose another folder, or remove it")
+    city = CITIES[name]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder:
+        archive = _fetched(city.source, Path(folder))
+        try:
+            with zipfile.ZipFile(archive) as packed:
+                packed.extractall(folder)
+            city_folder = Path(folder) / PurePosixPath(city.folder)
+            notice = f"{name}: {city.about}\nLicence: {city.licence}\nFetched from {city.source}\n"
+            (city_folder / "NOTICE.cosim.txt").write_text(notice, encoding="utf-8")
+            os.replace(city_folder, out)
+        except (OSError, zipfile.BadZipFile) as error:
+            raise InputError(f"{name}: {city.source} is no archive with {city.folder} ({error})") from None
+    return f"{notice}Next: cosim import {out / city.start} --out networks/{name}"
+
+
+def _fetched(source: str, folder: Path) -> Path:
+    """Download an archive. Raises InputError."""
+    try:
+        if source.startswith("http"):
+            archive = folder / "archive.zip"
+            with urllib.request.urlopen(source, timeout=SERVER_TIME_LIMIT_S) as answer:
+                archive.write_bytes(answer.read())
+            return archive
+        pip = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary", ":all:", "--dest", str(folder)]
+        subprocess.run([*pip, source], check=True, capture_output=True, text=True)
+        return next(folder.glob("*.whl"))  # a zip
+    except (OSError, StopIteration, subprocess.CalledProcessError) as error:
+        reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1:]
+        raise InputError(f"{source} cannot be fetched ({' '.join(reason)}); try again with internet access") from None
+
+
+def listed() -> str:
+    """Return the catalogue, a city with its licence on two lines."""
+    return "\n".join(f"{name:<14}{city.about}\n{'':<14}{city.licence}" for name, city in CITIES.items())

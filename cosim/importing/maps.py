@@ -1,0 +1,110 @@
+"""Maps of regions: streets in the colour of their region, gateways, outlines."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
+
+from cosim.importing.quality import Tables
+from cosim.importing.streets import Streets
+from cosim.sumo.arrays import EdgeNumbers, Points
+from nmfd.arrays import Positions
+
+CELLS = 160  # along the longer side of the raster for outlines
+POINT_SPACING_M = 40.0  # between the points that stand for an edge
+SMALLEST_RING_SHARE = 0.02  # of the area of the largest ring
+COLOURS = ("#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#b07aa1", "#edc948", "#9c755f", "#ff9da7", "#8cd17d")
+
+
+def colour(region: int) -> str:
+    """Return the colour of a region on maps, as #rrggbb."""
+    return COLOURS[region % len(COLOURS)]
+
+
+def region_map(ax: Axes, streets: Streets, regions: EdgeNumbers, names: Sequence[str], places: Positions) -> Axes:
+    """Draw every street in the colour of its region, with a scale bar."""
+    members = np.flatnonzero(streets.drivable)
+    lines = LineCollection(
+        [streets.shapes[n] for n in members],
+        linewidths=0.6 + 0.5 * np.minimum(streets.lanes[members], 4),
+        capstyle="round",
+        colors=[colour(region) for region in regions[members]],
+    )
+    ax.add_collection(lines)
+    ax.autoscale_view()
+    ax.set_aspect("equal")
+    ax.set_axis_off()
+    for region, (x, y) in enumerate(places):
+        box = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": colour(region), "alpha": 0.85}
+        title = f"{region} {names[region]}"
+        ax.text(x, y, title, ha="center", va="center", fontsize="small", zorder=5, bbox=box)
+    left, right = ax.get_xlim()
+    length = 10.0 ** np.floor(np.log10(0.4 * (right - left)))
+    bottom = ax.get_ylim()[0]
+    ax.plot([left, left + length], [bottom, bottom], color="black", linewidth=2)
+    text = f"{length:g} m" if length < 1000 else f"{length / 1000:g} km"
+    middle = (left + length / 2, bottom)
+    ax.annotate(text, middle, xytext=(0, 3), textcoords="offset points", ha="center", fontsize="small")
+    return ax
+
+
+def gateway_marks(ax: Axes, streets: Streets, tables: Tables) -> Axes:
+    """Mark the ends of edges at boundaries, filled if a controllable signal stands there."""
+    for controlled, face, label in ((True, "black", "gateway with a signal"), (False, "white", "without control")):
+        edges = sorted({g["from_edge"] for g in tables.gateways if (g["control"] == "controlled") == controlled})
+        x, y = np.array([streets.shapes[streets.number[edge]][-1] for edge in edges]).reshape(-1, 2).T
+        if len(x):
+            ax.scatter(x, y, s=14, facecolor=face, edgecolor="black", linewidths=0.8, zorder=4, label=label)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=2, frameon=False, fontsize="small")
+    return ax
+
+
+def rings_round(
+    shapes: Sequence[Points], members: np.ndarray, regions: EdgeNumbers, blocks: float = 0.0
+) -> list[list[Points]]:
+    """Return the outlines of every region, the largest first: rings (n, 2) [m] round the places nearest to its edges.
+
+    Args:
+        shapes: of E edges, each (n, 2) [m].
+        members: (E,) bool, the edges that count.
+        blocks: share of the map's extent between streets that is still no hole.
+    """
+    points, of = sampled(shapes, members)
+    low, high = points.min(axis=0), points.max(axis=0)
+    cell = max(float((high - low).max()) / CELLS, 1.0)
+    # Beyond this distance a place belongs to no street; the map must end there, or rings stay open.
+    reach = max(2.5 * max(cell, POINT_SPACING_M), blocks * float((high - low).max()))
+    x, y = (np.arange(low[a] - reach - 2 * cell, high[a] + reach + 3 * cell, cell) for a in (0, 1))
+    distance, nearest = cKDTree(points).query(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    label = np.where(distance < reach, regions[of[nearest]], -1).reshape(len(y), len(x))
+    ax = Figure().subplots()
+    outlines = []
+    for region in range(int(regions.max()) + 1):
+        rings = ax.contour(x, y, (label == region).astype(float), levels=[0.5]).allsegs[0]
+        rings.sort(key=lambda ring: -abs(_area(ring)))
+        rings = [ring for ring in rings if _area(ring) * _area(rings[0]) > 0]  # the others run round holes
+        outlines.append([ring for ring in rings if _area(ring) / _area(rings[0]) > SMALLEST_RING_SHARE])
+    return outlines
+
+
+def sampled(shapes: Sequence[Points], members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (n, 2) along the shapes of some edges, and the edge (n,) of each point."""
+    points, of = [], []
+    for n in np.flatnonzero(members):
+        shape = shapes[n]
+        steps = np.hypot(*np.diff(shape, axis=0).T) if len(shape) > 1 else np.zeros(0)
+        along = np.concatenate([[0.0], np.cumsum(steps)])
+        marks = np.linspace(0.0, along[-1], max(2, int(along[-1] / POINT_SPACING_M) + 1))
+        points.append(np.stack([np.interp(marks, along, shape[:, axis]) for axis in (0, 1)], axis=1))
+        of.append(np.full(len(marks), n))
+    return np.concatenate(points), np.concatenate(of)
+
+
+def _area(ring: Points) -> float:
+    """Return the area [m^2] of a polygon (n, 2) [m]; negative if it runs clockwise."""
+    x, y = ring[:, 0], ring[:, 1]
+    return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2
