@@ -659,7 +659,7 @@ LINES = {
         import {net} --regions 3 --out {out} --demand peak --gap -1|2|x|nan
         import {net} --regions 3 --out {out} --seeds 0|x
         import {net} --regions 3 --out {out} --method magic
-        import {net} --regions 3 --out {out} --no-run
+        import {net} --regions 3 --out {out}
         import {net} --edges {none} --out {out} --demand peak
         import {net} --edges {net} --out {out} --demand peak
         import {net} --taz {net} --out {out} --demand peak

@@ -63,9 +63,6 @@ def test_demos_of_sumo(tmp_path, name, expected):
         GAMES / f"{name}.sumocfg",
         "--regions",
         3,
-        "--method",
-        "geometric",
-        "--no-run",
         "--out",
         tmp_path / "networks" / name,
     )
@@ -89,15 +86,12 @@ def test_real_cities(tmp_path, name):
         CITIES / source,
         "--regions",
         count,
-        "--method",
-        "geometric",
-        "--no-run",
         *peak,
         "--out",
         tmp_path / "networks" / name,
     )
     assert result.exit_code == 0, result.output + str(result.exception)
-    assert f"{count} regions by method geometric" in result.stdout
+    assert f"{count} regions" in result.stdout
     check(tmp_path, name, 2)
 
 
@@ -109,9 +103,7 @@ def test_max_pressure_takes_no_longer_than_fixed_time(tmp_path, name, level):
     (config,) = (CITIES / name).glob("*.sumocfg") if (CITIES / name).is_dir() else (None,)
     if config is None:
         pytest.skip(f"no real city: {CITIES / name} is not there")
-    result = cosim(
-        "import", config, "--regions", 3, "--method", "geometric", "--no-run", "--out", tmp_path / "networks" / name
-    )
+    result = cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / name)
     assert result.exit_code == 0, result.output + str(result.exception)
     spent = {}
     for signals in ("no-control", "max-pressure", "max-pressure-cyclic"):

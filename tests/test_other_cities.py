@@ -10,7 +10,8 @@ from tiny_city import driven
 
 from cosim.importing.case import read_sumo_input
 from cosim.importing.demand import read_traffic
-from cosim.importing.importer import left_alone
+from cosim.importing.importer import import_city
+from cosim.importing.quality import left_alone
 from cosim.importing.streets import read_streets
 from cosim.plant.meter import Meter
 from cosim.plant.plant import SumoPlant
@@ -21,7 +22,6 @@ from nmfd.api import load_scenario
 from nmfd.errors import InputError
 
 FLOW = '<flow id="f" begin="0" end="600" number="60" from="A1B1" to="C1D1"/>'
-FAST = ("--method", "geometric", "--no-run")
 
 
 @pytest.fixture(scope="module")
@@ -51,12 +51,11 @@ def traffic_of(config):
     return read_traffic(case, read_streets(case.net, case.additional), seed=0)
 
 
-def imported(config, *options):
-    """(what it says, the scenario) of an import into two regions."""
-    out = config.parent / "networks" / "x"
-    result = cosim("import", config, "--regions", 2, "--out", out, "--force", *options)
-    assert result.exit_code == 0, result.stderr + str(result.exception)
-    return result.stdout, load_scenario(config.parent / "scenarios" / "x")
+def imported(source, **options):
+    """(report, scenario) of an import into two regions."""
+    out, scenario = (source.parent / kind / "x" for kind in ("networks", "scenarios"))
+    report = import_city(source, out, scenario, **{"regions": 2, "seeds": 1, "force": True} | options)
+    return report, load_scenario(scenario)
 
 
 def refused(config, *options):
@@ -78,12 +77,12 @@ def test_files_are_found_wherever_they_are(net, tmp_path, monkeypatch):
     config = below / "\u57ce.sumocfg"
     config.write_text('<configuration><n v="../../n\u00e9t 1.net.xml"/><r v="${MY_CITY}/c.rou.xml"/></configuration>')
     out = tmp_path / "networks" / 'd\'"x" \\ y'
-    result = cosim("import", config, "--regions", 2, *FAST, "--out", out)
+    result = cosim("import", config, "--regions", 2, "--out", out)
     assert result.exit_code == 0, result.stderr
     scenario = load_scenario(tmp_path / "scenarios" / out.name)
     assert scenario.name == out.name and scenario.demand.sum() * scenario.step == pytest.approx(60)
     config.write_text('<configuration><n v="${NO_SUCH}/a.net.xml"/></configuration>')
-    result = cosim("import", config, "--regions", 2, *FAST, "--out", tmp_path / "networks" / "y")
+    result = cosim("import", config, "--regions", 2, "--out", tmp_path / "networks" / "y")
     assert result.exit_code == 2 and "no such file" in result.stderr and "${NO_SUCH}" in result.stderr
 
 
@@ -100,14 +99,14 @@ def test_files_are_found_wherever_they_are(net, tmp_path, monkeypatch):
     ],
 )
 def test_options_that_are_wrong(city, options, expected):
-    assert expected in refused(city(options=options), *FAST)
+    assert expected in refused(city(options=options))
 
 
 @pytest.mark.parametrize("name", [".", "..", "networks/a,b"])
 def test_folders_that_can_have_no_city(city, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
-    result = cosim("import", city(), "--regions", 2, *FAST, "--out", name)
-    assert result.exit_code == 2 and "--out: expected a folder such as out/mycity" in result.stderr
+    result = cosim("import", city(), "--regions", 2, "--out", name)
+    assert result.exit_code == 2 and "--out: expected a folder such as networks/mycity" in result.stderr
     assert not list(tmp_path.rglob("*.toml"))
 
 
@@ -119,7 +118,7 @@ def test_steps_and_teleports_of_the_city(city):
 
 
 def test_an_id_twice(city):
-    line = refused(city(FLOW + '<trip id="f.3" depart="5" from="A1B1" to="C1D1"/>'), *FAST)
+    line = refused(city(FLOW + '<trip id="f.3" depart="5" from="A1B1" to="C1D1"/>'))
     assert "c.rou.xml: trip: id: expected one that no other vehicle has, got 'f.3'" in line
 
 
@@ -146,7 +145,6 @@ def test_cars_for_streets_that_are_closed_to_them(net, city, tmp_path):
             '<trip id="car" depart="12" from="A1B1" to="D1D2"/>',
             net_file="closed.net.xml",
         ),
-        *FAST,
     )
     assert "2 vehicles in" in said and "cars on streets that are closed to cars, left out: 62" in said
     due, departed, *_, backlog = driven(scenario, 2, 0.4)
@@ -164,7 +162,7 @@ def test_routes_of_a_nested_distribution(city):
     edges = [vehicle.find("route").get("edges") for vehicle in vehicles]
     assert len(edges) == 200 and 120 < edges.count("A1B1 B1C1") < 180 and "D1C1 C1B1" in edges
     assert not any({"fromTaz", "toTaz"} & set(vehicle.keys()) for vehicle in vehicles)
-    due, departed, *_, backlog = driven(imported(config, *FAST)[1], 2, 0.4)
+    due, departed, *_, backlog = driven(imported(config)[1], 2, 0.4)
     assert due == departed + backlog > 40
 
 
@@ -200,11 +198,11 @@ def test_signals_that_cannot_be_controlled(net, city, tmp_path):
     """Off, or without any programme, as railway crossings are: no gateway counts as controlled by them."""
     config = city(additional='<tlLogic id="B1" programID="off" type="static" offset="0"/>')
     case = read_sumo_input(config)
-    found = left_alone(read_streets(case.net, case.additional), traffic_of(config))
+    found = left_alone(read_streets(case.net, case.additional), traffic_of(config).switched)
     assert found == {"B1": "switched off"}
     text = re.sub(r'<tlLogic id="C2".*?</tlLogic>', "", net.read_text(), flags=re.DOTALL)
     (tmp_path / "other.net.xml").write_text(text)
-    found = left_alone(read_streets(tmp_path / "other.net.xml"), traffic_of(config))
+    found = left_alone(read_streets(tmp_path / "other.net.xml"))
     assert found == {"C2": "no programme"}
 
 
@@ -213,7 +211,7 @@ def test_phases_that_do_not_follow_in_order(net, city):
     text = re.sub(r'(<phase duration="\d+")', r'\1 next="0 1"', net.read_text())
     branching = net.with_name("branching.net.xml")
     branching.write_text(text)
-    said, scenario = imported(city(net_file=branching), *FAST)
+    said, scenario = imported(city(net_file=branching))
     assert "(branching signal)" in said and "no gateway has a signal that perimeter control can use" in said
     plant = SumoPlant(scenario)
     try:
@@ -226,12 +224,12 @@ def test_phases_that_do_not_follow_in_order(net, city):
 def test_cycles_shorter_than_half_a_second(net, tmp_path):
     """Of a network that somebody made for something else: control intervals are the usual 90 s."""
     (tmp_path / "fast.net.xml").write_text(re.sub(r'(<phase duration=")\d+', r"\g<1>0.05", net.read_text()))
-    _, scenario = imported(tmp_path / "fast.net.xml", "--demand", "peak", "--level", 0.1, *FAST)
+    _, scenario = imported(tmp_path / "fast.net.xml", peak=True, level=0.1, iterations=1)
     assert scenario.step == 90.0
 
 
 def test_a_city_along_a_straight_road(tmp_path):
-    """It has no width: k-means and the map must do without."""
+    """It has no width."""
     nodes = "".join(f'<node id="{n}" x="{200 * n}" y="0" type="traffic_light"/>' for n in range(9))
     edges = "".join(
         f'<edge id="f{n}" from="{n}" to="{n + 1}"/><edge id="b{n}" from="{n + 1}" to="{n}"/>' for n in range(8)
@@ -240,8 +238,8 @@ def test_a_city_along_a_straight_road(tmp_path):
     (tmp_path / "e.edg.xml").write_text(f"<edges>{edges}</edges>")
     net = tmp_path / "road.net.xml"
     tiny_city.run("netconvert", "-n", tmp_path / "n.nod.xml", "-e", tmp_path / "e.edg.xml", "-o", net)
-    text, scenario = imported(net, "--demand", "peak", "--level", 0.2)
-    assert "2 regions by method density" in text and scenario.network.adjacency.sum() == 2
+    text, scenario = imported(net, peak=True, level=0.2, iterations=1)
+    assert "2 regions" in text and scenario.network.adjacency.sum() == 2
     sizes = np.bincount(
         np.loadtxt(tmp_path / "networks" / "x" / "regions.csv", dtype=int, delimiter=",", skiprows=1, usecols=1)
     )
@@ -254,28 +252,32 @@ def test_own_regions_from_a_spreadsheet_and_in_pieces(net, city, tmp_path):
     rows = [f"{edge},{int(edge[0] in 'CD')}" for edge in edges]
     csv = tmp_path / "own.csv"
     csv.write_bytes("\r\n".join(["\ufeffedge,region", *rows, "", ""]).encode())
-    arguments = ("import", config, "--edges", csv, "--no-run", "--force", "--out", tmp_path / "networks" / "x")
-    result = cosim(*arguments)
-    assert result.exit_code == 0 and "are in other regions" not in result.stdout, result.stderr
+    text, scenario = imported(config, regions=csv)
+    assert "are in other regions" not in text and scenario.network.regions == 2
     apart = {"A0A1", "A1A2", "D2D3"}
     csv.write_text("\n".join(["edge,region", *(f"{edge},{int(edge in apart)}" for edge in edges)]))
-    result = cosim(*arguments)
-    assert result.exit_code == 0 and "1 streets are in other regions than own.csv says" in result.stdout
+    assert "1 streets are in other regions than in" in imported(config, regions=csv)[0]
 
 
 def test_sumos_own_words_in_one_line(city, capfd):
-    """SUMO tells stderr what is wrong with the input; here it is in the error, and nothing else is printed."""
+    """SUMO's message about the input is in the error, and nothing else is printed."""
     phases = '<phase duration="30" state="Gr"/><phase duration="30" state="rG"/>'
-    _, scenario = imported(city(additional=f'<tlLogic id="none" type="static" programID="1">{phases}</tlLogic>'), *FAST)
+    extra = f'<tlLogic id="none" type="static" programID="1">{phases}</tlLogic>'
+    with pytest.raises(InputError, match="sumo cannot run it: .* plan loaded for tls 'none'"):
+        imported(city(additional=extra))
+    _, scenario = imported(city())
+    (scenario.folder / "broken.add.xml").write_text(f"<additional>{extra}</additional>")
+    toml = scenario.folder / "scenario.toml"
+    toml.write_text(toml.read_text().replace("[sumo]\n", '[sumo]\nadditional = ["broken.add.xml"]\n'))
     capfd.readouterr()
     with pytest.raises(InputError, match="SUMO cannot run it .* plan loaded for tls 'none'"):
-        driven(scenario, 1, 0.4)
+        driven(load_scenario(scenario.folder), 1, 0.4)
     assert capfd.readouterr().err == ""
 
 
 def test_a_vehicle_that_sumo_gives_up_at_once(net, city):
     """It is loaded and gone in the same step: nothing to follow, and nothing breaks."""
-    _, scenario = imported(city(), *FAST)
+    _, scenario = imported(city())
     plant = SumoPlant(scenario)
     try:
         plant.reset(0)
@@ -313,7 +315,7 @@ def test_a_vehicle_that_sumo_gives_up_at_once(net, city):
     ],
 )
 def test_numbers_that_are_none(city, routes, expected):
-    assert f"c.rou.xml: {expected}" in refused(city(FLOW + routes), *FAST)
+    assert f"c.rou.xml: {expected}" in refused(city(FLOW + routes))
 
 
 def test_speeds_and_coordinates(city):
@@ -333,5 +335,5 @@ def test_speeds_and_coordinates(city):
 
 def test_a_generated_peak_beside_types_of_the_city(net, city):
     config = city("", '<vType id="car" vClass="passenger" sigma="0.9"/>')
-    text, _ = imported(config, "--demand", "peak", "--level", 0.1)
+    text, _ = imported(config, peak=True, level=0.1, iterations=1)
     assert "trips of a generated morning peak" in text

@@ -19,7 +19,10 @@ REDUCED = {  # what is added; of an option that is there already the last counts
     "cosim compare": [],
     "cosim report": [],
     "cosim evaluate": [*STEPS, "--seeds", 1, "--demand", 1],
-    "cosim import": ["--regions", 3, "--no-run", "--method", "geometric"],
+    "cosim import": [
+        "--regions",
+        3,
+    ],
     "cosim identify": ["--levels", 6, "--seeds", 1, "--own", "--iterations", 10],
     "cosim list": [],
     "nmfd list": [],

@@ -61,9 +61,6 @@ def city(tmp_path_factory):
         tiny_city.city(folder),
         "--regions",
         3,
-        "--no-run",
-        "--method",
-        "geometric",
         "--out",
         folder / "networks" / "tiny",
     )

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import sumo
-from commands import cosim, good
 
+from cosim.importing.importer import import_city
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from nmfd.model.scenario import Scenario
@@ -93,22 +93,11 @@ def city(folder: Path, *options: str) -> Path:
     return folder / "city.sumocfg"
 
 
-def imported(folder: Path) -> Path:
-    """The scenario of the city with demand in `folder`, which is cut into three regions and not run first."""
-    good(
-        cosim(
-            "import",
-            city(folder),
-            "--regions",
-            3,
-            "--no-run",
-            "--method",
-            "geometric",
-            "--out",
-            folder / "networks" / "tiny",
-        )
-    )
-    return folder / "scenarios" / "tiny"
+def imported(folder: Path, regions: int = 3, source: Path | None = None, **options) -> Path:
+    """Import a city, by default the one with demand, into `folder`; return its scenario."""
+    out, scenario = folder / "networks" / "tiny", folder / "scenarios" / "tiny"
+    import_city(source or city(folder), out, scenario, regions=regions, seeds=1, **options)
+    return scenario
 
 
 def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tuple:

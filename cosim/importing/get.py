@@ -103,7 +103,7 @@ def get(name: str, out: Path) -> str:
 def _fetched(source: str, folder: Path) -> Path:
     """Download an archive. Raises InputError."""
     try:
-        if source.startswith("http"):
+        if "://" in source:
             archive = folder / "archive.zip"
             with urllib.request.urlopen(source, timeout=SERVER_TIME_LIMIT_S) as answer:
                 archive.write_bytes(answer.read())

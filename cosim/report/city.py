@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from cosim.importing import atlas, quality
+from cosim.importing import maps, quality
 from cosim.importing.streets import Streets, read_streets
 from cosim.plant.launch import own_files
 from cosim.plant.settings import settings
@@ -22,7 +22,6 @@ from nmfd.model.regional_model import RegionalModel, load_network
 from nmfd.model.scenario import Scenario
 
 OF_REGIONS = ("region", "name", "edges", "lane_km", "signals", "pieces", "gateways", "controlled_gateways")
-OF_GATEWAYS = tuple(column for column in quality.GATEWAYS if column != "flow_veh")  # which a run would have to count
 
 
 class City:
@@ -58,7 +57,7 @@ class City:
     def gateways(self) -> pd.DataFrame:
         """A row per movement over a boundary, from region source to target: edges, lanes, signal with its links, and
         control: "controlled", "no signal", or why perimeter control leaves the signal alone."""
-        return pd.DataFrame(self._tables.gateways, columns=OF_GATEWAYS)
+        return pd.DataFrame(self._tables.gateways).drop(columns="flow_veh")
 
     @cached_property
     def flows(self) -> pd.DataFrame:
@@ -87,8 +86,8 @@ class City:
             from matplotlib import pyplot  # only where it is wanted: it brings global state
 
             _, ax = pyplot.subplots(figsize=(6.5, 6.0), layout="constrained")
-        atlas.region_map(ax, self._streets, self._regions, self.network.region_names, self._places)
-        atlas.gateway_marks(ax, self._streets, self._tables)
+        maps.region_map(ax, self._streets, self._regions, self.network.region_names, self._places)
+        maps.gateway_marks(ax, self._streets, self._tables)
         if flows and self.scenario is not None:
             figures.flow_arrows(ax, self._places, self.scenario.step * self.scenario.demand.sum(axis=0))
         return ax

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cosim.evaluation.run_metrics import regional_outflow
-from cosim.importing.layers import rings_round
+from cosim.importing.maps import rings_round
 from cosim.sumo.arrays import EdgeNumbers, PerEdge, PerGateway, Points
 from cosim.sumo.net import City, edge_shapes
 from nmfd.arrays import PerPair, PerRegion

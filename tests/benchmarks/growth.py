@@ -26,8 +26,7 @@ import sumolib
 from scipy.spatial import cKDTree
 
 from cosim.evaluation.simulate import Task, simulate
-from cosim.importing.importer import ImportOptions, import_city
-from cosim.importing.partition import Clustered
+from cosim.importing.importer import import_city
 from nmfd.runs.files import write_table
 from nmfd.studies import plots
 
@@ -95,15 +94,13 @@ def _import(folder: str) -> None:
     """In a process of its own."""
     at = Path(folder)
     import_city(
-        ImportOptions(
-            source=at / "net.net.xml",
-            routes=(at / "city.rou.xml",),
-            out=at / "networks" / "grid",
-            run=False,
-            scenario=at / "scenarios" / "grid",
-            mesoscopic=True,
-            cut=Clustered(method="geometric", regions=REGIONS),
-        )
+        at / "net.net.xml",
+        at / "networks" / "grid",
+        at / "scenarios" / "grid",
+        routes=(at / "city.rou.xml",),
+        mesoscopic=True,
+        regions=REGIONS,
+        seeds=1,
     )
 
 

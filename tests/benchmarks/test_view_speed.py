@@ -9,7 +9,7 @@ from bokeh.document import Document
 from bokeh.embed import file_html
 from bokeh.resources import INLINE
 
-from cosim.importing.layers import rings_round
+from cosim.importing.maps import rings_round
 from cosim.view import replay
 from cosim.view.page import Page
 from cosim.view.picture import CityPicture, Frame, Gate, between
