@@ -114,7 +114,7 @@ def test_faults_of_a_city_are_refused_on_the_regional_model(tmp_path):
 def city(tmp_path_factory):
     folder = tmp_path_factory.mktemp("city")
     out, config = folder / "networks" / "tiny", tiny_city.city(folder)
-    result = call("cosim", "import", config, "--regions", 3, "--no-run", "--method", "geometric", "--out", out)
+    result = call("cosim", "import", config, "--regions", 3, "--out", out)
     assert result.exit_code == 0, result.output
     return load_scenario(folder / "scenarios" / "tiny")
 

@@ -14,7 +14,6 @@ import gzip
 import os
 import subprocess
 import sys
-import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ import sumo
 from cosim.importing.case import Progress, run_sumo
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.errors import InputError
+from nmfd.runs.files import temporary_folder
 
 ITERATIONS = 20  # mesoscopic simulations, at most
 GAP = 0.05  # relative gap at which the assignment ends
@@ -86,8 +86,7 @@ def assign(
     Raises:
         InputError: with SUMO's own words if it refuses.
     """
-    with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as temporary:
-        folder = Path(temporary)
+    with temporary_folder() as folder:
         root = ElementTree.Element("routes")
         root.extend(elements)
         _step(folder, 0).mkdir()
@@ -145,8 +144,7 @@ def relative_gap(
         elements: as in `assign`.
         weights: edgeData file with the travel times.
     """
-    with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as temporary:
-        folder = Path(temporary)
+    with temporary_folder() as folder:
         vehicles = [n for n, element in enumerate(elements) if element.tag == "vehicle"]
         order = np.random.default_rng([seed, 0x676170]).permutation(len(vehicles))
         left_out = {vehicles[n] for n in order[GAP_SAMPLE:]}

@@ -1,6 +1,5 @@
 """Runs of the imported city without control by SUMO's own program: densities of its streets, routes driven."""
 
-import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -16,6 +15,7 @@ from cosim.sumo.arrays import EdgeNumbers, PerEdge
 from cosim.sumo.recorded_trips import MESOSCOPIC, draw, read_recorded_trips, write_recorded_trips
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.arrays import PerRegion, PerTurn
+from nmfd.runs.files import temporary_folder
 
 INTERVAL_S = 300.0  # of the densities
 PEAK_INTERVALS = 3  # in a row: those with the most vehicles count for the partition
@@ -113,12 +113,12 @@ def averaged_runs(
             progress(f"simulating without control, {seed + 1} of {seeds}", (seed + done) / seeds)
 
         reached(run["begin"])
-        with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as folder:
+        with temporary_folder() as folder:
             files, vehicles = routes, [vehicle.get("id", "") for vehicle in original.elements]
             if factor != 1.0 or seed:
                 jitter = JITTER_S if seed else 0.0
                 drawn = draw(original, seed=seed, factor=factor, jitter=jitter, begin=run["begin"])
-                files, vehicles = [Path(folder) / "vehicles.rou.xml"], [name for _, _, name in drawn]
+                files, vehicles = [folder / "vehicles.rou.xml"], [name for _, _, name in drawn]
                 write_recorded_trips(original, drawn, files[0])
             runs.append(
                 run_baseline(
@@ -154,8 +154,7 @@ def run_baseline(
     """Simulate without control. Raises InputError with SUMO's own words if it refuses."""
     # A vehicle with a new route by a rerouter makes SUMO fail when it writes the times of the edges it has left.
     rerouted = any(next(read_xml(path).iter("routeProbReroute"), None) is not None for path in additional)
-    with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as temporary:
-        folder = Path(temporary)
+    with temporary_folder() as folder:
         edges, measure = folder / "edges.xml", folder / "measure.add.xml"
         measure.write_text(
             f'<additional><edgeData id="all" freq="{INTERVAL_S:g}" file="{edges}" excludeEmpty="true"/></additional>',

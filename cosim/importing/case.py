@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ import sumo
 
 from cosim.sumo.xml_files import BROKEN, opened, read_xml
 from nmfd.errors import InputError
+from nmfd.runs.files import temporary_folder
 
 # Names that SUMO gives the same option.
 FILES = {
@@ -133,12 +133,12 @@ def sumo_input(source: Path | Box, progress: Progress, *, left_hand: bool = Fals
             raise InputError(f"--left-hand: {source} says itself on which side vehicles drive; omit it")
         yield read_sumo_input(source)
         return
-    with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as folder:
+    with temporary_folder() as folder:
         if not isinstance(source, Path):
             progress("fetching OpenStreetMap")
-            source = fetch_osm(source, Path(folder))
+            source = fetch_osm(source, folder)
         progress("netconvert")
-        yield SumoInput(source=source, net=_converted(source, Path(folder), left_hand), notice=LICENCE)
+        yield SumoInput(source=source, net=_converted(source, folder, left_hand), notice=LICENCE)
 
 
 def read_sumo_input(path: Path) -> SumoInput:

@@ -6,7 +6,6 @@ Addresses name a version that does not change: a commit of GitHub, or a release 
 import os
 import subprocess
 import sys
-import tempfile
 import urllib.request
 import zipfile
 from collections.abc import Mapping
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from nmfd.errors import InputError, did_you_mean
+from nmfd.runs.files import temporary_folder
 
 RESCO = "GPL-3.0, by the RESCO benchmark (github.com/Pi-Star-Lab/RESCO); this copy is of the package sumo-rl"
 SERVER_TIME_LIMIT_S = 60.0  # without a byte
@@ -86,12 +86,12 @@ def get(name: str, out: Path) -> str:
         raise InputError(f"--out: {out} exists; choose another folder, or remove it")
     city = CITIES[name]
     out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder:
-        archive = _fetched(city.source, Path(folder))
+    with temporary_folder(f".{out.name}-", where=out.parent) as folder:
+        archive = _fetched(city.source, folder)
         try:
             with zipfile.ZipFile(archive) as packed:
                 packed.extractall(folder)
-            city_folder = Path(folder) / PurePosixPath(city.folder)
+            city_folder = folder / PurePosixPath(city.folder)
             notice = f"{name}: {city.about}\nLicence: {city.licence}\nFetched from {city.source}\n"
             (city_folder / "NOTICE.cosim.txt").write_text(notice, encoding="utf-8")
             os.replace(city_folder, out)

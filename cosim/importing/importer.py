@@ -2,7 +2,6 @@
 
 import gzip
 import os
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -28,6 +27,7 @@ from nmfd.errors import InputError
 from nmfd.model import authority
 from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel
+from nmfd.runs.files import temporary_folder
 from nmfd.studies import plots
 
 LARGE_CITY_EDGES = 5000  # for cars: beyond, the run without control is mesoscopic, so that it takes a minute
@@ -218,8 +218,8 @@ def _peak(
     traffic = replace(traffic, destination=peak.destination, shared=beside.shared + types)
     clock = model.clock(case, streets, traffic)
     others = [element for element in traffic.shared if element.tag not in TYPES]
-    with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as folder:
-        additional = [Path(folder) / "city.add.xml"] if others else []
+    with temporary_folder() as folder:
+        additional = [folder / "city.add.xml"] if others else []
         for path in additional:
             ElementTree.ElementTree(wrapped(others, "additional")).write(path)
         assigned = assign(
@@ -252,8 +252,7 @@ def _folders(out: Path, scenario: Path) -> Iterator[tuple[Path, Path]]:
         pairs = []
         for folder in (out, scenario):
             folder.parent.mkdir(parents=True, exist_ok=True)
-            temporary = tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent)
-            pairs.append((Path(stack.enter_context(temporary)), folder))
+            pairs.append((stack.enter_context(temporary_folder(f".{folder.name}-", where=folder.parent)), folder))
         yield pairs[0][0], pairs[1][0]
         for temporary, folder in pairs:
             folder.mkdir(exist_ok=True)

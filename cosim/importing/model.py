@@ -16,8 +16,7 @@ from cosim.sumo.net import JAM_SPACING
 from nmfd.arrays import PairsOverTime
 from nmfd.model.identification import observed_split_ratios
 from nmfd.model.mfd import Mfd
-from nmfd.model.model_file import network_toml
-from nmfd.model.regional_model import RegionalModel
+from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.runs.config import quoted
 
 # Shape of the published MFD until one is measured: g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam.
@@ -155,9 +154,7 @@ def scenario_text(
         f"protected = [{protected}]             # the densest region; {network.region_names[protected]}",
         'demand_file = "demand.csv"  # veh/s by interval and pair of regions, counted from the vehicles',
         f"demand_factor = {factor:g}         # vehicles are left out, or drive twice",
-        "",
-        "[forecast]",
-        "error = 0.0                 # of the forecast demand, std of its logarithm",
+        "forecast_error = 0.0        # standard deviation of the logarithm of forecast over demand",
         "",
         "[sumo]",
         f"begin = {clock.begin:.1f}",
