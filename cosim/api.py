@@ -22,9 +22,9 @@ from cosim.evaluation import (
 from cosim.evaluation import evaluate as evaluation
 from cosim.evaluation import identify as identification
 from cosim.evaluation.simulate import Result, Task, drive, scenario_of, simulate
-from cosim.importing import download, find, importer
-from cosim.importing.osm import parse_box
-from cosim.importing.partition import Clustered, Drawn
+from cosim.importing import get as cities
+from cosim.importing import importer
+from cosim.importing.case import parse_box, seconds
 from cosim.report import card, html, pictures
 from cosim.sumo.outputs import check, paths
 from cosim.sumo.session import LOST, Window
@@ -353,7 +353,7 @@ def tune(
 
 def get(name: str | None, out: Path | None = None) -> str:
     """Download a published city to a folder, cities/NAME if None; without a name list the cities."""
-    return download.listed() if name is None else download.get(name, out or Path("cities") / name, _say)
+    return cities.listed() if name is None else cities.get(name, out or Path("cities") / name)
 
 
 def import_city(
@@ -382,25 +382,25 @@ def import_city(
     number = int(regions) if str(regions).isdecimal() else None
     if number is not None and number < 2:
         raise InputError(f"--regions: expected 2 or more regions, or a file, got {regions} instead")
-    cut = Clustered(method="density", regions=number) if number else Drawn(method="edges", file=Path(regions))
-    order = importer.ImportOptions(
-        source=parse_box(source) if isinstance(source, str) else source,
-        out=out,
-        scenario=out.parent.parent / "scenarios" / out.name,
-        cut=cut,
-        left_hand=left_hand,
-        routes=tuple(routes),
-        peak=demand is not None,
-        level=level,
-        mesoscopic=mesoscopic,
-        begin=importer.parse_time(begin, "--begin"),
-        end=importer.parse_time(end, "--end"),
-        seed=seed,
-        force=force,
-    )
+    scenario = out.parent.parent / "scenarios" / out.name
     with watched("import", None) as show:
-        text = importer.import_city(order, lambda stage, share=0.0: show and show(round(100 * share), 100, stage))
-    return f"{text}\nWritten to {out} (see map.png, quality.csv, gateways.csv) and {order.scenario}"
+        text = importer.import_city(
+            parse_box(source) if isinstance(source, str) else source,
+            out,
+            scenario,
+            regions=number or Path(regions),
+            left_hand=left_hand,
+            routes=tuple(routes),
+            peak=demand is not None,
+            level=level,
+            mesoscopic=mesoscopic,
+            begin=None if begin is None else seconds(begin, "--begin"),
+            end=None if end is None else seconds(end, "--end"),
+            seed=seed,
+            force=force,
+            progress=lambda stage, share=0.0: show and show(round(100 * share), 100, stage),
+        )
+    return f"{text}\nWritten to {out} (see map.png, quality.csv, gateways.csv) and {scenario}"
 
 
 def identify(
@@ -426,7 +426,8 @@ def identify(
     network: folder of the model, the scenario's network if None
     runs: folders of finished runs to fit as well
     """
-    scenario = find.scenario_of(scenario)
+    if (scenario / "network.toml").exists():
+        scenario = scenario.resolve().parent.parent / "scenarios" / scenario.name
     loaded = load_scenario(scenario, settings)
     words = (city or "own").split("+")
     options = [word for word in words if word not in ("own", "guided")]

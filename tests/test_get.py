@@ -9,6 +9,7 @@ import pytest
 from commands import cosim, error_line, good
 
 from cosim.importing import get
+from nmfd.errors import InputError
 
 
 def zipped(files: dict[str, bytes]) -> bytes:
@@ -37,13 +38,14 @@ def publish(monkeypatch, tmp_path):
 
 def test_a_city_comes_with_its_licence(publish, tmp_path):
     publish()
-    text = good(cosim("get", "there", "--out", tmp_path / "mine" / "there"))
+    text = get.get("there", tmp_path / "mine" / "there")
     folder = tmp_path / "mine" / "there"
     assert (folder / "a.sumocfg").read_bytes() == b"city" and (folder / "more" / "b.xml").read_bytes() == b"more"
     assert "Licence: MIT" in text and "Licence: MIT" in (folder / "NOTICE.cosim.txt").read_text()
     assert f"cosim import {folder / 'a.sumocfg'} --out networks/there" in text
     assert [path.name for path in folder.parent.iterdir()] == ["there"]
-    assert "exists; choose another folder" in error_line(cosim("get", "there", "--out", folder))
+    with pytest.raises(InputError, match="exists; choose another folder"):
+        get.get("there", folder)
 
 
 def test_a_package_comes_from_pip(publish, tmp_path, monkeypatch):
@@ -54,7 +56,7 @@ def test_a_package_comes_from_pip(publish, tmp_path, monkeypatch):
         (Path(command[-2]) / "package.whl").write_bytes(CONTENT)
 
     monkeypatch.setattr(subprocess, "run", download)
-    good(cosim("get", "there", "--out", tmp_path / "there"))
+    get.get("there", tmp_path / "there")
     assert (tmp_path / "there" / "a.sumocfg").read_bytes() == b"city"
 
 
@@ -69,7 +71,8 @@ def test_a_package_comes_from_pip(publish, tmp_path, monkeypatch):
 )
 def test_one_line_and_nothing_left(publish, tmp_path, content, source, expected):
     publish(content, source)
-    assert expected in error_line(cosim("get", "there", "--out", tmp_path / "mine" / "there"))
+    with pytest.raises(InputError, match=expected):
+        get.get("there", tmp_path / "mine" / "there")
     assert not list((tmp_path / "mine").iterdir())
 
 
