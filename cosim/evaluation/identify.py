@@ -25,7 +25,7 @@ from nmfd.errors import InputError
 from nmfd.model import identification, mfd
 from nmfd.model.identification import Observed, observed_split_ratios
 from nmfd.model.planning import GUIDED, GUIDING, PlanningModel
-from nmfd.model.regional_model import RegionalModel, network_toml, schema_line
+from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
 from nmfd.runs.tables import wrapped
@@ -159,8 +159,7 @@ def identify(
     target.mkdir(parents=True, exist_ok=True)
     files.write_text(
         target / "network.toml",
-        schema_line(target)
-        + network_toml(
+        network_toml(
             model,
             _sumo_table(own, target),
             f"Regional model: written by cosim identify from {len(found) - len(more)} loading runs of {loaded.name} under "

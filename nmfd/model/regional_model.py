@@ -3,7 +3,6 @@
 import hashlib
 import io
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -315,13 +314,6 @@ def check_step(network: RegionalModel, step: float, where: str) -> None:
                 f"{network.name}, whose vehicles leave at up to {fastest:.3g} 1/s; allowed is at most "
                 f"{1.0 / fastest:.3g} s: raise substeps or shorten step"
             )
-
-
-def schema_line(folder: Path) -> str:
-    """Return the line that names the JSON schema above `folder` for editors; "" where there is none."""
-    above = (parent / "network.schema.json" for parent in folder.absolute().parents)
-    schema = next((file for file in above if file.is_file()), None)
-    return f"#:schema {Path(os.path.relpath(schema, folder)).as_posix()}\n" if schema else ""
 
 
 def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) -> str:

@@ -1,32 +1,23 @@
-"""Settings, declared once as pydantic models and read from TOML: the edge at which files are validated.
-
-A declaration is a subclass of `Settings` whose fields are made by `setting` and `whole`; the reference pages and the
-JSON schemas for editors come from it (nmfd.runs.reference).
-"""
+"""Settings: pydantic models whose fields carry text and unit, and the validation of TOML files against them."""
 
 import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from nmfd.errors import InputError, did_you_mean
-from nmfd.runs import schema
-from nmfd.runs.files import check_file
 
-MOST = 10**9  # of a whole number without a limit of its own
-LONGEST = 1000  # characters of a text
-LONGEST_NAME = 100  # characters: names become file names
-DEEP = re.compile(rb"(?:\s*\.\s*[\"']?[\w-]+[\"']?){100}")  # a dotted key of so many parts
-SHOWN = 60  # characters of a wrong value that a message repeats
+MOST = 10**9  # default limit of a whole number
+SHOWN_CHARACTERS = 60  # of a wrong value in a message
 S = TypeVar("S", bound="Settings")
 
 
 def setting(text: str, default: Any = ..., *, unit: str = "", **limits: Any) -> Any:
-    """The field of a declaration. limits: ge, gt, le, lt, min_length, max_length, alias of pydantic.Field."""
-    if unit:  # given even so, it would replace what a type says of itself
+    """Return the field of a setting; limits: ge, gt, le, lt, min_length, max_length, alias of pydantic.Field."""
+    if unit:
         limits["json_schema_extra"] = {"unit": unit}
     return Field(default, description=text, **limits)
 
@@ -34,12 +25,12 @@ def setting(text: str, default: Any = ..., *, unit: str = "", **limits: Any) -> 
 def whole(
     text: str, default: Any = ..., *, low: int = 0, high: int = MOST, unit: str = "", alias: str | None = None
 ) -> Any:
-    """The same of a whole number from `low` to `high`."""
+    """Return the field of a whole number from `low` to `high`."""
     return setting(text, default, unit=unit, ge=low, le=high, alias=alias)
 
 
 class Problem(ValueError):
-    """What a validator finds wrong with `key` of its table, in words that end in the remedy."""
+    """Error of a validator about `key` of its table; the text ends in the remedy."""
 
     def __init__(self, key: str, text: str):
         super().__init__(text)
@@ -47,30 +38,30 @@ class Problem(ValueError):
 
 
 class Settings(BaseModel):
-    """A table of settings: unknown keys, texts for numbers, numbers that are not finite are mistakes."""
+    """Table of settings; unknown keys, texts for numbers and numbers that are not finite are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     def changed(self: S, **changes: Any) -> S:
-        """A copy with other values, checked like the first. InputError."""
+        """Return a checked copy with other values. Raise InputError."""
         return checked(type(self), {**vars(self), **changes}, "settings")
 
 
-def _line(text: str) -> str:
+def _printable(text: str) -> str:
     if not text.isprintable():
-        raise ValueError("not printable")
+        raise ValueError("should be printable text on one line")
     return text
 
 
 def _distinct(values: tuple) -> tuple:
     if len(set(values)) < len(values):
-        raise ValueError("not distinct")
+        raise ValueError("should be distinct values")
     return values
 
 
-DISTINCT = AfterValidator(_distinct), Field(strict=False, json_schema_extra={"uniqueItems": True})
-Text = Annotated[str, Field(min_length=1, max_length=LONGEST), AfterValidator(_line)]
-Name = Annotated[str, Field(min_length=1, max_length=LONGEST_NAME), AfterValidator(_line)]
+DISTINCT = AfterValidator(_distinct), Field(strict=False)
+Text = Annotated[str, Field(min_length=1, max_length=1000), AfterValidator(_printable)]
+Name = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_printable)]  # names become file names
 Texts = Annotated[tuple[Text, ...], *DISTINCT]
 Region = Annotated[int, Field(ge=0)]
 Regions = Annotated[tuple[Region, ...], *DISTINCT]
@@ -83,92 +74,80 @@ Rows = Annotated[tuple[S, ...], Field(strict=False)]  # a list of tables
 
 
 def read(path: Path) -> dict[str, Any]:
-    """The content of a TOML file; InputError if it is missing or not TOML."""
-    path = Path(path)
-    check_file(path, "give a TOML file")
+    """Read a TOML file. Raise InputError if it is missing or not TOML."""
     try:
-        content = path.read_bytes()
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        hint = did_you_mean(path.parent.name, (file.parent.name for file in path.parent.parent.glob(f"*/{path.name}")))
+        near = (file.parent.name for file in path.parent.parent.glob(f"*/{path.name}"))
+        hint = did_you_mean(path.parent.name, near)
         raise InputError(f"{path}: no such file{hint}; give the path of an existing one") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a readable file") from None
-    try:
-        if DEEP.search(content):  # the parser would take hours
-            raise RecursionError
-        return tomllib.loads(content.decode())
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: is not UTF-8 text; save it as UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: is not valid TOML: {error}; correct the line named") from None
-    except ValueError:  # of Python, which reads no whole numbers of thousands of digits
-        raise InputError(f"{path}: is not valid TOML: a number of thousands of digits; give a shorter one") from None
-    except RecursionError:
-        raise InputError(f"{path}: is not valid TOML: nested too deeply; write it anew") from None
+    except OSError as problem:
+        raise InputError(f"{path}: cannot be read ({problem.strerror}); give a readable file") from None
+    except (ValueError, RecursionError) as problem:  # also text in another encoding
+        raise InputError(f"{path}: is not valid TOML: {problem}; correct it") from None
 
 
 def checked(declaration: type[S], values: Mapping[str, Any], where: Path | str, prefix: str = "") -> S:
-    """The table `values` as `declaration` has it. InputError, which begins with "where: prefix + key: "."""
+    """Validate a table. Raise InputError that begins with "where: prefix + key: "."""
     try:
         return declaration.model_validate(values)
-    except ValidationError as error:
-        raise InputError(f"{where}: {prefix}{_told(declaration, values, error)}") from None
-
-
-def parsed(declaration: type[S], key: str, text: str | list[str]) -> Any:
-    """The value of a setting, or those of a list, from what the command line says. ValueError."""
-    field = declaration.model_fields[key]
-    kind: Any = Annotated[field.annotation, field]
-    return TypeAdapter(kind, config=declaration.model_config).validate_python(text, strict=False)
+    except ValidationError as invalid:
+        raise InputError(f"{where}: {prefix}{_first_problem(declaration, invalid)}") from None
 
 
 def error(where: Path | str, key: str, problem: str) -> InputError:
-    """What else is wrong with a key, in the same form."""
+    """Return the error for a key in the form of `checked`."""
     return InputError(f"{where}: {key}: {problem}")
 
 
 def got(allowed: str, value: Any) -> str:
-    """What a value should have been."""
-    return f"expected {allowed}, got {shown(value)} instead"
+    """Return what a value should have been and what it is."""
+    return f"expected {allowed}, got {_shown(value)} instead"
 
 
 def quoted(text: str) -> str:
-    """A text without line breaks as TOML writes it."""
+    """Return a text without line breaks as TOML writes it."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
-def shown(value: Any) -> str:
-    """A wrong value as a message repeats it: not more than the beginning of a long one."""
+def _shown(value: Any) -> str:
     try:
         text = repr(value)
-    except ValueError:  # Python refuses to print whole numbers of thousands of digits
+    except ValueError:  # Python prints no whole numbers of thousands of digits
         text = "a number of thousands of digits"
-    return text if len(text) <= SHOWN else text[:SHOWN] + "..."
+    return text if len(text) <= SHOWN_CHARACTERS else text[:SHOWN_CHARACTERS] + "..."
 
 
-def _told(declaration: type[Settings], values: Any, error: ValidationError) -> str:
-    """ "key: problem" of the first mistake; a misspelt key comes before the one that is missing for it."""
-    first = min(error.errors(include_url=False), key=lambda found: found["type"] != "extra_forbidden")
-    root = schema.of(declaration)
-    path, here, table, kind = "", root, root, first["type"]
-    for place in first["loc"]:
-        table = here
-        if isinstance(place, str):
-            path += f".{place}" if path else place
-            here = schema.resolved(root, here.get("properties", {}).get(place, here.get("additionalProperties") or {}))
-            values = values.get(place)
-        elif "$ref" in here.get("items", {}):
-            path += f"[{place}]"
-            here, values = schema.resolved(root, here["items"]), values[place]
-        else:  # of a list of plain values, which is shown as a whole
-            kind = "value"
-            break
-    if isinstance(problem := first.get("ctx", {}).get("error"), Problem):
+def _first_problem(declaration: type[Settings], invalid: ValidationError) -> str:
+    """Return "key: problem"; a misspelt key comes before the missing one that it was meant for."""
+    first = min(invalid.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden")
+    path = "".join(f"[{place}]" if isinstance(place, int) else f".{place}" for place in first["loc"]).lstrip(".")
+    problem = first.get("ctx", {}).get("error")
+    if isinstance(problem, Problem):
         return f"{'.'.join(filter(None, (path, problem.key)))}: {problem}"
-    if kind == "missing":
-        return f"{path}: missing; add {first['loc'][-1]} = <{schema.allowed(here)}>"
-    if kind == "extra_forbidden":
-        keys = list(table["properties"])
+    if first["type"] == "missing":
+        return f"{path}: missing; add it"
+    if first["type"] == "extra_forbidden":
+        fields = _table(declaration, first["loc"][:-1]).model_fields
+        keys = [field.alias or name for name, field in fields.items()]
         hint = did_you_mean(str(first["loc"][-1]), keys)
         return f"{path}: unknown key{hint}; allowed here: {', '.join(keys)}; remove or correct it"
-    return f"{path}: {got(schema.allowed(here), values)}"
+    text = re.sub(r"^(Value error, |(Input|String|Tuple|List|Value) (?=should))", "", first["msg"])
+    text = re.sub("dictionary( or instance of .*)?", "table", text)
+    return f"{path}: {text}, got {_shown(first['input'])}"
+
+
+def _table(declaration: type[BaseModel], path: tuple[int | str, ...]) -> type[BaseModel]:
+    """Return the declaration of the table at `path` inside a declaration."""
+    for place in path:
+        for name, field in declaration.model_fields.items():
+            if place in (name, field.alias):
+                declaration = _declaration_in(field.annotation) or declaration
+    return declaration
+
+
+def _declaration_in(kind: Any) -> type[BaseModel] | None:
+    """Return the declaration in a type such as tuple[DemandTable, ...] | None."""
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        return kind
+    return next(filter(None, map(_declaration_in, get_args(kind))), None)

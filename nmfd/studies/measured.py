@@ -21,7 +21,7 @@ from nmfd.arrays import Adjacency, Points
 from nmfd.errors import InputError
 from nmfd.model import detector_tables, mfd
 from nmfd.model.detector_tables import SPEEDS
-from nmfd.model.regional_model import NetworkTable, RegionalModel, load_network, network_toml, schema_line
+from nmfd.model.regional_model import NetworkTable, RegionalModel, load_network, network_toml
 from nmfd.runs import config, files
 from nmfd.runs.tables import wrapped
 from nmfd.studies import fit_quality, plots
@@ -359,4 +359,4 @@ def _write(out: Path, found: Identified, sources: Sources) -> None:
     files.write_table(out / "samples.csv", found.intervals, float_format="%.6g")
     fit_quality.write_fits(out / "fit.csv", found.fits, None)
     files.write_text(out / "identify.txt", found.text + "\n")
-    files.write_text(out / "network.toml", schema_line(out) + text)
+    files.write_text(out / "network.toml", text)
