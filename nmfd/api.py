@@ -13,19 +13,18 @@ from nmfd.controllers.dpc import rollout, training
 from nmfd.controllers.strategy import CONTROLLERS, check_tables, parse, parse_many
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario, with_demand
-from nmfd.runs import config, shipped
+from nmfd.runs import shipped
 from nmfd.runs.files import default_folder, file_name
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import raise_failures as raise_failures
 from nmfd.studies import benchmark as benchmark_study
 from nmfd.studies import bound as bound_study
-from nmfd.studies import measured
 from nmfd.studies import robustness as robustness_study
 from nmfd.studies.benchmark import PLANTS, draw_scenario
 from nmfd.studies.benchmark import summary_table as summary_table
-from nmfd.studies.measured import Identified
+from nmfd.studies.measured import identify as identify
+from nmfd.studies.robustness import SIGMAS_VEH_S
 from nmfd.studies.robustness import improvement_table as improvement_table
-from nmfd.studies.settings import Measured, Robustness
 from nmfd.types import Controller, Plant, Result
 
 if TYPE_CHECKING:
@@ -150,7 +149,7 @@ def robustness(
     scenario: Scenario | Path | str,
     controllers: str | Sequence[str],
     *,
-    sigmas: Sequence[float] = Robustness().sigmas,
+    sigmas: Sequence[float] = SIGMAS_VEH_S,
     scenarios: int = 20,
     out: Path | str | None = None,
     workers: int = 1,
@@ -291,47 +290,6 @@ def _file(scenario: Scenario, name: str, out: Path | str | None) -> Path:
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder; make it or choose another --out")
     return file
-
-
-def identify(
-    counts: Path | str,
-    *,
-    out: Path | str,
-    detectors: Path | str | None = None,
-    regions: Path | str | None = None,
-    about: Path | str | None = None,
-    adjacency: Path | str | None = None,
-    city: str | None = None,
-    skip_bad: bool = False,
-    name: str | None = None,
-    force: bool = False,
-    **settings: float,
-) -> Identified:
-    """Fit MFDs per region to measured counts and occupancies; write network.toml in the folder `out`.
-
-        identified = nmfd.identify("counts.csv", detectors="detectors.csv", regions="regions.csv", trip_length=1500.0,
-                                   out="networks/mine")
-        print(identified.text), identified.network.mfds, identified.to_frame()
-
-    counts, detectors, regions, about: tables like those of UTD19 (nmfd.model.detector_tables)
-    adjacency: a table region,neighbour or the network.toml of the same regions
-    settings: vehicle_length, trip_length [m], least_share [-] of nmfd.studies.settings.Measured
-
-    Raises InputError.
-    """
-    given = {"detectors": detectors, "regions": regions, "about": about, "adjacency": adjacency}
-    return measured.identify(
-        measured.Sources(
-            counts=Path(counts),
-            city=city,
-            skip_bad=skip_bad,
-            **{key: None if file is None else Path(file) for key, file in given.items()},
-        ),
-        config.checked(Measured, settings, "identify"),
-        out=Path(out),
-        name=name,
-        force=force,
-    )
 
 
 def _check_plant(plant: str, more: str = "") -> None:

@@ -87,7 +87,8 @@ def verdict(
     """
     flow, names = float(boundaries.flow.sum()), [_name(network, region) for region in range(network.regions)]
     usable, gateways = int(boundaries.controllable.sum()), int(boundaries.gateways.sum())
-    passed = f"; {_percent(float(boundaries.controlled.sum()) / max(flow, 1e-9))} of the {flow:,.0f} crossings {where} passed one"
+    share = _percent(float(boundaries.controlled.sum()) / max(flow, 1e-9))
+    passed = f"; {share} of the {flow:,.0f} crossings {where} passed one"
     details = [f"Of {gateways} gateways {usable} have a signal that perimeter control can use{passed if flow else ''}."]
     if most is not None:
         ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in zip(names, most, strict=True))

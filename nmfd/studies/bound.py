@@ -20,10 +20,9 @@ from nmfd.model import dynamics
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
-from nmfd.studies.settings import Bound
 from nmfd.tensors import one_thread
 
-ITERATIONS = Bound().iterations
+ITERATIONS = 1500
 LEARNING_RATE = 0.15  # of Adam, on logits; falls along a cosine
 INSIDE = 0.02  # a start is moved this far into the admissible set: on its edge there is no gradient
 

@@ -23,6 +23,7 @@ from nmfd.types import Result
 if TYPE_CHECKING:
     import pandas as pd
 
+SIGMAS_VEH_S = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0)  # of the noise on the demand
 KEPT = ("controller", "seed", "plant", "total_time_spent_veh_s", "final_accumulation_veh", "fallbacks")
 CAPTION = (
     "improvement of total time spent over no-control in the same perturbed scenario [%], mean ± 95 % interval; "
