@@ -288,9 +288,9 @@ class Result:
         return Result(self.data.assign(variables).assign_attrs(attrs))
 
     def without_times(self) -> "xarray.Dataset":
-        """Return the Dataset without wall times: the same for every run of the same seed."""
+        """Return the Dataset without wall times and key: the same for every run of the same seed."""
         data = self.data.drop_vars(HOST_TIMES, errors="ignore")
-        data.attrs = {name: value for name, value in data.attrs.items() if name not in HOST_TIMES}
+        data.attrs = {name: value for name, value in data.attrs.items() if name not in (*HOST_TIMES, "key")}
         return data
 
     def to_frame(self) -> "pandas.DataFrame":

@@ -12,11 +12,11 @@ import pytest
 import tiny
 import torch
 from commands import nmfd
+from nmfd.cli.declared import Declared, shown
 from PIL import Image
 
 from cosim.cli import main
 from nmfd import closed_loop
-from nmfd.cli.declared import Declared, shown
 from nmfd.controllers.dpc import rollout, training
 from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import CONTROLLERS
