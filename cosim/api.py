@@ -25,10 +25,10 @@ from cosim.evaluation.simulate import Result, Task, drive, scenario_of, simulate
 from cosim.importing import get as cities
 from cosim.importing import importer
 from cosim.importing.case import parse_box, seconds
-from cosim.report import card, html, pictures
+from cosim.report import card, figures, html
 from cosim.sumo.outputs import check, paths
 from cosim.sumo.session import LOST, Window
-from cosim.view import watch as live
+from cosim.view import live
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse, parse_many
 from nmfd.errors import InputError, RunFailed
@@ -221,17 +221,15 @@ def watch(
     for task in tasks:
         parse(task.controller)  # reports mistakes before anything starts
     scenario_of(tasks[0])
-    with watched("watch", None) as show:
-        if gui:
-            window = Window(options=("--start", "true", "--quit-on-end", "true", "--delay", "20"))
-            try:
-                found = {tasks[0].controller: simulate(tasks[0], show, window=window)}
-            except LOST:
-                return "The window was closed before the end."
-        else:
-            runs = live.watch(tasks, port=port, browse=_has_screen(), progress=show)
-            found = {run.name: run.outcome for run in runs if isinstance(run.outcome, Result)}
-    rows = {name: summary(result) for name, result in found.items()}
+    if gui:
+        window = Window(options=("--start", "true", "--quit-on-end", "true", "--delay", "20"))
+        try:
+            with watched("watch", None) as show:
+                rows = {tasks[0].controller: summary(simulate(tasks[0], show, window=window))}
+        except LOST:
+            return "The window was closed before the end."
+    else:
+        rows = {run.name: run.row for run in live.watch(tasks, port=port, browse=_has_screen(), tell=_say)}
     return "\n".join(
         f"{name}, seed {seed}: total time spent {row['total_time_spent_veh_s']:.4g} veh s, "
         f"{row['completed_veh']:,.0f} trips completed"
@@ -280,7 +278,7 @@ def evaluate(
     with watched("evaluate", None) as show:
         table, failures = evaluation.evaluate(order, workers=workers, scheduler=scheduler, progress=show, tell=_say)
         if len(table):
-            pictures.draw_all(order.out, evaluation.level_folders(order.out), loaded, evaluation.kept_runs(order))
+            figures.draw_all(results.read(order.out, scenario))
     if failures:
         raise RunFailed(f"{len(failures)} runs failed, and the same command tries them again: {'; '.join(failures)}")
     return f"{statistics.text(table)}\nWritten to {order.out}: see evaluate.md, pairs.csv and the figures"
@@ -314,7 +312,7 @@ def report(folders: Sequence[Path], *, seed: int | None = None, out: Path | None
     """
     found = [results.read(folder) for folder in folders]
     with watched("report", None) as show:
-        return html.write_page(out or folders[0] / "report.html", found, None, show, seed=seed)
+        return html.write_page(out or folders[0] / "report.html", found, seed=seed, progress=show)
 
 
 def tune(

@@ -23,9 +23,9 @@ def made(monkeypatch):
         "outcomes",
         lambda function, todo, workers, **_: ((task, made_up.result(task, city)) for task in todo),
     )
-    for module, name in ((html.pictures, "draw"), (html.pictures, "draw_more"), (experiment, "draw_accumulations")):
-        monkeypatch.setattr(module, name, lambda *_, **__: None)
-    monkeypatch.setattr(html, "_replay", lambda *_: (None, "no map"))
+    monkeypatch.setattr(html, "_pictures", lambda *_: [])
+    monkeypatch.setattr(html, "_map", lambda *_: ("", "", ""))
+    monkeypatch.setattr(experiment, "draw_accumulations", lambda *_, **__: None)
 
 
 def test_report_and_page(made, tmp_path):
@@ -47,4 +47,4 @@ def test_the_city_locks_without_gates_and_flows_with_them(tmp_path):
     )
     assert trips == same and locked < 0.75 * trips and served > 0.99 * trips
     page = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
-    assert "pi-gating instead of no control" in page and len(page) < 8e6
+    assert "pi-gating compared with no control" in page and len(page) < 8e6

@@ -12,7 +12,7 @@ from commands import cosim
 
 from cosim.evaluation import evaluate, experiment
 from cosim.evaluation.simulate import FACTS, Result
-from cosim.report import pictures
+from cosim.report import figures
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
@@ -197,12 +197,12 @@ def test_a_small_evaluation_in_sumo(city, tmp_path):
 
 def test_titles_name_the_most_teleports():
     rows = pd.DataFrame([{"controller": f"c{n}", "teleports": 0} for n in (1, 2)])
-    assert pictures.teleports(rows) == "no teleport in any run"
+    assert figures.teleports(rows) == "no teleport in any run"
     rows = pd.DataFrame(
         [{"controller": name, "teleports": count} for name, count in (("a", 1), ("b", 9), ("c", 4), ("d", 0), ("b", 2))]
     )
-    assert pictures.teleports(rows) == "teleports: b 11, c 4, others fewer"
-    assert pictures.teleports(rows[rows["controller"] != "a"]) == "teleports: b 11, c 4"
+    assert figures.teleports(rows) == "teleports: b 11, c 4, others fewer"
+    assert figures.teleports(rows[rows["controller"] != "a"]) == "teleports: b 11, c 4"
 
 
 @pytest.mark.parametrize(

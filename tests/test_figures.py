@@ -1,10 +1,11 @@
-"""Figures of an evaluation: data that arrives in them, distinct colours, every seed told apart."""
+"""Figures of an evaluation: data that arrives in them, and distinct colours."""
 
 import numpy as np
+import pandas as pd
 import pytest
 from trajectories import trajectory
 
-from cosim.report import figures, pictures
+from cosim.report import figures
 from nmfd.api import load_scenario
 from nmfd.studies import plots
 
@@ -28,31 +29,37 @@ def test_strategies_get_colours_of_their_own():
     assert len({colours[name] for name in names}) == len(names) and colours["no-control"] == plots.colour("no-control")
 
 
-def test_link_map_colours_by_density_and_parts_the_directions(ax):
-    shapes = [np.array([[0.0, 0.0], [100.0, 0.0]]), np.array([[100.0, 0.0], [0.0, 0.0]])]
-    figures.link_densities(ax, shapes, np.array([0.0, 120.0]), np.array([1, 2]), np.array([0, 0]))
-    lines = ax.collections[0]
-    assert [tuple(colour) for colour in lines.get_colors()] == [
-        tuple(figures.DENSITIES.to_rgba(density)) for density in (0.0, 120.0)
-    ]
-    there, back = (segment[0][1] for segment in lines.get_segments())
-    assert there < 0 < back  # each to the right of its direction
-
-
 def test_demand_figure_has_the_levels_as_ticks(ax):
     figures.over_demand(ax, {"dpc-pc": {0.8: (0.9, 0.1), 1.3: (0.5, np.nan)}, "pi-gating": {0.8: (0.7, 0.1)}})
     assert [tick.get_text() for tick in ax.get_xticklabels()] == ["0.8", "1.3"]
     assert ax.get_ylim()[0] == 0.0 and len(ax.containers) == 2
 
 
+def test_the_frontier_has_the_share_of_due_trips_over_demand(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(plots, "save", lambda drawing, path: drawn.append((path.name, drawing.axes[0])))
+    rows = pd.DataFrame(
+        [
+            (level, name, 1, 5.0, served, 100, 0)
+            for name, level, served in (("a", 1.0, 100), ("a", 2.0, 80), ("b", 1.0, 90), ("b", 2.0, 30))
+        ],
+        columns=["demand", "controller", "seed", "total_time_spent_veh_s", "completed_veh", "trips", "teleports"],
+    )
+    figures.draw_levels(tmp_path, rows)
+    assert [name for name, _ in drawn] == ["frontier.png", "demand.png"]
+    shares = {one.get_label(): one.lines[0].get_ydata() for one in drawn[0][1].containers}
+    np.testing.assert_allclose(shares["a"], [100.0, 80.0])
+    np.testing.assert_allclose(shares["b"], [90.0, 30.0])
+
+
 def test_prices_of_the_regions_that_have_one_and_the_trips_that_wait_there(monkeypatch, tmp_path):
     network, drawn = load_scenario("two_region_2013").network, []
     run, title = trajectory("dpc-pcrg", 0), [plots.region_title(network, region) for region in (0, 1)]
-    told, waiting = np.zeros(run.perimeter.shape[:2]), np.zeros(run.backlog.shape)
-    told[1:, 1], waiting[2:, 0, 1], waiting[:, 1, 0] = 0.25, 40.0, 1.0  # one waits for a gap in traffic anywhere
+    added, waiting = np.zeros(run.perimeter.shape[:2]), np.zeros(run.backlog.shape)
+    added[1:, 1], waiting[2:, 0, 1], waiting[:, 1, 0] = 0.25, 40.0, 1.0  # one waits for a gap in traffic anywhere
     monkeypatch.setattr(plots, "save", lambda drawing, path: drawn.extend(drawing.axes) or path)
-    pictures.prices(tmp_path / "prices.png", network, run.assign(prices=told, backlog=waiting), "no teleport")
+    figures._draw_prices(tmp_path / "x.png", network, run.assign(prices=added, backlog=waiting), "no teleport")
     shown = [{step.get_label(): step.get_data().values for step in ax.patches} for ax in drawn]
     assert [list(each) for each in shown] == [title[1:], title[:1]]
-    np.testing.assert_allclose(shown[0][title[1]], 100.0 * told[:, 1])
+    np.testing.assert_allclose(shown[0][title[1]], 100.0 * added[:, 1])
     np.testing.assert_allclose(shown[1][title[0]], waiting[1:, 0].sum(axis=1))  # at the end of the interval

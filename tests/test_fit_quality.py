@@ -9,15 +9,13 @@ import tiny
 from commands import error_line, good, nmfd
 
 from cosim.evaluation import model_validation, prediction_error
-from cosim.report import html
-from nmfd.api import load_scenario, train
+from nmfd.api import train
 from nmfd.errors import InputError
 from nmfd.model import identification
 from nmfd.model.authority import Boundaries, verdict
 from nmfd.model.identification import Observed
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import load_network, network_toml
-from nmfd.studies import fit_quality
 from nmfd.studies.fit_quality import MEANINGS, fit_table, prediction_table, region_fits, write_fits
 
 
@@ -198,18 +196,3 @@ def test_training_on_a_doubtful_model_says_so(tmp_path):
     text = tiny.row_network().replace("adjacent = [1]", 'adjacent = [1]\ndoubts = ["R2 -0.50", "one seed"]')
     result = nmfd("train", tiny.write(tmp_path, network=text), *TRAIN, tmp_path / "p.pt")
     assert result.exit_code == 0 and "region 0 is doubtful: R2 -0.50; one seed" in result.stderr
-
-
-def test_the_page_tells_doubts_and_verdict(tmp_path):
-    from types import SimpleNamespace
-
-    text = tiny.row_network().replace("adjacent = [1]", 'adjacent = [1]\ndoubts = ["R2 -0.50"]')
-    scenario = load_scenario(tiny.write(tmp_path, network=text))
-    (tmp_path / "network" / "verdict.txt").write_text("Can perimeter control help? No: x.\nOf 3 gateways.\n\nfrom to\n")
-    run = SimpleNamespace(scenario=scenario, rows=pd.DataFrame({"controller": ["no-control"]}))
-    lines = html._models(run)
-    assert "is doubtful in region 0: R2 -0.50." in lines[0] and lines[-2:] == [
-        "Can perimeter control help? No: x.",
-        "Of 3 gateways.",
-    ]
-    assert any(line.startswith("WARNING, R2: ") for line in lines) and fit_quality.meanings([]) == []

@@ -15,11 +15,9 @@ import libsumo
 import numpy as np
 import pytest
 import tiny_city
-from made_up import rows_of
 
 import cosim
 from cosim.plant.meter import Meter
-from cosim.report import summary_text
 from cosim.sumo.net import load_city
 from cosim.sumo.recorded_trips import MESOSCOPIC
 from cosim.sumo.session import Session, _flush_all
@@ -500,7 +498,3 @@ def test_a_run_says_who_was_removed_and_gains_nothing_by_it(tmp_path):
     there = (trajectory.accumulation + trajectory.backlog).sum(axis=(1, 2))
     gone = np.concatenate([[0], record["removals"].sum(axis=(1, 2)).cumsum()])
     assert metrics.total_time_spent(trajectory) == 90.0 * (there + gone)[:-1].sum()
-    rows = rows_of({(1.0, "no-control"): {1: 1.0}}).assign(removed_veh=removed, teleports=0)
-    assert "removed before the last edge of their route" in summary_text.head(rows)
-    assert f"no-control {removed:,.1f}." in summary_text.head(rows)
-    assert "removed" not in summary_text.head(rows.assign(removed_veh=0))

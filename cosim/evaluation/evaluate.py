@@ -3,7 +3,7 @@
 <folder>/demand-<level>/    the run folder of a demand level (cosim.evaluation.experiment)
 <folder>/evaluate.md, evaluate.csv, pairs.csv, runs.csv    the tables (statistics), new after every run; in the
     first,  at the end, why (explain)
-what is drawn of a level lies in its folder, what is drawn across levels here (cosim.report.pictures)
+what is drawn of a level lies in its folder, what is drawn across levels here (cosim.report.figures)
 """
 
 import re

@@ -1,6 +1,5 @@
-"""A city to look at before anything runs: its regions, gateways and flows as tables and on a map."""
+"""A city before anything runs: its regions, gateways and flows as tables and on a map."""
 
-from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from cosim.importing import maps, quality
 from cosim.importing.streets import Streets, read_streets
 from cosim.plant.launch import own_files
 from cosim.plant.settings import settings
-from cosim.report import figures
 from cosim.sumo import net
 from cosim.sumo.build import ensure_built
 from nmfd.api import load_scenario
@@ -20,8 +18,10 @@ from nmfd.arrays import Positions
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel, load_network
 from nmfd.model.scenario import Scenario
+from nmfd.studies import plots
 
-OF_REGIONS = ("region", "name", "edges", "lane_km", "signals", "pieces", "gateways", "controlled_gateways")
+REGION_COLUMNS = ["region", "name", "edges", "lane_km", "signals", "pieces", "gateways", "controlled_gateways"]
+LEAST_FLOW_SHARE, WIDEST_FLOW = 0.05, 4.5  # of the largest flow; points
 
 
 class City:
@@ -31,13 +31,14 @@ class City:
         city.plot()
         city.regions, city.gateways, city.flows
 
-    name; network: its RegionalModel; scenario: nmfd.Scenario, None of a network alone
+    network: the regional model; scenario: None for a network alone
     """
 
     def __init__(self, city: Path | str | Scenario | RegionalModel):
-        """city: the folder of a network or a scenario, or what was loaded from one. InputError without a SUMO city."""
+        """city: a loaded scenario or network, its folder or its name. Raises InputError without a SUMO city."""
         if not isinstance(city, Scenario | RegionalModel):
-            city = _loaded(city)
+            alone = any(Path(city).parent.glob("*/network.toml"))  # there, or misspelt
+            city = load_network(city) if alone else load_scenario(city)
         self.scenario = city if isinstance(city, Scenario) else None
         self.network = city.network if isinstance(city, Scenario) else city
         self.name = city.name
@@ -45,59 +46,70 @@ class City:
 
     @cached_property
     def regions(self) -> pd.DataFrame:
-        """A row per region: name, edges and lane_km for cars, signals, pieces (1 is connected), gateways that touch it
-        and those under control, x_m and y_m of its middle, and of its MFD critical_veh, jam_veh, max_outflow_veh_s."""
-        rows = pd.DataFrame(self._tables.quality[:-1], columns=OF_REGIONS).astype({"region": int})
+        """One row per region.
+
+        name, edges and lane_km for cars, signals, pieces (1 is connected), gateways and controlled ones, centre x_m and
+        y_m, and critical_veh, jam_veh and max_outflow_veh_s of its MFD
+        """
+        rows = pd.DataFrame(self._tables.quality[:-1])[REGION_COLUMNS].astype({"region": int})
         rows["x_m"], rows["y_m"] = self._places.round(1).T
-        for column, what in (("critical_veh", "critical"), ("jam_veh", "jam"), ("max_outflow_veh_s", "capacity")):
-            rows[column] = [getattr(mfd, what) for mfd in self.network.mfds]
+        for column, attribute in (("critical_veh", "critical"), ("jam_veh", "jam"), ("max_outflow_veh_s", "capacity")):
+            rows[column] = [getattr(mfd, attribute) for mfd in self.network.mfds]
         return rows
 
     @cached_property
     def gateways(self) -> pd.DataFrame:
-        """A row per movement over a boundary, from region source to target: edges, lanes, signal with its links, and
-        control: "controlled", "no signal", or why perimeter control leaves the signal alone."""
+        """One row per movement over a boundary: edges, lanes, signal with its links, and its control."""
         return pd.DataFrame(self._tables.gateways).drop(columns="flow_veh")
 
     @cached_property
     def flows(self) -> pd.DataFrame:
-        """A row per pair of regions with demand: origin, destination, trips_veh in all, peak_veh_s.
+        """One row per pair of regions with demand: origin, destination, trips_veh in all, peak_veh_s.
 
-        InputError of a network alone, which has none.
+        Raises:
+            InputError: for a network alone.
         """
         if self.scenario is None:
             raise InputError(f"{self.name}: is a network, without demand; give the folder of a scenario on it")
-        demand = self.scenario.demand
-        trips = self.scenario.step * demand.sum(axis=0)
-        pairs = np.argwhere(trips > 0)
-        return pd.DataFrame(
-            {
-                "origin": pairs[:, 0],
-                "destination": pairs[:, 1],
-                "trips_veh": trips[trips > 0],
-                "peak_veh_s": demand.max(axis=0)[trips > 0],
-            }
-        )
+        demand, trips = self.scenario.demand, self._trips
+        origin, destination = np.nonzero(trips)
+        peak = demand.max(axis=0)[trips > 0]
+        columns = {"origin": origin, "destination": destination, "trips_veh": trips[trips > 0], "peak_veh_s": peak}
+        return pd.DataFrame(columns)
 
     def plot(self, ax: Axes | None = None, *, flows: bool = True) -> Axes:
-        """The map: streets in the colour of their region, gateways with and without control, and with `flows` arrows
-        for the demand between regions, if there is a scenario. ax: None for a new figure of pyplot. Returns `ax`."""
-        if ax is None:
-            from matplotlib import pyplot  # only where it is wanted: it brings global state
+        """Draw streets in the colour of their region, gateways, and arrows for the demand between regions.
 
-            _, ax = pyplot.subplots(figsize=(6.5, 6.0), layout="constrained")
+        Args:
+            ax: where to draw; a new figure if None.
+            flows: draw the arrows, if there is a scenario.
+        """
+        ax = plots.figure(6.5, 6.0).subplots() if ax is None else ax
         maps.region_map(ax, self._streets, self._regions, self.network.region_names, self._places)
         maps.gateway_marks(ax, self._streets, self._tables)
         if flows and self.scenario is not None:
-            figures.flow_arrows(ax, self._places, self.scenario.step * self.scenario.demand.sum(axis=0))
+            self._draw_flows(ax)
         return ax
 
     def __repr__(self) -> str:
-        """Name and numbers."""
         return f"<City {self.name}: {len(self.regions)} regions, {len(self.gateways)} gateways>"
 
     def _repr_html_(self) -> str:
         return self.regions.to_html(index=False)
+
+    def _draw_flows(self, ax: Axes) -> None:
+        between = self._trips * ~np.eye(len(self._trips), dtype=bool)
+        most = float(between.max(initial=0.0))
+        for i, j in np.argwhere((between > 0) & (between >= LEAST_FLOW_SHARE * most)):
+            style = {"arrowstyle": "-|>", "connectionstyle": "arc3,rad=0.15", "color": "black", "alpha": 0.35}
+            style |= {"shrinkA": 14, "shrinkB": 14, "linewidth": WIDEST_FLOW * between[i, j] / most}
+            ax.annotate("", self._places[j], self._places[i], zorder=4, arrowprops=style)
+        ax.set_title(f"demand between regions, widest arrow {most:,.0f} trips", fontsize="medium")
+
+    @cached_property
+    def _trips(self) -> np.ndarray:
+        """Trips of the whole scenario, (R, R) [veh]."""
+        return self.scenario.step * self.scenario.demand.sum(axis=0)
 
     @cached_property
     def _city(self) -> net.City:
@@ -115,26 +127,12 @@ class City:
     @cached_property
     def _places(self) -> Positions:
         streets = self._streets
-        return np.stack(
-            [streets.centre[streets.drivable & (self._regions == r)].mean(axis=0) for r in range(self.network.regions)]
-        )
+        of_region = [streets.drivable & (self._regions == r) for r in range(self.network.regions)]
+        return np.stack([streets.centre[members].mean(axis=0) for members in of_region])
 
     @cached_property
     def _tables(self) -> quality.Tables:
-        alone: Mapping[str, str] = quality.left_alone(self._streets)
+        alone = quality.left_alone(self._streets)
         if self.scenario is not None:
-            alone = {**alone, **dict.fromkeys(settings(self.scenario).leave_signals, "left alone by the scenario")}
+            alone |= dict.fromkeys(settings(self.scenario).leave_signals, "left alone by the scenario")
         return quality.tables(self._streets, self._regions, self.network.region_names, self._city, None, alone)
-
-
-def _loaded(where: Path | str) -> Scenario | RegionalModel:
-    """The scenario or network in a folder, or of that name. InputError."""
-    folder = Path(where)
-    if (folder / "scenario.toml").is_file():
-        return load_scenario(where)
-    try:
-        return load_network(where)
-    except InputError:
-        if any(folder.parent.glob("*/network.toml")):  # meant, but misspelt or broken
-            raise
-    return load_scenario(where)

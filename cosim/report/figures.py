@@ -1,104 +1,49 @@
-"""Figures of an evaluation in SUMO; the manners of nmfd.studies.plots: draw into `ax`, return it, simulate nothing."""
+"""Figures of an evaluation in SUMO: functions that draw into `ax`, and the files of one demand level."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float, Real
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
 
-from cosim.sumo.arrays import EdgeNumbers, PerEdge, Points, Series
-from nmfd.arrays import PerPair, Positions
+from cosim.evaluation import model_validation, statistics
+from cosim.evaluation.experiment import read_run
+from cosim.evaluation.results import Finished
+from cosim.evaluation.run_metrics import regional_outflow
+from cosim.sumo.arrays import Series
+from cosim.sumo.net import City
 from nmfd.model.regional_model import RegionalModel
+from nmfd.model.scenario import Scenario
 from nmfd.studies import plots
-from nmfd.studies.benchmark import REFERENCE
+from nmfd.studies.benchmark import REFERENCE, draw_accumulations
+from nmfd.types import Result
 
-JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
-DENSITIES = ScalarMappable(
-    Normalize(0.0, JAM_DENSITY),
-    LinearSegmentedColormap.from_list("density", ["#d9d9d9", "#fecc5c", "#e31a1c", "#4d0010"]),
-)
-ASIDE = 0.007  # of the map's width: how far the lines of the two directions of a street are drawn apart
-LEAST_FLOW, WIDEST_FLOW = 0.05, 4.5  # of the largest one; points
-SATURATION = 0.5  # veh/s and lane
+Read = Callable[[str, int], Result]  # controller, seed -> run
+
+SATURATION_FLOW = 0.5  # veh/s and lane
 COMMANDED, GREEN_SHOWN, FLOWED = "#333333", "#009e73", "#0059a8"
-
-
-def link_densities(
-    ax: Axes, shapes: Sequence[Points], density: PerEdge, lanes: EdgeNumbers, region: EdgeNumbers
-) -> Axes:
-    """A map of the edges in the colours of DENSITIES.
-
-    shapes: E lines (n, 2) [m]; density: (E,) [veh/km and lane]; lanes, region: (E,)
-    """
-    points = np.concatenate(shapes)
-    apart = ASIDE * np.ptp(points[:, 0])
-    order = np.argsort(density, kind="stable")  # the full ones on top
-    ax.add_collection(
-        LineCollection(
-            [_to_the_right(shapes[n], apart) for n in order],
-            colors=DENSITIES.to_rgba(density[order]),
-            linewidths=0.5 + 0.4 * lanes[order],
-            capstyle="butt",
-        )
-    )
-    for r in np.unique(region):
-        middle = np.mean([shapes[n].mean(axis=0) for n in np.flatnonzero(region == r)], axis=0)
-        ax.text(
-            *middle,
-            str(r),
-            fontsize=8,
-            fontweight="bold",
-            ha="center",
-            va="center",
-            bbox={"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": "#30506f", "linewidth": 0.8},
-        )
-    ax.autoscale_view()
-    ax.set_aspect("equal")
-    ax.set_axis_off()
-    return ax
-
-
-def _to_the_right(shape: Points, distance: float) -> Points:
-    """The line moved sideways, as seen in its direction."""
-    along = shape[-1] - shape[0]
-    return shape + distance * np.array([along[1], -along[0]]) / max(np.hypot(*along), 1e-9)
-
-
-def flow_arrows(ax: Axes, places: Positions, trips: PerPair) -> Axes:
-    """The demand between regions on a map: arrows as wide as their trips.
-
-    places: (R, 2) [m]; trips: (R, R) [veh], those within a region and below LEAST_FLOW of the most are not drawn
-    """
-    between = trips * ~np.eye(len(trips), dtype=bool)
-    most = float(between.max(initial=0.0))
-    for i, j in np.argwhere((between > 0) & (between >= LEAST_FLOW * most)):
-        ax.annotate(
-            "",
-            places[j],
-            places[i],
-            zorder=4,
-            arrowprops={
-                "arrowstyle": "-|>",
-                "connectionstyle": "arc3,rad=0.15",
-                "color": "black",
-                "alpha": 0.35,
-                "shrinkA": 14,
-                "shrinkB": 14,
-                "linewidth": WIDEST_FLOW * between[i, j] / most,
-            },
-        )
-    if most:
-        ax.set_title(f"demand between regions, widest arrow {most:,.0f} trips", fontsize="medium")
-    return ax
+SHOWN_PANELS = 11  # boundaries, or pairs of region and destination, that are shown one by one
+WAITING_TRIPS = 5  # a region with more of them is shown; a few always wait for a gap in traffic
+SHARE_WINDOW = 3  # control intervals over which realised shares are taken
+NAMED_CONTROLLERS = 2  # with the most teleports, in a title
+MARKERS = "o^sDvPX"
 
 
 def perimeter(ax: Axes, step: float, commanded: Series, green: Series, flow: Series) -> Axes:
-    """One boundary over time: u (T,) as commanded, green as a share of the original programme's, and flow as a share
-    of what passes in that at saturation."""
+    """Draw one boundary over time.
+
+    Args:
+        ax: where to draw.
+        step: control interval (s).
+        commanded: u (-, (T,)).
+        green: share of the original green (-, (T,)).
+        flow: share of the saturation flow of the original green (-, (T,)).
+    """
     time = plots.time_axis(ax, step * np.arange(len(commanded) + 1))
     for values, tone, label, width in (
         (flow, FLOWED, "flow / saturation flow of the original green", 1.2),
@@ -107,40 +52,15 @@ def perimeter(ax: Axes, step: float, commanded: Series, green: Series, flow: Ser
     ):
         ax.stairs(values, time, color=tone, linewidth=width, label=label, baseline=None)
     ax.set_ylim(0.0, max(1.08, 1.05 * float(np.nanmax([green, flow], initial=1.0))))
-    ax.set_ylabel("share [-]")
-    ax.spines[["top", "right"]].set_visible(False)
-    return ax
-
-
-def by_region(
-    ax: Axes, step: float, values: Float[np.ndarray, "T R"], regions: Sequence[int], network: RegionalModel, label: str
-) -> Axes:
-    """Something of these regions over time: `values` (T, R), one per control interval; `label` of the axis."""
-    time = plots.time_axis(ax, step * np.arange(len(values) + 1))
-    for region in regions:
-        ax.stairs(
-            values[:, region],
-            time,
-            color=colormaps["tab10"](region % 10),
-            linewidth=1.6,
-            baseline=None,
-            label=plots.region_title(network, region),
-        )
-    ax.set_ylim(bottom=0.0)
-    ax.set_ylabel(label)
-    ax.spines[["top", "right"]].set_visible(False)
-    return ax
+    return _finished(ax, None, "share [-]")
 
 
 def green_against_command(ax: Axes, commanded: Float[np.ndarray, " n"], green: Float[np.ndarray, " n"]) -> Axes:
-    """Every boundary and interval: share of the original green that was shown against the commanded u, both (n,)."""
+    """Draw the share of the original green against the commanded u, for all boundaries and intervals."""
     ax.scatter(commanded, green, s=5, color=GREEN_SHOWN, alpha=0.35, linewidths=0)
-    ax.set_xlabel("commanded u [-]")
-    ax.set_ylabel("green shown / original [-]")
     ax.set_xlim(0.0, 1.0)
     ax.set_ylim(0.0, max(1.08, 1.05 * float(np.nanmax(green, initial=1.0))))
-    ax.spines[["top", "right"]].set_visible(False)
-    return ax
+    return _finished(ax, "commanded u [-]", "green shown / original [-]")
 
 
 def splits(
@@ -150,64 +70,267 @@ def splits(
     realised: Float[np.ndarray, "T H"],
     neighbours: Sequence[int],
 ) -> Axes:
-    """The vehicles of one region for one destination over time: theta (T, H) as commanded (lines) and the shares that
-    left by each of the H neighbours (dots; NaN where nobody left)."""
+    """Draw commanded (lines) and realised (dots) split ratios of one region and destination over time."""
     time = plots.time_axis(ax, step * np.arange(len(commanded) + 1))
     for n, h in enumerate(neighbours):
         tone = colormaps["tab10"](h % 10)
         ax.stairs(commanded[:, n], time, color=tone, linewidth=1.5, label=f"by {h}", baseline=None)
         ax.plot(time[:-1] + np.diff(time) / 2, realised[:, n], "o", color=tone, markersize=3)
     ax.set_ylim(-0.04, 1.04)
-    ax.set_ylabel("share [-]")
-    ax.spines[["top", "right"]].set_visible(False)
-    return ax
+    return _finished(ax, None, "share [-]")
 
 
 def split_totals(
     ax: Axes, commanded: Float[np.ndarray, " n"], realised: Float[np.ndarray, " n"], vehicles: Real[np.ndarray, " n"]
 ) -> Axes:
-    """theta as commanded against as realised, (n,) each, over the whole run; area by `vehicles` (n,)."""
+    """Draw realised against commanded split ratios of the whole run, with an area by vehicles."""
+    size = 90.0 * vehicles / max(vehicles.max(initial=0.0), 1.0) + 3.0
     ax.plot([0, 1], [0, 1], color="#bbbbbb", linewidth=1.0, zorder=1)
-    ax.scatter(
-        commanded,
-        realised,
-        s=90.0 * vehicles / max(vehicles.max(initial=0.0), 1.0) + 3.0,
-        color=FLOWED,
-        alpha=0.45,
-        linewidths=0,
-        zorder=2,
-    )
-    ax.set_xlabel("commanded θ [-], mean of the run")
-    ax.set_ylabel("share that went there [-]")
+    ax.scatter(commanded, realised, s=size, color=FLOWED, alpha=0.45, linewidths=0, zorder=2)
     ax.set_xlim(-0.04, 1.04)
     ax.set_ylim(-0.04, 1.04)
-    ax.spines[["top", "right"]].set_visible(False)
-    return ax
+    return _finished(ax, "commanded θ [-], mean of the run", "realised share [-]")
+
+
+def by_region(
+    ax: Axes, step: float, values: Float[np.ndarray, "T R"], regions: Sequence[int], network: RegionalModel, label: str
+) -> Axes:
+    """Draw a quantity of some regions over time."""
+    time = plots.time_axis(ax, step * np.arange(len(values) + 1))
+    for region in regions:
+        tone, title = colormaps["tab10"](region % 10), plots.region_title(network, region)
+        ax.stairs(values[:, region], time, color=tone, linewidth=1.6, baseline=None, label=title)
+    ax.set_ylim(bottom=0.0)
+    return _finished(ax, None, label)
 
 
 def over_demand(ax: Axes, ratios: Mapping[str, Mapping[float, tuple[float, float]]], against: str = REFERENCE) -> Axes:
-    """Total time spent as a share of that of `against`, over the demand level: controller -> level -> mean over seeds
-    and half of its 95 % interval (NaN of a single seed)."""
+    """Draw total time spent relative to `against` over the demand level.
+
+    Args:
+        ax: where to draw.
+        ratios: controller -> level -> mean and half of its 95 % interval (-), NaN for a single seed.
+        against: the controller with ratio 1.
+    """
     tones = plots.colours([against, *ratios])
     ax.axhline(1.0, color=tones[against], linewidth=1.0)
-    levels = sorted({level for points in ratios.values() for level in points})
-    aside = 0.012 * max(levels[-1] - levels[0], 0.1)  # so that intervals do not hide each other
     for number, (controller, points) in enumerate(ratios.items()):
         mean, half = np.array(list(points.values())).reshape(-1, 2).T
-        ax.errorbar(
-            np.array(list(points)) + aside * (number - (len(ratios) - 1) / 2),
-            mean,
-            np.nan_to_num(half),
-            color=tones[controller],
-            linewidth=1.6,
-            capsize=3,
-            marker="o^sDv"[number % 5],
-            markersize=4,
-            label=controller,
-        )
-    ax.set_xticks(levels, [f"{level:g}" for level in levels])
-    ax.set_xlabel("demand, multiple of the scenario's")
-    ax.set_ylabel(f"total time spent / that of {against} [-]")
+        style = _style(number, controller, tones)
+        ax.errorbar(_aside([*points], number, len(ratios)), mean, np.nan_to_num(half), label=controller, **style)
+    _level_ticks(ax, {level for points in ratios.values() for level in points})
     ax.set_ylim(bottom=0.0)
+    return _finished(ax, "demand, multiple of the scenario's", f"total time spent / that of {against} [-]")
+
+
+def frontier(ax: Axes, shares: Mapping[str, Mapping[float, float]]) -> Axes:
+    """Draw the share of the due trips that was served over the demand level, controller -> level -> share."""
+    tones = plots.colours([*shares])
+    for number, (controller, points) in enumerate(shares.items()):
+        levels = _aside([*points], number, len(shares))
+        ax.errorbar(levels, 100.0 * np.array([*points.values()]), label=controller, **_style(number, controller, tones))
+    ax.axhline(100.0, color="#777777", linestyle="--", linewidth=1.0)
+    _level_ticks(ax, {level for points in shares.values() for level in points})
+    return _finished(ax, "demand, multiple of the scenario's", "trips served [%]")
+
+
+def ranked(rows: pd.DataFrame) -> list[str]:
+    """Return the controllers of one demand level, the best first: by paired change, else by mean time spent."""
+    level = rows["demand"].iloc[0]
+    reference = statistics.by_seed(rows, level, statistics.compared_with(rows))
+    score = {}
+    for name in dict.fromkeys(rows["controller"]):
+        values = statistics.by_seed(rows, level, name)
+        percent = statistics.paired(values, reference).percent
+        score[name] = float(np.mean(list(values.values()))) if np.isnan(percent) else percent
+    return sorted(score, key=score.__getitem__)
+
+
+def shown_seed(rows: pd.DataFrame) -> int:
+    """Return the first seed that most controllers have."""
+    return int(rows["seed"].value_counts().sort_index().idxmax())
+
+
+def teleports(rows: pd.DataFrame) -> str:
+    """Return how many vehicles were teleported, with the controllers that have most of them."""
+    counts = rows.groupby("controller", sort=False)["teleports"].sum()
+    counts = counts[counts > 0].sort_values(ascending=False, kind="stable")
+    named = [f"{name} {count:.0f}" for name, count in counts.iloc[:NAMED_CONTROLLERS].items()]
+    more = ["others fewer"] * (len(counts) > NAMED_CONTROLLERS)
+    return "teleports: " + ", ".join(named + more) if named else "no teleport in any run"
+
+
+def draw_all(finished: Finished) -> None:
+    """Draw the pictures of every demand level into its folder, and those of several levels beside them."""
+    for level in finished.levels:
+        draw_level(level.folder, finished.scenario, finished.map(), level.rows, partial(read_run, level.folder))
+    if len(finished.levels) > 1:
+        draw_levels(finished.path, finished.rows)
+
+
+def draw_level(out: Path, scenario: Scenario, city: City, rows: pd.DataFrame, read: Read) -> None:
+    """Draw all pictures of one demand level into the folder `out`.
+
+    Args:
+        out: an existing folder.
+        scenario: of the runs.
+        city: of the scenario.
+        rows: a row per run, as in cosim.evaluation.statistics.
+        read: returns a run.
+    """
+    seed, note, network = shown_seed(rows), teleports(rows), scenario.network
+    runs = [read(row.controller, row.seed) for row in rows.itertuples()]
+    shaded = ", shaded: all seeds" if rows["seed"].nunique() > 1 else ""
+    title = f"seed {seed}{shaded}; {note}"
+    draw_accumulations(out, scenario, runs, seed=seed, title=title, outflow=lambda run: regional_outflow(run, run.step))
+    best_first = {run.controller: run for run in runs if run.seed == seed}
+    best_first = {name: best_first[name] for name in ranked(rows) if name in best_first}
+    against = statistics.compared_with(rows)
+    other = next((name for name in best_first if name != against), None)
+    _draw_mfds(out / "mfd.png", network, [best_first[name] for name in (against, other) if name in best_first])
+    results = list(best_first.values())
+    if gating := next((run for run in results if _gates(run, network)), None):
+        _draw_perimeter(out / "perimeter.png", city, network, gating, note)
+    if guiding := next((run for run in results if run.guided.sum() > 0), None):
+        _draw_splits(out / "splits.png", network, guiding, note)
+    if priced := next((run for run in results if run.prices.any()), None):
+        _draw_prices(out / "prices.png", network, priced, note)
+
+
+def draw_levels(out: Path, rows: pd.DataFrame) -> None:
+    """Draw time spent and trips served over several demand levels into the folder `out`."""
+    against = statistics.compared_with(rows)
+    ratios: dict[str, dict[float, tuple[float, float]]] = {}
+    shares: dict[str, dict[float, float]] = {}
+    for level, names in statistics.groups(rows).items():
+        reference = statistics.by_seed(rows, level, against)
+        for name in names:
+            part = rows[(rows["demand"] == level) & (rows["controller"] == name)]
+            shares.setdefault(name, {})[level] = float(part["completed_veh"].sum() / max(part["trips"].sum(), 1))
+            pair = statistics.paired(statistics.by_seed(rows, level, name), reference)
+            if name != against and not np.isnan(pair.percent):
+                ratios.setdefault(name, {})[level] = 1.0 + pair.percent / 100.0, pair.percent_half / 100.0
+    drawing = plots.figure(7.5, 4.8)
+    ax = frontier(drawing.subplots(), shares)
+    _save(drawing, [ax], out / "frontier.png", f"mean over seeds; {teleports(rows)}")
+    if ratios:
+        drawing = plots.figure(7.5, 4.8)
+        ax = over_demand(drawing.subplots(), ratios, against)
+        _save(drawing, [ax], out / "demand.png", f"paired by seed, 95 % intervals; {teleports(rows)}")
+
+
+def _gates(result: Result, network: RegionalModel) -> bool:
+    """Return True if a boundary was ever commanded below its original programme."""
+    return bool((result.perimeter[:, network.adjacency] < network.u_max - 1e-9).any())
+
+
+def _draw_mfds(path: Path, network: RegionalModel, results: Sequence[Result]) -> None:
+    samples = []
+    for region in range(network.regions):
+        clouds = {
+            run.controller: model_validation.outflow_samples([run], [run], network.u_max, region, network.adjacency)
+            for run in results
+        }
+        samples.append({name: np.concatenate(list(parts.values())) for name, parts in clouds.items()})
+    plots.draw_mfds(path, network, samples)
+
+
+def _draw_perimeter(path: Path, city: City, network: RegionalModel, run: Result, note: str) -> None:
+    """Draw the boundaries that were closed most over time, and all in one cloud."""
+    pairs = {}
+    for pair in map(tuple, np.argwhere(network.adjacency)):
+        members = [
+            n
+            for n, gateway in enumerate(city.gateways)
+            if (gateway.source, gateway.target) == pair and not np.isnan(run.gateway_original_green[0, n])
+        ]
+        links = [len(city.gateways[n].links) for n in members]
+        original, shown = run.gateway_original_green[:, members] * links, run.gateway_green[:, members] * links
+        if members and original.sum() > 0:
+            flow = run.gateway_flow[:, members].sum(axis=1) / (SATURATION_FLOW * original.sum(axis=1))
+            pairs[pair] = run.perimeter[:, *pair], shown.sum(axis=1) / original.sum(axis=1), flow
+    if not pairs:
+        return
+    closed = [pair for pair in pairs if pairs[pair][0].min() < network.u_max - 1e-9]
+    shown_pairs = sorted(sorted(closed, key=lambda pair: pairs[pair][0].mean())[:SHOWN_PANELS])
+    drawing, axes = plots.panels(len(shown_pairs) + 1)
+    for ax, pair in zip(axes, shown_pairs, strict=False):
+        perimeter(ax, run.step, *pairs[pair]).set_title(f"{pair[0]} > {pair[1]}", fontsize="medium")
+    commanded, green, _ = (np.concatenate(values) for values in zip(*pairs.values(), strict=True))
+    green_against_command(axes[-1], commanded, green).set_title("all boundaries", fontsize="medium")
+    _save(drawing, axes, path, f"{run.controller}, seed {run.seed}; {note}")
+
+
+def _draw_splits(path: Path, network: RegionalModel, run: Result, note: str) -> None:
+    """Draw the busiest choices between neighbours over time, and all in one cloud."""
+    crossings = run.crossings.astype(float)
+    leaving = crossings.sum(axis=2)  # (T, R, R), from i bound for j
+    choices = [
+        (i, j)
+        for i, j in np.ndindex(network.adjacency.shape)
+        if i != j and network.split_mask[i, :, j].sum() > 1 and leaving[:, i, j].sum() > 0
+    ]
+    if not choices:
+        return
+    totals = []
+    for i, j in choices:
+        neighbours = np.flatnonzero(network.split_mask[i, :, j])
+        weight = leaving[:, i, j][:, None]
+        commanded = (run.splits[:, i, neighbours, j] * weight).sum(axis=0) / weight.sum()
+        realised = crossings[:, i, neighbours, j].sum(axis=0) / weight.sum()
+        totals.append(np.stack([commanded, realised, np.full(len(neighbours), weight.sum())]))
+    shown = sorted(sorted(choices, key=lambda pair: -leaving[:, *pair].sum())[:SHOWN_PANELS])
+    drawing, axes = plots.panels(len(shown) + 1)
+    kernel = np.ones(min(SHARE_WINDOW, len(crossings)))
+    for ax, (i, j) in zip(axes, shown, strict=False):
+        neighbours = np.flatnonzero(network.split_mask[i, :, j])
+        moved = np.stack([np.convolve(crossings[:, i, h, j], kernel, mode="same") for h in neighbours], axis=1)
+        every = moved.sum(axis=1, keepdims=True)
+        realised = np.where(every > 0, moved / np.maximum(every, 1.0), np.nan)
+        splits(ax, run.step, run.splits[:, i, neighbours, j], realised, neighbours)
+        ax.set_title(f"in {i}, bound for {j}", fontsize="medium")
+    split_totals(axes[-1], *np.concatenate(totals, axis=1)).set_title("all", fontsize="medium")
+    how = f"commanded θ (lines), shares over {SHARE_WINDOW} intervals (dots)"
+    _save(drawing, axes, path, f"{run.controller}, seed {run.seed}: {how}; {note}")
+
+
+def _draw_prices(path: Path, network: RegionalModel, run: Result, note: str) -> None:
+    """Draw the added travel times that guided drivers were given, and the trips that waited to begin."""
+    added, waiting = 100.0 * run.prices, run.backlog[1:].sum(axis=2)
+    drawing, axes = plots.panels(2)
+    for ax, values, least, title, label in (
+        (axes[0], added, 0.0, "ways through", "added travel time [%]"),
+        (axes[1], waiting, WAITING_TRIPS, "trips that begin in", "waiting trips [veh]"),
+    ):
+        by_region(ax, run.step, values, np.flatnonzero(values.max(axis=0) > least).tolist(), network, label)
+        ax.set_title(title, fontsize="medium")
+    _save(drawing, axes, path, f"{run.controller}, seed {run.seed}; {note}")
+
+
+def _save(drawing: Figure, axes: Sequence[Axes], path: Path, title: str) -> None:
+    drawing.suptitle(title, fontsize="medium")
+    plots.legend_below(drawing, axes)
+    plots.save(drawing, path)
+
+
+def _style(number: int, controller: str, tones: Mapping[str, str]) -> dict:
+    marker = MARKERS[number % len(MARKERS)]
+    return {"color": tones[controller], "linewidth": 1.6, "capsize": 3, "marker": marker, "markersize": 4}
+
+
+def _aside(levels: Sequence[float], number: int, count: int) -> np.ndarray:
+    """Return demand levels moved a little, so that intervals do not hide each other."""
+    return np.array(levels) + 0.012 * max(max(levels) - min(levels), 0.1) * (number - (count - 1) / 2)
+
+
+def _level_ticks(ax: Axes, levels: set[float]) -> None:
+    ax.set_xticks(sorted(levels), [f"{level:g}" for level in sorted(levels)])
+
+
+def _finished(ax: Axes, x: str | None, y: str) -> Axes:
+    """Label the axes and remove the frame; x: None if the axis has its label."""
+    if x is not None:
+        ax.set_xlabel(x)
+    ax.set_ylabel(y)
     ax.spines[["top", "right"]].set_visible(False)
     return ax

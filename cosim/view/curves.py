@@ -1,119 +1,82 @@
-"""The curves beside the map: what regions hold over time, the MFD plane, a gate, and what came of it so far."""
+"""The curves beside the map: load of all regions, accumulation, MFD plane and perimeter of one, totals of the city."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from bokeh.models import (
-    ColorBar,
+    CDSView,
     ColumnDataSource,
     FixedTicker,
     HoverTool,
-    LinearAxis,
+    IndexFilter,
     LinearColorMapper,
     Plot,
-    Range1d,
     Span,
 )
 from bokeh.plotting import figure
 
 from cosim.view import colours
+from cosim.view.city_map import colour_bar
 from cosim.view.picture import CityPicture, Frame
 
-TRAIL = 30  # control intervals behind the present point in the MFD plane
-HEIGHT = 230  # pixels
-OVER = 2.0  # critical accumulations: the dark end of the scale of `Load`
-HOUR = 3600.0
-MINUTE = 60.0
+TRAIL_INTERVALS = 30  # behind the present point in the MFD plane
+CURVE_HEIGHT = 230  # pixels
+DARKEST_LOAD = 2.0  # critical accumulations
+HOUR = 3600.0  # s
+MINUTE = 60.0  # s
+MARKERS = ("circle", "square")  # of the runs side by side
+OF_REGION = ("accumulation", "outflow", "u", "green")  # columns that depend on the region shown
 
 
 class Load:
-    """One run: accumulation against critical, of every region over time, as a table of colours."""
+    """Accumulation over critical accumulation of every region of one run over time, as a raster."""
 
     def __init__(self, picture: CityPicture, title: str):
-        """It is as wide as the whole horizon."""
         self._picture = picture
-        self.plot = plot = _figure(title, "time [min]", "region", height=130 + 18 * min(picture.regions, 12))
-        plot.y_range.start, plot.y_range.end = picture.regions - 0.5, -0.5
-        plot.x_range.start, plot.x_range.end = 0.0, picture.steps * picture.step / MINUTE
-        plot.yaxis.ticker = FixedTicker(ticks=list(range(picture.regions)))
-        plot.grid.visible = False
+        horizon = picture.steps * picture.step / MINUTE
+        self.plot = _figure(title, "time [min]", "region", height=130 + 18 * min(picture.regions, 12))
+        self.plot.y_range.start, self.plot.y_range.end = picture.regions - 0.5, -0.5
+        self.plot.x_range.start, self.plot.x_range.end = 0.0, horizon
+        self.plot.yaxis.ticker = FixedTicker(ticks=list(range(picture.regions)))
+        self.plot.grid.visible = False
         self._source = ColumnDataSource({"image": [self._values([])]})
-        mapper = LinearColorMapper(palette=colours.scale(), low=0.0, high=OVER, nan_color=colours.LAND)
-        plot.image(
-            "image",
-            x=0.0,
-            y=-0.5,
-            dw=picture.steps * picture.step / MINUTE,
-            dh=picture.regions,
-            source=self._source,
-            color_mapper=mapper,
+        mapper = LinearColorMapper(palette=colours.scale(), low=0.0, high=DARKEST_LOAD, nan_color=colours.LAND)
+        self.plot.image(
+            "image", x=0.0, y=-0.5, dw=horizon, dh=picture.regions, source=self._source, color_mapper=mapper
         )
-        plot.add_layout(
-            ColorBar(
-                color_mapper=mapper,
-                title="accumulation / critical [-]",
-                orientation="horizontal",
-                height=8,
-                width=220,
-                ticker=FixedTicker(ticks=[0.0, 1.0, 2.0]),
-                title_text_font_style="normal",
-                title_text_font_size="11px",
-                title_text_color=colours.FAINT,
-                bar_line_color=None,
-                padding=4,
-                location=(0, 0),
-                major_tick_line_color=None,
-            ),
-            "below",
-        )
-        self.now = _now(plot)
+        self.plot.add_layout(colour_bar(mapper, "accumulation / critical [-]", [0.0, 1.0, 2.0]), "below")
+        self.now = _now(self.plot)
 
     def show(self, whole: Sequence[Frame]) -> None:
-        """whole: the frames at the ends of control intervals so far"""
+        """Draw the frames at the ends of the control intervals so far."""
         self._source.data = {"image": [self._values(whole)]}
 
     def _values(self, whole: Sequence[Frame]) -> np.ndarray:
-        """(R, T), NaN where nothing was seen yet."""
+        """Return (R, T) loads, NaN where there is no frame."""
         values = np.full((self._picture.regions, self._picture.steps), np.nan, np.float32)
-        for frame in whole:
-            if 0 < frame.intervals <= self._picture.steps:
-                values[:, frame.intervals - 1] = frame.accumulation / self._picture.critical
+        for frame in whole[1:]:
+            values[:, frame.intervals - 1] = frame.accumulation / self._picture.critical
         return values
 
 
 class Curves:
-    """All runs in one set of axes: of the chosen region and gate, and of the whole city."""
+    """All runs in one set of axes, for one region and for the whole city.
+
+    lines: one source per run, a row per whole frame; past, present: the filters of the MFD plane
+    """
 
     def __init__(self, picture: CityPicture, names: Sequence[str]):
-        """names: of the runs"""
-        self._picture, self._names = picture, names
-        horizon = picture.steps * picture.step / MINUTE
+        self._picture = picture
         self.region = _figure("", "time [min]", "accumulation [veh]")
         self.plane = _figure("", "accumulation [veh]", "outflow [veh/s]")
-        self.gate = _figure("", "time [min]", "share [-]")
+        self.gates = _figure("", "time [min]", "share [-]")
         self.trips = _figure("Completed trips", "time [min]", "trips [veh]")
-        self.spent = _figure("Total time spent so far", "time [min]", "time spent [veh h]")
-        self.street = _figure("", "time [min]", "density [veh/km and lane]")
-        self.street.extra_y_ranges = {"speed": Range1d(0.0, 1.1)}
-        self.street.add_layout(
-            LinearAxis(
-                y_range_name="speed",
-                axis_label="speed / allowed [-]",
-                axis_label_text_font_style="normal",
-                axis_label_text_color=colours.FAINT,
-                major_label_text_color=colours.FAINT,
-                minor_tick_line_color=None,
-                axis_line_color=colours.LINE,
-                major_tick_line_color=colours.LINE,
-            ),
-            "right",
-        )
-        overtime = (self.region, self.gate, self.trips, self.spent, self.street)
-        self.lines, self.points, self.trails = [], [], []
-        for plot in overtime:
-            plot.x_range.start, plot.x_range.end = 0.0, horizon
-        self.gate.y_range.start, self.gate.y_range.end = -0.04, 1.08
-        self.critical = ColumnDataSource({"x": [], "y": []})
+        self.spent = _figure("Total time spent", "time [min]", "time spent [veh h]")
+        over_time = (self.region, self.gates, self.trips, self.spent)
+        for plot in over_time:
+            plot.x_range.start, plot.x_range.end = 0.0, picture.steps * picture.step / MINUTE
+        self.gates.y_range.start, self.gates.y_range.end = -0.04, 1.08
+        self.critical, self.mfd = (ColumnDataSource({"x": [], "y": []}) for _ in range(2))
         self.region.line(
             "x",
             "y",
@@ -123,157 +86,97 @@ class Curves:
             line_width=1.5,
             legend_label="critical",
         )
-        self.curve = ColumnDataSource({"x": [], "y": []})
-        self.plane.line("x", "y", source=self.curve, color=colours.FAINT, line_width=2, legend_label="fitted MFD")
+        self.plane.line("x", "y", source=self.mfd, color=colours.FAINT, line_width=2, legend_label="MFD of the model")
+        self.lines, self.past, self.present = [], [], []
         for n, name in enumerate(names):
-            colour, dash = colours.RUNS[n]
-            empty: dict[str, list[float]] = {
-                key: []
-                for key in ("time", "accumulation", "outflow", "u", "green", "completed", "spent", "density", "speed")
-            }
-            line = ColumnDataSource(empty)
-            for plot, key in ((self.region, "accumulation"), (self.trips, "completed"), (self.spent, "spent")):
-                plot.line("time", key, source=line, color=colour, line_dash=dash, line_width=2, legend_label=name)
-            self.gate.step(
-                "time",
-                "u",
-                source=line,
-                color=colour,
-                line_dash=dash,
-                line_width=2,
-                mode="before",
-                legend_label=f"u, {name}",
-            )
-            self.gate.scatter(
-                "time",
-                "green",
-                source=line,
-                size=5,
-                marker=("circle", "square")[n],
-                line_color=colour,
-                fill_color=colours.PAPER,
-                legend_label=f"green, {name}",
-            )
-            self.street.line(
-                "time",
-                "density",
-                source=line,
-                color=colour,
-                line_dash=dash,
-                line_width=2,
-                legend_label=f"density, {name}",
-            )
-            self.street.scatter(
-                "time",
-                "speed",
-                source=line,
-                y_range_name="speed",
-                size=5,
-                line_color=colour,
-                marker=("circle", "square")[n],
-                fill_color=colours.PAPER,
-                legend_label=f"speed, {name}",
-            )
-            trail, point = ColumnDataSource({"x": [], "y": []}), ColumnDataSource({"x": [], "y": []})
-            self.plane.line("x", "y", source=trail, color=colour, line_dash=dash, alpha=0.5, line_width=1.5)
-            self.plane.scatter("x", "y", source=trail, color=colour, alpha=0.35, size=4)
-            self.plane.scatter(
-                "x",
-                "y",
-                source=point,
-                color=colour,
-                size=12,
-                marker=("circle", "square")[n],
-                line_color=colours.PAPER,
-                legend_label=name,
-            )
-            self.lines.append(line)
-            self.trails.append(trail)
-            self.points.append(point)
-        for plot in (*overtime, self.plane):
-            _legend(plot)
-        for plot in (self.gate, self.street):  # values are at the top and at the bottom: below them
+            self._add_run(n, name)
+        for plot in (*over_time, self.plane):
             legend = plot.legend[0]
-            legend.update(location="left", ncols=2, margin=0)
-            plot.add_layout(legend, "below")
-        self.choose_street(None)
-        self.now = [_now(plot) for plot in overtime]
+            legend.update(location="top_left", background_fill_alpha=0.75, border_line_alpha=0.0)
+            legend.update(label_text_font_size="11px", spacing=0, padding=2)
+        legend = self.gates.legend[0]  # values are at the top and at the bottom
+        legend.update(location="left", ncols=2, margin=0)
+        self.gates.add_layout(legend, "below")
+        self.now = [_now(plot) for plot in over_time]
 
-    def choose(self, region: int, gate: tuple[int, int] | None) -> None:
-        """The region and the gate whose curves are shown."""
-        picture = self._picture
-        name, curve = picture.region_names[region], picture.curves[region]
-        self._region, self._gate = region, gate
-        self._members = [n for one in picture.gates if (one.source, one.target) == gate for n in one.gateways]
-        self.region.title.text = f"Region {region}, {name}: accumulation"
-        self.plane.title.text = f"Region {region}, {name}: MFD plane"
-        self.gate.title.text = (
-            "No gate with a signal" if gate is None else (f"Gate {gate[0]} → {gate[1]}: command and green")
-        )
-        self.critical.data = {
-            "x": [0.0, picture.steps * picture.step / MINUTE],
-            "y": [float(picture.critical[region])] * 2,
-        }
-        self.curve.data = {"x": curve[:, 0].astype(np.float32), "y": curve[:, 1].astype(np.float32)}
+    @property
+    def titles(self) -> list:
+        """Titles that name the region."""
+        return [plot.title for plot in (self.region, self.plane, self.gates)]
 
-    def choose_street(self, street: int | None) -> None:
-        """The street whose curves are shown."""
-        self._street = street
-        self.street.title.text = (
-            "Click a street of the map"
-            if street is None
-            else (f"Street {self._picture.edges[street]}: density and speed")
+    def choose(self, region: int) -> None:
+        """Select the region of the curves; `show` draws it."""
+        self._region = region
+        self._gateways = [n for gate in self._picture.gates if gate.target == region for n in gate.gateways]
+        self._sources = sorted({gate.source for gate in self._picture.gates if gate.target == region and gate.signal})
+        name = f"Region {region}" + f", {self._picture.region_names[region]}" * (
+            self._picture.region_names[region] != str(region)
         )
+        for title, text in zip(self.titles, ("accumulation", "MFD plane", "gates into it, mean"), strict=True):
+            title.text = f"{name}: {text}"
+        horizon, level = self._picture.steps * self._picture.step / MINUTE, float(self._picture.critical[region])
+        self.critical.data = {"x": [0.0, horizon], "y": [level, level]}
+        x, y = np.asarray(self._picture.curves[region], np.float32).T
+        self.mfd.data = {"x": x, "y": y}
 
     def show(self, runs: Sequence[Sequence[Frame]], time: float) -> None:
-        """runs: the whole frames of every run so far; time: [s], that is looked at"""
+        """Draw the whole frames of every run, and mark the time [s] in the MFD plane."""
         for n, whole in enumerate(runs):
-            later = [frame for frame in whole if frame.intervals]
-            shares = [self._shares(frame) for frame in whole]
-            self.lines[n].data = {
-                "time": np.array([frame.time for frame in whole], np.float32) / MINUTE,
-                "accumulation": np.array([frame.accumulation[self._region] for frame in whole], np.float32),
-                "outflow": np.array([frame.outflow[self._region] for frame in whole], np.float32),
-                "u": np.array([u for u, _ in shares], np.float32),
-                "green": np.array([green for _, green in shares], np.float32),
-                "completed": np.array([frame.completed for frame in whole], np.float32),
-                "spent": np.array([frame.time_spent / HOUR for frame in whole], np.float32),
-                # Zero where no street is chosen: of nothing at all Bokeh finds no range.
-                **{
-                    name: np.array(
-                        [0.0 if self._street is None else getattr(frame, name)[self._street] for frame in whole],
-                        np.float32,
-                    )
-                    for name in ("density", "speed")
-                },
+            values = {
+                "time": [frame.time / MINUTE for frame in whole],
+                "accumulation": [frame.accumulation[self._region] for frame in whole],
+                "outflow": [frame.outflow[self._region] for frame in whole],
+                "u": [_mean(frame.perimeter[self._sources, self._region]) for frame in whole],
+                "green": [_mean(frame.green[self._gateways]) for frame in whole],
+                "completed": [frame.completed for frame in whole],
+                "spent": [frame.time_spent / HOUR for frame in whole],
             }
-            past = [frame for frame in later if frame.time <= time][-TRAIL:]
-            x, y = (
-                np.array(values, np.float32)
-                for values in (
-                    [frame.accumulation[self._region] for frame in past],
-                    [frame.outflow[self._region] for frame in past],
-                )
-            )
-            self.trails[n].data = {"x": x, "y": y}
-            self.points[n].data = {"x": x[-1:], "y": y[-1:]}
+            self.lines[n].data = {name: np.array(column, np.float32) for name, column in values.items()}
+            last = sum(frame.time <= time for frame in whole) - 1
+            self.past[n].indices = list(range(max(1, last - TRAIL_INTERVALS + 1), last))
+            self.present[n].indices = [last] if last > 0 else []
 
     def mark(self, time: float) -> None:
-        """A line at the time [s] that is looked at."""
+        """Draw a line at a time [s]."""
         for now in self.now:
             now.location = time / MINUTE
 
-    def _shares(self, frame: Frame) -> tuple[float, float]:
-        """u, and the green of the chosen gate as a share of the original."""
-        if self._gate is None or not frame.intervals:
-            return float("nan"), float("nan")
-        green = frame.green[self._members]
-        return float(frame.perimeter[self._gate]), float(np.nanmean(green)) if not np.isnan(green).all() else (
-            float("nan")
+    def _add_run(self, n: int, name: str) -> None:
+        (colour, dash), marker = colours.RUNS[n], MARKERS[n]
+        columns = ("time", *OF_REGION, "completed", "spent")
+        source = ColumnDataSource({column: np.zeros(0, np.float32) for column in columns})
+        style = {"source": source, "color": colour, "line_dash": dash, "line_width": 2}
+        for plot, column in ((self.region, "accumulation"), (self.trips, "completed"), (self.spent, "spent")):
+            plot.line("time", column, legend_label=name, **style)
+        self.gates.step("time", "u", mode="before", legend_label=f"u, {name}", **style)
+        self.gates.scatter(
+            "time",
+            "green",
+            source=source,
+            size=5,
+            marker=marker,
+            line_color=colour,
+            fill_color=colours.PAPER,
+            legend_label=f"green, {name}",
         )
+        past, present = IndexFilter(indices=[]), IndexFilter(indices=[])
+        points = {"source": source, "marker": marker, "color": colour}
+        self.plane.scatter("accumulation", "outflow", view=CDSView(filter=past), size=4, alpha=0.5, **points)
+        self.plane.scatter(
+            "accumulation", "outflow", view=CDSView(filter=present), size=12, legend_label=name, **points
+        )
+        self.lines.append(source)
+        self.past.append(past)
+        self.present.append(present)
 
 
-def _figure(title: str, x: str, y: str, height: int = HEIGHT) -> Plot:
+def _mean(values: np.ndarray) -> float:
+    """Return the mean without NaN, NaN if nothing is left."""
+    values = values[~np.isnan(values)]
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def _figure(title: str, x: str, y: str, height: int = CURVE_HEIGHT) -> Plot:
     plot = figure(
         title=title,
         height=height,
@@ -283,22 +186,15 @@ def _figure(title: str, x: str, y: str, height: int = HEIGHT) -> Plot:
         x_axis_label=x,
         y_axis_label=y,
         outline_line_color=None,
-        background_fill_color=colours.PAPER,
     )
     plot.axis.axis_label_text_font_style = "normal"
     plot.axis.axis_label_text_color = plot.axis.major_label_text_color = colours.FAINT
     plot.axis.axis_line_color = plot.axis.major_tick_line_color = colours.LINE
     plot.axis.minor_tick_line_color = None
-    plot.grid.grid_line_color = colours.LINE
-    plot.grid.grid_line_alpha = 0.6
+    plot.grid.grid_line_color, plot.grid.grid_line_alpha = colours.LINE, 0.6
     plot.title.text_font_size, plot.title.text_color = "13px", colours.INK
     plot.add_tools(HoverTool(tooltips=[(x, "$x{0.0}"), (y, "$y{0.00}")]))
     return plot
-
-
-def _legend(plot: Plot) -> None:
-    plot.legend.location, plot.legend.background_fill_alpha, plot.legend.border_line_alpha = "top_left", 0.75, 0.0
-    plot.legend.label_text_font_size, plot.legend.spacing, plot.legend.padding = "11px", 0, 2
 
 
 def _now(plot: Plot) -> Span:

@@ -1,225 +1,319 @@
-"""The live page of one viewer: what they look at, and the buttons. Runs and pace are everybody's."""
+"""The live page: runs in processes of their own, and the Bokeh server that shows them on this machine."""
 
+import logging
+import multiprocessing
+import queue
 import time
-from functools import partial
+import webbrowser
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
 
+import numpy as np
 from bokeh.document import Document
-from bokeh.models import Button, RadioButtonGroup, Select, Slider, TextInput
+from bokeh.models import Button, RadioButtonGroup, Select
+from bokeh.server.server import Server
+from tornado.ioloop import PeriodicCallback
 
-from cosim.view.budget import Budget
-from cosim.view.city_map import DENSITY, SPEED
-from cosim.view.curves import MINUTE
+from cosim.evaluation.simulate import Task, scenario_of, simulate
+from cosim.plant.settings import settings
+from cosim.sumo.arrays import PerEdge
+from cosim.sumo.net import City
 from cosim.view.page import Page
-from cosim.view.show import Show
+from cosim.view.picture import CityPicture, Frame, after, between, first
+from nmfd.errors import InputError, RunFailed
+from nmfd.metrics import summary
+from nmfd.types import Controls, State
 
-EVERY = 200  # ms of wall time between two pictures: 5 Hz, 4 Hz where the browser is slow
+REFRESH_MS = 250  # between two pictures
+FRAME_RATE = 8.0  # frames per second of wall time within control intervals, at most
+OPENING_S = 10.0  # time to open the page of runs that have ended
+PACES = {"as fast as possible": 0.0, "60 s per s": 1 / 60, "20 s per s": 1 / 20, "5 s per s": 1 / 5, "real time": 1.0}
+FOREVER = float("inf")
+
+
+@dataclass
+class Seen:
+    """One run as shown so far.
+
+    whole: the frames at the ends of control intervals; latest: the last frame; row: the summary of a finished run;
+    error: the failure of another
+    """
+
+    name: str
+    whole: list[Frame] = field(default_factory=list)
+    latest: Frame | None = None
+    row: dict | None = None
+    error: Exception | None = None
+
+    @property
+    def over(self) -> bool:
+        """True if the run has ended."""
+        return self.row is not None or self.error is not None
+
+    def add(self, frame: Frame) -> None:
+        """Store a new frame."""
+        self.latest = frame
+        if frame.whole:
+            self.whole.append(frame)
+
+    def at(self, time: float) -> Frame | None:
+        """Return the last frame until a time [s], None before the first."""
+        if self.latest is not None and self.latest.time <= time:
+            return self.latest
+        return next((frame for frame in reversed(self.whole) if frame.time <= time), None)
+
+
+class Show:
+    """Runs side by side, each in its own process, at a common pace."""
+
+    def __init__(self, tasks: Sequence[Task]):
+        spawn = multiprocessing.get_context("spawn")
+        self.runs = [Seen(task.controller) for task in tasks]
+        self.picture: CityPicture | None = None
+        self._messages = spawn.Queue()
+        self._limit, self._delay = spawn.Value("d", FOREVER), spawn.Value("d", 0.0)
+        self._processes = [
+            spawn.Process(target=run, args=(n, task, self._messages, self._limit, self._delay), daemon=True)
+            for n, task in enumerate(tasks)
+        ]
+        for process in self._processes:
+            process.start()
+
+    @property
+    def over(self) -> bool:
+        """True if all runs have ended."""
+        return all(seen.over for seen in self.runs)
+
+    @property
+    def now(self) -> float:
+        """Return the time [s] that all runs under way have reached."""
+        times = [seen.latest.time if seen.latest else 0.0 for seen in self.runs if not seen.over]
+        return min(times, default=max((seen.latest.time for seen in self.runs if seen.latest), default=0.0))
+
+    @property
+    def paused(self) -> bool:
+        """True if the runs are held."""
+        return self._limit.value != FOREVER
+
+    def pause(self, hold: bool) -> None:
+        """Hold all runs at their next frame, or release them."""
+        self._limit.value = 0.0 if hold else FOREVER
+
+    def pace(self, delay: float) -> None:
+        """Set the least wall time per simulated second [s]."""
+        self._delay.value = delay
+
+    def update(self) -> None:
+        """Take what the runs have sent."""
+        ended = [not process.is_alive() for process in self._processes]  # before their last messages are read
+        with suppress(queue.Empty):
+            while True:
+                n, message = self._messages.get_nowait() if not any(ended) else self._messages.get(timeout=0.05)
+                if isinstance(message, CityPicture):
+                    self.picture = self.picture or message
+                elif isinstance(message, Frame):
+                    self.runs[n].add(message)
+                elif isinstance(message, Exception):
+                    self.runs[n].error = message
+                else:
+                    self.runs[n].row = message
+        for seen, gone, process in zip(self.runs, ended, self._processes, strict=True):
+            if gone and not seen.over:
+                seen.error = RunFailed(f"{seen.name}: its process ended with exit code {process.exitcode}")
+
+    def close(self) -> None:
+        """End the runs that are still under way."""
+        for process in self._processes:
+            process.terminate()
+            process.join()
+        self._messages.close()
+
+
+def run(n: int, task: Task, messages: Any, limit: Any, delay: Any) -> None:
+    """Run a task as number n, and send its picture, frames, and summary or error."""
+    try:
+        result = simulate(task, observer=Reporter(n, task, messages, limit, delay))
+        messages.put((n, summary(result)))
+    except (InputError, RunFailed) as error:
+        messages.put((n, type(error)(f"{task.controller}: {error}")))
+
+
+class Reporter:
+    """The observer of one run: it sends frames and holds the run to the pace; the run stays the same otherwise."""
+
+    def __init__(self, n: int, task: Task, messages: Any, limit: Any, delay: Any):
+        """limit: time [s] at which the run waits; delay: least wall time per simulated second; both are shared"""
+        self._n, self._messages, self._limit, self._delay = n, messages, limit, delay
+        self._scenario = scenario_of(task)
+        self._begin = settings(self._scenario).begin
+        self._speed: PerEdge | None = None
+        self._sent = self._time = 0.0
+        self._due = time.perf_counter()
+
+    def began(self, city: City, state: State) -> None:
+        """Send the city and the first frame."""
+        self._picture = CityPicture.of(self._scenario, city)
+        self._state, self._frame = state, first(self._picture, len(city.gateways), state)
+        self._send(self._picture)
+        self._send(self._frame)
+        self._wait(0.0)
+
+    def sampled(self, time_: float, vehicles: PerEdge, speed: PerEdge) -> None:
+        """Send a frame within a control interval if the last one is old enough."""
+        now, self._speed = time_ - self._begin, np.where(vehicles > 0, speed, np.nan)
+        if now < (self._state.step + 1) * self._picture.step - 1e-6:  # else `recorded` follows
+            if now >= self._limit.value or time.perf_counter() - self._sent > 1.0 / FRAME_RATE:
+                self._send(between(self._picture, self._frame, now, vehicles, speed))
+            self._wait(now)
+
+    def recorded(self, controls: Controls, state: State, row: Mapping[str, np.ndarray]) -> None:
+        """Send the frame at the end of a control interval."""
+        spent = float(self._state.unfinished.sum())
+        self._frame = after(self._picture, self._frame, spent, controls, state, row, self._speed)
+        self._state = state
+        self._send(self._frame)
+        self._wait(state.time)
+
+    def _send(self, message: object) -> None:
+        self._messages.put((self._n, message))
+        self._sent = time.perf_counter()
+
+    def _wait(self, now: float) -> None:
+        """Return when the run may go on from a time [s]."""
+        parent = multiprocessing.parent_process()
+        self._due = max(self._due + self._delay.value * (now - self._time), time.perf_counter() - 1.0)
+        self._time = now
+        while now >= self._limit.value or time.perf_counter() < self._due:
+            if parent is not None and not parent.is_alive():
+                raise RunFailed("the page was closed")
+            left = self._due - time.perf_counter()
+            time.sleep(min(max(left, 0.001), 0.05) if now < self._limit.value else 0.05)
 
 
 class Viewer:
-    """A document of the server: it looks at `show` a few times a second, more seldom if `budget` says so."""
+    """The page of one browser; pause and pace are common to all."""
 
-    def __init__(self, show: Show, document: Document, budget: Budget):
-        """show: whose picture is there; budget: of all viewers"""
+    def __init__(self, show: Show, document: Document):
+        """show: has its picture already"""
         assert show.picture is not None
-        self._show, picture = show, show.picture
-        self._page = Page(picture, [seen.name for seen in show.runs])
-        self._numbers = {edge: n for n, edge in enumerate(picture.edges)}
-        self._at: float | None = None  # the time that is looked back at [s], None for the present
-        self._by = DENSITY
-        self._drawn: tuple[object, ...] = ()
+        self._show, self._page, self._by = show, Page(show.picture, [seen.name for seen in show.runs]), "density"
         self._traced: tuple[object, ...] = ()
-        self._moving = False
-        bar, choices = self._buttons(), self._choices()
-        for n, one in enumerate(self._page.maps):
-            one.regions.selected.on_change("indices", partial(self._region_clicked, n))
-            one.gates.selected.on_change("indices", partial(self._gate_clicked, n))
-            one.streets.selected.on_change("indices", partial(self._street_clicked, n))
-        self._page.place(
-            document,
-            f"{len(picture.edges):,} streets, {picture.regions} regions, control interval "
-            f"{picture.step:g} s, {picture.steps} intervals",
-            bar,
-            choices,
-            streets=True,
-        )
-        self._next, self._budget = 0.0, budget
+        self._pause = Button(label="Pause", button_type="primary", name="pause", width=90)
+        self._pause.on_click(self._toggle)
+        pace = Select(title="Pace", name="pace", width=170, value=next(iter(PACES)), options=list(PACES))
+        pace.on_change("value", lambda _, __, new: show.pace(PACES[new]))
+        colour = RadioButtonGroup(labels=["Density", "Speed"], active=0, name="colour")
+        colour.on_change("active", lambda _, __, new: self._colour(new))
+        self._page.regions.on_change("value", lambda _, __, new: self._choose(int(new)))
+        for one in self._page.maps:
+            one.regions.selected.on_change("indices", self._tapped)
+        document.title = f"{show.picture.name}: {' against '.join(self._page.names)}"
+        document.add_root(self._page.layout([self._pause, pace, self._page.regions, colour]))
         self.refresh()
-        document.add_periodic_callback(self._look, EVERY)
-
-    def _look(self) -> None:
-        """Draw, if the last picture is long enough ago."""
-        now = time.monotonic()
-        if now >= self._next:
-            self.refresh()
-            self._next = now + (self._budget.slower() - 0.5) * EVERY / 1000.0
+        document.add_periodic_callback(self.refresh, REFRESH_MS)
 
     def refresh(self) -> None:
         """Draw what has changed."""
-        show = self._show
-        now = show.now if self._at is None else min(self._at, show.now)
-        frames = [seen.at(now) for seen in show.runs]
-        held = [
-            frozenset(
-                (i, h)
-                for (i, h), share in {(i, h): share for _, i, h, share in seen.switched}.items()
-                if share is not None
-            )
-            for seen in show.runs
-        ]
-        drawn = (now, self._by, *held, *(None if frame is None else (frame.time, frame.whole) for frame in frames))
-        whole = [[frame for frame in seen.whole if frame.time <= show.now] for seen in show.runs]
-        traced = (self._page.region, self._page.gate, self._page.street, self._at, *(len(frames) for frames in whole))
-        if drawn != self._drawn:
-            self._page.show(frames, now, self._by, held)
-            self._drawn = drawn
+        show, now = self._show, self._show.now
+        self._pause.label = "Finished" if show.over else ("Go on" if show.paused else "Pause")
+        self._pause.disabled = show.over
+        self._page.show([seen.at(now) for seen in show.runs], now, self._by)
+        runs = [[frame for frame in seen.whole if frame.time <= now] for seen in show.runs]
+        traced = (self._page.region, *map(len, runs))
         if traced != self._traced:
-            self._page.trace(whole, now)
+            self._page.trace(runs, now)
             self._traced = traced
-        self._label(now)
 
-    def _buttons(self) -> list:
-        self._pause = Button(label="Pause", button_type="primary", name="pause", width=90)
-        self._pause.on_click(lambda: self._do(self._show.go if self._show.paused else self._show.pause))
-        step = Button(label="Step", name="step", width=70)
-        step.on_click(lambda: self._do(self._show.step))
-        slower, faster = (Button(label=label, name=label.lower(), width=80) for label in ("Slower", "Faster"))
-        self._running = [self._pause, step, slower, faster]
-        slower.on_click(lambda: self._do(partial(self._show.hurry, -1)))
-        faster.on_click(lambda: self._do(partial(self._show.hurry, 1)))
-        picture = self._page.picture
-        self._time = Slider(
-            start=0.0,
-            end=picture.steps * picture.step / MINUTE,
-            value=0.0,
-            step=picture.step / MINUTE,
-            name="time",
-            title="time [min]",
-            sizing_mode="stretch_width",
-        )
-        self._time.on_change("value", self._jumped)
-        self._live = Button(label="Live", name="live", width=70, button_type="success")
-        self._live.on_click(self._back_to_live)
-        self._state = Button(label="", name="state", disabled=True, width=200, button_type="light")
-        return [self._pause, step, slower, faster, self._time, self._live, self._state]
-
-    def _choices(self) -> list:
-        picture = self._page.picture
-        colour = RadioButtonGroup(labels=["Density", "Speed"], active=0, name="colour")
-        colour.on_change("active", lambda _, __, new: self._coloured((DENSITY, SPEED)[new]))
-        self._regions = Select(
-            title="Region",
-            name="region",
-            value=str(self._page.region),
-            width=210,
-            options=[(str(n), f"{n} {name}") for n, name in enumerate(picture.region_names)],
-        )
-        self._regions.on_change("value", lambda _, __, new: self._choose(int(new), None))
-        self._gates = Select(
-            title="Gate",
-            name="gate",
-            value=_text(self._page.gate),
-            width=110,
-            options=[_text(gate) for gate in picture.boundaries],
-        )
-        self._gates.on_change("value", lambda _, __, new: self._choose(self._page.region, _pair(new)))
-        self._whose = Select(
-            title="of the run",
-            name="whose",
-            value="0",
-            width=200,
-            options=[(str(n), seen.name) for n, seen in enumerate(self._show.runs)],
-        )
-        self._street = TextInput(title="Street", name="street", placeholder="its name, or click it", width=170)
-        self._street.on_change("value", lambda _, __, new: self._choose_street(new))
-        buttons: list[Button] = []
-        for label, name, share in (
-            ("Close gate", "close", 0.0),
-            ("Open gate", "open", 1.0),
-            ("Let go", "release", None),
-        ):
-            button = Button(label=label, name=name, width=100, disabled=self._page.gate is None)
-            button.on_click(partial(self._switch, share))
-            buttons.append(button)
-        self._running += buttons
-        return [colour, self._regions, self._street, self._gates, self._whose, *buttons]
-
-    def _do(self, command: object) -> None:
-        command()  # type: ignore[operator]
+    def _toggle(self) -> None:
+        self._show.pause(not self._show.paused)
         self.refresh()
 
-    def _switch(self, share: float | None) -> None:
-        if self._page.gate is not None:
-            self._show.switch(int(self._whose.value), *self._page.gate, share)
-
-    def _coloured(self, by: str) -> None:
-        self._by = by
+    def _colour(self, number: int) -> None:
+        self._by = ("density", "speed")[number]
         self.refresh()
 
-    def _jumped(self, _: str, __: float, new: float) -> None:
-        if not self._moving:
-            self._at = MINUTE * new
+    def _choose(self, region: int) -> None:
+        if region != self._page.region:
+            self._page.choose(region)
+            self._page.regions.value = str(region)
             self.refresh()
 
-    def _back_to_live(self) -> None:
-        self._at = None
-        self.refresh()
-
-    def _region_clicked(self, n: int, _: str, __: list[int], new: list[int]) -> None:
-        source = self._page.maps[n].regions
-        if new:
-            region = int(source.data["region"][new[0]])
-            source.selected.indices = []
-            self._choose(region, None)
-
-    def _gate_clicked(self, n: int, _: str, __: list[int], new: list[int]) -> None:
-        if new:
-            gate = self._page.picture.gates[new[0]]
-            self._page.maps[n].gates.selected.indices = []
-            self._whose.value = str(n)
-            if gate.signal:
-                self._choose(gate.target, (gate.source, gate.target))
-
-    def _street_clicked(self, n: int, _: str, __: list[int], new: list[int]) -> None:
-        if new:
-            self._page.maps[n].streets.selected.indices = []
-            self._street.value = self._page.picture.edges[new[0]]
-
-    def _choose_street(self, name: str) -> None:
-        """Nothing for a name that no street has."""
-        if (name := name.strip()) in self._numbers:
-            self._page.choose_street(self._numbers[name])
-            self.refresh()
-
-    def _choose(self, region: int, gate: tuple[int, int] | None) -> None:
-        """gate: None for the region's first one"""
-        if self._moving:
-            return
-        gate = gate or self._page.gate_of(region)
-        if (region, gate) == (self._page.region, self._page.gate):
-            return
-        self._page.choose(region, gate)
-        self._moving = True
-        self._regions.value, self._gates.value = str(region), _text(gate)
-        self._moving = False
-        self.refresh()
-
-    def _label(self, now: float) -> None:
-        show = self._show
-        self._pause.label = "Go on" if show.paused else "Pause"
-        self._moving = True
-        self._time.value = min(now / MINUTE, self._time.end)
-        self._moving = False
-        self._live.button_type = "success" if self._at is None else "default"
-        for button in self._running if show.over else ():
-            button.disabled = True
-        rate = "as fast as SUMO goes" if not show.pace.delay else f"{1.0 / show.pace.delay:,.0f} s per second at most"
-        self._state.label = "finished" if show.over else ("paused" if show.paused else rate)
+    def _tapped(self, _: str, __: list[int], indices: list[int]) -> None:
+        if indices:
+            source = self._page.maps[0].regions
+            region = int(source.data["region"][indices[0]])
+            for one in self._page.maps:
+                one.regions.selected.indices = []
+            self._choose(region)
 
 
-def _text(gate: tuple[int, int] | None) -> str:
-    return "" if gate is None else f"{gate[0]} → {gate[1]}"
+def watch(
+    tasks: Sequence[Task],
+    *,
+    port: int = 0,
+    browse: bool = False,
+    tell: Callable[[str], None] = print,
+) -> list[Seen]:
+    """Run the tasks side by side with a live page until they have ended and the page is closed.
+
+    Args:
+        tasks: one or two runs.
+        port: of the page on this machine; 0 for a free one.
+        browse: open the page in a browser.
+        tell: called with a line that has the address.
+
+    Raises:
+        InputError: for a port in use, or a wrong task.
+        RunFailed: if a run fails.
+    """
+    logging.getLogger("bokeh").setLevel(logging.ERROR)
+    show = Show(tasks)
+    try:
+        while show.picture is None and not show.over:
+            show.update()
+            time.sleep(0.05)
+        if show.picture is not None:
+            _serve(show, port, browse, tell)
+    finally:
+        show.close()
+    errors = [seen.error for seen in show.runs if seen.error is not None]
+    if errors:
+        raise errors[0]
+    return show.runs
 
 
-def _pair(text: str) -> tuple[int, int] | None:
-    source, _, target = text.partition(" → ")
-    return (int(source), int(target)) if target else None
+def _serve(show: Show, port: int, browse: bool, tell: Callable[[str], None]) -> None:
+    """Serve the page until all runs have ended and no browser is connected."""
+    try:
+        server = Server(
+            {"/": lambda document: Viewer(show, document) and None},
+            address="localhost",
+            port=port,
+            unused_session_lifetime_milliseconds=3000,
+            check_unused_sessions_milliseconds=1000,
+        )
+    except OSError as error:
+        raise InputError(f"--port {port}: cannot be used ({error.strerror}); choose another one") from None
+    ended_at: float | None = None
+
+    def update() -> None:
+        nonlocal ended_at
+        show.update()
+        if show.over:
+            ended_at = ended_at or time.monotonic()
+            failed = all(seen.error is not None for seen in show.runs)
+            if failed or (not server.get_sessions("/") and time.monotonic() - ended_at > OPENING_S):
+                server.io_loop.stop()
+
+    address = f"http://localhost:{server.port}/"
+    tell(f"Watch it at {address}")
+    if browse:
+        webbrowser.open(address)
+    server.start()
+    PeriodicCallback(update, REFRESH_MS / 2).start()
+    try:
+        server.io_loop.start()
+    finally:
+        server.stop()

@@ -1,170 +1,227 @@
-"""The page: the maps, the curves and the numbers of some runs, and their place; no server, and nothing that is done."""
+"""The page of one or two runs: maps, curves and numbers, live or with a slider over a finished run."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
-from pathlib import Path
+from typing import Any
 
-from bokeh.document import Document
-from bokeh.models import Div, Model
-from jinja2 import Environment, PackageLoader
+import numpy as np
+from bokeh.layouts import column, row
+from bokeh.models import ColumnDataSource, CustomJS, Div, LayoutDOM, Select, Slider, Toggle
 
 from cosim.view import colours
-from cosim.view.city_map import DENSITY, CityMap
-from cosim.view.curves import HOUR, MINUTE, Curves, Load
+from cosim.view.city_map import CityMap
+from cosim.view.curves import HOUR, MINUTE, OF_REGION, TRAIL_INTERVALS, Curves, Load
 from cosim.view.picture import CityPicture, Frame
 
-HERE = Path(__file__).parent
-WIDE = ".bk-clearfix { display: block !important; }"  # of a Div, which else is no wider than its words
-TEMPLATES = Environment(loader=PackageLoader("cosim.view", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+PLAY_PERIOD_MS = 150  # wall time per control interval
+NARROWEST = 330  # pixels, of a plot; on a narrower screen plots stand below each other
+WIDE = ".bk-clearfix { display: block !important; }"  # a Div is only as wide as its text otherwise
+KEY = (
+    f"<span style='color:{colours.GREEN}'>◕</span> gate, green part: share of its original green time &ensp; "
+    f"<span style='color:{colours.QUEUE}'>●</span> halo: queue before it &ensp; "
+    f"<span style='color:{colours.GUIDED}'>▲</span> drivers guided from region to region"
+)
+# The tables hold a row per control interval (film) or region (choices) for every source that changes with it.
+SLIDER_JS = """
+const k = Math.round(slider.value / slider.step)
+const put = (tables, row) => {
+  for (const [source, table, columns] of tables) {
+    for (const name of columns) source.data[name] = table.data[name][row]
+    source.change.emit()
+  }
+}
+if (cb_obj === region) {
+  put(choices, Number(region.value))
+  titles.forEach((title, n) => { title.text = texts[n][Number(region.value)] })
+}
+put(film, k)
+numbers.text = words[k]
+for (const span of spans) span.location = slider.value
+const begin = Math.max(1, k - trail + 1)
+for (const one of past) one.indices = [...Array(Math.max(0, k - begin)).keys()].map(n => n + begin)
+for (const one of present) one.indices = k > 0 ? [k] : []
+"""
+PLAY_JS = """
+clearInterval(window.playing)
+cb_obj.label = cb_obj.active ? "Pause" : "Play"
+const last = () => slider.value > slider.end - slider.step / 2
+if (cb_obj.active && last()) slider.value = slider.start
+if (cb_obj.active) window.playing = setInterval(() => {
+  if (last()) cb_obj.active = false
+  else slider.value = Math.min(slider.value + slider.step, slider.end)
+}, period)
+"""
 
 
 class Page:
-    """The runs `names` side by side."""
+    """Maps, curves and numbers of the runs `names` side by side."""
 
     def __init__(self, picture: CityPicture, names: Sequence[str]):
-        """A region in the middle to begin with: that with the most boundaries."""
         self.picture, self.names = picture, names
         self.maps = [CityMap(picture, name) for name in names]
-        self.loads = [Load(picture, f"{name}: how full the regions are") for name in names]
+        self.loads = [Load(picture, f"{name}: load of the regions") for name in names]
         self.curves = Curves(picture, names)
-        self.numbers = Div(text="", sizing_mode="stretch_width", stylesheets=[WIDE])
+        self.numbers = Div(sizing_mode="stretch_width", stylesheets=[WIDE])
         ends = [region for gate in picture.gates for region in (gate.source, gate.target)]
-        self.street: int | None = None
-        self.region = max(range(picture.regions), key=ends.count)
-        self.gate = self.gate_of(self.region)
-        self.choose(self.region, self.gate)
+        self.choose(max(range(picture.regions), key=ends.count))
+        options = [(str(n), name if name == str(n) else f"{n} {name}") for n, name in enumerate(picture.region_names)]
+        self.regions = Select(name="region", title="Region", width=190, value=str(self.region), options=options)
 
-    def gate_of(self, region: int) -> tuple[int, int] | None:
-        """The first gate into a region, or out of it; None where there is none with a signal."""
-        gates = self.picture.boundaries
-        return next(
-            (gate for gate in gates if gate[1] == region), next((gate for gate in gates if gate[0] == region), None)
-        )
-
-    def choose(self, region: int, gate: tuple[int, int] | None) -> None:
-        """The region and the gate whose curves are shown, from the next `curves` on."""
-        self.region, self.gate = region, gate
+    def choose(self, region: int) -> None:
+        """Select the region whose curves are shown; `trace` draws them."""
+        self.region = region
         for one in self.maps:
             one.choose(region)
-        self.curves.choose(region, gate)
+        self.curves.choose(region)
 
-    def choose_street(self, street: int) -> None:
-        """The street whose curves are shown, from the next `curves` on."""
-        self.street = street
-        for one in self.maps:
-            one.choose_street(street)
-        self.curves.choose_street(street)
-
-    def show(
-        self,
-        frames: Sequence[Frame | None],
-        time: float,
-        by: str = DENSITY,
-        held: Sequence[frozenset[tuple[int, int]]] = (),
-    ) -> None:
-        """The runs at `time` [s]: a frame of each, None where there is none yet; by: the colour of streets; held: of
-        each, the gates that were switched by hand."""
-        for n, (one, frame) in enumerate(zip(self.maps, frames, strict=True)):
+    def show(self, frames: Sequence[Frame | None], time: float, by: str = "density") -> None:
+        """Draw maps and numbers at a time [s]: a frame of every run, None before its first one."""
+        for one, frame in zip(self.maps, frames, strict=True):
             if frame is not None:
-                one.show(frame, by, held[n] if held else frozenset())
+                one.show(frame, by)
         for load in self.loads:
             load.now.location = time / MINUTE
         self.curves.mark(time)
         self.numbers.text = numbers(self.names, frames, time)
 
     def trace(self, runs: Sequence[Sequence[Frame]], time: float) -> None:
-        """The curves: the frames at the ends of control intervals of every run, and the time [s] that is looked at."""
+        """Draw the curves from the whole frames of every run, with the time [s] marked."""
         for load, whole in zip(self.loads, runs, strict=True):
             load.show(whole)
         self.curves.show(runs, time)
 
-    def layout(
-        self, bar: Sequence[Model], choices: Sequence[Model], *, streets: bool = False
-    ) -> tuple[dict[str, Model], dict[str, list[str]]]:
-        """What stands on the page: models by name, and which of them is where (`body.html.j2`). bar, choices: what one
-        can press, with names; streets: whether one can be chosen."""
-        curves, street = self.curves, {"street_curve": self.curves.street} if streets else {}
-        roots = {
-            "numbers": self.numbers,
-            **{f"map{n}": one.plot for n, one in enumerate(self.maps)},
-            **{f"load{n}": one.plot for n, one in enumerate(self.loads)},
-            "region_curve": curves.region,
-            "plane": curves.plane,
-            "gate_curve": curves.gate,
-            "trips": curves.trips,
-            "spent": curves.spent,
-            **street,
-            **{str(model.name): model for model in (*bar, *choices)},
-        }
-        for name, model in roots.items():
-            model.name = name
-        return roots, {
-            "bar": [str(model.name) for model in bar],
-            "choices": [str(model.name) for model in choices],
-            "maps": [name for name in roots if name.startswith("map")],
-            "loads": [name for name in roots if name.startswith("load")],
-            "curves": ["region_curve", "plane", "gate_curve", *street, "trips", "spent"],
-        }
-
-    def place(
-        self,
-        document: Document,
-        subtitle: str,
-        bar: Sequence[Model],
-        choices: Sequence[Model],
-        *,
-        streets: bool = False,
-    ) -> None:
-        """Put it into a document; arguments as in `layout`."""
-        roots, places = self.layout(bar, choices, streets=streets)
-        with document.models.freeze():  # else all models are looked through anew with every root
-            for model in roots.values():
-                document.add_root(model)
-        document.title = f"{self.picture.name}: {' against '.join(self.names)}"
-        document.template = TEMPLATES.get_template("page.html.j2")
-        document.template_variables.update(
-            heading=document.title, subtitle=subtitle, css=style("page.css", "runs.css"), **places
+    def layout(self, bar: Sequence[LayoutDOM]) -> LayoutDOM:
+        """Return the page as one model, with `bar` above it."""
+        curves = self.curves
+        beside = [] if len(self.maps) > 1 else [column(curves.region, curves.plane, sizing_mode="stretch_width")]
+        below = [curves.region, curves.plane] if len(self.maps) > 1 else []
+        for n, one in enumerate(self.maps):
+            one.plot.name = f"map{n}"
+        curves.plane.name = "plane"
+        self.numbers.name = "numbers"
+        return column(
+            _wrapped(bar, narrowest=0),
+            self.numbers,
+            _wrapped([*(one.plot for one in self.maps), *beside]),
+            Div(text=KEY, styles={"color": colours.FAINT, "font-size": "13px"}),
+            _wrapped([load.plot for load in self.loads]),
+            _wrapped([*below, curves.gates, curves.trips, curves.spent]),
+            sizing_mode="stretch_width",
         )
 
 
-def style(*names: str) -> str:
-    """Style sheets of the page, one after the other."""
-    return "\n".join((HERE / name).read_text(encoding="utf-8") for name in names)
+def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> LayoutDOM:
+    """Return the page of finished runs, which needs no server.
+
+    It starts where two runs differ most, or where one has most vehicles. runs: whole frames by name
+    """
+    page, whole = Page(picture, list(runs)), list(runs.values())
+    last, step = max(map(len, whole)) - 1, picture.step / MINUTE
+    inside = [[frames[min(k, len(frames) - 1)].accumulation.sum() for k in range(last + 1)] for frames in whole]
+    begin = int(np.argmax(np.abs(np.subtract(inside[0], inside[-1]) if len(inside) > 1 else inside[0])))
+    moving = [
+        *((one.streets, ["value"]) for one in page.maps),
+        *((one.gates, ["end", "green", "queue", "halo"]) for one in page.maps),
+        *((one.arrows, ["width", "head", "guided"]) for one in page.maps),
+    ]
+    of_region = [
+        *((one.regions, ["width", "line", "fill"]) for one in page.maps),
+        *((line, list(OF_REGION)) for line in page.curves.lines),
+        (page.curves.critical, ["x", "y"]),
+        (page.curves.mfd, ["x", "y"]),
+    ]
+    film, choices, words, first = _tables(moving), _tables(of_region), [], page.region
+    texts: list[list[str]] = [[] for _ in page.curves.titles]
+    for k in range(last + 1):
+        page.show([frames[min(k, len(frames) - 1)] for frames in whole], k * picture.step)
+        _add_row(film)
+        words.append(page.numbers.text)
+    for region in range(picture.regions):
+        page.choose(region)
+        page.trace(whole, begin * picture.step)
+        _add_row(choices)
+        for title, text in zip(page.curves.titles, texts, strict=True):
+            text.append(title.text)
+    page.choose(first)
+    page.trace(whole, begin * picture.step)
+    page.show([frames[min(begin, len(frames) - 1)] for frames in whole], begin * picture.step)
+    slider = Slider(
+        start=0.0,
+        end=last * step,
+        value=begin * step,
+        step=step,
+        title="time [min]",
+        name="time",
+        sizing_mode="stretch_width",
+    )
+    play = Toggle(label="Play", name="play", width=90, button_type="primary")
+    callback = CustomJS(
+        args={
+            "slider": slider,
+            "region": page.regions,
+            "film": film,
+            "choices": choices,
+            "titles": page.curves.titles,
+            "texts": texts,
+            "numbers": page.numbers,
+            "words": words,
+            "past": page.curves.past,
+            "present": page.curves.present,
+            "trail": TRAIL_INTERVALS,
+            "spans": [*(load.now for load in page.loads), *page.curves.now],
+        },
+        code=SLIDER_JS,
+    )
+    slider.js_on_change("value", callback)
+    page.regions.js_on_change("value", callback)
+    play.js_on_change("active", CustomJS(args={"slider": slider, "period": PLAY_PERIOD_MS}, code=PLAY_JS))
+    return page.layout([play, slider, page.regions])
+
+
+def _tables(sources: Sequence[tuple[ColumnDataSource, list[str]]]) -> list[list[Any]]:
+    """Return [source, empty table of its columns, columns] for every source."""
+    return [[source, ColumnDataSource({name: [] for name in names}), names] for source, names in sources]
+
+
+def _add_row(tables: Sequence[Sequence[Any]]) -> None:
+    """Add the present values of the sources to their tables."""
+    for source, table, names in tables:
+        for name in names:
+            values = source.data[name]
+            table.data[name].append(values.copy() if isinstance(values, np.ndarray) else list(values))
+
+
+def _wrapped(parts: Sequence[LayoutDOM], narrowest: int = NARROWEST) -> LayoutDOM:
+    """Return a row that breaks into several on a narrow screen."""
+    for part in parts if narrowest else ():
+        part.styles = {"flex": f"1 1 {narrowest}px", "min-width": "0", "max-width": "760px"}
+    return row(*parts, sizing_mode="stretch_width", styles={"flex-wrap": "wrap", "gap": "8px 14px"})
 
 
 def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -> str:
-    """What has come of the runs so far, in HTML."""
+    """Return the totals of the runs at a time [s], as HTML."""
     lines = []
     for n, (name, frame) in enumerate(zip(names, frames, strict=True)):
-        told = (
-            ()
-            if frame is None
-            else (
-                ("inside [veh]", frame.accumulation.sum()),
-                ("waiting to enter [veh]", frame.waiting),
-                ("completed trips [veh]", frame.completed),
-                ("time spent [veh h]", frame.time_spent / HOUR),
-                ("removed [veh]", frame.removed),
-            )
-        )
-        cells = "".join(
-            f"<div style='flex:0 0 138px'><div style='font-size:19px;font-variant-numeric:tabular-nums'>{value:,.0f}"
-            f"</div><div style='font-size:12px;color:{colours.FAINT}'>{text}</div></div>"
-            for text, value in told
-        )
-        note = (
-            ""
-            if frame is None or not frame.note
-            else (f"<div style='flex-basis:100%;font-size:13px;color:{colours.QUEUE}'>{escape(frame.note[:200])}</div>")
-        )
         colour, dash = colours.RUNS[n]
+        cells = note = ""
+        if frame is not None:
+            totals = {
+                "inside [veh]": frame.accumulation.sum(),
+                "waiting to enter [veh]": frame.waiting,
+                "completed trips [veh]": frame.completed,
+                "time spent [veh h]": frame.time_spent / HOUR,
+                "removed [veh]": frame.removed,
+            }
+            cells = "".join(
+                f"<div style='flex:0 0 138px'><div style='font-size:19px'>{value:,.0f}</div>"
+                f"<div style='font-size:12px;color:{colours.FAINT}'>{label}</div></div>"
+                for label, value in totals.items()
+            )
+        if frame is not None and frame.note:
+            note = f"<div style='flex-basis:100%;color:{colours.QUEUE}'>{escape(frame.note[:200])}</div>"
         lines.append(
             f"<div style='display:flex;flex-wrap:wrap;gap:2px 10px;align-items:center;border-left:4px {dash} {colour};"
             f"padding-left:12px;margin:5px 0'><div style='flex:1 1 140px;font-weight:650;color:{colour}'>{escape(name)}"
             f"</div>{cells}{note}</div>"
         )
-    return (
-        "<div style='display:flex;flex-wrap:wrap;gap:4px 36px;align-items:center'>"
-        f"<div style='font-size:24px;font-weight:650;flex:0 0 130px;white-space:nowrap'>{time / MINUTE:.1f} min</div>"
-        f"<div style='flex:1 1 280px;min-width:0'>{''.join(lines)}</div></div>"
-    )
+    return f"<div style='font-size:22px;font-weight:650'>{time / MINUTE:.1f} min</div>{''.join(lines)}"

@@ -1,15 +1,10 @@
-"""What is drawn, as plain data: a city, which stays as it is, and frames of what happens in it.
-
-A frame is made from a row of the record and a state, whether the run is still going on (cosim.view.run) or finished
-(`frames`): the same page shows both.
-"""
+"""Plain data of what is drawn: a city, and frames of a live or finished run in it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
-from jaxtyping import Float
 
 from cosim.evaluation.run_metrics import regional_outflow
 from cosim.importing.maps import rings_round
@@ -17,18 +12,29 @@ from cosim.sumo.arrays import EdgeNumbers, PerEdge, PerGateway, Points
 from cosim.sumo.net import City, edge_shapes
 from nmfd.arrays import PerPair, PerRegion
 from nmfd.model.scenario import Scenario
-from nmfd.types import Controls, Result, State
+from nmfd.types import Controls, State
 
-CURVE = 60  # points of an MFD
-BLOCKS = 0.06  # of the map's extent: no hole in a region
-BACK = 0.015  # of it: how far before the end of a street its gate is drawn
-BEYOND = 2.0  # critical accumulations: where a curve ends, or at the jam if that comes first
+CURVE_POINTS = 60  # of an MFD
+CURVE_END = 2.0  # critical accumulations, or the jam accumulation if that is less
+REGION_REACH = 0.08  # of the map's extent: places farther from all streets belong to no region
+GATE_SETBACK = 0.015  # of the map's extent: distance of a gate from the end of its street
+ROW = (  # variables of a result that `after` reads
+    "gateway_green",
+    "gateway_original_green",
+    "gateway_queue",
+    "arrivals",
+    "crossings",
+    "edge_vehicles",
+    "guided",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Gate:
-    """Where streets lead from one region to another over one junction: source, target; place (x, y) [m]; gateways:
-    their numbers in the city; signal: whether a signal stands there."""
+    """A place where an edge ends at a boundary.
+
+    source, target: regions; place: (x, y) [m]; gateways: their numbers in the city; signal: True if controlled
+    """
 
     source: int
     target: int
@@ -39,13 +45,12 @@ class Gate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CityPicture:
-    """What does not change during a run. The same only as itself.
+    """The constant part of a picture.
 
-    name: of the scenario; region_names: R; edges: E ids
-    shapes: E lines (n, 2) [m]; lane_km (E,) [km]: length times lanes; limit (E,) [m/s]; lanes, region: (E,)
-    outlines: of every region, rings (n, 2) [m]; places: (R, 2) [m], where its number stands
-    gates: of the map; critical: (R,) [veh]; curves: R MFDs, (n, 2) of [veh] and [veh/s]
-    step: control interval [s]; steps: of them; low, high: bounds of u [-]
+    name: of the scenario; region_names: R; edges: E ids; shapes: E lines (n, 2) [m]
+    lane_km: (E,) length times lanes; limit: (E,) [m/s]; lanes, region: (E,)
+    outlines: rings (n, 2) [m] of every region; places: (R, 2) [m] of its number
+    critical: (R,) [veh]; curves: R MFDs (n, 2) in veh and veh/s; step: control interval [s]; steps: number of them
     """
 
     name: str
@@ -63,22 +68,15 @@ class CityPicture:
     curves: Sequence[Points]
     step: float
     steps: int
-    low: float
-    high: float
 
     @property
     def regions(self) -> int:
-        """R."""
+        """Number of regions R."""
         return len(self.region_names)
-
-    @property
-    def boundaries(self) -> list[tuple[int, int]]:
-        """(i, h) that have a gate with a signal."""
-        return sorted({(gate.source, gate.target) for gate in self.gates if gate.signal})
 
     @classmethod
     def of(cls, scenario: Scenario, city: City) -> Self:
-        """The picture of a scenario's city."""
+        """Return the picture of a scenario's city."""
         shapes, network = edge_shapes(city), scenario.network
         region = np.array([city.region_of[edge] for edge in city.edges])
         middles = np.array([shape.mean(axis=0) for shape in shapes])
@@ -91,29 +89,25 @@ class CityPicture:
             limit=np.array([city.speed[edge] for edge in city.edges]),
             lanes=np.array([city.lanes[edge] for edge in city.edges]),
             region=region,
-            outlines=rings_round(shapes, np.ones(len(shapes), dtype=bool), region, BLOCKS),
+            outlines=rings_round(shapes, np.ones(len(shapes), dtype=bool), region, REGION_REACH),
             places=np.stack([middles[region == r].mean(axis=0) for r in range(city.regions)]),
             gates=_gates(city, dict(zip(city.edges, shapes, strict=True))),
             critical=network.critical,
             curves=[_curve(mfd.critical, mfd.jam, mfd.outflow) for mfd in network.mfds],
             step=scenario.step,
             steps=scenario.steps,
-            low=network.u_min,
-            high=network.u_max,
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """What the city is doing at one moment. What is counted per control interval is of the last one that has ended.
+    """The city at one moment; flows and signals are those of the last complete control interval.
 
-    time: since the start [s]; intervals: that have ended; whole: whether one ends just now
-    density: (E,) [veh/km and lane]; speed: (E,) [-], of what is allowed, NaN where nobody drives or nobody measured it
-    accumulation: (R,) [veh] inside; outflow: (R,) [veh/s]; waiting: [veh] that could not enter yet
-    completed, removed: [veh] since the start; time_spent: total so far [veh s], of nmfd.metrics at the end
-    perimeter: (R, R) [-], u as commanded; green: (G,) [-], of the original, NaN where nobody commands; queue: (G,)
-    [veh] halting; guided: (R, R) [veh] rerouted from i to h
-    note: what was not as it should be
+    time: since the start [s]; intervals: completed ones; whole: True at the end of an interval
+    density: (E,) [veh/km and lane]; speed: (E,) share of the speed limit, NaN without a measurement
+    accumulation: (R,) [veh]; outflow: (R,) [veh/s]; waiting: to enter [veh]; completed, removed: since the start [veh]
+    time_spent: total since the start [veh s]; perimeter: (R, R) commanded u; green: (G,) share of the original green,
+    NaN without control; queue: (G,) halting vehicles; guided: (R, R) reroutes from i to h [veh]; note: a warning
     """
 
     time: float
@@ -135,7 +129,7 @@ class Frame:
 
 
 def first(picture: CityPicture, gateways: int, state: State) -> Frame:
-    """At the beginning. gateways: of the city"""
+    """Return the frame at the start of a run in a city with so many gateways."""
     edges, regions = len(picture.edges), picture.regions
     return Frame(
         time=0.0,
@@ -149,7 +143,7 @@ def first(picture: CityPicture, gateways: int, state: State) -> Frame:
         completed=0.0,
         removed=0.0,
         time_spent=0.0,
-        perimeter=np.full((regions, regions), picture.high),
+        perimeter=np.full((regions, regions), np.nan),
         green=np.full(gateways, np.nan),
         queue=np.zeros(gateways),
         guided=np.zeros((regions, regions)),
@@ -157,10 +151,7 @@ def first(picture: CityPicture, gateways: int, state: State) -> Frame:
 
 
 def between(picture: CityPicture, before: Frame, time: float, vehicles: PerEdge, speed: PerEdge) -> Frame:
-    """In the middle of a control interval: `before` with what streets do at `time` [s] since the start.
-
-    vehicles: (E,) [veh]; speed: (E,) [m/s]
-    """
+    """Return a frame within a control interval: the last whole one with new vehicles (E,) and speeds (E,) [m/s]."""
     return replace(
         before,
         time=time,
@@ -179,10 +170,14 @@ def after(
     row: Mapping[str, np.ndarray],
     speed: PerEdge | None = None,
 ) -> Frame:
-    """At the end of a control interval.
+    """Return the frame at the end of a control interval.
 
-    spent: vehicles that spent time in it [veh]; controls: of it; state: now; row: of the record; speed: (E,) [m/s],
-    None where nobody measured it
+    Args:
+        spent: unfinished vehicles at its start (veh).
+        controls: the commands of the interval.
+        state: the state at its end.
+        row: one row of the record.
+        speed: mean speeds (m/s, (E,)), None without a measurement.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         green = row["gateway_green"] / row["gateway_original_green"]
@@ -206,59 +201,65 @@ def after(
     )
 
 
-def frames(picture: CityPicture, trajectory: Result) -> list[Frame]:
-    """Of a finished run, one at its beginning and one at the end of every control interval."""
+def frames(picture: CityPicture, result: Any) -> list[Frame]:
+    """Return the frames of a finished run: one at its start and one at the end of every control interval."""
     states = [
         State(
             step=k,
-            time=k * trajectory.step,
-            accumulation=trajectory.accumulation[k],
-            backlog=trajectory.backlog[k],
-            completed=float(trajectory.completed[k]),
-            removed=trajectory.removed[k],
+            time=k * picture.step,
+            accumulation=result.accumulation[k],
+            backlog=result.backlog[k],
+            completed=float(result.completed[k]),
+            removed=result.removed[k],
         )
-        for k in range(len(trajectory.accumulation))
+        for k in range(len(result.accumulation))
     ]
-    record = {name: x.values for name, x in trajectory.data.data_vars.items() if x.dims[0] == "interval"}
-    found = [first(picture, trajectory.gateway_green.shape[1], states[0])]
+    made = [first(picture, result.gateway_green.shape[1], states[0])]
     for k, state in enumerate(states[1:]):
-        controls = Controls(perimeter=trajectory.perimeter[k], splits=None, note=trajectory.note[k])
-        row = {name: values[k] for name, values in record.items()}
-        found.append(after(picture, found[-1], float(states[k].unfinished.sum()), controls, state, row))
-    return found
+        controls = Controls(perimeter=result.perimeter[k], splits=None, note=str(result.note[k]))
+        row = {name: getattr(result, name)[k] for name in ROW}
+        made.append(after(picture, made[-1], float(states[k].unfinished.sum()), controls, state, row))
+    return made
+
+
+def _length(shape: Points) -> float:
+    """Return the length of a line [m]."""
+    return max(float(np.hypot(*np.diff(shape, axis=0).T).sum()), 1e-9)
+
+
+def _along(shape: Points, shares: np.ndarray) -> Points:
+    """Return the points (n, 2) of a line at these shares of its length."""
+    at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shape, axis=0).T))])
+    return np.stack([np.interp(shares * at[-1], at, shape[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def _streets(picture: CityPicture, vehicles: PerEdge, speed: PerEdge | None) -> dict[str, np.ndarray]:
-    """Density and speed of a frame, as half of what they would take in full."""
+    """Return density and speed of a frame in half precision."""
     share = np.full(len(vehicles), np.nan) if speed is None else np.where(vehicles > 0, speed / picture.limit, np.nan)
     return {"density": (vehicles / picture.lane_km).astype(np.float16), "speed": share.astype(np.float16)}
 
 
-def _curve(critical: float, jam: float, outflow: object) -> Points:
-    x = np.linspace(0.0, min(jam, BEYOND * critical), CURVE)
-    return np.stack([x, outflow(x)], axis=1)  # type: ignore[operator]
+def _curve(critical: float, jam: float, outflow: Any) -> Points:
+    x = np.linspace(0.0, min(jam, CURVE_END * critical), CURVE_POINTS)
+    return np.stack([x, outflow(x)], axis=1)
 
 
-def _before_end(shape: Float[np.ndarray, "n 2"], distance: float) -> tuple[float, float]:
-    """A point of a line so far before its end [m], or in its middle: gates of both ways must not lie on one another."""
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shape, axis=0).T))])
-    at = max(along[-1] - distance, 0.5 * along[-1])
-    return float(np.interp(at, along, shape[:, 0])), float(np.interp(at, along, shape[:, 1]))
-
-
-def _gates(city: City, shapes: Mapping[str, Float[np.ndarray, "n 2"]]) -> tuple[Gate, ...]:
-    """One for every edge that ends at a boundary and region behind it."""
+def _gates(city: City, shapes: Mapping[str, Points]) -> tuple[Gate, ...]:
+    """Return one gate for every edge that ends at a boundary and region behind it."""
     members: dict[tuple[str, int], list[int]] = {}
     for n, gateway in enumerate(city.gateways):
         members.setdefault((gateway.from_edge, gateway.target), []).append(n)
-    back = BACK * float(np.ptp(np.concatenate(list(shapes.values())), axis=0).max())
-    return tuple(
-        Gate(
-            source=city.gateways[numbers[0]].source,
-            target=target,
-            place=_before_end(shapes[edge], back),
-            gateways=tuple(numbers),
-            signal=any(city.gateways[n].signal is not None for n in numbers),
+    setback = GATE_SETBACK * float(np.ptp(np.concatenate(list(shapes.values())), axis=0).max())
+    gates = []
+    for (edge, target), numbers in members.items():
+        [(x, y)] = _along(shapes[edge], np.array([max(1.0 - setback / _length(shapes[edge]), 0.5)]))
+        gates.append(
+            Gate(
+                source=city.gateways[numbers[0]].source,
+                target=target,
+                place=(float(x), float(y)),
+                gateways=tuple(numbers),
+                signal=any(city.gateways[n].signal is not None for n in numbers),
+            )
         )
-        for (edge, target), numbers in members.items()
-    )
+    return tuple(gates)

@@ -1,4 +1,4 @@
-"""The live view of a city as large as Luxembourg, 5,747 streets: pytest -n0 tests/benchmarks --benchmark-only"""
+"""The view of a city as large as Luxembourg, 5,747 streets: pytest -n0 tests/benchmarks --benchmark-only"""
 
 import pickle
 from dataclasses import replace
@@ -6,12 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bokeh.document import Document
-from bokeh.embed import file_html
-from bokeh.resources import INLINE
+from bokeh.embed import components
 
 from cosim.importing.maps import rings_round
-from cosim.view import replay
-from cosim.view.page import Page
+from cosim.view.page import Page, with_slider
 from cosim.view.picture import CityPicture, Frame, Gate, between
 
 EDGES, REGIONS, GATES, ACROSS = 5747, 12, 300, 76
@@ -19,24 +17,16 @@ EDGES, REGIONS, GATES, ACROSS = 5747, 12, 300, 76
 
 @pytest.fixture(scope="module")
 def city():
-    """Streets of 150 m with four bends each, in 4 x 3 regions."""
+    """Streets of 150 m with four bends each, in 12 regions."""
     random, shapes = np.random.default_rng(0), []
     for n in range(EDGES):
         begin = 150.0 * np.array([n // 2 % ACROSS, n // 2 // ACROSS])
-        end = begin + 150.0 * np.eye(2)[n % 2]
-        shapes.append(np.linspace(begin, end, 6) + random.normal(0.0, 8.0, (6, 2)))
+        shapes.append(np.linspace(begin, begin + 150.0 * np.eye(2)[n % 2], 6) + random.normal(0.0, 8.0, (6, 2)))
     middles = np.array([shape.mean(axis=0) for shape in shapes])
-    columns, rows = (
-        np.minimum(middles[:, a] / (np.ptp(middles[:, a]) / n), n - 1).astype(int).clip(0) for a, n in ((0, 4), (1, 3))
-    )
-    region = columns + 4 * rows
+    region = np.minimum(REGIONS * middles[:, 0] / np.ptp(middles[:, 0]), REGIONS - 1).astype(int).clip(0)
     gates = tuple(
         Gate(
-            source=int(region[e]),
-            target=int(region[e] + 1) % REGIONS,
-            place=(float(middles[e][0]), float(middles[e][1])),
-            gateways=(n,),
-            signal=True,
+            source=int(region[e]), target=int(region[e] + 1) % REGIONS, place=(*middles[e],), gateways=(n,), signal=True
         )
         for n, e in enumerate(random.choice(EDGES, GATES, replace=False))
     )
@@ -49,15 +39,13 @@ def city():
         limit=np.full(EDGES, 14.0),
         lanes=random.integers(1, 4, EDGES),
         region=region,
-        outlines=rings_round(shapes, np.ones(EDGES, dtype=bool), region, 0.06),
+        outlines=rings_round(shapes, np.ones(EDGES, dtype=bool), region, 0.08),
         places=np.stack([middles[region == r].mean(axis=0) for r in range(REGIONS)]),
         gates=gates,
         critical=np.full(REGIONS, 500.0),
         curves=[np.ones((60, 2))] * REGIONS,
         step=60.0,
         steps=60,
-        low=0.1,
-        high=0.9,
     )
 
 
@@ -83,48 +71,20 @@ def frame():
 
 
 def test_a_frame_in_the_run(benchmark, city, frame):
-    """What the run itself pays, at most eight times a second: to 10 % of its time, 12 ms each."""
     vehicles, speed = np.ones(EDGES), np.ones(EDGES)
     benchmark(lambda: pickle.dumps(between(city, frame, 10.0, vehicles, speed)))
     assert benchmark.stats["median"] < 0.005
 
 
 def test_a_picture_in_the_server(benchmark, city, frame):
-    """Two maps, four times a second."""
     page, document = Page(city, ["one", "other"]), Document()
-    page.place(document, "", [], [])
-    page.show([frame, frame], 0.0)
+    document.add_root(page.layout([]))
     benchmark(page.show, [frame, frame], 10.0)
     assert benchmark.stats["median"] < 0.1
 
 
-def test_a_page_for_one_more_viewer(benchmark, city):
-    """Of which forty must not hold up a run: 1.1 s before the streets were encoded once for all."""
-
-    def made():
-        page, document = Page(city, ["one", "other"]), Document()
-        page.place(document, "", [], [], streets=True)
-        return document.to_json()
-
-    made()
-    benchmark.pedantic(made, rounds=3)
-    assert benchmark.stats["median"] < 2.0
-
-
-def test_the_size_of_the_page(benchmark, city):
-    page, document = Page(city, ["one", "other"]), Document()
-    page.place(document, "", [], [])
-    html = benchmark.pedantic(
-        file_html,
-        (document, INLINE),
-        {"template": document.template, "template_variables": (document.template_variables)},
-        rounds=1,
-    )
-    assert len(html) < 15e6
-
-
 def test_the_size_of_a_report(benchmark, city, frame):
-    """One hour of two runs, an interval a minute, on the map with a slider; pictures and tables take 1 to 2 MB more."""
+    """One hour of two runs, an interval a minute."""
     random = np.random.default_rng(1)
     runs = {
         name: [
@@ -140,5 +100,5 @@ def test_the_size_of_a_report(benchmark, city, frame):
         ]
         for name in ("one", "other")
     }
-    made = benchmark.pedantic(replay.embedded, (city, runs), rounds=1)
-    assert sum(map(len, (*made.scripts, *made.roots.values()))) < 13e6
+    script, div = benchmark.pedantic(lambda: components(with_slider(city, runs), wrap_script=False), rounds=1)
+    assert len(script) + len(div) < 13e6
