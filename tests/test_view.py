@@ -179,6 +179,6 @@ def test_a_process_that_dies_is_an_error(task):
 
 def test_wrong_ways_to_watch(task):
     base = ("watch", task.scenario, "--controller", "no-control")
-    assert "--gui: shows one run" in error_line(cosim(*base, "--gui", "--port", 5006))
+    assert "--gui: shows one run" in error_line(cosim(*base, "--gui", "--against", "pi-gating"))
     assert cosim(*base, "--port", 70000).exit_code == 2
     assert "nobody" in error_line(cosim(*base, "--against", "nobody"))

@@ -125,7 +125,7 @@ class Session:
             if window is not None:
                 raise InputError(
                     f"{window.program} cannot show {net_file}: {_one_line(error)}; check DISPLAY, or use `cosim run` "
-                    "and `cosim video`"
+                    "and `cosim report`"
                 ) from None
             raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {_one_line(error)}") from None
         Session._open = True
