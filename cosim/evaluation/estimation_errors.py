@@ -1,6 +1,7 @@
 """How good the estimate was that the controllers saw: tables and pictures of runs with measurement = "estimate"."""
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
-from nmfd.studies.traffic_states import OutflowOf, remembered
+from nmfd.studies.traffic_states import OutflowOf
 from nmfd.types import Result
 
 COLUMNS = (
@@ -89,7 +90,7 @@ def write_errors(
         path = folder / f"estimate-{run_folder.run_name(trajectory.controller, trajectory.seed)}.png"
         if not path.exists():
             drawing, axes = plots.panels(network.regions)
-            known = None if outflow is None else remembered(outflow)
+            known = None if outflow is None else cache(outflow)
             for region, ax in enumerate(axes):
                 plots.region_estimate(ax, network, region, trajectory, known)
             plots.legend_below(drawing, axes)

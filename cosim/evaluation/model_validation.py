@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from nmfd.runs import files, run_folder
 from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
 from nmfd.studies.fit_quality import SPILLBACK
-from nmfd.studies.traffic_states import model_outflow, remembered
+from nmfd.studies.traffic_states import model_outflow
 from nmfd.types import Controls, Observation, Result
 
 COLUMNS = (
@@ -230,7 +231,7 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
     drawing, axes = plots.panels(scenario.network.regions + 1)
     measured = run_metrics.regional_outflow(result, result.step)
     predicted_outflow = model_outflow(scenario.network)
-    outflow = remembered(lambda t: measured if t.plant == "sumo" else predicted_outflow(t))
+    outflow = cache(lambda t: measured if t.plant == "sumo" else predicted_outflow(t))
     for region, ax in enumerate(axes[:-1]):
         plots.region_accumulation(ax, scenario.network, region, [result, predicted], outflow=outflow)
     plots.total_accumulation(axes[-1], [result.assign(backlog=np.zeros_like(result.backlog)), predicted])

@@ -3,7 +3,7 @@
 import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -18,7 +18,7 @@ from nmfd.runs.progress import Progress
 from nmfd.runs.run_many import Run, run_many, run_name
 from nmfd.runs.tables import text_table
 from nmfd.studies import plots
-from nmfd.studies.traffic_states import OutflowOf, model_outflow, remembered
+from nmfd.studies.traffic_states import OutflowOf, model_outflow
 from nmfd.types import Plant, Result
 
 if TYPE_CHECKING:
@@ -206,7 +206,7 @@ def draw_accumulations(
     plots.legend_below(drawing, [ax], columns=6)
     plots.save(drawing, folder / "total_accumulation.png")
     network = scenario.network
-    outflow = remembered(outflow or model_outflow(network))
+    outflow = cache(outflow or model_outflow(network))
     drawing, axes = plots.panels(network.regions)
     for region, ax in enumerate(axes):
         plots.region_accumulation(ax, network, region, trajectories, seed, outflow)

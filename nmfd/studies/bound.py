@@ -1,8 +1,7 @@
 """The bound: full-horizon optimal control of the regional model with perfect knowledge of the demand.
 
-Gradient descent (Adam) on all controls of all intervals at once, through `dynamics`. The problem is not convex, so
-several starts are descended together and the best answer is kept: it is the least total time spent that is known to
-be possible, not one that is proven to be the least.
+Gradient descent (Adam) on all controls of all intervals at once, through `dynamics`, from several starts. The problem
+is not convex: the result is the least total time spent known to be possible, not a proven minimum.
 """
 
 import math
@@ -23,12 +22,12 @@ from nmfd.model.scenario import Scenario
 from nmfd.tensors import one_thread
 
 ITERATIONS = 1500
-LEARNING_RATE = 0.15  # of Adam, on logits; falls along a cosine
-INSIDE = 0.02  # a start is moved this far into the admissible set: on its edge there is no gradient
+LEARNING_RATE = 0.15  # of Adam, on logits; decays along a cosine
+INSIDE = 0.02  # distance of starts from the edge of the admissible set, where the gradient is zero
 
 
 def check(name: str) -> None:
-    """InputError unless `name` is a bound."""
+    """Raise InputError unless `name` is a bound."""
     if name not in NAMES:
         raise InputError(f"--controller: {name!r} is no bound; choose one of {', '.join(NAMES)}")
 
@@ -41,50 +40,38 @@ def compute(
     iterations: int = ITERATIONS,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Plan:
-    """The bound `name` ("bound-pc" or "bound-pcrg"), from neutral starts and the closed loops of `starts`.
+    """Return the bound `name` ("bound-pc" or "bound-pcrg"), from neutral starts and closed loops.
 
-    starts: strategies with the same action set or a smaller one; default PI gating and the scenario's own policies
+    starts: strategies of these closed loops; default PI gating and the scenario's own policies
     """
     check(name)
-    guidance = NAMES[name]
-    begin = neutral_starts(scenario.network, scenario.steps, guidance=guidance)
+    guidance, network, steps = NAMES[name], scenario.network, scenario.steps
+    begin = neutral_starts(network, steps, guidance=guidance)
     for strategy in _usual_starts(scenario, guidance) if starts is None else starts:
-        trajectory = closed_loop.run(
-            NmfdPlant(scenario),
-            strategy.make(scenario),
-            scenario,
-            seed=0,
-            progress=progress
-            and (lambda done, total, name=strategy.name: progress(done, total, f"closed loop {name}")),
-        )
-        if not guidance and not np.array_equal(trajectory.splits[0], scenario.network.nominal_splits):
-            raise InputError(f"--from: {strategy.name} guides routes, which {name} may not; omit it")
-        begin[strategy.name] = trajectory.perimeter, trajectory.splits
+        if progress:
+            progress(0, steps, f"closed loop {strategy.name}")
+        result = closed_loop.run(NmfdPlant(scenario), strategy.make(scenario), scenario, seed=0)
+        begin[strategy.name] = result.perimeter, result.splits
     return solve(scenario, begin, guidance=guidance, iterations=iterations, progress=progress)
 
 
 def _usual_starts(scenario: Scenario, guidance: bool) -> list[Strategy]:
-    candidates = (["pi-gating"] if scenario.protected else []) + ["dpc-pc"] + (["dpc-pcrg"] if guidance else [])
-    return [
-        parse(name)
-        for name in candidates
-        if not name.startswith("dpc") or (scenario.folder is not None and (scenario.folder / f"{name}.pt").is_file())
-    ]
+    names = ["dpc-pc", "dpc-pcrg"] if guidance else ["dpc-pc"]
+    trained = [name for name in names if scenario.folder and (scenario.folder / f"{name}.pt").is_file()]
+    return [parse(name) for name in [*(["pi-gating"] if scenario.protected else []), *trained]]
 
 
 def neutral_starts(network: RegionalModel, steps: int, *, guidance: bool) -> dict[str, tuple]:
-    """Perimeter (T, R, R) and splits (T, R, R, R) that know nothing: everything open, and everything in the middle."""
-    mask = network.split_mask
-    even = mask / np.maximum(mask.sum(axis=1, keepdims=True), 1)
+    """Return perimeter (T, R, R) and splits (T, R, R, R) of open boundaries, and of mean controls."""
+    mask, nominal = network.split_mask, network.nominal_splits
+    even = mask / np.maximum(mask.sum(axis=1, keepdims=True), 1) if guidance else nominal
 
     def constant(u: float, splits: np.ndarray) -> tuple:
-        return (
-            np.broadcast_to(np.where(network.adjacency, u, 0.0), (steps, *network.adjacency.shape)),
-            np.broadcast_to(splits if guidance else network.nominal_splits, (steps, *splits.shape)),
-        )
+        perimeter = np.where(network.adjacency, u, 0.0)
+        return np.broadcast_to(perimeter, (steps, *perimeter.shape)), np.broadcast_to(splits, (steps, *splits.shape))
 
     return {
-        "open": constant(network.u_max, network.nominal_splits),
+        "open": constant(network.u_max, nominal),
         "middle": constant(0.5 * (network.u_min + network.u_max), even),
     }
 
@@ -99,9 +86,9 @@ def solve(
     learning_rate: float = LEARNING_RATE,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Plan:
-    """The best plan found from `starts`: name -> perimeter (T, R, R) and splits (T, R, R, R).
+    """Return the best plan by separate descents from `starts`: name -> perimeter (T, R, R) and splits (T, R, R, R).
 
-    The descents do not see one another. A KeyboardInterrupt ends them early; what was found by then is returned.
+    A KeyboardInterrupt ends them early and returns the best plan so far.
     """
     network = scenario.network
     parameters = dynamics.parameters(network)
@@ -112,7 +99,7 @@ def solve(
     kept: list[tuple] = [()] * len(starts)
     iteration = 0
     try:
-        for iteration in range(iterations + 1):  # the last only looks at what the step before has reached
+        for iteration in range(iterations + 1):  # the last only evaluates
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate * 0.5 * (1.0 + math.cos(math.pi * iteration / (iterations + 1)))
             perimeter, splits = controls()
@@ -122,7 +109,7 @@ def solve(
                 kept[n] = tuple(logits[:, n].detach().clone() for logits in controls.logits)
             if iteration < iterations:
                 optimizer.zero_grad()
-                torch.log(totals.clamp(min=1.0)).sum().backward()  # every descent by its own scale
+                torch.log(totals.clamp(min=1.0)).sum().backward()  # each at its own scale
                 optimizer.step()
                 if progress:
                     progress(iteration + 1, iterations, f"best {best.min():.4g} veh s")
@@ -131,8 +118,8 @@ def solve(
             raise
     winner = int(best.argmin())
     with torch.no_grad():
-        for logits, found in zip(controls.logits, kept[winner], strict=True):
-            logits[:, 0] = found
+        for logits, best_logits in zip(controls.logits, kept[winner], strict=True):
+            logits[:, 0] = best_logits
         perimeter, splits = (value[:, 0].numpy() for value in controls())
     names = list(starts)
     return Plan(
@@ -151,7 +138,7 @@ class _Controls:
         mask = torch.tensor(network.split_mask)
         self._adjacency = torch.tensor(network.adjacency, dtype=torch.float64)
         self._mask, self._bounds = mask.double(), (network.u_min, network.u_max)
-        # Rows with no way out (j = i) keep finite logits and are zeroed: a softmax of nothing but -inf is NaN.
+        # Rows without next region (j = i) keep finite logits and are zeroed: a softmax of only -inf is NaN.
         self._blocked = ~mask & mask.any(dim=1, keepdim=True)
         self._nominal = torch.tensor(network.nominal_splits).expand(steps, 1, *mask.shape)
         width = network.u_max - network.u_min
@@ -166,7 +153,7 @@ class _Controls:
             logits.requires_grad_()
 
     def __call__(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Perimeter (T, B, R, R) and splits (T, B, R, R, R), or (T, 1, R, R, R) without guidance."""
+        """Return perimeter (T, B, R, R) and splits (T, B, R, R, R), or (T, 1, R, R, R) without guidance."""
         low, high = self._bounds
         perimeter = (low + (high - low) * torch.sigmoid(self.logits[0])) * self._adjacency
         if len(self.logits) == 1:
@@ -181,7 +168,7 @@ def _total_time_spent(
     perimeter: Float[torch.Tensor, "T B R R"],
     splits: Float[torch.Tensor, "T b R R R"],  # b: B or 1
 ) -> Float[torch.Tensor, " B"]:
-    """TTS (B,) [veh s] of plans from the start of the scenario by the definition of nmfd.metrics."""
+    """Return the total time spent (B,) [veh s] of plans."""
     x = torch.from_numpy(scenario.start).expand(perimeter.shape[1], -1, -1)
     states = [x]
     for k in range(scenario.steps - 1):

@@ -1,8 +1,4 @@
-"""What state a region is in, by what leaves it: told from measured outflow, not from a fitted curve alone.
-
-The same accumulation can flow or stand, and a fitted curve may be wrong; therefore a picture that colours a region
-looks at how many vehicles left it in the run that it shows.
-"""
+"""Traffic state of a region from its measured outflow, since the same accumulation can flow or stand."""
 
 from collections.abc import Callable, Sequence
 from enum import IntEnum
@@ -18,22 +14,21 @@ from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
 from nmfd.types import Result
 
-WINDOW = 3  # control intervals over which accumulation and outflow are averaged: single ones are noisy
-NEAR = 0.9  # of the largest outflow: near capacity
-COLLAPSED = 0.7  # of the largest outflow in the runs, with more vehicles than then: congested, whatever the curve says
-SLOW = 1 / 3  # of what could leave: congested, or held back
-STANDING = 0.1  # of what could leave: the free outflow of so many vehicles, or the largest
-FEWEST = 5.0  # vehicles, for an outflow per vehicle that means something
-EXPECTED = 10.0  # vehicles that would have left if they had been free: with fewer, none may be chance
-COUNTED = 30.0  # vehicles that left at the largest outflow: with fewer, less may be chance
-STRIP, STRIPS = 0.045, 0.3  # height of a strip, and of all together at most, as shares of the axes
+WINDOW = 3  # control intervals of the moving averages
+NEAR_SHARE = 0.9  # of the largest outflow: near capacity
+COLLAPSED_SHARE = 0.7  # of the largest outflow in the runs, with more vehicles than then: congested
+SLOW_SHARE, STANDING_SHARE = 1 / 3, 0.1  # of the possible outflow
+LEAST_VEHICLES = 5.0  # for an outflow per vehicle
+LEAST_POSSIBLE = 10.0  # vehicles that could leave within the window: with fewer, none may be chance
+LEAST_COUNTED = 30.0  # vehicles within the window at the largest outflow: with fewer, less may be chance
+STRIP_HEIGHT, STRIPS_HEIGHT = 0.045, 0.3  # of one, and of all at most, as shares of the axes
 
 RegionalOutflow = Float[np.ndarray, "T R"]
 OutflowOf = Callable[[Result], RegionalOutflow | None]
 
 
 class TrafficState(IntEnum):
-    """Of a region during a control interval."""
+    """State of a region during a control interval."""
 
     FLOWING = 0
     NEAR_CAPACITY = 1
@@ -41,7 +36,7 @@ class TrafficState(IntEnum):
     STANDING = 3
 
 
-# Label, colour, hatch: from light to dark, so that they are told apart in grey and by colour-blind readers, too.
+# Label, colour, hatch; from light to dark.
 LOOKS = {
     TrafficState.FLOWING: ("below critical and flowing", "#dfeee0", ""),
     TrafficState.NEAR_CAPACITY: ("near capacity: outflow within 10 % of the largest", "#6cbf84", ""),
@@ -53,12 +48,13 @@ LOOKS = {
 def states(
     mfd: Mfd, step: float, accumulation: Sequence[Float[np.ndarray, " S"]], outflow: Sequence[Float[np.ndarray, " T"]]
 ) -> list[Int[np.ndarray, " T"]]:
-    """The TrafficState of one region in every interval of some runs, accumulations [veh] and outflows [veh/s] each.
+    """Return the TrafficState of one region in each interval of some runs.
 
-    near capacity: the outflow is within 10 % of the largest, which is that of the curve or, if more, of the runs;
-    congested: beyond the critical accumulation with less outflow, or holding more vehicles than at the largest outflow
-    of the runs and letting out less than COLLAPSED of it, or less than SLOW of what could leave; standing: less than
-    STANDING of that
+    Near capacity: outflow near the largest of curve and runs. Congested: less beyond the critical accumulation, or less
+    than COLLAPSED_SHARE of the largest with more vehicles, or less than SLOW_SHARE of the possible outflow. Standing:
+    less than STANDING_SHARE of it.
+
+    accumulation: [veh] and outflow: [veh/s] of each run
     """
     x = [_smooth(0.5 * (run[1:] + run[:-1])) for run in accumulation]
     q = [_smooth(run) for run in outflow]
@@ -66,35 +62,36 @@ def states(
     best = int(np.argmax(every_q)) if len(every_q) else 0
     largest, held = (every_q[best], every_x[best]) if len(every_q) else (0.0, 0.0)
     most = max(mfd.capacity, largest)
-    free = max([mfd.c, *(every_q / np.maximum(every_x, FEWEST))])
-    told = largest * step * WINDOW >= COUNTED
-    found, stay = [], 1 + int(np.ceil(1.0 / (free * step)))
+    free = max([mfd.c, *(every_q / np.maximum(every_x, LEAST_VEHICLES))])
+    significant = largest * step * WINDOW >= LEAST_COUNTED
+    series, stay = [], 1 + int(np.ceil(1.0 / (free * step)))
     for run, one, out in zip(accumulation, x, q, strict=True):
         state = np.full(len(one), int(TrafficState.FLOWING))
-        state[(one > mfd.critical) | (told & (one > 1.1 * held) & (out < COLLAPSED * largest))] = TrafficState.CONGESTED
-        could = np.minimum(free * _for_a_while(one, run[0], stay), most)
-        enough = could * step * WINDOW >= EXPECTED
-        state[enough & (out < SLOW * could)] = TrafficState.CONGESTED
-        state[out >= NEAR * most] = TrafficState.NEAR_CAPACITY
-        state[enough & (out < STANDING * could)] = TrafficState.STANDING
-        found.append(state)
-    return found
+        state[(one > mfd.critical) | (significant & (one > 1.1 * held) & (out < COLLAPSED_SHARE * largest))] = (
+            TrafficState.CONGESTED
+        )
+        possible = np.minimum(free * _lasting(one, run[0], stay), most)
+        enough = possible * step * WINDOW >= LEAST_POSSIBLE
+        state[enough & (out < SLOW_SHARE * possible)] = TrafficState.CONGESTED
+        state[out >= NEAR_SHARE * most] = TrafficState.NEAR_CAPACITY
+        state[enough & (out < STANDING_SHARE * possible)] = TrafficState.STANDING
+        series.append(state)
+    return series
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
-    """(T,): means over WINDOW intervals around each, fewer at the ends."""
+    """Return moving averages (T,) over WINDOW intervals, fewer at the ends."""
     window = np.ones(min(WINDOW, len(values)))
     return np.convolve(values, window, mode="same") / np.convolve(np.ones(len(values)), window, mode="same")
 
 
-def _for_a_while(x: np.ndarray, first: float, stay: int) -> np.ndarray:
-    """(T,) [veh]: what a region has held at least for `stay` intervals; who has just come cannot leave yet."""
+def _lasting(x: np.ndarray, first: float, stay: int) -> np.ndarray:
+    """Return the least accumulation (T,) [veh] of the last `stay` intervals: new vehicles cannot leave yet."""
     return np.lib.stride_tricks.sliding_window_view(np.concatenate([np.full(stay, first), x]), stay + 1).min(axis=1)
 
 
 def model_outflow(network: RegionalModel) -> OutflowOf:
-    """What leaves every region of a run on a regional plant [veh/s]; nothing of a microsimulation, which measures it
-    itself."""
+    """Return a function: outflow (T, R) [veh/s] of a run on a regional plant, None for other plants."""
     p = dynamics.parameters(network)
 
     def outflow(trajectory: Result) -> RegionalOutflow | None:
@@ -110,57 +107,27 @@ def model_outflow(network: RegionalModel) -> OutflowOf:
     return outflow
 
 
-def remembered(outflow: OutflowOf) -> OutflowOf:
-    """The same, asked once per run: pictures ask for every region."""
-    known: dict[tuple[str, str, int], RegionalOutflow | None] = {}
-
-    def once(trajectory: Result) -> RegionalOutflow | None:
-        key = trajectory.controller, trajectory.plant, trajectory.seed
-        if key not in known:
-            known[key] = outflow(trajectory)
-        return known[key]
-
-    return once
-
-
 def draw_strips(
     ax: Axes,
     time: Sequence[Float[np.ndarray, " S"]],
-    found: Sequence[Int[np.ndarray, " T"]],
+    runs: Sequence[Int[np.ndarray, " T"]],
     tones: Sequence[str],
     hollow: Sequence[bool],
 ) -> float:
-    """A strip per run at the top of `ax` in the colours of its states, a mark in the run's own colour before it, or a
-    hollow one; returns the share of the axes that is left below them. time: of the states, in the unit of the axis."""
-    height = min(STRIP, STRIPS / max(len(found), 1))
-    for row, (edges, state, tone, empty) in enumerate(zip(time, found, tones, hollow, strict=True)):
-        y = 1.0 - (row + 1) * height
-        begin = 0
+    """Draw a strip of states per run at the top of `ax`, with a mark in the colour of the run; return the share below.
+
+    time: edges of the intervals, in the unit of the axis; hollow: marks without filling
+    """
+    height = min(STRIP_HEIGHT, STRIPS_HEIGHT / max(len(runs), 1))
+    for row, (edges, state, tone, empty) in enumerate(zip(time, runs, tones, hollow, strict=True)):
+        y, begin = 1.0 - (row + 1) * height, 0
         for kind, members in groupby(state.tolist()):
             end = begin + len(list(members))
             label, fill, hatch = LOOKS[TrafficState(kind)]
-            ax.broken_barh(
-                [(edges[begin], edges[end] - edges[begin])],
-                (y + 0.1 * height, 0.8 * height),
-                facecolor=fill,
-                edgecolor="#ffffff" if hatch else fill,
-                hatch=hatch,
-                linewidth=0.0,
-                label=label,
-                transform=ax.get_xaxis_transform(),
-                zorder=4,
-            )
+            style = dict(facecolor=fill, edgecolor="#ffffff" if hatch else fill, hatch=hatch, linewidth=0.0, zorder=4)
+            bar, where = [(edges[begin], edges[end] - edges[begin])], (y + 0.1 * height, 0.8 * height)
+            ax.broken_barh(bar, where, label=label, transform=ax.get_xaxis_transform(), **style)
             begin = end
-        ax.scatter(
-            [-0.025],
-            [y + 0.5 * height],
-            s=9,
-            marker="s",
-            facecolor="none" if empty else tone,
-            edgecolor=tone,
-            transform=ax.transAxes,
-            clip_on=False,
-            linewidths=0.8,
-            zorder=5,
-        )
-    return 1.0 - len(found) * height
+        mark = dict(marker="s", facecolor="none" if empty else tone, edgecolor=tone, linewidths=0.8, zorder=5)
+        ax.scatter([-0.025], [y + 0.5 * height], s=9, transform=ax.transAxes, clip_on=False, **mark)
+    return 1.0 - len(runs) * height
