@@ -1,11 +1,9 @@
 """Economic model predictive control: the least total time spent over a horizon of the regional model.
 
 As in Tumu et al.: perimeter control alone ("mpc-pc") or with route guidance ("mpc-pcrg"), the demand known ahead,
-nothing assumed beyond the horizon, unless a terminal cost says what comes ("mpc-pc-terminal", terminal.py). Not as
-there: single shooting, so that only the controls are unknown, with exact gradients by the adjoint method (edge_model),
-and projected gradients (projected_gradient). Every control is bounded or in a simplex and acts linearly on the model,
-so that nearly all of them end at a bound; finding out which takes a few gradients, while an interior-point method
-factorises the whole horizon some twenty times.
+nothing beyond the horizon unless there is a terminal cost (terminal.py). Unlike there: single shooting, so that only
+the controls are unknown, with exact gradients by the adjoint method (edge_model) and projected gradients
+(projected_gradient). Nearly all controls end at a bound; a few gradients find out which.
 """
 
 import time
@@ -32,33 +30,30 @@ from nmfd.runs.config import Problem, setting, whole
 from nmfd.types import Controls, Observation, Status
 
 MAX_ITERATIONS = 1000  # of the solver, per decision
-ROUNDING = 0.005  # of the smallest jam accumulation: over which the solver sees the kink of the MFD there rounded off
-# The solver stops when, to first order, no admissible plan can save more than this share of the total time spent. A
-# tenth changes the benchmark's total time spent by less than 1 %, either way. At its limits it may stop at ACCEPTABLE.
+JAM_ROUNDING = 0.005  # of the smallest jam accumulation: width of the rounded kink of the MFD in the solver
+# Relative tolerance: to first order, no admissible plan saves more of the total time spent. A tenth of it changes the
+# benchmark's total time spent by less than 1 %. At its limits the solver may stop at ACCEPTABLE_TOLERANCE.
 TOLERANCE = 1e-6
-ACCEPTABLE = 1e-5
+ACCEPTABLE_TOLERANCE = 1e-5
+TERMINAL_TOLERANCE = 1e-4  # with a terminal cost, which is no more exact
 FAILED = Status.SOLVER_FAILURE | Status.FALLBACK
-# With a terminal cost, which is no more exact than that, the same sums count what lies beyond the horizon as well: a
-# hundredth of it changes the benchmark's total time spent by 0.1 %, and takes ten times as long.
-COARSE = 1e-4
-TERMINAL = "-terminal"  # behind the name
-IN_TIME = 0.9  # share of the deadline that the solver has; the rest is for what becomes of its plan
-FEW = 5.0  # veh: added to the vehicles that a control decides on, where these scale the solver's steps
+DEADLINE_SHARE = 0.9  # of the deadline for the solver
+METRIC_OFFSET_VEH = 5.0  # added to the vehicles that a control affects, which scale the solver's steps
 
 
 class Mpc(Options):
-    """Of model predictive control."""
+    """Options of model predictive control."""
 
-    horizon: int = whole("control intervals that the plan looks ahead", 8, low=2, high=1000)
+    horizon: int = whole("horizon of the plan, in control intervals", 8, low=2, high=1000)
     control_horizon: int | None = whole(
-        "control intervals with controls of their own, the last of which stay in force over the rest of the horizon; "
-        "without it, all of them",
+        "control intervals with controls of their own, the last of which hold to the end of the horizon; all by "
+        "default",
         None,
         low=1,
         high=1000,
     )
     solver: Literal["projected-gradient", "ipopt"] = setting(
-        "ipopt: the published formulation by CasADi and IPOPT, two orders of magnitude slower: the reference",
+        "ipopt is the reference: the published formulation by CasADi and IPOPT, two orders of magnitude slower",
         "projected-gradient",
     )
 
@@ -70,10 +65,7 @@ class Mpc(Options):
 
 
 class Admissible:
-    """The plans (K, E + V) of edge_model that a controller may choose: u in its bounds, theta in simplices.
-
-    Without guidance theta is the nominal one.
-    """
+    """Set of admissible plans (K, E + V): u within bounds, theta in simplices, or nominal without guidance."""
 
     def __init__(self, network: RegionalModel, model: Turns, *, guidance: bool):
         self._network, self._model, self._guidance = network, model, guidance
@@ -82,18 +74,18 @@ class Admissible:
         self._unused = (slice(None), slice(None), unused)
 
     def open(self, moves: int) -> Plan:
-        """The plan without control: perimeters open, nominal splits."""
+        """Return the plan without control: open perimeter, nominal splits."""
         return np.tile(np.concatenate([np.full(self._edges, self._network.u_max), self._model.own]), (moves, 1))
 
     def project(self, plan: Plan) -> Plan:
-        """The nearest admissible plan."""
+        """Return the nearest admissible plan."""
         perimeter = np.clip(plan[:, : self._edges], self._network.u_min, self._network.u_max)
         if not self._guidance:
             return np.concatenate([perimeter, np.broadcast_to(self._model.own, plan[:, self._edges :].shape)], axis=1)
         return np.concatenate([perimeter, self._simplices(plan[:, self._edges :])], axis=1)
 
     def _simplices(self, splits: np.ndarray) -> np.ndarray:
-        """The nearest shares (K, V) >= 0 whose sum is 1 over the turns of every cell (Michelot, 1986)."""
+        """Return the nearest shares (K, V) >= 0 with sum 1 over the turns of every cell (Michelot, 1986)."""
         groups, value = self._groups(len(splits)), splits.ravel()
         count = groups.max(initial=-1) + 1
         positive = np.ones(len(value), dtype=bool)
@@ -106,7 +98,7 @@ class Admissible:
             positive = still
 
     def gap(self, plan: Plan, gradient: Plan) -> float:
-        """What the best admissible plan would save if the objective were linear [its unit]."""
+        """Return what the best admissible plan saves on the linearised objective."""
         u, of_u = plan[:, : self._edges], gradient[:, : self._edges]
         saved = float((of_u * (u - np.where(of_u > 0, self._network.u_min, self._network.u_max))).sum())
         if not self._guidance or not len(self._model.turns):
@@ -118,12 +110,12 @@ class Admissible:
         return saved + float((splits.ravel() * (of_splits.ravel() - least[groups])).sum())
 
     def _groups(self, moves: int) -> np.ndarray:
-        """(K * V,) int: the simplex, one per interval and cell, of every share."""
+        """Return the number of the simplex of every share, one per interval and cell, (K * V,)."""
         cells = len(self._model.region)
         return (cells * np.arange(moves)[:, None] + self._model.source).ravel()
 
     def controls(self, decision: Decision) -> tuple[PerPair, PerTurn | None]:
-        """Perimeter (R, R) and splits (R, R, R), or None without guidance, of one interval (E + V,) of a plan."""
+        """Return perimeter (R, R) and splits (R, R, R), or None, of one interval (E + V,) of a plan."""
         perimeter = np.where(self._network.adjacency, self._network.u_max, 0.0)
         perimeter[tuple(self._model.edges.T)] = decision[: self._edges]
         if not self._guidance:
@@ -134,24 +126,22 @@ class Admissible:
         return perimeter, splits
 
     def decision(self, perimeter: PerPair, splits: PerTurn) -> Decision:
-        """One interval (E + V,) of a plan, of perimeter (R, R) and splits (R, R, R)."""
+        """Return one interval (E + V,) of a plan from perimeter (R, R) and splits (R, R, R)."""
         return np.concatenate([perimeter[tuple(self._model.edges.T)], splits[tuple(self._model.turns.T)]])
 
 
 class EconomicMpc:
-    """Economic MPC on a regional model and a forecast of the demand (nmfd.types.Controller).
+    """Economic MPC on a regional model and a demand forecast.
 
-    The solver starts from its last plan, moved on by one interval, or from no control where that is better. Where it
-    stops short of its tolerance, the status says why; the best plan that it has found, which is never worse than the
-    one that it started from, is used. Where it finds none (it fails, diverges, or meets its deadline first), the last
-    plan is used, moved on, for as long as it reaches, and then PI gating takes over, or without a protected region the
-    open perimeter, until the solver is back. The backlog counts as demand of the first interval; negative measurements
-    count as 0.
+    The solver starts from its last plan, shifted by one interval, or from no control if that is better. If it stops
+    short of its tolerance, the status says so and its best plan is used, which is no worse than the initial one. If it
+    fails or meets its deadline first, the shifted last plan is used as long as it lasts; then PI gating, or the open
+    perimeter without a protected region. The backlog counts as demand of the first interval.
     """
 
     def __init__(self, planning: PlanningModel, *, guidance: bool, terminal: Terminal | None = None):
-        """terminal: what comes after the horizon. InputError for a wrong option."""
-        self.name = _name(guidance, terminal is not None)
+        """Raise InputError for a wrong option. terminal: cost beyond the horizon"""
+        self.name = ("mpc-pcrg" if guidance else "mpc-pc") + ("-terminal" if terminal is not None else "")
         self._terminal = terminal
         self._beyond: Callable[[PerCell], tuple[float, PerCell]] | None = None
         self.options = options(Mpc, planning, self.name)
@@ -160,11 +150,11 @@ class EconomicMpc:
         self._regions = network.regions
         self._used = used if len(used) else np.arange(network.regions)
         self._demand, self._step, self._steps = planning.forecast, planning.step, planning.steps
-        # With one Euler step per interval, the last controls move vehicles that the horizon does not see arrive.
+        # With one Euler step per interval, the last controls move vehicles that do not arrive within the horizon.
         blind = planning.integrator == "euler" and planning.substeps == 1 and terminal is None
         self._moves = min(horizon - 1 if blind else horizon, self.options.control_horizon or horizon)
         self._model = edge_model.build(network, self._used, guidance=guidance)
-        rounded = replace(self._model, rounding=ROUNDING * min(mfd.jam for mfd in network.mfds))
+        rounded = replace(self._model, rounding=JAM_ROUNDING * min(mfd.jam for mfd in network.mfds))
         scheme: dict = {"step": planning.step, "substeps": planning.substeps, "integrator": planning.integrator}
         self._exact: Callable = partial(edge_model.vehicle_steps, self._model, **scheme)
         self._rounded: Callable = partial(edge_model.vehicle_steps, rounded, gradient=True, **scheme)
@@ -173,19 +163,19 @@ class EconomicMpc:
         self._open = self.admissible.open(self._moves)
         self._gating = PiGating(planning) if planning.protected else None
         self.deadline = planning.step  # s: a later answer is of no use
-        self._ipopt, self._tolerance = None, TOLERANCE if terminal is None else COARSE
-        if terminal is not None and self.options.solver == "ipopt":
-            raise InputError(
-                f"{planning.where}: controllers.{self.name}.solver: ipopt knows no terminal cost; omit it, or use "
-                f"{self.name.removesuffix(TERMINAL)}"
-            )
+        self._tolerance = TOLERANCE if terminal is None else TERMINAL_TOLERANCE
+        self._ipopt = None
         if self.options.solver == "ipopt":
+            if terminal is not None:
+                raise InputError(
+                    f"{planning.where}: controllers.{self.name}.solver: ipopt has no terminal cost; omit it"
+                )
             self._ipopt = Ipopt(
                 planning,
                 guidance=guidance,
                 horizon=horizon,
                 iterations=MAX_ITERATIONS,
-                seconds=IN_TIME * self.deadline,
+                seconds=DEADLINE_SHARE * self.deadline,
             )
         self.reset()
 
@@ -194,41 +184,35 @@ class EconomicMpc:
         self._gates = False  # PI gating is in control
 
     def act(self, observation: Observation) -> Controls:
-        deadline = time.perf_counter() + IN_TIME * self.deadline
+        deadline = time.perf_counter() + DEADLINE_SHARE * self.deadline
         start, demand = self.forecast(observation)
-        self._look_beyond(observation.step + self.options.horizon)
+        if self._terminal is not None:
+            self._beyond = partial(self._terminal, step=observation.step + self.options.horizon)
         last = np.concatenate([self._plan[1:], self._plan[-1:]]) if self._left else self._open
         try:
             if self._left and self._cheaper(self._open, last, start, demand, deadline):
                 last = self._open
-            found = self._solve(start, demand, last, deadline)
+            minimum = self._solve(start, demand, last, deadline)
         except Late:
-            return self._without(observation, last, TIME_LIMIT)
+            return self._fallback(observation, last, TIME_LIMIT)
         except (ArithmeticError, ValueError, RuntimeError) as error:  # of NumPy and SciPy, LinAlgError too
-            return self._without(observation, last, f"solver failed ({type(error).__name__})")
-        known = np.isfinite(found.gap)
-        reason = None if known and found.gap <= ACCEPTABLE * found.value else found.reason
-        if reason is not None and (found.point is last or not known) and reason != AT_REST:
-            return self._without(observation, last, reason)
-        self._plan, self._left, self._gates = found.point, self._moves - 1, False
+            return self._fallback(observation, last, f"solver failed ({type(error).__name__})")
+        known = np.isfinite(minimum.gap)
+        reason = None if known and minimum.gap <= ACCEPTABLE_TOLERANCE * minimum.value else minimum.reason
+        if reason is not None and (minimum.point is last or not known) and reason != AT_REST:
+            return self._fallback(observation, last, reason)
+        self._plan, self._left, self._gates = minimum.point, self._moves - 1, False
         return (
             self._first() if reason is None else self._first(Status.SOLVER_FAILURE, f"{reason}: best plan so far used")
         )
 
     def _cheaper(self, plan: Plan, than: Plan, start: PerCell, demand: Demands, deadline: float) -> bool:
-        """Whether `plan` costs less, by the exact model. Raises Late."""
-        return (
-            self._exact(start, demand, plan, deadline=deadline, beyond=self._beyond)[0]
-            < self._exact(start, demand, than, deadline=deadline, beyond=self._beyond)[0]
-        )
+        """Return True if `plan` costs less by the exact model. Raise Late."""
+        costs = [self._exact(start, demand, one, deadline=deadline, beyond=self._beyond)[0] for one in (plan, than)]
+        return costs[0] < costs[1]
 
-    def _look_beyond(self, step: int) -> None:
-        """The horizon ends at the beginning of interval `step`."""
-        if self._terminal is not None:
-            self._beyond = partial(self._terminal, step=step)
-
-    def _without(self, observation: Observation, last: Plan, reason: str) -> Controls:
-        """The controls of an interval for which no plan was found."""
+    def _fallback(self, observation: Observation, last: Plan, reason: str) -> Controls:
+        """Return the controls of an interval without a new plan."""
         self._plan = last
         if self._left:
             self._left -= 1
@@ -239,34 +223,33 @@ class EconomicMpc:
             self._gating.reset()
         self._gates = True
         _, splits = self.admissible.controls(self._open[0])
-        return replace(
-            self._gating.act(observation), splits=splits, status=FAILED, note=f"{reason}: pi-gating in control"
-        )
+        note = f"{reason}: pi-gating in control"
+        return replace(self._gating.act(observation), splits=splits, status=FAILED, note=note)
 
     def _first(self, status: Status = Status.OK, note: str = "") -> Controls:
-        """The first interval of the plan."""
+        """Return the first interval of the plan."""
         perimeter, splits = self.admissible.controls(self._plan[0])
         return Controls(perimeter=perimeter, splits=splits, status=status, note=note)
 
     def cost(self, start: PerCell, demand: Demands, plan: Plan) -> float:
-        """Total time spent over the horizon [veh s] by the exact model, under a plan (moves, E + V)."""
+        """Return the total time spent over the horizon (veh s) of a plan (moves, E + V) by the exact model."""
         return self._step * self._exact(start, demand, plan)[0]
 
     def forecast(self, observation: Observation) -> tuple[PerCell, Demands]:
-        """The cells (C,) [veh] now and the demand (horizon, C) [veh/s] of them, as edge_model numbers them."""
+        """Return the cells (veh, (C,)) now and their demand (veh/s, (horizon, C)), numbered as in edge_model."""
         first, horizon = min(observation.step, self._steps), self.options.horizon
         known = self._demand[first : first + horizon]
         demand = np.zeros((horizon, *known.shape[1:]))
         demand[: len(known)] = known
         demand[0] += observation.backlog / self._step
-        held = np.maximum(observation.accumulation, 0.0)
-        start = held[:, self._used].ravel()
+        start = np.maximum(observation.accumulation, 0.0)[:, self._used].ravel()
         return start, demand[:, :, self._used].reshape(horizon, -1)
 
     def _solve(self, start: PerCell, demand: Demands, plan: Plan, deadline: float) -> Minimum:
-        """The best plan found from `plan` (moves, E + V); its value, in vehicles, is that of the rounded model.
+        """Return the best plan from `plan` on, with its value (veh) by the rounded model.
 
-        deadline: by time.perf_counter [s]. Raises Late.
+        deadline: by time.perf_counter (s)
+        Raises: Late
         """
         if self._ipopt is not None:
             return self._by_ipopt(self._ipopt, start, demand)
@@ -275,14 +258,14 @@ class EconomicMpc:
             self.admissible.project,
             self.admissible.gap,
             plan,
-            metric=(self._affected(start, demand, plan, deadline=deadline) + FEW) ** 2,
+            metric=(self._affected(start, demand, plan, deadline=deadline) + METRIC_OFFSET_VEH) ** 2,
             tolerance=self._tolerance,
             iterations=MAX_ITERATIONS,
             seconds=deadline - time.perf_counter(),
         )
 
     def _by_ipopt(self, solver: Ipopt, start: PerCell, demand: Demands) -> Minimum:
-        """The plan of IPOPT, made admissible: it keeps to bounds and sums up to its tolerance only."""
+        """Return the plan of IPOPT, made admissible: it meets bounds and sums up to its tolerance only."""
         regions = self._regions
         state, forecast = np.zeros((regions, regions)), np.zeros((len(demand), regions, regions))
         state[:, self._used] = start.reshape(regions, -1)
@@ -295,9 +278,6 @@ class EconomicMpc:
 
 
 def load(path: Path, planning: PlanningModel, *, guidance: bool) -> EconomicMpc:
-    """MPC with the terminal cost in the file `path`. InputError if it is none of this model."""
-    return EconomicMpc(planning, guidance=guidance, terminal=read(path, planning, _name(guidance, terminal=True)))
-
-
-def _name(guidance: bool, terminal: bool) -> str:
-    return ("mpc-pcrg" if guidance else "mpc-pc") + TERMINAL * terminal
+    """Return MPC with the terminal cost in the file `path`. Raise InputError if it does not fit."""
+    name = "mpc-pcrg-terminal" if guidance else "mpc-pc-terminal"
+    return EconomicMpc(planning, guidance=guidance, terminal=read(path, planning, name))

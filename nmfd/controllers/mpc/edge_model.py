@@ -1,9 +1,8 @@
-"""The regional model along the list of its turns, with exact gradients: for optimisation, also over many regions.
+"""Regional model in edge-list form with exact gradients, for optimisation over many regions.
 
-A turn (i, h, j) is the way of the vehicles in i bound for j over the boundary to h: theta in edge-list form. Only turns
-and destinations in use are listed, so that a plane city costs R^2 and not R^3. The equations are those of
-`nmfd.model.dynamics`; the gradient of the total time spent follows by the adjoint method, at about the
-cost of two more rollouts.
+A turn (i, h, j) is the movement of the vehicles in i bound for j over the boundary to h. Only turns and destinations in
+use are listed, so that a planar city costs R^2 and not R^3. The equations are those of `nmfd.model.dynamics`. The
+gradient of the total time spent follows by the adjoint method, at about the cost of two more rollouts.
 """
 
 import math
@@ -18,8 +17,7 @@ from nmfd.arrays import PerRegion
 from nmfd.controllers.mpc.projected_gradient import Late
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
-# Weights of the slopes of an explicit Runge-Kutta scheme, and where each slope but the first is taken, in steps along
-# the slope before it.
+# Explicit Runge-Kutta schemes: weights of the slopes, and nodes of all but the first, in steps along the one before.
 SCHEMES = {"euler": ((1.0,), ()), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.5, 0.5, 1.0))}
 
 PerCell = Float[np.ndarray, " C"]
@@ -32,16 +30,16 @@ Decision = Float[np.ndarray, " D"]
 
 @dataclass(frozen=True, kw_only=True)
 class Turns:
-    """One network with J destinations in use, as C = R J cells x_ij, E edges u_ih and V turns theta_ihj.
+    """Network with J destinations in use, as C = R J cells x_ij, E edges u_ih and V turns theta_ihj.
 
-    destinations: (J,) int; cells are numbered (i, n) -> i J + n for the n-th of them
-    edges: (E, 2) int, the (i, h) that a turn crosses; turns: (V, 3) int, the (i, h, j)
-    edge: (V,) int, edge of every turn; source, target: (V,) int, the cells x_ij and x_hj of every turn
-    own: (V,) [-], the nominal theta_ihj
-    region: (C,) int; ends: (C,) bool, trips end here (i = j)
-    a, b, c, jam: (R,) of the MFDs
-    exit_rates: (C,) [-]; capacity: (E,) [veh/s] under u = 1, or None; storage: (R,) [veh] or None
-    rounding: [veh], width over which the kink of the MFDs at the jam accumulation is rounded off; 0 for the exact model
+    destinations: (J,); cell (i, n) of the n-th destination has number i J + n
+    edges: (i, h) of every edge, (E, 2); turns: (i, h, j), (V, 3)
+    edge: edge of every turn, (V,); source, target: cells x_ij and x_hj of every turn, (V,)
+    own: nominal theta_ihj (-, (V,))
+    region: (C,); ends: cells in which trips end (i = j), (C,)
+    a, b, c, jam: of the MFDs, (R,)
+    exit_rates: (-, (C,)); capacity: under u = 1 (veh/s, (E,)) or None; storage: (veh, (R,)) or None
+    rounding: width of the rounded kink of the MFDs at the jam accumulation (veh); 0 for the exact model
     """
 
     destinations: Int[np.ndarray, " J"]
@@ -64,7 +62,7 @@ class Turns:
 
 
 def build(network: RegionalModel, destinations: Int[np.ndarray, " J"], *, guidance: bool) -> Turns:
-    """The turns of vehicles bound for `destinations` (J,): all possible ones with guidance, else the nominal ones."""
+    """Return the turns of vehicles bound for `destinations` (J,): all with guidance, else the nominal ones."""
     regions, count = network.regions, len(destinations)
     in_use = np.isin(np.arange(regions), destinations)
     turns = np.argwhere((network.split_mask if guidance else network.nominal_splits > 0) & in_use)
@@ -94,7 +92,7 @@ def build(network: RegionalModel, destinations: Int[np.ndarray, " J"], *, guidan
 
 
 def rate(model: Turns, accumulation: PerRegion) -> tuple[PerRegion, PerRegion]:
-    """q_i [1/s] (R,) and dq_i/dx_i [1/(veh s)] (R,) of the accumulations x_i (R,) [veh].
+    """Return q_i (1/s, (R,)) and dq_i/dx_i (1/(veh s), (R,)) of the accumulations x_i (veh, (R,)).
 
     With rounding r, min(x, jam) is (x + jam - sqrt((x - jam)^2 + r^2)) / 2: off by r/2 at the jam accumulation, and by
     less than r^2 / (4 |x - jam|) elsewhere.
@@ -109,10 +107,7 @@ def rate(model: Turns, accumulation: PerRegion) -> tuple[PerRegion, PerRegion]:
 
 
 def derivative(model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, splits: PerTurn) -> tuple[PerCell, tuple]:
-    """dx/dt (C,) [veh/s] of x (C,) [veh] under demand (C,) [veh/s], perimeter (E,) [-] and splits (V,) [-].
-
-    Also what `pull_derivative` needs.
-    """
+    """Return dx/dt (veh/s, (C,)) of x (veh, (C,)) under demand (veh/s, (C,)), and the record for `pull_derivative`."""
     cells = len(x)
     accumulation = x.reshape(len(model.jam), -1).sum(axis=1)
     q, change_of_q = rate(model, accumulation)
@@ -134,9 +129,8 @@ def derivative(model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, sp
 def _boundary(
     model: Turns, wish: PerEdge, perimeter: PerEdge, accumulation: PerRegion
 ) -> tuple[PerEdge, PerEdge, PerEdge, PerEdge]:
-    """The share of `wish` (E,) [veh/s] that passes (dynamics.passing) [-], and how it changes (E,) with the wish
-    [s/veh], with u [-] and with the accumulation of the region ahead [1/veh]."""
-    assert model.capacity is not None and model.storage is not None  # who calls looks at that
+    """Return the share of `wish` (veh/s, (E,)) that passes, and its derivatives by wish, u and accumulation ahead."""
+    assert model.capacity is not None and model.storage is not None
     ahead = model.edges[:, 1]
     free = 1.0 - accumulation[ahead] / model.storage[ahead]
     room, open_capacity = np.maximum(free, LEAST_ROOM), model.capacity
@@ -153,7 +147,7 @@ def _boundary(
 def pull_derivative(
     model: Turns, adjoint: PerCell, perimeter: PerEdge, splits: PerTurn, record: tuple
 ) -> tuple[PerCell, PerEdge, PerTurn]:
-    """The gradient of x (C,), of the perimeter (E,) and the splits (V,), where one of dx/dt has `adjoint` (C,)."""
+    """Return the gradients by x (C,), perimeter (E,) and splits (V,), if that by dx/dt is `adjoint` (C,)."""
     x, leaving, q, change_of_q, wish, share, boundary = record
     regions, edges = len(model.jam), len(model.edges)
     gain = adjoint[model.target] - adjoint[model.source]
@@ -179,7 +173,7 @@ def advance(
     step: float,
     integrator: str = "euler",
 ) -> tuple[PerCell, list]:
-    """x (C,) after `step` [s] by one step of the integrator, and what `pull_advance` needs."""
+    """Return x (C,) after one integration step of `step` (s), and the records for `pull_advance`."""
     weights, nodes = SCHEMES[integrator]
     total, records, at = np.zeros_like(x), [], x
     for stage, weight in enumerate(weights):
@@ -200,7 +194,7 @@ def pull_advance(
     step: float,
     integrator: str = "euler",
 ) -> tuple[PerCell, Decision]:
-    """The gradient of x (C,) and of the decision (E + V,) before a step, where x after it has `adjoint` (C,)."""
+    """Return the gradients by x (C,) and decision (E + V,) before a step, if that by x after it is `adjoint`."""
     weights, nodes = SCHEMES[integrator]
     of_x, of_decision, of_node = adjoint, np.zeros(len(perimeter) + len(splits)), np.zeros_like(adjoint)
     for stage in reversed(range(len(weights))):
@@ -225,13 +219,14 @@ def vehicle_steps(
     deadline: float = math.inf,
     beyond: Callable[[PerCell], tuple[float, PerCell]] | None = None,
 ) -> tuple[float, Plan | None]:
-    """Vehicles in the network, summed over the ends of H control intervals of `step` [s], and its gradient.
+    """Return the vehicles summed over the ends of H control intervals, and the gradient (K, E + V) or None.
 
-    start: (C,) [veh]; demand: (H, C) [veh/s]
-    plan: (K, E + V) [-], u of the edges and theta of the turns in every interval; the last stays in force
-    deadline: by time.perf_counter [s]
-    beyond: what the state at the end costs besides, in vehicles and intervals, and its gradient
-    The gradient (K, E + V) is None unless asked for. Raises Late.
+    start: (veh, (C,)); demand: (veh/s, (H, C))
+    plan: u of the edges and theta of the turns in every interval (-, (K, E + V)); the last stays in force
+    step: control interval (s)
+    deadline: by time.perf_counter (s)
+    beyond: terminal cost of the final state (veh intervals) and its gradient
+    Raises: Late
     """
     interval, edges = _intervals(plan, len(demand), substeps), len(model.edges)
     x, total, tape = start, 0.0, []
@@ -271,9 +266,9 @@ def affected_vehicles(
     integrator: str = "euler",
     deadline: float = math.inf,
 ) -> Plan:
-    """How many vehicles every number of the plan decides on (K, E + V) [veh]; arguments as in `vehicle_steps`.
+    """Return the vehicles that every number of the plan affects (veh, (K, E + V)); arguments as in `vehicle_steps`.
 
-    Of an edge, those that want to cross it in that interval; of a turn, those that leave its cell.
+    For an edge, the vehicles that want to cross it in that interval; for a turn, those that leave its cell.
     """
     edges = len(model.edges)
     x, leaving = start, np.zeros((len(plan), len(model.turns)))
@@ -295,5 +290,5 @@ def _look(deadline: float) -> None:
 
 
 def _intervals(plan: Plan, horizon: int, substeps: int) -> Int[np.ndarray, " N"]:
-    """The row of the plan in force at every integration step."""
+    """Return the row of the plan in force at every integration step."""
     return np.minimum(np.arange(horizon * substeps) // substeps, len(plan) - 1)

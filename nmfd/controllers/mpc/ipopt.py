@@ -1,8 +1,7 @@
-"""The decisions of economic MPC by IPOPT, on the formulation as it is published: the reference of our own solver.
+"""Economic MPC by IPOPT on the published formulation: the reference of the projected-gradient solver.
 
 Multiple shooting on the CasADi twin of the regional model (nmfd.model.dynamics_casadi): every x_ij, u_ih and theta_ihj
-of every interval is a variable, the dynamics are constraints, and MUMPS factorises the whole horizon at every step. Two
-orders of magnitude slower than projected_gradient; `solver = "ipopt"` in the options of an MPC chooses it.
+of every interval is a variable and the dynamics are constraints. Two orders of magnitude slower.
 """
 
 import casadi as ca
@@ -12,11 +11,11 @@ from nmfd.arrays import PairsOverTime, PerPair, TurnsOverTime
 from nmfd.model import dynamics_casadi as model
 from nmfd.model.planning import PlanningModel
 
-UNIT = 1000.0  # veh: the accumulations of the solver, for its scaling
+UNIT = 1000.0  # veh, unit of the accumulations in the solver
 
 
 class Ipopt:
-    """Minimises the vehicles in the network, summed over the ends of `horizon` intervals."""
+    """Solver that minimises the vehicles summed over the ends of `horizon` intervals."""
 
     def __init__(
         self,
@@ -27,7 +26,7 @@ class Ipopt:
         iterations: int = 200,
         seconds: float | None = None,
     ):
-        """iterations: at most; seconds: deadline of a decision [s], none if None"""
+        """iterations: at most; seconds: deadline of a decision (s), or None"""
         network = planning.network
         self._network, self._horizon, self._guidance = network, horizon, guidance
         self._edges, self._turns = np.argwhere(network.adjacency), np.argwhere(network.split_mask & guidance)
@@ -68,9 +67,9 @@ class Ipopt:
         )
 
     def solve(self, state: PerPair, demand: PairsOverTime) -> tuple[PairsOverTime, TurnsOverTime, str | None]:
-        """u (H, R, R) [-], theta (H, R, R, R) [-], and why IPOPT stopped short of convergence, or None.
+        """Return u (-, (H, R, R)), theta (-, (H, R, R, R)), and the reason if IPOPT did not converge, else None.
 
-        state: (R, R) [veh]; demand: (H, R, R) [veh/s]
+        state: (veh, (R, R)); demand: (veh/s, (H, R, R))
         """
         network, regions, horizon = self._network, self._network.regions, self._horizon
         guess = np.concatenate(
@@ -105,7 +104,7 @@ class Ipopt:
         return perimeter
 
     def _splits(self, theta: ca.SX) -> tuple[list[ca.SX], list[ca.SX]]:
-        """R matrices (R, R), and what must be 0 for their shares to have the sum 1."""
+        """Return R matrices (R, R), and the constraints that are 0 if their shares have sum 1."""
         regions = self._network.regions
         if not self._guidance:
             return [ca.SX(rows) for rows in model.splits_list(self._network.nominal_splits)], []

@@ -1,4 +1,4 @@
-"""Minimising a smooth function over a simple convex set: spectral projected gradients with a certificate.
+"""Spectral projected gradients with a certificate, for smooth functions on simple convex sets.
 
 Birgin, Martinez and Raydan, "Nonmonotone spectral projected gradient methods on convex sets", SIAM J. Optim. 10 (2000).
 """
@@ -10,23 +10,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MEMORY = 20  # values that a step is compared with: some may rise
-SUFFICIENT = 1e-4  # of the decrease that the slope promises
-SHORTEST = 1e-10  # of a step, below which the line search gives up
-LONGEST = 1e10  # spectral step length
+MEMORY = 20  # recent values that a step is compared with: nonmonotone search
+SUFFICIENT_DECREASE = 1e-4  # share of the decrease by the slope
+MIN_STEP_SHARE = 1e-10  # below which the line search ends
+MAX_STEP = 1e10  # spectral step length
 AT_REST = "no further descent"
 TIME_LIMIT = "time limit"
 
 
 class Late(Exception):
-    """The deadline came in the middle of one evaluation."""
+    """Deadline reached during an evaluation."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Minimum:
-    """point: the best one found; value: there
-    gap: value is at most so much above the least one, if the function is convex; else to first order, at a point that
-        is no better
+    """Result of a search.
+
+    point, value: the best
+    gap: bound on value minus minimum if the function is convex; else to first order, at a point that is no better
     reason: why the search stopped short of its tolerance, or None
     evaluations: of the function and its gradient
     """
@@ -52,11 +53,11 @@ def minimise(
     """Descend from the admissible `start` until gap <= tolerance * |value|.
 
     function: point -> value and gradient; it may raise Late
-    seconds: from now on; the clock is looked at after every evaluation, in the line search, too
-    project: the nearest admissible point
-    gap: (point, gradient) -> the most by which any admissible point is lower on the linear model (Frank-Wolfe)
-    metric: weights of the squared length of a step, about in proportion to the second derivatives; the nearest point
-        in this metric must be that of `project`, as it is for bounds, and for simplices of one weight each
+    project: point -> nearest admissible point
+    gap: (point, gradient) -> largest decrease of the linear model over admissible points (Frank-Wolfe)
+    metric: weights of the squared length of a step, about proportional to the second derivatives; the nearest point in
+        this metric must be that of `project`, as for bounds, and for simplices of one weight each
+    seconds: time limit, checked after every evaluation (s)
     """
     deadline = time.perf_counter() + seconds
     point = start
@@ -67,7 +68,7 @@ def minimise(
     if not (np.isfinite(value) and np.isfinite(gradient).all()):
         return Minimum(point=start, value=value, gap=np.inf, evaluations=1, reason="not a number")
     recent, evaluations = deque([value], MEMORY), 1
-    length = 1.0 / max(np.abs(gradient / metric).max(initial=0.0), 1.0 / LONGEST)
+    length = 1.0 / max(np.abs(gradient / metric).max(initial=0.0), 1.0 / MAX_STEP)
     best, least = (point, np.inf), np.inf
 
     def stopped(reason: str) -> Minimum:
@@ -91,17 +92,17 @@ def minimise(
                 other_value, other_gradient = function(other)
             except Late:
                 return stopped(TIME_LIMIT)
-            if other_value <= limit + SUFFICIENT * share * slope:
+            if other_value <= limit + SUFFICIENT_DECREASE * share * slope:
                 break
             if time.perf_counter() > deadline:
                 return stopped(TIME_LIMIT)
-            if share < SHORTEST:
+            if share < MIN_STEP_SHARE:
                 return stopped(AT_REST)
             lowest = -0.5 * share**2 * slope / (other_value - value - share * slope)  # of the parabola through both
             share = lowest if 0.1 * share <= lowest <= 0.5 * share else 0.5 * share
         moved, turned = other - point, other_gradient - gradient
         curvature = float((moved * turned).sum())
-        length = min(float((metric * moved**2).sum()) / curvature if curvature > 0 else 4.0 * length, LONGEST)
+        length = min(float((metric * moved**2).sum()) / curvature if curvature > 0 else 4.0 * length, MAX_STEP)
         point, value, gradient = other, other_value, other_gradient
         recent.append(value)
     return stopped(reason)
