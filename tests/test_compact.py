@@ -11,7 +11,7 @@ from commands import good, nmfd
 
 from nmfd import closed_loop
 from nmfd.api import load_scenario
-from nmfd.controllers.dpc.compact import HELD, CompactPolicy, Numbers
+from nmfd.controllers.dpc.compact import FILL_TIME_S, CompactPolicy, Numbers
 from nmfd.controllers.dpc.policy import Architecture, DpcController
 from nmfd.controllers.dpc.policy_file import checkpoint, load_policy
 from nmfd.controllers.rules import PiGating
@@ -75,7 +75,7 @@ def test_gates_and_prices_are_those_of_the_formula(network):
     controls = DpcController(policy(network, metering=True)).act(
         Observation(step=0, time=0.0, accumulation=x, backlog=0.0 * x)
     )
-    expected = np.maximum(1.3 - full, 0.0) * [mfd.critical for mfd in network.mfds] / HELD
+    expected = np.maximum(1.3 - full, 0.0) * [mfd.critical for mfd in network.mfds] / FILL_TIME_S
     np.testing.assert_allclose(controls.metering, expected, rtol=1e-5, atol=1e-5)
     assert (controls.prices > 0.0).any() and (controls.prices == 0.0).any()
 
@@ -91,7 +91,7 @@ def test_trips_wait_for_the_protected_regions_wherever_they_begin(network):
         centre = gain * (1.1 - full[CENTRE])
         room = np.maximum(np.minimum(1.4 - full, centre), 0.0)
         found = made.metering(torch.from_numpy(x)).detach().numpy()
-        np.testing.assert_allclose(found, room * critical / HELD, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(found, room * critical / FILL_TIME_S, rtol=1e-4, atol=1e-5)
         seen |= {(gain, "own" if a < centre else "protected" if a > 0.0 else "none") for a in room}
     assert seen == set(product((1.0, 2.5), ("own", "protected", "none")))
 

@@ -1,4 +1,4 @@
-"""DPC: constraints by construction, the activation, policy files, and training that resumes as if uninterrupted."""
+"""DPC: constraints by construction, policy files, and training that resumes as if uninterrupted."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +9,8 @@ import tiny
 import torch
 
 from nmfd.api import load_scenario
-from nmfd.controllers.dpc import policy as dpc
 from nmfd.controllers.dpc import training
-from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy, SoftExponential
+from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint, load, load_policy
 from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import parse
@@ -24,9 +23,9 @@ from nmfd.types import Observation, Status
 NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
 
 
-def policy(*, guidance, activation="gelu", network=NETWORK, spread=1.0):
+def policy(*, guidance, network=NETWORK, spread=1.0):
     torch.manual_seed(0)
-    made = Policy(network, Architecture(width=16, guidance=guidance, activation=activation))
+    made = Policy(network, Architecture(width=16, guidance=guidance))
     with torch.no_grad():
         for weights in made.parameters():
             weights.add_(spread * torch.randn_like(weights))
@@ -37,10 +36,9 @@ def measurement(accumulation):
     return Observation(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros_like(accumulation))
 
 
-@pytest.mark.parametrize("activation", dpc.ACTIVATIONS)
 @pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
-def test_any_weights_and_any_state_give_admissible_controls(guidance, activation):
-    controller, random = DpcController(policy(guidance=guidance, activation=activation)), np.random.default_rng(0)
+def test_any_weights_and_any_state_give_admissible_controls(guidance):
+    controller, random = DpcController(policy(guidance=guidance)), np.random.default_rng(0)
     for scale in (0.0, 1.0, 1e3, 1e5, 1e7):
         controls = controller.act(measurement(scale * random.standard_normal((7, 7))))
         assert controls.status == Status.OK
@@ -75,36 +73,6 @@ def test_a_batch_is_the_same_as_one_by_one():
     for n in range(5):
         for batched, single in zip(together, made(x[n]), strict=True):
             torch.testing.assert_close(batched[n], single, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("alpha", [-0.7, -0.1, 0.0, 0.1, 0.7])
-def test_soft_exponential_is_the_published_function(alpha):
-    """Godfrey and Gashler (2015), equation 1, wherever its logarithm is defined."""
-    activation, x = SoftExponential(1).double(), torch.linspace(-1.0, 3.0, 41, dtype=torch.float64)[:, None]
-    torch.nn.init.constant_(activation.alpha, alpha)
-    if alpha < 0:
-        x = x[1.0 - alpha * (x + alpha) > 0.01][:, None]
-        expected = -torch.log(1.0 - alpha * (x + alpha)) / alpha
-    else:
-        expected = (torch.exp(alpha * x) - 1.0) / alpha + alpha if alpha > 0 else x
-    torch.testing.assert_close(activation(x).detach(), expected)
-
-
-@pytest.mark.parametrize("alpha", [-2.0, -1e-5, 0.0, 1e-5, 2.0])
-def test_soft_exponential_is_finite_everywhere(alpha):
-    activation = SoftExponential(1)
-    torch.nn.init.constant_(activation.alpha, alpha)
-    x = torch.tensor([[-1e4], [-1.0], [0.0], [1.0], [1e4]], requires_grad=True)
-    value = activation(x)
-    value.sum().backward()
-    assert torch.isfinite(value).all() and torch.isfinite(x.grad).all() and torch.isfinite(activation.alpha.grad).all()
-
-
-def test_soft_exponential_can_leave_the_identity():
-    """df/dalpha at alpha = 0 is 1 + x^2 / 2: were it 0, the activation would stay what it starts as."""
-    activation = SoftExponential(1)
-    activation(torch.tensor([[2.0]])).sum().backward()
-    assert activation.alpha.grad.item() == pytest.approx(3.0, rel=0.01)
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 """Policy files: weights with what they were trained for, and the controllers in them."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,8 @@ def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
     """Return the policy in `path` and its checkpoint. Raise InputError if it was trained for another network."""
     content = read_policy_file(path)
     try:
-        architecture = Architecture(**content["architecture"])
+        names = {field.name for field in fields(Architecture)}
+        architecture = Architecture(**{key: value for key, value in content["architecture"].items() if key in names})
         if content["network_hash"] != network.hash and not architecture.local:
             raise InputError(
                 f"{path}: network_hash: the policy was trained for network {content['network']!r} "
