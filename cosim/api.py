@@ -14,7 +14,6 @@ from cosim.evaluation import (
     estimation_errors,
     experiment,
     model_validation,
-    prediction_error,
     results,
     statistics,
     tuning,
@@ -34,7 +33,7 @@ from nmfd.controllers.strategy import parse, parse_many
 from nmfd.errors import InputError, RunFailed
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario, with_demand
-from nmfd.runs.files import default_folder, file_name
+from nmfd.runs.files import default_folder, file_name, write_table
 from nmfd.runs.progress import Progress, watched
 from nmfd.types import Controller
 
@@ -291,9 +290,9 @@ def compare(folder: Path, *, controller: str | None = None, seed: int | None = N
     model: folder of the network that predicts, the controller's model if None
     """
     if controller is None:
-        errors = prediction_error.prediction_errors(results.read(folder), model)
-        prediction_error.write_foresights(folder / "foresight.csv", errors)
-        return f"{prediction_error.foresight_table(errors)}\nWritten to {folder / 'foresight.csv'}"
+        rows = model_validation.prediction_errors(results.read(folder), model)
+        write_table(folder / "foresight.csv", rows, float_format="%.6g")
+        return f"{model_validation.prediction_table(rows)}\nWritten to {folder / 'foresight.csv'}"
     found = results.read(folder)
     if found.evaluation:
         raise InputError(f"{folder}: has a run folder for every demand level; give one of them, or omit --controller")

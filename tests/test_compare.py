@@ -4,13 +4,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import tiny
 import torch
 import trajectories
 
 from cosim.evaluation.identify import as_it_was, samples_of, static_model
-from cosim.evaluation.model_validation import errors, held_up, outflow_samples, predict, predict_next
+from cosim.evaluation.model_validation import error_table, errors, held_up, outflow_samples, predict, predict_next
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
 from nmfd.model import dynamics, mfd
@@ -75,6 +76,9 @@ def test_a_model_that_discharges_too_slowly_holds_too_many(scenario, result):
     rows = errors(wrong, result, predict(wrong, result))
     assert rows[-1]["bias_veh"] > 100 and rows[-1]["rmse_share"] > 0.01
     assert rows[-1]["next_interval_rmse_veh"] < rows[-1]["rmse_veh"]
+    simulated = result.accumulation.sum(axis=(1, 2))
+    assert rows[-1]["persistence_rmse_veh"] == pytest.approx(np.sqrt((simulated**2).mean()))
+    assert error_table(pd.DataFrame(rows)).splitlines()[0].count("if nothing changed") == 2
 
 
 def test_several_intervals_ahead(scenario, result):
@@ -112,7 +116,7 @@ def test_the_model_of_those_who_drive():
 
 def test_outflow_samples_lie_on_the_mfd(scenario, result):
     for region in (0, 3):
-        cloud = outflow_samples([result], [result], scenario.network.u_max, region, scenario.network.adjacency)
+        cloud = outflow_samples([result], scenario.network.u_max, region, scenario.network.adjacency)
         points = np.concatenate(list(cloud.values()))
         expected = scenario.network.mfds[region].outflow(points[:, 0])
         # The samples are taken at the middle of an interval, the flows at its beginning.

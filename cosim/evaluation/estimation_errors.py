@@ -1,4 +1,4 @@
-"""How good the estimate was that the controllers saw: tables and pictures of runs with measurement = "estimate"."""
+"""Errors of estimated states: tables and figures of runs with measurement = "estimate"."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -14,100 +14,56 @@ from nmfd.studies import plots
 from nmfd.studies.traffic_states import OutflowOf
 from nmfd.types import Result
 
-COLUMNS = (
-    "controller",
-    "seed",
-    "region",
-    "name",
-    "critical_veh",
-    "mean_veh",
-    "rmse_veh",
-    "rmse_share",
-    "bias_veh",
-    "cell_rmse_veh",
-)
 CAPTION = (
-    "estimate against exact accumulation of a region: RMSE, also as a share of the critical accumulation; bias > 0: "
-    "too many; x_ij RMSE: of the single cells (region, destination) in which there were vehicles; mean over runs"
+    "estimate against true accumulation of a region: RMSE, also as a share of the critical accumulation; bias > 0: "
+    "too many; x_ij RMSE: of the cells (region, destination) with vehicles; mean over runs"
 )
+MEANS = ["critical_veh", "mean_veh", "rmse_veh", "rmse_share", "bias_veh", "cell_rmse_veh"]
 
 
-def errors(network: RegionalModel, trajectory: Result) -> list[dict]:
-    """One row of COLUMNS per region, and one for all of them (region "all"): the mean over regions of the errors, as
-    roots of mean squares."""
-    exact, off = trajectory.accumulation, trajectory.observed - trajectory.accumulation
+def errors(network: RegionalModel, result: Result) -> list[dict]:
+    """Return a row per region, and one for "all": means over regions, of errors as root mean squares."""
+    exact, off = result.accumulation, result.observed - result.accumulation
     used = (exact > 0).any(axis=0)
-    rows = []
-    for i, mfd in enumerate(network.mfds):
-        total, cells = off[:, i].sum(axis=1), off[:, i][:, used[i]]
-        rows.append(
-            dict(
-                zip(
-                    COLUMNS,
-                    (
-                        trajectory.controller,
-                        trajectory.seed,
-                        i,
-                        network.region_names[i],
-                        mfd.critical,
-                        float(exact[:, i].sum(axis=1).mean()),
-                        _rms(total),
-                        _rms(total) / mfd.critical,
-                        float(total.mean()),
-                        _rms(cells),
-                    ),
-                    strict=True,
-                )
-            )
-        )
-    numbers = pd.DataFrame(rows)
-    together = {name: float(numbers[name].mean()) for name in ("critical_veh", "mean_veh", "bias_veh")}
-    together |= {name: _rms(numbers[name]) for name in ("rmse_veh", "rmse_share")}
-    whole = {
-        "controller": trajectory.controller,
-        "seed": trajectory.seed,
-        "region": "all",
-        "name": "mean of the regions",
-        **together,
-        "cell_rmse_veh": _rms(off[:, used]),
-    }
-    return [*rows, {name: whole[name] for name in COLUMNS}]
+    rows: list[dict] = []
+    for i, critical in enumerate(network.critical):
+        error, mean = off[:, i].sum(axis=1), float(exact[:, i].sum(axis=1).mean())
+        values = (critical, mean, _rms(error), _rms(error) / critical, error.mean(), _rms(off[:, i][:, used[i]]))
+        rows.append({"region": i, "name": network.region_names[i], **dict(zip(MEANS, map(float, values), strict=True))})
+    table = pd.DataFrame(rows)
+    whole = table[MEANS].mean().to_dict() | {name: _rms(table[name]) for name in ("rmse_veh", "rmse_share")}
+    rows.append({"region": "all", "name": "mean of the regions", **whole, "cell_rmse_veh": _rms(off[:, used])})
+    return [{"controller": result.controller, "seed": result.seed, **row} for row in rows]
 
 
 def write_errors(
-    folder: Path, network: RegionalModel, trajectories: Sequence[Result], outflow: OutflowOf | None = None
+    folder: Path, network: RegionalModel, results: Sequence[Result], outflow: OutflowOf | None = None
 ) -> pd.DataFrame:
-    """estimation.csv, and one picture per run that was controlled on estimates; nothing without such a run.
-
-    outflow: what left every region of a run, for the picture (nmfd.studies.plots)
-    """
-    estimated = [trajectory for trajectory in trajectories if trajectory.estimated]
-    rows = pd.DataFrame([row for trajectory in estimated for row in errors(network, trajectory)], columns=COLUMNS)
-    if not estimated:
-        return rows
-    files.write_table(folder / "estimation.csv", rows)
-    for trajectory in estimated:
-        path = folder / f"estimate-{run_folder.run_name(trajectory.controller, trajectory.seed)}.png"
+    """Write estimation.csv and a figure per run that was controlled on estimates; nothing without such a run."""
+    estimated = [result for result in results if result.estimated]
+    rows = pd.DataFrame([row for result in estimated for row in errors(network, result)])
+    if estimated:
+        files.write_table(folder / "estimation.csv", rows)
+    for result in estimated:
+        path = folder / f"estimate-{run_folder.run_name(result.controller, result.seed)}.png"
         if not path.exists():
             drawing, axes = plots.panels(network.regions)
             known = None if outflow is None else cache(outflow)
             for region, ax in enumerate(axes):
-                plots.region_estimate(ax, network, region, trajectory, known)
+                plots.region_estimate(ax, network, region, result, known)
             plots.legend_below(drawing, axes)
             plots.save(drawing, path)
     return rows
 
 
 def error_table(rows: pd.DataFrame) -> str:
-    """The errors as text: one line per controller and region, means over seeds."""
-    numbers = ["critical_veh", "mean_veh", "rmse_veh", "rmse_share", "bias_veh", "cell_rmse_veh"]
+    """Return the errors as text, a line per controller and region, means over seeds."""
     keys = ["controller", "region", "name"]
-    shown = rows.astype({"region": str}).groupby(keys, sort=False)[numbers].mean().reset_index()
-    for column in numbers:
-        shown[column] = [
-            f"{100 * value:.1f} %" if column == "rmse_share" else f"{value:.1f}" for value in shown[column]
-        ]
-    headings = ["controller", "region", "name", "critical", "mean", "RMSE", "of critical", "bias", "x_ij RMSE"]
+    shown = rows.astype({"region": str}).groupby(keys, sort=False)[MEANS].mean().reset_index()
+    for name in MEANS:
+        percent = name == "rmse_share"
+        shown[name] = [f"{100 * value:.1f} %" if percent else f"{value:.1f}" for value in shown[name]]
+    headings = [*keys, "critical", "mean", "RMSE", "of critical", "bias", "x_ij RMSE"]
     return text_columns(headings, shown.to_numpy().tolist(), CAPTION)
 
 

@@ -1,5 +1,6 @@
-"""The microsimulation against what the regional model predicts, for the same demand and the recorded controls."""
+"""Microsimulation against the predictions of the regional model: `cosim compare`, and samples of MFDs."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -10,63 +11,65 @@ import pandas as pd
 import torch
 from jaxtyping import Bool, Float
 
-from cosim.evaluation import run_metrics
-from cosim.sumo.arrays import Points, RegionCounts, Series
+from cosim.evaluation import experiment, run_metrics
+from cosim.evaluation.results import Finished
+from cosim.sumo.arrays import Points, RegionCounts
 from nmfd import closed_loop
 from nmfd.arrays import Adjacency
+from nmfd.controllers.strategy import parse
+from nmfd.errors import InputError
 from nmfd.model.dynamics import advance, parameters
+from nmfd.model.identification import Observed
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
-from nmfd.runs.tables import text_columns
+from nmfd.runs.tables import text_table
 from nmfd.studies import plots
-from nmfd.studies.fit_quality import SPILLBACK
+from nmfd.studies.fit_quality import SPILLBACK, predictions
 from nmfd.studies.traffic_states import model_outflow
 from nmfd.types import Controls, Observation, Result
 
-COLUMNS = (
-    "region",
-    "name",
-    "critical_veh",
-    "mean_veh",
-    "rmse_veh",
-    "rmse_share",
-    "persistence_rmse_veh",
-    "bias_veh",
-    "next_interval_rmse_veh",
-    "next_interval_rmse_share",
-    "next_interval_persistence_rmse_veh",
+COLLAPSED_SHARE = 0.7  # of the largest outflow so far, below which a denser region is collapsed
+FEWEST_VEHICLES = 5.0  # in a region during an interval that counts as a sample
+OF_ONE_RUN = (
+    "RMSE, bias: of the accumulation predicted for the whole run from its start [veh]; next interval: predicted from "
+    "every recorded state; if nothing changed: RMSE of constant accumulation; bias > 0: the model holds too many"
 )
-COLLAPSED = 0.7  # of the largest outflow so far
-CAPTION = (
-    "RMSE, bias: of the accumulation that the regional model predicts for the whole run from its start [veh]; next "
-    "interval: predicted one control interval ahead from every recorded state; if nothing changed: RMSE of the "
-    "prediction that the region keeps what it holds, from the start or for one interval [veh]; bias > 0: the model "
-    "holds too many"
+OF_ALL_RUNS = (
+    "RMSE of the accumulation predicted from every recorded state under the recorded departures and controls, as a "
+    "share of the region's critical accumulation, mean of the regions; if nothing changed: of constant accumulation; "
+    "most: largest accumulation of any region in any run, as a share of its critical one"
 )
 
 
 class Replay:
-    """The recorded controls of a trajectory, as a controller (nmfd.types.Controller)."""
+    """Controller that repeats the recorded controls of a run."""
 
-    def __init__(self, trajectory: Result):
-        """trajectory: with as many intervals as are to be controlled"""
-        self.name, self._trajectory = trajectory.controller, trajectory
+    def __init__(self, result: Result):
+        self.name, self._result = result.controller, result
 
     def reset(self, seed: int = 0) -> None:
-        """There is nothing to reset."""
+        """Start a new run."""
 
     def act(self, observation: Observation) -> Controls:
-        """The controls that were recorded for this control step, whatever is observed."""
+        """Return the recorded controls of this step."""
         k = observation.step
-        return Controls(perimeter=self._trajectory.perimeter[k], splits=self._trajectory.splits[k])
+        return Controls(perimeter=self._result.perimeter[k], splits=self._result.splits[k])
+
+
+def observed(result: Result) -> Observed:
+    """Return a run as identification sees it; demand is what entered the streets."""
+    return Observed(
+        accumulation=result.accumulation,
+        demand=result["departures"] / result.step,
+        perimeter=result.perimeter,
+        splits=result.splits,
+        crossings=result["crossings"].sum(axis=3),
+    )
 
 
 def predict(scenario: Scenario, result: Result) -> Result:
-    """The regional model from the same start, under the departures and controls that the microsimulation recorded.
-
-    Demand is what entered the streets, not what wished to: the backlog is none of the model's business here.
-    """
+    """Run the regional model from the same start under the recorded departures and controls."""
     same = replace(
         scenario,
         steps=len(result.perimeter),
@@ -74,103 +77,171 @@ def predict(scenario: Scenario, result: Result) -> Result:
         measurement_std=0.0,
         faults=(),
     )
-    trajectory = closed_loop.run(NmfdPlant(same), Replay(result), same, seed=result.seed)
-    return trajectory.assign(plant="nmfd")
+    return closed_loop.run(NmfdPlant(same), Replay(result), same, seed=result.seed).assign(plant="nmfd")
 
 
 def predict_next(scenario: Scenario, result: Result, intervals: int = 1) -> Float[np.ndarray, "K R"]:
-    """(T + 1 - intervals, R) [veh]: accumulations `intervals` ahead of every recorded state, by the regional model."""
-    trajectory, steps = result, len(result.perimeter)
-    x = torch.from_numpy(trajectory.accumulation[: steps + 1 - intervals])
+    """Predict the accumulations [veh] some intervals ahead of every recorded state, (T + 1 - intervals, R)."""
+    x = torch.from_numpy(result.accumulation[: len(result.perimeter) + 1 - intervals])
     demand = torch.from_numpy(result["departures"] / scenario.step)
-    perimeter, splits = torch.from_numpy(trajectory.perimeter), torch.from_numpy(trajectory.splits)
-    p = parameters(scenario.network)
+    perimeter, splits = torch.from_numpy(result.perimeter), torch.from_numpy(result.splits)
+    p, scheme = parameters(scenario.network), {"integrator": scenario.integrator, "substeps": scenario.substeps}
     for n in range(intervals):
-        part = slice(n, n + len(x))
-        x = advance(
-            p,
-            x,
-            demand[part],
-            perimeter[part],
-            splits[part],
-            scenario.step,
-            integrator=scenario.integrator,
-            substeps=scenario.substeps,
-        )
+        k = slice(n, n + len(x))
+        x = advance(p, x, demand[k], perimeter[k], splits[k], scenario.step, **scheme)
     return x.sum(-1).numpy()
 
 
 def errors(scenario: Scenario, result: Result, predicted: Result) -> list[dict]:
-    """One row of COLUMNS per region, and one for all of them (region "all").
-
-    rmse, bias: of the predicted accumulation over the whole run, model minus simulation; share: of the critical
-    accumulation; next_interval: predicted from the recorded state one control interval before.
-    """
-    simulated = result.accumulation.sum(-1)
-    whole = predicted.accumulation.sum(-1) - simulated
-    ahead = predict_next(scenario, result) - simulated[1:]
-    critical = scenario.network.critical
-    rows = [
-        _row(i, scenario.network.region_names[i], critical[i], simulated[:, i], whole[:, i], ahead[:, i])
-        for i in range(scenario.network.regions)
-    ]
-    return [*rows, _row("all", "all regions", critical.sum(), simulated.sum(1), whole.sum(1), ahead.sum(1))]
-
-
-def _row(
-    region: int | str,
-    name: str,
-    critical: float,
-    simulated: Float[np.ndarray, " S"],
-    whole: Float[np.ndarray, " S"],
-    ahead: Series,
-) -> dict:
-    rmse, next_rmse, still, next_still = (
-        float(np.sqrt((part**2).mean())) for part in (whole, ahead, simulated[0] - simulated, np.diff(simulated))
-    )
-    return dict(
-        zip(
-            COLUMNS,
-            (
-                region,
-                name,
-                float(critical),
-                float(simulated.mean()),
-                rmse,
-                rmse / critical,
-                still,
-                float(whole.mean()),
-                next_rmse,
-                next_rmse / critical,
-                next_still,
-            ),
-            strict=True,
+    """Return the prediction errors of a run, a row per region and one for "all" together."""
+    network, simulated = scenario.network, result.accumulation.sum(-1)
+    whole, ahead = predicted.accumulation.sum(-1) - simulated, predict_next(scenario, result) - simulated[1:]
+    rows = []
+    for i in [*range(network.regions), "all"]:
+        part = slice(None) if i == "all" else slice(i, i + 1)
+        critical, seen = float(network.critical[part].sum()), simulated[:, part].sum(1)
+        off, next_off = whole[:, part].sum(1), ahead[:, part].sum(1)
+        rows.append(
+            {
+                "region": i,
+                "name": "all regions" if i == "all" else network.region_names[i],
+                "critical_veh": critical,
+                "mean_veh": float(seen.mean()),
+                "rmse_veh": _rms(off),
+                "rmse_share": _rms(off) / critical,
+                "persistence_rmse_veh": _rms(seen[0] - seen),
+                "bias_veh": float(off.mean()),
+                "next_interval_rmse_veh": _rms(next_off),
+                "next_interval_rmse_share": _rms(next_off) / critical,
+                "next_interval_persistence_rmse_veh": _rms(np.diff(seen)),
+            }
         )
+    return rows
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+def error_table(rows: pd.DataFrame) -> str:
+    """Return the prediction errors of a run as text."""
+    return text_table(
+        [
+            {
+                "region": row["region"],
+                "name": row["name"],
+                "critical": f"{row['critical_veh']:.1f}",
+                "mean": f"{row['mean_veh']:.1f}",
+                "RMSE": f"{row['rmse_veh']:.1f}",
+                "of critical": f"{100 * row['rmse_share']:.1f} %",
+                "if nothing changed": f"{row['persistence_rmse_veh']:.1f}",
+                "bias": f"{row['bias_veh']:.1f}",
+                "next interval RMSE": f"{row['next_interval_rmse_veh']:.1f}",
+                "of critical ": f"{100 * row['next_interval_rmse_share']:.1f} %",
+                "if nothing changed ": f"{row['next_interval_persistence_rmse_veh']:.1f}",
+            }
+            for row in rows.to_dict("records")
+        ],
+        OF_ONE_RUN,
     )
 
 
-def outflow_samples(
-    trajectories: Sequence[Result], records: Sequence[dict], u_max: float, region: int, adjacency: Adjacency
-) -> dict[str, Points]:
-    """MFD samples of one region: label -> (n, 2) of accumulation [veh] and outflow [veh/s].
+def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
+    """Write compare-<run>.csv and two figures beside a run; return the rows of `errors`."""
+    network, predicted = scenario.network, predict(scenario, result)
+    rows = pd.DataFrame(errors(scenario, result, predicted))
+    name = run_folder.run_name(result.controller, result.seed)
+    files.write_table(folder / f"compare-{name}.csv", rows)
+    drawing, axes = plots.panels(network.regions + 1)
+    measured, model = run_metrics.regional_outflow(result, result.step), model_outflow(network)
+    outflow = cache(lambda run: measured if run.plant == "sumo" else model(run))
+    for region, ax in enumerate(axes[:-1]):
+        plots.region_accumulation(ax, network, region, [result, predicted], outflow=outflow)
+    plots.total_accumulation(axes[-1], [result.assign(backlog=np.zeros_like(result.backlog)), predicted])
+    axes[-1].set_title("all regions", fontsize="medium")
+    plots.legend_below(drawing, axes, columns=4)
+    plots.save(drawing, folder / f"compare-{name}-accumulation.png")
+    samples = [outflow_samples([result], network.u_max, region, network.adjacency) for region in range(network.regions)]
+    plots.draw_mfds(folder / f"compare-{name}-mfd.png", network, samples)
+    return rows
 
-    Labels: "loading" and "unloading", and SPILLBACK for intervals in which a neighbour's congestion, not the region's
-    own, limited what could leave (`held_up`).
 
-    Per control interval, the outflow that the model's g has to give: trips ended in the region and transfers out of
-    it as counted, the transfers divided by the u of the interval where it was below the bound that is meant by the
-    original programme. In the model x_ii leaves at q x_ii and x_ij at u q x_ij, so q = outflow / (x_ii + u x_i,other).
+def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFrame:
+    """Return the prediction errors of all runs of a folder, a row per strategy, demand level and region.
+
+    Args:
+        model: folder of the predicting network; None for that with which each controller plans.
+
+    Raises:
+        InputError: if the city has changed since the runs.
+    """
+    if found.changed:
+        raise InputError(f"{found.path}: {found.changed}; run them again to compare them")
+    scenario = found.scenario
+    scheme = {"step": scenario.step, "substeps": scenario.substeps, "integrator": scenario.integrator}
+    tables = []
+    for level in found.levels:
+        for controller, rows in level.rows.groupby("controller", sort=False):
+            network = parse(controller).planning(scenario, model).network
+            runs = [observed(experiment.read_run(level.folder, controller, seed)) for seed in rows["seed"]]
+            error = predictions(network, runs, scheme)
+            columns = {
+                "demand": level.demand,
+                "controller": controller,
+                "runs": len(runs),
+                "model": os.path.normpath(network.folder) if network.folder else "",
+                "region": range(network.regions),
+                "critical_veh": network.critical,
+                "most_share": np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
+                / network.critical,
+                "next_interval_rmse_share": error.model[0],
+                "next_interval_persistence_rmse_share": error.persistence[0],
+                "ahead_s": error.ahead,
+                "ahead_rmse_share": error.model[1],
+                "ahead_persistence_rmse_share": error.persistence[1],
+            }
+            tables.append(pd.DataFrame(columns))
+    return pd.concat(tables, ignore_index=True)
+
+
+def prediction_table(rows: pd.DataFrame) -> str:
+    """Return prediction errors as text, one line per strategy and demand level."""
+    lines = []
+    for (demand, controller), group in rows.groupby(["demand", "controller"], sort=False):
+        mean = (100 * group.filter(like="rmse_share").mean()).map("{:.1f} %".format)
+        lines.append(
+            {
+                "demand": f"{demand:g}",
+                "controller": controller,
+                "runs": group["runs"].iloc[0],
+                "model": Path(group["model"].iloc[0]).name,
+                "most": f"{group['most_share'].max():.1f}",
+                "next interval": mean["next_interval_rmse_share"],
+                "if nothing changed": mean["next_interval_persistence_rmse_share"],
+                "later": f"{mean['ahead_rmse_share']} ({group['ahead_s'].iloc[0]:g} s)",
+                "if nothing changed ": mean["ahead_persistence_rmse_share"],
+            }
+        )
+    return text_table(lines, OF_ALL_RUNS)
+
+
+def outflow_samples(results: Sequence[Result], u_max: float, region: int, adjacency: Adjacency) -> dict[str, Points]:
+    """Return the MFD samples of a region: label -> (n, 2) of accumulation [veh] and outflow [veh/s].
+
+    Labels are "loading", "unloading", and SPILLBACK for intervals in which a neighbour's congestion limits the outflow
+    (`held_up`). The outflow of an interval is that which the model's g gives: trips ended in the region, and transfers
+    divided by u. In the model x_ii leaves at q x_ii and x_ij at u q x_ij, so q = outflow / (x_ii + u x_i,other).
     """
     samples: dict[str, list[Points]] = {"loading": [], "unloading": [], SPILLBACK: []}
-    for trajectory, record in zip(trajectories, records, strict=True):
-        x = 0.5 * (trajectory.accumulation[1:] + trajectory.accumulation[:-1])
+    for result in results:
+        x = 0.5 * (result.accumulation[1:] + result.accumulation[:-1])
         total, own = x.sum(2), x[:, range(x.shape[1]), range(x.shape[1])]
-        outflow = run_metrics.regional_outflow(record, trajectory.step)
-        share = np.minimum(trajectory.perimeter[:, region].max(axis=1), u_max)
+        outflow = run_metrics.regional_outflow(result, result.step)
+        share = np.minimum(result.perimeter[:, region].max(axis=1), u_max)
         weight = own[:, region] + share * (total - own)[:, region]
         points = np.stack([total[:, region], outflow[:, region] * total[:, region] / np.maximum(weight, 1e-9)], axis=1)
-        rising = np.diff(trajectory.accumulation[:, region].sum(1)) >= 0
-        seen, blocked = total[:, region] >= 5.0, held_up(total, outflow, adjacency)[:, region]
+        rising = np.diff(result.accumulation[:, region].sum(1)) >= 0
+        seen, blocked = total[:, region] >= FEWEST_VEHICLES, held_up(total, outflow, adjacency)[:, region]
         samples["loading"].append(points[seen & ~blocked & rising])
         samples["unloading"].append(points[seen & ~blocked & ~rising])
         samples[SPILLBACK].append(points[seen & blocked])
@@ -178,11 +249,10 @@ def outflow_samples(
 
 
 def held_up(accumulation: RegionCounts, outflow: RegionCounts, adjacency: Adjacency) -> Bool[np.ndarray, "T R"]:
-    """(T, R) bool: a neighbour that collapsed before the region did is collapsed in this interval.
+    """Mark the intervals in which a neighbour that collapsed before the region is collapsed.
 
-    Collapsed: holding more vehicles (T, R) than when its outflow (T, R) was largest so far, and letting out less than
-    COLLAPSED of that. Queues that spill back over a boundary lower the outflow of the region behind it; its own MFD
-    is not to blame.
+    A collapsed region holds more vehicles (T, R) than when its outflow (T, R) was largest so far, and lets out less
+    than COLLAPSED_SHARE of that. Its queues spill back and lower the outflow of the region behind.
     """
     steps, regions = outflow.shape
     collapsed = np.zeros((steps, regions), dtype=bool)
@@ -191,56 +261,8 @@ def held_up(accumulation: RegionCounts, outflow: RegionCounts, adjacency: Adjace
         for k in range(steps):
             if outflow[k, i] >= outflow[best, i]:
                 best = k
-            collapsed[k, i] = (
-                accumulation[k, i] > accumulation[best, i] and outflow[k, i] < COLLAPSED * outflow[best, i]
-            )
+            fuller = accumulation[k, i] > accumulation[best, i]
+            collapsed[k, i] = fuller and outflow[k, i] < COLLAPSED_SHARE * outflow[best, i]
     onset = np.where(collapsed.any(axis=0), collapsed.argmax(axis=0), steps)
     earlier = adjacency & (onset[None, :] < onset[:, None])
     return (collapsed[:, None, :] & earlier[None]).any(axis=2)
-
-
-def error_table(rows: pd.DataFrame) -> str:
-    """The errors as text."""
-    shown = rows.copy()
-    for column in (name for name in COLUMNS if name.endswith("_veh")):
-        shown[column] = [f"{value:.1f}" for value in rows[column]]
-    for column in ("rmse_share", "next_interval_rmse_share"):
-        shown[column] = [f"{100 * value:.1f} %" for value in rows[column]]
-    headings = [
-        "region",
-        "name",
-        "critical",
-        "mean",
-        "RMSE",
-        "of critical",
-        "if nothing changed",
-        "bias",
-        "next interval RMSE",
-        "of critical",
-        "if nothing changed",
-    ]
-    return text_columns(headings, shown.to_numpy().tolist(), CAPTION)
-
-
-def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
-    """Compare, and add compare-<run>.csv and two pictures to the run folder; returns the rows of `errors`."""
-    predicted = predict(scenario, result)
-    rows = pd.DataFrame(errors(scenario, result, predicted), columns=COLUMNS)
-    name = run_folder.run_name(result.controller, result.seed)
-    files.write_table(folder / f"compare-{name}.csv", rows)
-    drawing, axes = plots.panels(scenario.network.regions + 1)
-    measured = run_metrics.regional_outflow(result, result.step)
-    predicted_outflow = model_outflow(scenario.network)
-    outflow = cache(lambda t: measured if t.plant == "sumo" else predicted_outflow(t))
-    for region, ax in enumerate(axes[:-1]):
-        plots.region_accumulation(ax, scenario.network, region, [result, predicted], outflow=outflow)
-    plots.total_accumulation(axes[-1], [result.assign(backlog=np.zeros_like(result.backlog)), predicted])
-    axes[-1].set_title("all regions", fontsize="medium")
-    plots.legend_below(drawing, axes, columns=4)
-    plots.save(drawing, folder / f"compare-{name}-accumulation.png")
-    samples = [
-        outflow_samples([result], [result], scenario.network.u_max, region, scenario.network.adjacency)
-        for region in range(scenario.network.regions)
-    ]
-    plots.draw_mfds(folder / f"compare-{name}-mfd.png", scenario.network, samples)
-    return rows

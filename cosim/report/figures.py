@@ -228,7 +228,7 @@ def _draw_mfds(path: Path, network: RegionalModel, results: Sequence[Result]) ->
     samples = []
     for region in range(network.regions):
         clouds = {
-            run.controller: model_validation.outflow_samples([run], [run], network.u_max, region, network.adjacency)
+            run.controller: model_validation.outflow_samples([run], network.u_max, region, network.adjacency)
             for run in results
         }
         samples.append({name: np.concatenate(list(parts.values())) for name, parts in clouds.items()})
