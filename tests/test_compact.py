@@ -208,7 +208,7 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
         ),
         ("compact = true\nlocal = true", "compact: begins with its numbers"),
         ("metering = true", "metering: only for compact policies"),
-        ("steps = 0", "steps: expected a whole number from 1"),
+        ("steps = 0", "steps: should be greater than or equal to 1"),
         ("descend = false", "descend: only for compact policies"),
     ],
 )

@@ -231,7 +231,7 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
     "options, problem",
     [
         ({"widht": 3}, "widht: unknown key"),
-        ({"steps": 0}, "steps: expected a whole number from 1"),
+        ({"steps": 0}, "steps: should be greater than or equal to 1"),
         ({"steps": 1.5}, "steps: expected a whole number"),
     ],
 )

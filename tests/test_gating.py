@@ -91,10 +91,10 @@ def test_reset_forgets():
     "options, problem",
     [
         ({"kP": 1.0}, "kP: unknown key"),
-        ({"ki": 0.0}, "ki: expected a number above 0"),
-        ({"kp": -1.0}, "kp: expected a number from 0 up"),
+        ({"ki": 0.0}, "ki: should be greater than 0"),
+        ({"kp": -1.0}, "kp: should be greater than or equal to 0"),
         ({"set_point": [1.0, 2.0]}, "set_point: expected a list of 1 numbers"),
-        ({"set_point": [-5.0]}, "set_point: expected a list of numbers above 0"),
+        ({"set_point": [-5.0]}, "set_point\[0\]: should be greater than 0"),
     ],
 )
 def test_wrong_options(options, problem):

@@ -92,7 +92,7 @@ def test_whatever_is_read_is_no_pipe(place):
     [
         (b"steps = " + b"9" * 5000, "a number of thousands of digits"),
         (b"steps = -" + b"9" * 5000, "a number of thousands of digits"),
-        (tiny.SCENARIO.replace("step = 30.0", "step = 1e999").encode(), "step: expected a number above 0"),
+        (tiny.SCENARIO.replace("step = 30.0", "step = 1e999").encode(), "step: should be a finite number"),
         (b'name = "\xff"', "is not UTF-8"),
         (b"\xff\xfe" + tiny.SCENARIO.encode("utf-16-le"), "is not UTF-8"),
         (b'name = "\0"', "is not valid TOML"),
@@ -100,8 +100,8 @@ def test_whatever_is_read_is_no_pipe(place):
         (b"\0" * 100, "is not valid TOML"),
         (b"a = " + b"[" * 100_000, "nested too deeply|is not valid TOML"),
         (b"a = " + b"{b = " * 20_000, "nested too deeply|is not valid TOML"),
-        (b"a" + b".a" * 100_000 + b" = 1", "unknown key|nested too deeply|is not valid TOML"),
-        (b"[" + b"a." * 2000 + b"a]", "unknown key|nested too deeply"),
+        (b"a" + b".a" * 100_000 + b" = 1", "unknown key|is not valid TOML"),
+        (b"[" + b"a." * 2000 + b"a]", "unknown key|is not valid TOML"),
     ],
     ids=range(12),
 )

@@ -131,7 +131,7 @@ def test_a_candidate_whose_run_failed_has_no_score(city, tmp_path, runs):
         (["--option", "kP=1:2"], "controllers.pi-gating.kP: unknown key; allowed here: regions, set_point"),
         (["--option", "kp=1:2", "--option", "kp=1:3"], "kp is there twice"),
         (["--option", "set_point[1]=1:2"], "set_point[0], set_point[1]"),
-        (["--option", "kp=-1:2"], "kp: expected a number from 0 up"),
+        (["--option", "kp=-1:2"], "kp: should be greater"),
     ],
 )
 def test_one_line_for_what_cannot_be_tuned(city, tmp_path, arguments, expected):
