@@ -28,7 +28,7 @@ from cosim.report import card, figures, html
 from cosim.sumo.outputs import check, paths
 from cosim.sumo.session import LOST, Window
 from cosim.view import live
-from nmfd.api import load_scenario
+from nmfd.api import check_policies, load_scenario
 from nmfd.controllers.strategy import parse, parse_many
 from nmfd.errors import InputError, RunFailed
 from nmfd.metrics import summary
@@ -264,6 +264,7 @@ def evaluate(
     """
     loaded = load_scenario(scenario, settings)
     strategies = parse_many(controllers, loaded, regional=False)
+    check_policies(policies or {}, strategies)
     order = evaluation.Evaluation(
         scenario=scenario,
         settings=tuple((settings or {}).items()),

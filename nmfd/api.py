@@ -1,6 +1,7 @@
 """Functions behind the commands of `nmfd`; exported by the package `nmfd`."""
 
 import re
+import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import takewhile
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from nmfd import closed_loop
 from nmfd.controllers import open_loop
 from nmfd.controllers.dpc import rollout, training
-from nmfd.controllers.strategy import CONTROLLERS, check_tables, parse, parse_many
+from nmfd.controllers.strategy import CONTROLLERS, Strategy, check_tables, parse, parse_many
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario, with_demand
 from nmfd.runs import shipped
@@ -133,9 +134,11 @@ def benchmark(
     """
     scenario, files = _loaded(scenario), {name: Path(file) for name, file in (policies or {}).items()}
     _check_plant(plant)
+    strategies = parse_many(controllers, scenario, regional=True)
+    check_policies(files, strategies)
     return benchmark_study.benchmark(
         scenario,
-        parse_many(controllers, scenario, regional=True),
+        strategies,
         range(seeds) if isinstance(seeds, int) else list(seeds),
         plant,
         out=default_folder(scenario.name) if out is None else Path(out),
@@ -199,21 +202,28 @@ def train(
     strategy = parse(controller)
     chosen = training.settings(scenario, strategy, steps)
     file = _file(scenario, f"{controller}.pt", out)
+    if not anyway:
+        model = training.check(scenario, strategy)
+        for region, doubts in zip(model.region_names, model.doubts, strict=False):
+            if doubts:
+                print(f"nmfd: the model of region {region} is doubtful: {'; '.join(doubts)}", file=sys.stderr)
     compiled = chosen.descend and chosen.steps >= training.WORTH_COMPILING and rollout.can_compile(device)
-    with watched(controller, progress) as show:
-        training.train(
-            scenario,
-            strategy,
-            seed=seed,
-            out=file,
-            steps=steps,
-            resume=resume,
-            device=device,
-            compiled=compiled,
-            anyway=anyway,
-            progress=show,
-        )
-    return file
+    try:
+        with watched(controller, progress) as show:
+            return training.train(
+                scenario,
+                strategy,
+                seed=seed,
+                out=file,
+                steps=steps,
+                resume=resume,
+                device=device,
+                compiled=compiled,
+                anyway=anyway,
+                progress=show,
+            )
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"the best policy so far, if any, is {file}; add --resume to continue") from None
 
 
 def bound(
@@ -290,6 +300,16 @@ def _file(scenario: Scenario, name: str, out: Path | str | None) -> Path:
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder; make it or choose another --out")
     return file
+
+
+def check_policies(policies: Mapping[str, Path], strategies: Sequence[Strategy]) -> None:
+    """Raise InputError for a policy file of a controller that is not among the strategies."""
+    known = [strategy.name for strategy in strategies]
+    for name in policies:
+        if name not in known:
+            raise InputError(
+                f"--policy: {name!r} is not among {', '.join(known)}{did_you_mean(name, known)}; add it there"
+            )
 
 
 def _check_plant(plant: str, more: str = "") -> None:

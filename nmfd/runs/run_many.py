@@ -116,6 +116,10 @@ def run_many(
                     rows[run.file] = _row(run.file, outcome)
                     if show:
                         show(done, len(todo), run.name)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"finished runs are in {out}; the same command with --out {out} continues"
+            ) from None
         finally:
             table = _table(rows, keys)
             write_table(out / TABLE, table)
