@@ -1,7 +1,7 @@
 """Size and style of the house against its budget, and its picture.
 
-    python .ci/house.py            print the figures; exit 1 if one is beyond its budget or the picture is out of date
-    python .ci/house.py --draw     draw .ci/house.svg from the imports
+python .ci/house.py            print the figures; exit 1 if one is beyond its budget or the picture is out of date
+python .ci/house.py --draw     draw .ci/house.svg from the imports
 """
 
 import ast
@@ -33,7 +33,9 @@ def main() -> None:
     figures = measured()
     for name, (value, limit) in figures.items():
         print(f"{name:45} {value:8,} of {limit:,}")
-    problems = [f"{name}: {value:,} is more than {limit:,}" for name, (value, limit) in figures.items() if value > limit]
+    problems = [
+        f"{name}: {value:,} is more than {limit:,}" for name, (value, limit) in figures.items() if value > limit
+    ]
     problems += odd_docstrings() + long_pages()
     if not PICTURE.is_file() or edges_in(PICTURE.read_text(encoding="utf-8")) != arrows():
         problems.append(f"{PICTURE.name}: is out of date; run python .ci/house.py --draw")
@@ -124,7 +126,9 @@ def arrows() -> set[tuple[str, str]]:
     """Return the imports between rooms."""
     graph = grimp.build_graph("nmfd", "cosim", exclude_type_checking_imports=True)
     inside = floors()
-    found = ((room(one), room(other)) for one in graph.modules for other in graph.find_modules_directly_imported_by(one))
+    found = (
+        (room(one), room(other)) for one in graph.modules for other in graph.find_modules_directly_imported_by(one)
+    )
     return {(one, other) for one, other in found if one != other and one in inside and other in inside}
 
 
