@@ -185,7 +185,7 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
     for descend in ("false", "true"):
         (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend=descend))
         files[descend] = scenario / "dpc-pcrg.pt" if descend == "true" else tmp_path / "first.pt"
-        good(nmfd("train", scenario, "--controller", "dpc-pcrg", "--no-compile", "--out", files[descend]))
+        good(nmfd("train", scenario, "--controller", "dpc-pcrg", "--out", files[descend]))
     (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend="false"))
     (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend="true"))
     loaded = load_scenario(scenario)
@@ -208,7 +208,7 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
         ),
         ("compact = true\nlocal = true", "compact: begins with its numbers"),
         ("metering = true", "metering: only for compact policies"),
-        ("steps = 0", "steps: should be greater than or equal to 1"),
+        ("steps = 0", "steps: should be greater"),
         ("descend = false", "descend: only for compact policies"),
     ],
 )

@@ -317,7 +317,7 @@ def test_decoders_are_trained_in_turn(tmp_path, scenario, steps):
 
 
 def test_the_best_validation_is_kept(tmp_path, scenario, monkeypatch):
-    scores, logged, notes = iter([7.0, 5.0, 6.0]), [], []
+    scores, notes = iter([7.0, 5.0, 6.0]), []
     monkeypatch.setattr(training, "VALIDATION_PERIOD", 2)
     monkeypatch.setattr(training, "validate", lambda *_: next(scores))
     out = training.train(
@@ -326,10 +326,8 @@ def test_the_best_validation_is_kept(tmp_path, scenario, monkeypatch):
         seed=3,
         out=tmp_path / "p.pt",
         steps=5,
-        log=lambda done, loss, score: logged.append((done, score, loss > 0.0)),
         progress=lambda *note: notes.append(note),
     )
-    assert logged == [(2, 7.0, True), (4, 5.0, True), (5, 6.0, True)]
     assert notes == [
         (1, 5, "best inf veh s"),
         (2, 5, "best 7 veh s"),
@@ -375,8 +373,7 @@ def test_the_model_that_a_controller_is_trained_on_must_be_measured(scenario):
     city = replace(scenario, network=own)
     with pytest.raises(InputError, match="placeholder: is true.*--anyway trains dpc-pc all the same"):
         training.check(city, parse("dpc-pc"))
-    believed = training.check(scenario, parse("dpc-pc"))
-    assert believed is not scenario.network and believed.hash == scenario.network.hash
+    training.check(scenario, parse("dpc-pc"))
     shut = replace(scenario.network, controllable=np.zeros_like(scenario.network.adjacency, dtype=float))
     with pytest.raises(InputError, match="controllable: is 0 at every boundary.*dpc-pcrg all the same"):
         training.check(replace(scenario, network=shut), parse("dpc-pcrg"))

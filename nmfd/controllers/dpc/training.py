@@ -6,7 +6,6 @@ validation on the scenario itself is kept. The same seed gives the same weights.
 
 import io
 import math
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,7 +24,7 @@ from nmfd.model.authority import NO_GATEWAY
 from nmfd.model.planning import Options, PlanningModel, options, planning_model
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
-from nmfd.runs.config import Flow, Numbers, Problem, Share, setting, whole
+from nmfd.runs.config import Flow, Numbers, Problem, Share, error, setting, whole
 from nmfd.runs.files import atomic
 from nmfd.tensors import one_thread
 
@@ -134,35 +133,27 @@ def settings(scenario: Scenario, strategy: "Strategy", steps: int | None = None)
             f'--controller: {strategy.name!r} needs a table [controllers."{strategy.name}"] in {scenario.folder}/'
             f"scenario.toml with what is different from {kind.name}; add one, or train {kind.name}"
         )
-    setup = options(Training, planning_model(scenario, kind.name, table), kind.name, table)
+    planning = planning_model(scenario, kind.name, table)
+    setup = options(Training, planning, kind.name, table)
     if setup.local and kind.guides:
-        raise InputError(
-            f"{scenario.folder}/scenario.toml: controllers.{table}.local: a local policy guides no routes; train "
-            "dpc-pc, or omit it"
-        )
+        raise error(planning.where, f"controllers.{table}.local", "a local policy guides no routes; train dpc-pc")
     return setup if steps is None else setup.changed(steps=steps)
 
 
-def check(scenario: Scenario, strategy: "Strategy") -> RegionalModel:
-    """Return the model to train on. Raise InputError if no gateway can be controlled or MFDs are placeholders."""
-    city = scenario.network
-    believed = planning_model(scenario, strategy.controller.name, strategy.table(scenario)).network
+def check(scenario: Scenario, strategy: "Strategy") -> None:
+    """Raise InputError if no gateway can be controlled or the MFDs are placeholders."""
+    city, believed = scenario.network, strategy.planning(scenario).network
+    file = city.name if city.folder is None else city.folder / "network.toml"
     if city.controllable is not None and not city.controllable.any():
         raise InputError(
-            f"{_file(city)}: controllable: is 0 at every boundary: {NO_GATEWAY}; --anyway trains {strategy.name} all "
-            "the same"
+            f"{file}: controllable: is 0 at every boundary: {NO_GATEWAY}; --anyway trains {strategy.name} all the same"
         )
     if believed.placeholder:
         raise InputError(
-            f"{_file(believed)}: placeholder: is true: its MFDs are guesses from lanes and speed limits; a policy "
-            f"would learn them; run 'cosim identify {os.path.dirname(_file(city)) or 'NETWORK'}' first, or set it to "
-            f"false after putting in your own MFDs; --anyway trains {strategy.name} all the same"
+            f"{file if believed.folder is None else believed.folder / 'network.toml'}: placeholder: is true: its MFDs "
+            f"are guesses from lanes and speed limits; run 'cosim identify {city.folder}' first, or set it to false "
+            f"after putting in your own MFDs; --anyway trains {strategy.name} all the same"
         )
-    return believed
-
-
-def _file(network: RegionalModel) -> str:
-    return network.name if network.folder is None else os.path.normpath(network.folder / "network.toml")
 
 
 def available(device: str) -> str:
@@ -184,16 +175,14 @@ def train(
     compiled: bool = False,
     anyway: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
-    log: Callable[[int, float, float], object] | None = None,
 ) -> Path:
     """Train the policy of `strategy` on the regional model and write it to `out`.
 
-    `out` holds the best policy after every validation. `out`.resume holds the state that `resume` continues from.
+    `out` holds the best policy after every validation, `out`.resume the state that `resume` continues from.
 
     compiled: compile the step, about twice as fast after a minute or two; the weights differ by rounding
     anyway: train even if `check` raises
     progress: called with (done, steps, note) after every step
-    log: called with (done, TTS in training, TTS in validation) (veh s) after every validation
     """
     with one_thread():
         setup = settings(scenario, strategy, steps)
@@ -201,14 +190,8 @@ def train(
             check(scenario, strategy)
         planning = planning_model(scenario, strategy.controller.name, strategy.table(scenario))
         steps = setup.steps if setup.descend else 0
-        configuration = {
-            "controller": strategy.name,
-            "scenario": planning.name,
-            "seed": seed,
-            "compiled": compiled,
-            **vars(setup),
-            "steps": steps,
-        }
+        configuration = {"controller": strategy.name, "scenario": planning.name, "seed": seed, "compiled": compiled}
+        configuration |= {**vars(setup), "steps": steps}
         torch.manual_seed(seed)
         generator = torch.Generator().manual_seed(seed)
         architecture = Architecture(
@@ -229,56 +212,61 @@ def train(
             begin_as_gate(policy, rollout, generator)
         advance = compiled_step(rollout.step) if compiled else rollout.step
         optimizer = torch.optim.Adam(policy.parameters(), lr=setup.learning_rate)
-        first, best, history = 0, float("inf"), list[list[float]]()
+        first, best = 0, float("inf")
         state_file = out.with_name(out.name + ".resume")
         if resume:
-            first, best, history = _restore(state_file, configuration, policy, optimizer, generator)
-            for done, trained, score in history:
-                if log:
-                    log(int(done), trained, score)
+            first, best = _restore(state_file, configuration, policy, optimizer, generator)
         for step in range(first, steps):
             for group in optimizer.param_groups:
                 cosine = 0.5 * (1.0 + math.cos(math.pi * step / steps))
                 group["lr"] = setup.learning_rate * (0.1 + 0.9 * cosine)
-            rollout.draw_model(BATCH, setup.mfd_spread, generator, setup.mfd_scale)
-            x, demand = rollout.random_start(BATCH, DEMAND_SPREAD, RANDOM_START_SHARE, generator, setup.levels)
-            demand = rollout.perturb(demand, torch.rand(BATCH, generator=generator), setup.noise, generator)
-            # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
-            loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
-            optimizer.zero_grad()
-            loss.backward()
-            if architecture.guidance and not setup.compact:
-                # The decoders are trained in turn. Not by requires_grad, which would compile the step once for each.
-                for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
-                    weights.grad = None
-            torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
-            optimizer.step()
-            if isinstance(policy, CompactPolicy):
-                policy.bound()
+            _descend(policy, rollout, setup, generator, advance, optimizer, step)
             last = step + 1 == steps
             if (step + 1) % VALIDATION_PERIOD == 0 or last:
-                score = validate(policy, rollout, seed, setup)
-                history.append([step + 1, math.exp(loss.item()), score])
-                if log:
-                    log(step + 1, history[-1][1], score)
-                if score < best:
+                if (score := validate(policy, rollout, seed, setup)) < best:
                     best = score
                     _keep(policy, planning.network, configuration, best, out)
-                if not last:
-                    write(_state(configuration, step + 1, best, history, policy, optimizer, generator), state_file)
+                state = {"configuration": configuration, "step": step + 1, "best": best}
+                state |= {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
+                write(state | {"generator": generator.get_state()}, state_file)
             if progress:
                 progress(step + 1, steps, f"best {best:.4g} veh s")
         if not steps:  # the initial policy
             best = validate(policy, rollout, seed, setup)
-            if log:
-                log(0, best, best)
+            _keep(policy, planning.network, configuration, best, out)
             if progress:
                 progress(1, 1, f"initial policy {best:.4g} veh s")
-            _keep(policy, planning.network, configuration, best, out)
         if not math.isfinite(best):
             raise RunFailed(f"{strategy.name}: every validation of {steps} steps diverged; lower the learning rate")
         state_file.unlink(missing_ok=True)
         return out
+
+
+def _descend(
+    policy: Policy,
+    rollout: Rollout,
+    setup: Training,
+    generator: torch.Generator,
+    advance: Callable,
+    optimizer: torch.optim.Optimizer,
+    step: int,
+) -> None:
+    """Do one Adam step."""
+    rollout.draw_model(BATCH, setup.mfd_spread, generator, setup.mfd_scale)
+    x, demand = rollout.random_start(BATCH, DEMAND_SPREAD, RANDOM_START_SHARE, generator, setup.levels)
+    demand = rollout.perturb(demand, torch.rand(BATCH, generator=generator), setup.noise, generator)
+    # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
+    loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
+    optimizer.zero_grad()
+    loss.backward()
+    if policy.architecture.guidance and not setup.compact:
+        # The decoders are trained in turn. Not by requires_grad, which would compile the step once for each.
+        for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
+            weights.grad = None
+    torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+    optimizer.step()
+    if isinstance(policy, CompactPolicy):
+        policy.bound()
 
 
 def begin_as_no_control(policy: Policy, network: RegionalModel) -> None:
@@ -339,33 +327,14 @@ def _keep(policy: Policy, network: RegionalModel, configuration: Mapping[str, An
     write(checkpoint(policy, network, {**configuration, "validation_veh_s": score}), out)
 
 
-def _state(
-    configuration: Mapping[str, Any],
-    step: int,
-    best: float,
-    history: list[list[float]],
-    policy: Policy,
-    optimizer: torch.optim.Optimizer,
-    generator: torch.Generator,
-) -> dict[str, Any]:
-    return {
-        "configuration": configuration,
-        "step": step,
-        "best": best,
-        "history": history,
-        "policy": policy.state_dict(),
-        "optimizer": optimizer.state_dict(),
-        "generator": generator.get_state(),
-    }
-
-
 def _restore(
     state_file: Path,
     configuration: Mapping[str, Any],
     policy: Policy,
     optimizer: torch.optim.Optimizer,
     generator: torch.Generator,
-) -> tuple[int, float, list[list[float]]]:
+) -> tuple[int, float]:
+    """Restore the state of a training; return the number of its next step and its best validation."""
     state = read_file(state_file, "nothing to resume; train without --resume")
     for key, value in configuration.items():
         if state["configuration"].get(key) != value:
@@ -376,7 +345,7 @@ def _restore(
     policy.load_state_dict(state["policy"])
     optimizer.load_state_dict(state["optimizer"])
     generator.set_state(state["generator"])
-    return int(state["step"]), float(state["best"]), list(state["history"])
+    return int(state["step"]), float(state["best"])
 
 
 def write(content: dict, path: Path) -> None:
