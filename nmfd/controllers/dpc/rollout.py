@@ -1,4 +1,4 @@
-"""Rollouts of the regional model under a policy, as tensors and many at once: what training descends."""
+"""Batched rollouts of the regional model under a policy, as tensors: the objective of training."""
 
 import os
 import shutil
@@ -22,10 +22,7 @@ Levels = Float[torch.Tensor, " B"]
 
 
 class Rollout:
-    """The scenario's regional model as tensors on `device`, for many rollouts at once.
-
-    Random numbers are drawn on the CPU, so that they are the same on every device.
-    """
+    """Regional model of a scenario as tensors; random numbers are drawn on the CPU, so that devices agree."""
 
     def __init__(
         self,
@@ -34,7 +31,7 @@ class Rollout:
         device: str | torch.device = "cpu",
         detour_cost: float = 0.0,
     ):
-        """detour_cost: what a vehicle loses that is guided off the drivers' own split ratios [s]"""
+        """detour_cost: time lost by a vehicle that is guided off the nominal split ratios (s)"""
 
         def tensor(values: Any) -> torch.Tensor:
             return torch.tensor(values, dtype=dtype, device=device)
@@ -57,12 +54,12 @@ class Rollout:
         generator: torch.Generator,
         levels: tuple[float, float] = (1.0, 1.0),
     ) -> tuple[States, Demands]:
-        """Initial states (B, R, R) [veh] and demands (T, B, R, R) [veh/s].
+        """Return initial states (veh, (B, R, R)) and demands (veh/s, (T, B, R, R)).
 
-        levels: the demand of a whole rollout is multiplied by a number between these
-        A share of the rollouts starts at a random time of the scenario from a random state, which fills the regions
-        up to between nothing and 80 % of their jam accumulation with vehicles for the destinations in use; the others
-        start as the scenario does.
+        spread: every flow is scaled by a factor from 1 - spread to 1 + spread
+        share: of the rollouts that start at a random time from a random state, with regions filled to at most 80 % of
+            the jam accumulation; the others start as the scenario
+        levels: range of one factor of all demand, per rollout
         """
 
         def uniform(*shape: int) -> torch.Tensor:
@@ -83,11 +80,11 @@ class Rollout:
         return torch.where((rollout < share * batch)[:, None, None], x, self.start), demand
 
     def draw_model(self, batch: int, spread: float, generator: torch.Generator, scale: float = 1.0) -> None:
-        """From now on every one of `batch` rollouts has a regional model of its own, around the nominal one.
+        """Draw a regional model for each of `batch` rollouts, around the nominal one.
 
-        spread: standard deviation of the logarithm of every region's accumulation axis (jam and critical accumulation,
-        storage), and half of it of its outflow and of the capacities [-]
-        scale: of all accumulation axes besides [-]; spread 0 and scale 1 give the nominal model
+        spread: standard deviation of the logarithm of every region's accumulation axis (jam, critical accumulation,
+            storage), and half of that for its outflow and capacities (-)
+        scale: factor of all accumulation axes (-)
         """
         p, regions = self._nominal, len(self.jam)
         if spread or scale != 1.0:
@@ -97,7 +94,7 @@ class Rollout:
                 return torch.exp(share * spread * normal.clamp(-2.0, 2.0))
 
             wide, high = scale * factor(regions), factor(regions, share=0.5)
-            # The integration step stays short enough: no rate rises above the largest that the network was checked for.
+            # No rate rises above the largest that the integration step was checked for.
             high = high.clamp(max=1.0 / (self._fastest() * self.planning.step / self.planning.substeps))
             p = replace(
                 p,
@@ -111,7 +108,7 @@ class Rollout:
         self.parameters = p
 
     def _fastest(self) -> torch.Tensor:
-        """The largest rate at which vehicles leave each region (R,) [1/s]."""
+        """Return the largest rate at which vehicles leave each region (1/s, (R,))."""
         p = self._nominal
         return p.c if p.exit_rates is None else p.c * p.exit_rates.amax(-1)
 
@@ -127,7 +124,7 @@ class Rollout:
         return (demand + (normal * sigma).to(self.device)).clamp(min=0.0)
 
     def step(self, policy: Policy, x: States, demand: States, noise: States) -> States:
-        """The state (B, R, R) [veh] one control interval after x, which `policy` saw with `noise` (B, R, R) [veh]."""
+        """Return the state one control interval after x (veh, (B, R, R)), which `policy` observes with `noise`."""
         perimeter, splits = policy(x + noise)
         return dynamics.advance(
             self.parameters,
@@ -141,8 +138,7 @@ class Rollout:
         )
 
     def entering(self, policy: Policy, seen: States, demand: States, backlog: States) -> tuple[States, States]:
-        """The demand (B, R, R) [veh/s] that a policy lets enter where it has `seen` the states, and the backlog
-        (B, R, R) [veh] after it."""
+        """Return the admitted demand (veh/s, (B, R, R)) and the backlog after it (veh, (B, R, R))."""
         if not policy.architecture.metering:
             return demand, backlog
         return dynamics.admitted(backlog, demand, policy.metering(seen), self.planning.step)
@@ -150,10 +146,9 @@ class Rollout:
     def states(
         self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None
     ) -> tuple[Demands, Demands, Float[torch.Tensor, "T B"]]:
-        """The states (T, B, R, R) [veh] under `policy` from x (B, R, R), what it saw of them through the noise, and how
-        many (T, B) [veh] waited to enter, because it did not let them.
+        """Return the states under `policy`, the observed ones (veh, (T, B, R, R)), and the backlog (veh, (T, B)).
 
-        step: what to use instead of `self.step`, such as its compiled form
+        step: replaces `self.step`, such as its compiled form
         """
         noise = torch.randn(demand.shape, generator=generator, dtype=self.dtype).to(self.device)
         noise *= self.planning.measurement_std
@@ -176,7 +171,7 @@ class Rollout:
         return self.planning.step * vehicles
 
     def _diverted(self, x: PerPair, splits: PerTurn) -> PerPair:
-        """Vehicles (..., R, R) [veh/s] that leave a region another way than by the drivers' own split ratios."""
+        """Return the flow that leaves a region off the nominal split ratios (veh/s, (..., R, R))."""
         p = self.parameters
         leaving = dynamics.rate(p, x.sum(-1)).unsqueeze(-1) * x
         if p.exit_rates is not None:
@@ -185,26 +180,23 @@ class Rollout:
 
 
 def can_compile(device: str = "cpu") -> bool:
-    """Whether torch.compile works on `device`, found out with one small function.
-
-    It needs a C++ compiler, but also Python's headers and OpenMP, and on a GPU Triton.
-    """
+    """Return True if torch.compile works on `device`: it needs a C++ compiler, headers, OpenMP, on a GPU Triton."""
     if shutil.which(os.environ.get("CXX", "g++")) is None:
         return False
     try:
         with warnings.catch_warnings():
             compiled_step(torch.neg)(torch.ones(1, device=device))
-    except Exception:  # of the compiler, its tools, or a cache that cannot be written: all the same here
+    except Exception:  # of the compiler, its tools, or the cache
         return False
     return True
 
 
 def compiled_step(step: Callable) -> Callable:
-    """`step`, to be compiled in this process when it is called first."""
+    """Return `step`, compiled at its first call."""
     import torch._dynamo
     import torch._inductor.config
 
-    warnings.filterwarnings("ignore", category=FutureWarning, module="torch._inductor")  # PyTorch's own business
+    warnings.filterwarnings("ignore", category=FutureWarning, module="torch._inductor")
     torch._inductor.config.compile_threads = 1  # no pool of processes beside one training
-    torch._dynamo.reset()  # what an earlier training compiled counts towards a limit, beyond which nothing is compiled
+    torch._dynamo.reset()  # earlier trainings count towards a limit
     return torch.compile(step, dynamic=False)
