@@ -18,7 +18,7 @@ COUNTED = {
 }
 
 # Attributes of a Result that are no column of a table of runs.
-NO_COLUMNS = {"step", "estimated", "wall_time", "key"}
+NO_COLUMNS = {"step", "estimated", "wall_time", "key", "scenario_folder"}
 # Columns of a table of runs on any plant: type and meaning.
 SUMMARY: dict[str, tuple[type, str]] = {
     "controller": (str, "the strategy"),

@@ -1,141 +1,150 @@
-"""The evaluation: controllers x seeds x demand levels in SUMO, paired by seed, with tables.
+"""Evaluation: controllers x seeds x demand levels of one or several scenarios in SUMO, in one ranked table.
 
-<folder>/demand-<level>/    the run folder of a demand level (cosim.evaluation.experiment)
-<folder>/evaluate.md, evaluate.csv, pairs.csv, runs.csv    the tables (statistics), new after every run; in the
-    first,  at the end, why (explain)
-what is drawn of a level lies in its folder, what is drawn across levels here (cosim.report.figures)
+    <out>/[<scenario>/]demand-<level>/   results of the runs
+    <out>/runs.csv, manifest.json        one row per run; commands, commits, versions, seeds and hashes (run_many)
+    <out>/evaluate.md                    tables paired by seed, and why; of several scenarios the ranking first
+
+A suite is a TOML file: `seeds = [2000, 2001]` and a table [scenarios] of demand levels, `grid7_peak = [0.8, 1.0]`.
 """
 
-import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+import random
+import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
 
+import numpy as np
 import pandas as pd
+from pydantic import Field, TypeAdapter, ValidationError
+from typing_extensions import TypedDict
 
-from cosim.evaluation import experiment, explain, statistics
-from cosim.evaluation.simulate import Task
+from cosim.evaluation import explain, results, statistics
+from cosim.evaluation.runs import city_key, runs_of
 from nmfd.api import load_scenario
-from nmfd.errors import InputError, did_you_mean
-from nmfd.runs import files
-from nmfd.runs.workers import ended
+from nmfd.controllers.strategy import Strategy
+from nmfd.errors import InputError
+from nmfd.model.scenario import Scenario
+from nmfd.runs import config, files
+from nmfd.runs.progress import Progress
+from nmfd.runs.run_many import TABLE, Run, read_manifest, run_many
+from nmfd.runs.tables import markdown_table
+from nmfd.types import HOST_TIMES
 
 
-@dataclass(frozen=True, kw_only=True)
-class Evaluation:
-    """scenario: its folder; controllers: strategies; levels: multiples of the scenario's demand; steps: control
-    intervals, all if None; policies: controller -> file instead of the scenario's own; reference: a controller to
-    pair with, besides no control; time_limit: of controllers of the user's own, instead of the scenario's; out: the
-    folder of the evaluation."""
+class Suite(TypedDict):
+    seeds: Annotated[list[int], Field(min_length=1)]
+    scenarios: dict[str, Annotated[list[Annotated[float, Field(gt=0.0, le=10.0)]], Field(min_length=1)]]
 
-    scenario: Path
-    controllers: tuple[str, ...]
-    seeds: Sequence[int]
-    out: Path
-    levels: tuple[float, ...] = (1.0,)
-    settings: tuple[tuple[str, object], ...] = ()
-    steps: int | None = None
-    policies: Mapping[str, Path] = field(default_factory=dict)
-    time_limit: float | None = None
-    reference: str | None = None
 
-    def plan(self) -> list[tuple[Path, Task]]:
-        """Every run with its run folder, seed by seed, so that whatever is finished compares like with like."""
-        return [
-            (
-                experiment.level_folder(self.out, level),
-                Task(
-                    scenario=self.scenario,
-                    settings=self.settings,
-                    controller=name,
-                    seed=seed,
-                    policy=self.policies.get(name),
-                    steps=self.steps,
-                    demand_factor=level,
-                    time_limit=self.time_limit,
-                ),
-            )
-            for seed in self.seeds
-            for level in self.levels
-            for name in self.controllers
-        ]
+def read_suite(file: Path) -> tuple[list[tuple[Scenario, list[float]]], list[int]]:
+    """Read the scenarios with their demand levels, and the seeds, of a suite.
+
+    Scenarios are shipped names, or folders seen from that of the file.
+
+    Raises:
+        InputError: the file is no suite, or a scenario is missing
+    """
+    try:
+        suite = TypeAdapter(Suite).validate_python(config.read(file))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"{file}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    beside = {name: file.parent / name for name in suite["scenarios"]}
+    folders = {name: path if (path / "scenario.toml").is_file() else Path(name) for name, path in beside.items()}
+    return [(load_scenario(folders[name]), levels) for name, levels in suite["scenarios"].items()], suite["seeds"]
 
 
 def evaluate(
-    evaluation: Evaluation,
+    scenarios: Sequence[tuple[Scenario, Sequence[float]]],
+    strategies: Sequence[Strategy],
+    seeds: Sequence[int],
     *,
+    out: Path,
+    policies: Mapping[str, Path] | None = None,
     workers: int = 1,
     scheduler: str | None = None,
-    progress: Callable[[int, int, str], None] | None = None,
-    tell: Callable[[str], None] | None = None,
-) -> tuple[pd.DataFrame, list[str]]:
-    """Run what is not there yet and write tables; returns `tables.statistics` and a line per failed run.
+    progress: Progress = None,
+) -> pd.DataFrame:
+    """Do the runs that are not in `out`, write the tables, and return one row per run (nmfd.runs.run_many).
 
-    The tables are of all runs in the folder. progress, tell: as in `experiment.perform`. Raises InputError.
+    scenarios: each with its demand levels
+    policies: strategy name -> file instead of the scenario's
     """
-    out = evaluation.out
-    check_folder(out)
-    known = {*evaluation.controllers, *kept_runs(evaluation)["controller"]}
-    if evaluation.reference is not None and evaluation.reference not in known:
-        raise InputError(
-            f"--reference: {evaluation.reference!r} is neither among --controllers nor in {out}"
-            f"{did_you_mean(evaluation.reference, known)}; add it to them"
-        )
-    failures = experiment.perform(
-        evaluation.plan(),
-        workers=workers,
-        fresh=True,
-        progress=progress,
-        tell=tell,
-        kept=lambda: statistics.write_tables(out, kept_runs(evaluation), None),
-    )
-    rows, table = kept_runs(evaluation), pd.DataFrame()
-    if len(rows):
-        table = statistics.write_tables(out, rows, evaluation.reference)
-        scenario = load_scenario(evaluation.scenario, dict(evaluation.settings))
-        why = explain.text(level_folders(out), scenario.network, kept_runs(evaluation))
-        remarks = "".join(f"- {line}\n" for line in experiment.remarks(rows))
-        files.write_text(
-            out / "evaluate.md",
-            "\n".join(filter(None, (statistics.markdown(table, evaluation.reference), remarks, why))),
-        )
-    if failures and table.empty and all(failure.mistake for _, failure in failures):
-        raise ended([(experiment.label(task), failure) for task, failure in failures[:1]])
-    return table, [f"{experiment.label(task)}: {failure.reason}" for task, failure in failures]
+    runs = plan(scenarios, strategies, seeds, policies)
+    rows = run_many(runs, out, workers=workers, scheduler=scheduler, progress=progress)
+    done = results.finished_rows(rows)
+    if len(done):
+        files.write_text(out / "evaluate.md", report(out, done))
+    return rows
 
 
-def check_folder(out: Path) -> None:
-    """InputError for a folder that is a run folder itself, instead of holding one for each demand level."""
-    if (out / "manifest.json").is_file():
-        raise InputError(f"{out}: is the folder of another command; choose another folder with --out")
+def plan(
+    scenarios: Sequence[tuple[Scenario, Sequence[float]]],
+    strategies: Sequence[Strategy],
+    seeds: Sequence[int],
+    policies: Mapping[str, Path] | None = None,
+) -> list[Run]:
+    """Return all runs of an evaluation, seed by seed, so that what is finished compares like with like."""
+    runs = []
+    for scenario, levels in scenarios:
+        city = city_key(scenario, strategies)
+        above = f"{files.file_name(scenario.name)}/" if len(scenarios) > 1 else ""
+        for level in levels:
+            folder = f"{above}demand-{level:g}"
+            runs += runs_of(scenario, strategies, seeds, city=city, demand=level, policies=policies, folder=folder)
+    return sorted(runs, key=lambda run: seeds.index(int(run.name.rpartition("-")[2])))
 
 
-def level_folders(out: Path) -> dict[float, Path]:
-    """Demand level -> its run folder, those in `out` that hold finished runs."""
-    found = {}
-    for path in out.glob("demand-*/summary.csv"):
-        if re.fullmatch(r"demand-[\d.e+-]+", path.parent.name) and (path.parent / "sumo.csv").is_file():
-            found[float(path.parent.name.removeprefix("demand-"))] = path.parent
-    return dict(sorted(found.items()))
+def report(out: Path, rows: pd.DataFrame) -> str:
+    """Return evaluate.md for the finished runs."""
+    names = list(dict.fromkeys(rows["scenario"]))
+    parts = [] if len(names) == 1 else [ranking(rows)]
+    for name in names:
+        finished = results.read(out, name)
+        parts += [f"# {name}"] if len(names) > 1 else []
+        parts += [statistics.markdown(finished.rows), *(explain.text(level, finished) for level in finished.levels)]
+    return "\n\n".join(parts)
 
 
-def kept_runs(evaluation: Evaluation) -> pd.DataFrame:
-    """`experiment.overview` of every demand level, with a column demand; controllers in the order asked for."""
-    parts = []
-    for level, folder in level_folders(evaluation.out).items():
-        rows = experiment.overview(folder)
-        rows.insert(0, "demand", level)
-        parts.append(rows)
-    return _ordered(
-        evaluation,
-        pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=["demand", "controller", "seed"]),
-    )
+def ranking(rows: pd.DataFrame) -> str:
+    """Return controllers by their mean change of TTS over scenarios and demand levels, as markdown."""
+    changes: dict[str, list[float]] = {}
+    for _, part in rows.groupby("scenario", sort=False):
+        for row in statistics.statistics(part).to_dict("records"):
+            same = row["controller"] == row["against"]
+            changes.setdefault(row["controller"], []).append(0.0 if same else row["change_percent"])
+    order = sorted(changes, key=lambda name: float(np.mean(changes[name])))
+    table = [
+        [place, name, f"{np.mean(changes[name]):+.1f} %", len(changes[name])] for place, name in enumerate(order, 1)
+    ]
+    return markdown_table(["rank", "controller", "mean change of TTS", "scenarios and demand levels"], table)
 
 
-def _ordered(evaluation: Evaluation, rows: pd.DataFrame) -> pd.DataFrame:
-    names = list(dict.fromkeys([*evaluation.controllers, *rows["controller"]]))
-    return rows.sort_values(
-        ["demand", "controller", "seed"],
-        ignore_index=True,
-        key=lambda column: column.map(names.index) if column.name == "controller" else column,
-    )
+def check(runs: Sequence[Run], out: Path, number: int, *, workers: int = 1) -> list[str]:
+    """Do `number` random runs of a table again, and return a line per difference.
+
+    out: folder with runs.csv and manifest.json, with or without the results
+    """
+    kept, before = read_manifest(out)["folders"], results.finished_rows(pd.read_csv(out / TABLE))
+    rows = {(row["folder"], row["controller"], row["seed"]): row for row in before.to_dict("records")}
+    chosen = random.Random(0).sample(list(runs), min(number, len(runs)))
+    lines = [
+        f"{run.file}: {name} was {kept.get(run.folder, {}).get('key', {}).get(name)}, is {value}"
+        for run in chosen
+        for name, value in run.key.items()
+        if name != "controller" and kept.get(run.folder, {}).get("key", {}).get(name) != value
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        again = run_many(chosen, folder, workers=workers)
+        again.to_csv(Path(folder, TABLE), index=False)  # as the kept table went through a file
+        again = pd.read_csv(Path(folder, TABLE))
+    for row in again.to_dict("records"):
+        old = rows.get((row.get("folder", ""), row["controller"], row["seed"]), {})
+        lines += [
+            f"{row['controller']}, seed {row['seed']}: {name} was {old.get(name)}, is {row[name]}"
+            for name in row
+            if not (name in HOST_TIMES or "_ms" in name or name in ("evaluation_time_s", "wall_time_s"))
+            and old.get(name) != row[name]
+            and not (pd.isna(row[name]) and pd.isna(old.get(name, np.nan)))
+        ]
+    return lines

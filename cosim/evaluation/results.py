@@ -1,166 +1,140 @@
-"""The finished runs in a folder of `cosim run` or `cosim evaluate`, with the city that they ran in."""
+"""Finished runs in a folder of `cosim run` or `cosim evaluate`, with scenario and city."""
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 
-from cosim.evaluation import evaluate, experiment
-from cosim.sumo.build import SumoFiles, ensure_built
-from cosim.sumo.net import City, load_city
+from cosim.sumo.build import ensure_built
+from cosim.sumo.net import City, city_of
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
-from nmfd.runs.files import check_file, file_hash
+from nmfd.runs.files import file_hash, read_table
+from nmfd.runs.run_many import TABLE, read_manifest, run_name
+from nmfd.types import Result
 
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
-    """The runs at one demand level: a run folder.
+    """Runs of one scenario at one demand level.
 
-    rows: as in cosim.evaluation.statistics, with NaN for what an older version did not record; manifest: manifest.json
+    demand: multiple of the scenario's demand; folder: of the result files; rows: one per run; key: what all runs depend
+    on; controllers: name -> what only its runs depend on
     """
 
     demand: float
     folder: Path
     rows: pd.DataFrame
-    manifest: Mapping
+    key: Mapping
+    controllers: Mapping
+
+    def read(self, controller: str, seed: int) -> Result:
+        """Return a finished run. Raises InputError."""
+        return read_run(self.folder, controller, seed)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finished:
-    """levels: at least one, by demand; evaluation: whether `cosim evaluate` made the folder
-    city: None where the city is no longer that of the runs, for the reason in `changed`"""
+    """Finished runs of one scenario: at least one level, by demand; sessions: of manifest.json."""
 
     path: Path
     levels: tuple[Level, ...]
-    evaluation: bool
     scenario: Scenario
-    city: City | None
-    changed: str
+    sessions: tuple[Mapping, ...]
 
     @property
     def rows(self) -> pd.DataFrame:
-        """Of all levels, one below the other."""
+        """One row per run of all levels."""
         return pd.concat([level.rows for level in self.levels], ignore_index=True)
 
     @property
     def name(self) -> str:
-        """Of the folder."""
+        """Name of the folder."""
         return self.path.resolve().name
 
     def map(self) -> City:
-        """The city. Raises InputError where it is no longer that of the runs."""
-        if self.city is None:
-            raise InputError(f"{self.path}: {self.changed}: there is no map of the runs any more; run them again")
-        return self.city
+        """Return the city. Raises InputError if it has changed since the runs."""
+        files = ensure_built(self.scenario.network)
+        for key, file in (("net_file_hash", files.net_file), ("regions_hash", files.regions_csv)):
+            if self.levels[0].key[key] != file_hash(file):
+                raise InputError(f"{self.path}: {file} has changed since the runs; run them again")
+        return city_of(self.scenario.network)
 
-    def level(self, demand: float | None) -> Level:
-        """That of a demand, or the one nearest to the scenario's own. Raises InputError."""
+    def level(self, demand: float | None = None) -> Level:
+        """Return the level of `demand`, nearest to 1 if None. Raises InputError."""
         if demand is None:
             return min(self.levels, key=lambda level: abs(level.demand - 1.0))
         for level in self.levels:
             if abs(level.demand - demand) < 1e-9:
                 return level
-        there = ", ".join(f"{level.demand:g}" for level in self.levels)
-        raise InputError(f"--demand: {self.path} has no runs at {demand:g}; choose one of {there}")
+        raise InputError(f"{self.path}: has no runs at demand {demand:g}")
 
 
-def read(path: Path, scenario: Path | None = None) -> Finished:
-    """scenario: its folder, if not where the manifest says. Raises InputError for a folder without finished runs."""
-    folders = evaluate.level_folders(path)
-    evaluation = bool(folders)
-    if not folders:
-        if not (path / "manifest.json").is_file():
-            raise InputError(f"{path}: holds no finished runs; give a folder of `cosim run` or `cosim evaluate`")
-        if not (path / "summary.csv").is_file() or not (path / "sumo.csv").is_file():
-            raise InputError(f"{path}: holds no finished runs in SUMO; finish one with `cosim run` or `cosim evaluate`")
-        folders = {_manifest(path)["configuration"]["demand_factor"]: path}
-    levels = tuple(_level(demand, folder, _order(path)) for demand, folder in folders.items())
-    configuration = levels[0].manifest["configuration"]
-    loaded = load_scenario(scenario or scenario_folder(levels[0].folder, levels[0].manifest))
-    if configuration.get("scenario") != loaded.name:
-        raise InputError(
-            f"--scenario: the runs are of {configuration.get('scenario')}, not of {loaded.name}; give its folder"
+def read(path: Path, scenario: str | None = None) -> Finished:
+    """Read the finished runs of a folder.
+
+    scenario: name of one of several scenarios, the first if None
+
+    Raises:
+        InputError: the folder holds no finished runs in SUMO
+    """
+    if not (path / TABLE).is_file():
+        raise InputError(f"{path}: holds no finished runs; give a folder of `cosim run` or `cosim evaluate`")
+    manifest, rows = read_manifest(path), read_table(path / TABLE, {}, "run again")
+    rows = finished_rows(rows)
+    if rows.empty or "scenario" not in rows:
+        raise InputError(f"{path}: holds no finished runs in SUMO; finish one with `cosim run` or `cosim evaluate`")
+    rows = rows[rows["scenario"] == (scenario or rows["scenario"].iloc[0])]
+    levels = [
+        Level(
+            demand=float(demand),
+            folder=path / part["folder"].iloc[0],
+            rows=part.reset_index(drop=True),
+            key=manifest["folders"][part["folder"].iloc[0]]["key"],
+            controllers=manifest["folders"][part["folder"].iloc[0]]["controllers"],
         )
-    files = ensure_built(loaded.network)
-    changed = _changed(configuration, files)
+        for demand, part in rows.groupby("demand", sort=True)
+    ]
+    first = levels[0].read(rows_of(levels[0])[0][0], rows_of(levels[0])[0][1])
     return Finished(
         path=path,
-        levels=levels,
-        evaluation=evaluation,
-        scenario=loaded,
-        changed=changed,
-        city=None if changed else load_city(files.net_file, files.regions_csv, loaded.network.regions),
+        levels=tuple(levels),
+        scenario=load_scenario(_scenario_folder(Path(first.scenario_folder), first.scenario, path)),
+        sessions=tuple(manifest["sessions"]),
     )
 
 
-def _order(path: Path) -> list[str]:
-    """The controllers as `cosim evaluate` shows them; others follow as they come."""
-    table = path / "runs.csv"
-    if not table.is_file():
-        return []
-    try:
-        return list(dict.fromkeys(pd.read_csv(table, usecols=["controller"], dtype=str)["controller"]))
-    except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
-        raise InputError(f"{table}: is no table of runs ({error}); delete it") from None
-
-
-def _level(demand: float, folder: Path, order: Sequence[str]) -> Level:
-    rows = experiment.overview(folder)
-    if rows.empty:
-        raise InputError(f"{folder}: holds no finished runs; run the command that began it again")
-    rows.insert(0, "demand", float(demand))
-    names = list(dict.fromkeys([*order, *rows["controller"]]))
-    rows = rows.sort_values(
-        ["controller", "seed"],
+def finished_rows(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of finished runs, controllers together, with a column folder."""
+    rows = rows[rows["failure"].isna() | (rows["failure"] == "")].drop(columns="failure")
+    if "folder" not in rows:
+        rows.insert(0, "folder", "")
+    rows["folder"] = rows["folder"].fillna("")
+    order = list(dict.fromkeys(rows["controller"]))
+    return rows.sort_values(
+        [name for name in ("scenario", "demand", "controller", "seed") if name in rows],
         ignore_index=True,
-        key=lambda column: column.map(names.index) if column.name == "controller" else column,
+        kind="stable",
+        key=lambda column: column.map(order.index) if column.name == "controller" else column,
     )
-    return Level(demand=float(demand), folder=folder, rows=rows, manifest=_manifest(folder))
 
 
-def _manifest(folder: Path) -> dict:
-    path = folder / "manifest.json"
-    check_file(path, "give a folder of `cosim run` or `cosim evaluate`")
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        configuration, scenario = manifest["configuration"], manifest["sessions"][-1]["scenario_folder"]
-        numbers = [configuration[key] for key in ("demand_factor", "steps", "step_s")]
-        if not isinstance(scenario, str) or not all(isinstance(number, (int, float)) for number in numbers):
-            raise TypeError
-        return manifest
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give a folder of `cosim run` or `cosim evaluate`") from None
-    except (ValueError, KeyError, IndexError, TypeError):
-        raise InputError(f"{path}: is no manifest of runs in SUMO; give a folder of `cosim run`") from None
+def rows_of(level: Level) -> list[tuple[str, int]]:
+    """Return controller and seed of every run."""
+    return list(zip(level.rows["controller"], map(int, level.rows["seed"]), strict=True))
 
 
-def scenario_folder(folder: Path, manifest: Mapping) -> Path:
-    """Of the runs in `folder`: where the manifest says, from here or from a folder above the runs, or as it came with
-    the package. InputError."""
-    return found_again(Path(manifest["sessions"][-1]["scenario_folder"]), folder, "manifest.json: scenario_folder")
+def read_run(folder: Path, controller: str, seed: int) -> Result:
+    """Return a finished run. Raises InputError."""
+    return Result.read(folder / f"{run_name(controller, seed)}.nc")
 
 
-def found_again(name: Path, folder: Path, said: str) -> Path:
-    """The scenario `name`, of runs in `folder`; said: where that is written. Of a whole path that is not there, as on
-    another machine, its end will do. InputError."""
-    ends = [Path(*name.parts[-count:]) for count in (3, 2, 1)] if name.is_absolute() else []
-    for end in (name, *ends):
-        for above in (Path(), *folder.resolve().parents):
-            if (above / end / "scenario.toml").is_file():
-                return above / end
-        if ((found := shipped.found(end, shipped.SCENARIO, beside=Path())) / "scenario.toml").is_file():
-            return found
-    raise InputError(f"{folder / said}: there is no {name}; give it with --scenario, or go to where it is")
-
-
-def _changed(configuration: Mapping, files: SumoFiles) -> str:
-    """Why the city is not the one of the runs; empty if it is."""
-    for key, file in (("net_file_hash", files.net_file), ("regions_hash", files.regions_csv)):
-        if configuration.get(key) not in (None, file_hash(file)):
-            return f"{file} has changed since the runs were made"
-    return ""
+def _scenario_folder(folder: Path, name: str, runs: Path) -> Path:
+    """Return where the scenario of `runs` is, shipped or in its folder. Raises InputError."""
+    for place in (folder, shipped.found(name, shipped.SCENARIO, beside=Path())):
+        if (place / "scenario.toml").is_file():
+            return place
+    raise InputError(f"{runs}: its scenario {folder} is not there any more")

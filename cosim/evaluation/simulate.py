@@ -1,188 +1,134 @@
-"""One closed-loop run in SUMO: a task that can be handed to another process, and all that came of it."""
+"""One closed-loop run in SUMO, and the facts in its result."""
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
-from cosim.evaluation import estimation_errors, run_metrics
+import numpy as np
+from jaxtyping import Bool
+
+from cosim.evaluation import estimation_errors
 from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
 from cosim.plant.observer import Observer
 from cosim.plant.plant import SumoPlant
 from cosim.plant.record import Record, settled
 from cosim.plant.settings import settings
+from cosim.sumo.arrays import EdgesOverTime, RegionCounts
+from cosim.sumo.net import City, Gateway, gateway_room_taken
 from cosim.sumo.outputs import check_whole
 from cosim.sumo.session import Window
+from cosim.sumo.tripinfo import TripFacts
 from nmfd import closed_loop, metrics
-from nmfd.api import load_scenario
-from nmfd.controllers.strategy import Strategy, parse
-from nmfd.model.planning import PlanningModel
-from nmfd.model.scenario import Scenario, with_demand, with_faults
+from nmfd.arrays import PerRegion
+from nmfd.controllers.strategy import Strategy
+from nmfd.model.scenario import Scenario, with_demand
 from nmfd.quantities import variables
-from nmfd.runs import run_folder
 from nmfd.runs.files import atomic
-from nmfd.types import Controller, Result
+from nmfd.types import Result
 
-# Columns of sumo.csv, beside those of summary.csv, and what they say.
-FACTS = {
-    "controller": "the strategy",
-    "seed": "of trips, drivers and guidance",
-    "trips": "that were due",
-    "departed_veh": "trips that could enter",
-    "final_backlog_veh": "waiting to enter at the end",
-    "total_backlog_veh_s": "time integral of those who wait to enter",
-    "teleports": "out of jams, by SUMO",
-    "mean_trip_time_s": "on the road, of all trips, unfinished ones with what they had spent at the end",
-    "mean_departure_delay_s": "between the wanted and the real departure, of all trips",
-    "mean_time_loss_s": "lost on the road against driving freely, of all trips (SUMO's timeLoss)",
-    "delay_gini": "Gini coefficient of the mean delays of regions of origin (run_metrics.delay_gini)",
-    "co2_kg": "of all vehicles, by SUMO's HBEFA4 petrol car",
-    "fuel_kg": "of all vehicles, by the same model",
-    "gateway_queue_mean_veh": "halting on the edges before gateways, mean over edges and time",
-    "gateway_queue_max_veh": "the longest of these queues",
+FULL_SHARE = 0.8  # of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards
+FACTS = {  # attribute of a result, column of runs.csv -> meaning
+    "scenario": "name of the scenario",
+    "demand": "multiple of the scenario's demand",
+    "trips": "trips due",
+    "departed_veh": "trips that entered",
+    "final_backlog_veh": "trips waiting to enter at the end",
+    "total_backlog_veh_s": "time integral of trips waiting to enter",
+    "teleports": "vehicles that SUMO took out of jams",
+    "mean_trip_time_s": "time on the road, mean over all trips; unfinished ones with what they spent until the end",
+    "mean_departure_delay_s": "wanted to actual departure, mean over all trips",
+    "mean_time_loss_s": "time lost against driving freely, mean over all trips (SUMO's timeLoss)",
+    "delay_gini": "Gini coefficient of the mean delays of regions of origin",
+    "co2_kg": "CO2 of all vehicles, SUMO's HBEFA4 petrol car",
+    "fuel_kg": "fuel of all vehicles, same model",
+    "gateway_queue_mean_veh": "vehicles halting on edges before gateways, mean over edges and time",
+    "gateway_queue_max_veh": "longest queue before a gateway",
     "gateway_full_share": "share of these edges and intervals that were full",
-    "notes": "what was said most often of decisions that were not as they should be",
-    "outside_training": "where this is beyond what the policy was trained for",
-    "leaking_share": "share of the flow over the boundaries that passes no signal under control",
-    "estimate_rmse_share": "error of estimated accumulations, as a share of the critical ones",
+    "notes": "most frequent notes of decisions that were not OK",
+    "outside_training": "how demand is outside the training range of the policy",
+    "leaking_share": "share of the boundary flow that passes no signal under control",
+    "estimate_rmse_share": "error of estimated accumulations, share of the critical ones",
     "estimate_cell_rmse_veh": "error of estimated accumulations by destination",
-    "sumo_time_s": "of it, SUMO's own steps",
-    "overhead_share": "of it, the share outside SUMO",
-    "setup_time_s": "before the first interval",
-    "signals_left_alone": "signals that keep their own programmes",
-    "removed_veh": "taken out before the end of their trips",
-    "removed_waiting_veh": "of these, before they could enter",
-    "freed_veh": "vehicles that waited for each other on a junction with free streets behind it, and were set down",
-    "led_on_veh": "guided drivers who could not change lanes and went on where theirs led",
-    "jumps": "vehicles that came into another region where no gateway leads there",
+    "sumo_time_s": "wall time of SUMO's own steps",
+    "overhead_share": "share of the wall time outside SUMO",
+    "setup_time_s": "wall time before the first interval",
+    "signals_left_alone": "signals with their own programmes",
+    "removed_veh": "vehicles removed before the end of their trips",
+    "removed_waiting_veh": "those of them removed before they entered",
+    "freed_veh": "vehicles in a gridlocked junction that were moved on",
+    "led_on_veh": "guided vehicles that could not change lanes and went on where theirs led",
+    "jumps": "vehicles that entered another region without a gateway",
     **PRESSURE_FACTS,
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """scenario: its folder; controller: the name of a strategy (nmfd.controllers.strategy); policy: of a DPC controller, instead of the
-    scenario's own; steps: control intervals, all if None; demand_factor: multiplies all flows;
-    options: of the controller, instead of those of the scenario; sumo_output: kind (cosim.sumo.outputs) and file of
-    SUMO's own outputs; faults: besides those of the scenario; time_limit: of a controller of the user's own
-    [s], instead of that of the scenario."""
-
-    scenario: Path
-    controller: str
-    seed: int
-    policy: Path | None = None
-    steps: int | None = None
-    demand_factor: float = 1.0
-    settings: tuple[tuple[str, Any], ...] = ()
-    options: tuple[tuple[str, object], ...] = ()
-    sumo_output: tuple[tuple[str, Path], ...] = ()
-    faults: tuple[str, ...] = ()
-    time_limit: float | None = None
-
-    def __post_init__(self) -> None:
-        """A text will do for the scenario's folder."""
-        object.__setattr__(self, "scenario", Path(self.scenario))
-
-
-def scenario_of(task: Task) -> Scenario:
-    """The scenario with the horizon and demand of `task`. Raises InputError."""
-    scenario = with_faults(load_scenario(task.scenario, dict(task.settings)), task.faults)
-    scenario = with_demand(scenario, steps=task.steps, factor=task.demand_factor)
-    if not task.options:
-        return scenario
-    tables = scenario.controller_options
-    table = parse(task.controller).table(scenario)
-    return replace(scenario, controller_options={**tables, table: {**tables.get(table, {}), **dict(task.options)}})
-
-
 def simulate(
-    task: Task,
-    progress: Callable[[int, int], None] | None = None,
-    observer: Observer | None = None,
-    window: Window | None = None,
-) -> Result:
-    """Run `task` in this process, which must hold no other SUMO session. Raises InputError.
-
-    observer: is shown the run while it goes on, which stays the same
-    """
-    begin = time.perf_counter()
-    scenario, strategy = scenario_of(task), parse(task.controller)
-    result = drive(
-        scenario,
-        strategy,
-        strategy.make(scenario, task.policy),
-        seed=task.seed,
-        progress=progress,
-        begin=begin,
-        outputs=dict(task.sumo_output),
-        planning=strategy.planning(scenario),
-        observer=observer,
-        window=window,
-    )
-    outside = strategy.outside_training(scenario, task.demand_factor, task.policy)
-    return result.assign(outside_training=outside)
-
-
-def drive(
     scenario: Scenario,
     strategy: Strategy,
-    controller: Controller,
     *,
     seed: int,
-    progress: Callable[[int, int], None] | None = None,
-    begin: float | None = None,
+    demand: float = 1.0,
+    policy: Path | None = None,
     outputs: Mapping[str, Path] | None = None,
-    planning: PlanningModel | None = None,
+    progress: Callable[[int, int], None] | None = None,
     observer: Observer | None = None,
     window: Window | None = None,
 ) -> Result:
-    """The closed loop of `controller` in SUMO, filed under `strategy.name`, whose options the city takes.
+    """Run `strategy` in SUMO, in this process, which may hold no other SUMO session.
 
-    begin: when the setting up began (time.perf_counter); outputs: SUMO's own, kind (cosim.sumo.outputs) -> file, there
-    only if all goes well; planning: what states are estimated with, if not the scenario itself; observer: is shown the
-    run while it goes on.
-    Raises InputError.
+    seed: of trips, drivers and guidance
+    demand: multiple of the scenario's demand
+    policy: policy file instead of the scenario's
+    outputs: kind of SUMO's own output (cosim.sumo.outputs) -> file
+    progress: called as progress(done, steps) after every control interval
+    observer: gets the state of the run while it goes on
+    window: options of sumo-gui
+
+    Raises:
+        InputError: the strategy cannot run in this city
     """
-    begin = time.perf_counter() if begin is None else begin
+    begin = time.perf_counter()
+    name, scenario = scenario.name, with_demand(scenario, factor=demand)
+    controller = strategy.make(scenario, policy)
     with ExitStack() as stack:
         files = {kind: stack.enter_context(atomic(path)) for kind, path in (outputs or {}).items()}
         plant = SumoPlant(
             scenario,
             overrides=settings(scenario).changed(**strategy.city),
             outputs=files,
-            planning=planning,
+            planning=strategy.planning(scenario),
             observer=observer,
             window=window,
         )
         stack.callback(plant.close)
-        trajectory = run_folder.labelled(
-            closed_loop.run(plant, controller, scenario, seed=seed, progress=progress),
-            controller=strategy.name,
-            plant="sumo",
-        )
-        trips, sumo_time, leaks, facts = plant.trips, plant.sumo_time, set(plant.leaks()), plant.trip_facts()
+        result = closed_loop.run(plant, controller, scenario, seed=seed, progress=progress)
+        result = result.assign(controller=strategy.name, plant="sumo")
+        trips, sumo_time, leaks, trip_facts = plant.trips, plant.sumo_time, set(plant.leaks()), plant.trip_facts()
         record = plant.record()
-        trajectory = settled(trajectory, record)
-        backlog = trajectory.backlog.sum(axis=(1, 2))
-        row = {
+        result = settled(result, record)
+        backlog = result.backlog.sum(axis=(1, 2))
+        facts = {
+            "scenario": name,
+            "scenario_folder": str(scenario.folder or ""),
+            "demand": float(demand),
             "trips": trips,
             "departed_veh": int(record.departures.sum()),
             "final_backlog_veh": int(backlog[-1]),
             "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
             "teleports": int(record.teleports.sum()),
-            **run_metrics.trip_facts(facts),
-            "delay_gini": run_metrics.delay_gini(trajectory, record, plant.time_loss()),
-            **run_metrics.queue_facts(record, plant.city),
-            "notes": metrics.notes(trajectory),
-            "outside_training": "",
-            "leaking_share": run_metrics.leaking_share(record, plant.city, leaks),
-            **_estimation(scenario, trajectory),
+            **_trip_means(trip_facts),
+            "delay_gini": delay_gini(result, record, plant.time_loss()),
+            **queue_facts(record, plant.city),
+            "notes": metrics.notes(result),
+            "outside_training": strategy.outside_training(scenario, demand, policy),
+            "leaking_share": leaking_share(record, plant.city, leaks),
+            **_estimate_errors(scenario, result),
             "sumo_time_s": sumo_time,
-            "overhead_share": 1.0 - sumo_time / trajectory.wall_time,
-            "setup_time_s": time.perf_counter() - begin - trajectory.wall_time,
+            "overhead_share": 1.0 - sumo_time / result.wall_time,
+            "setup_time_s": time.perf_counter() - begin - result.wall_time,
             "signals_left_alone": len(plant.other_signals),
             "removed_veh": int(record.removals.sum() + record.given_up.sum()),
             "removed_waiting_veh": int(record.given_up.sum()),
@@ -191,12 +137,71 @@ def drive(
             **plant.pressure_facts(),
         }
         check_whole(files)
-    return trajectory.add(variables(Record, asdict(record)), row)
+    return result.add(variables(Record, asdict(record)), facts)
 
 
-def _estimation(scenario: Scenario, trajectory: Result) -> dict[str, float]:
-    """Errors of the estimate, over all regions; NaN where the controller saw the exact state."""
-    if not trajectory.estimated:
+def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> RegionCounts:
+    """Return trips that ended in every region and vehicles that left it (T, R) [veh/s].
+
+    record: arrays of cosim.plant.record.Record; step: control interval [s]
+    """
+    return (record["arrivals"] + record["crossings"].sum(axis=(2, 3))) / step
+
+
+def delay_gini(result: Result, record: Record, time_loss: PerRegion) -> float:
+    """Return the Gini coefficient of the mean delays of regions of origin, weighted by their trips.
+
+    The delay of a trip is its time loss on the road and its wait to enter. Unfinished trips count until the end.
+    time_loss: SUMO's timeLoss of all trips that began in a region (R,) [s]
+    """
+    begun = record.departures.sum(axis=(0, 2)) + result.backlog[-1].sum(axis=1)
+    trips = begun + record.given_up.sum(axis=(0, 2))
+    waiting = result.step * result.backlog[:-1].sum(axis=(0, 2))
+    return metrics.gini((time_loss + waiting) / np.maximum(trips, 1.0), trips.astype(float))
+
+
+def queue_facts(record: Record, city: City) -> dict[str, float]:
+    """Return queues on the edges before gateways, every edge once."""
+    first: dict[str, int] = {}
+    for n, gateway in enumerate(city.gateways):
+        first.setdefault(gateway.from_edge, n)
+    upstream = list(first.values())
+    queue, longest = record.gateway_queue[:, upstream], record.gateway_queue_max[:, upstream]
+    full = _gateway_full(record.edge_vehicles, city)[:, upstream]
+    return {
+        "gateway_queue_mean_veh": float(queue.mean()),
+        "gateway_queue_max_veh": float(longest.max()),
+        "gateway_full_share": float(full.mean()),
+    }
+
+
+def leaking_share(record: Record, city: City, leaks: Collection[Gateway]) -> float:
+    """Return the share of the boundary flow that passes gateways without a signal under control."""
+    flow = record.gateway_flow.sum(axis=0)
+    leaking = sum(passed for gateway, passed in zip(city.gateways, flow, strict=True) if gateway in leaks)
+    return float(leaking / max(flow.sum(), 1))
+
+
+def _gateway_full(edge_vehicles: EdgesOverTime, city: City) -> Bool[np.ndarray, "T G"]:
+    """Return whether the edge before each gateway holds FULL_SHARE of its room (T, G)."""
+    return gateway_room_taken(edge_vehicles.astype(float), city) >= FULL_SHARE
+
+
+def _trip_means(facts: TripFacts) -> dict[str, float]:
+    """Return means over all trips due [s], and emissions of the whole run [kg]."""
+    trips = max(facts.trips, 1)
+    return {
+        "mean_trip_time_s": facts.travel_time / trips,
+        "mean_departure_delay_s": facts.departure_delay / trips,
+        "mean_time_loss_s": facts.time_loss / trips,
+        "co2_kg": facts.co2,
+        "fuel_kg": facts.fuel,
+    }
+
+
+def _estimate_errors(scenario: Scenario, result: Result) -> dict[str, float]:
+    """Return errors of the estimate over all regions, NaN if the controller got the exact state."""
+    if not result.estimated:
         return {"estimate_rmse_share": math.nan, "estimate_cell_rmse_veh": math.nan}
-    whole = estimation_errors.errors(scenario.network, trajectory)[-1]
+    whole = estimation_errors.errors(scenario.network, result)[-1]
     return {"estimate_rmse_share": whole["rmse_share"], "estimate_cell_rmse_veh": whole["cell_rmse_veh"]}

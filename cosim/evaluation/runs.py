@@ -1,0 +1,109 @@
+"""Runs in SUMO for nmfd.runs.run_many: jobs, and everything that their results depend on."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+from cosim.evaluation.simulate import simulate
+from cosim.plant import incidents
+from cosim.plant.feasible import check_strategy
+from cosim.plant.launch import own_files, own_vehicles
+from cosim.plant.settings import FILES, PRESSURES, settings
+from cosim.sumo import outputs
+from cosim.sumo.build import ensure_built
+from cosim.sumo.net import check_adjacency, load_city
+from cosim.sumo.signals import HELD, read_signals
+from cosim.sumo.xml_files import read_xml
+from nmfd.controllers.strategy import Strategy
+from nmfd.model.scenario import Scenario, with_demand
+from nmfd.runs.files import file_hash
+from nmfd.runs.run_many import Run, run_name
+
+
+def runs_of(
+    scenario: Scenario,
+    strategies: Sequence[Strategy],
+    seeds: Sequence[int],
+    *,
+    city: Mapping[str, object] | None = None,
+    demand: float = 1.0,
+    policies: Mapping[str, Path] | None = None,
+    folder: str = "",
+    sumo_output: Sequence[str] = (),
+    out: Path = Path(),
+) -> list[Run]:
+    """Return the runs of strategies x seeds at one demand level, seed by seed.
+
+    city: result of `city_key`, computed if None
+    demand: multiple of the scenario's demand
+    policies: strategy name -> file instead of the scenario's
+    folder: below that of all runs, `out`
+    sumo_output: kinds of SUMO's own outputs to write to `out` (cosim.sumo.outputs)
+
+    Raises:
+        InputError: a strategy cannot run in this city
+    """
+    flows = np.ascontiguousarray(with_demand(scenario, factor=demand).demand)
+    shared = {
+        **(city or city_key(scenario, strategies)),
+        "steps": scenario.steps,
+        "demand": float(demand),
+        "demand_hash": hashlib.sha256(flows.tobytes()).hexdigest()[:16],
+    }
+    policies = policies or {}
+    if sumo_output:
+        shared["sumo_output"] = list(sumo_output)
+    keys = {s.name: {**shared, "controller": s.fingerprint(scenario, policies.get(s.name))} for s in strategies}
+    return [
+        Run(
+            run_name(strategy.name, seed),
+            keys[strategy.name],
+            partial(
+                simulate,
+                scenario,
+                strategy,
+                seed=seed,
+                demand=demand,
+                policy=policies.get(strategy.name),
+                outputs=dict(outputs.paths(tuple(sumo_output), out, strategy.name, seed)),
+            ),
+            folder,
+        )
+        for seed in seeds
+        for strategy in strategies
+    ]
+
+
+def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, object]:
+    """Check that the strategies can run in the city; return what all runs there depend on. Raises InputError."""
+    chosen = settings(scenario)
+    files = ensure_built(scenario.network)
+    city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
+    check_adjacency(city, scenario.network)
+    own_vehicles(scenario, chosen, city)
+    used = {strategy.city.get("signals", chosen.signals) for strategy in strategies}
+    simple, _ = read_signals(city, own_files(scenario, chosen.additional), HELD)
+    everywhere = not used.isdisjoint(PRESSURES)
+    incidents.check(scenario.ordered_faults, city, "faults", [signal.id for signal in simple] if everywhere else ())
+    for path in own_files(scenario, (*chosen.background, *chosen.additional)):
+        read_xml(path)
+    for strategy in strategies:
+        check_strategy(strategy, scenario, city)
+    sumo = chosen.model_dump(mode="json", exclude_defaults=True)
+    hashes = {key: [file_hash(path) for path in own_files(scenario, sumo[key])] for key in FILES if key in sumo}
+    return {
+        "scenario": scenario.name,
+        "network": scenario.network.name,
+        "plant": "sumo",
+        "step_s": scenario.step,
+        "net_file_hash": file_hash(files.net_file),
+        "regions_hash": file_hash(files.regions_csv),
+        "measurement_std_veh": scenario.measurement_std,
+        "sumo": {**sumo, **hashes},
+        "libsumo": metadata.version("libsumo"),
+        "faults": list(scenario.faults),
+    }
