@@ -3,41 +3,42 @@
 import os
 import sys
 import webbrowser
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from cosim.evaluation import (
     estimation_errors,
-    experiment,
     model_validation,
+    prediction_error,
     results,
     statistics,
     tuning,
 )
 from cosim.evaluation import evaluate as evaluation
 from cosim.evaluation import identify as identification
-from cosim.evaluation.simulate import Result, Task, drive, scenario_of, simulate
+from cosim.evaluation.runs import runs_of
+from cosim.evaluation.simulate import regional_outflow, simulate
 from cosim.importing import get as cities
 from cosim.importing import importer
 from cosim.importing.case import parse_box, seconds
 from cosim.report import card, figures, html
-from cosim.sumo.outputs import check, paths
+from cosim.sumo.outputs import check
 from cosim.sumo.session import LOST, Window
 from cosim.view import live
-from nmfd.api import check_policies, load_scenario
+from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse, parse_many
-from nmfd.errors import InputError, RunFailed
+from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario, with_demand
-from nmfd.runs.files import default_folder, file_name, write_table
+from nmfd.runs.files import default_folder, file_name
 from nmfd.runs.progress import Progress, watched
-from nmfd.types import Controller
+from nmfd.runs.run_many import raise_failures, run_many
+from nmfd.studies.benchmark import draw_accumulations
+from nmfd.types import Controller, Result
 
-DEMO = Path("demo")  # a shipped scenario
+DEMO = "demo"  # a shipped scenario
 
 
 def run(
@@ -46,86 +47,61 @@ def run(
     *,
     seed: int = 0,
     steps: int | None = None,
-    demand_factor: float = 1.0,
+    demand: float = 1.0,
     policy: Path | str | None = None,
     city: str = "",
     sumo_output: Mapping[str, Path | str] | None = None,
     progress: Progress = None,
 ) -> Result:
-    """One closed loop in SUMO, in this process and without a run folder.
+    """Run one closed loop in SUMO, in this process and without a run folder.
+
+    scenario: shipped name, folder of a scenario.toml, or result of nmfd.load_scenario
+    controller: strategy by name, or an object with `reset` and `act` (nmfd.Controller)
+    seed: of trips, drivers and guidance; the same seed gives the same result, but for wall times
+    steps: control intervals; the scenario's if None
+    demand: multiple of the scenario's demand
+    policy: policy file, if not SCENARIO/NAME.pt
+    city: words of the strategy for a controller object, such as "max-pressure+rerouting-30"
+    sumo_output: files of SUMO's own outputs: {"tripinfo": "trips.xml"}, also summary, edgedata, emission
+    progress: None for a bar, False for none, or a function of done and total control intervals
+
+    The result has the arrays of cosim.plant.record.Record, and the facts of cosim.evaluation.simulate as attributes.
 
         >>> result = cosim.run("grid7_peak", "pi-gating+rerouting-30", seed=3, steps=2)
         >>> result.accumulation.shape, result.crossings.shape
         ((3, 7, 7), (2, 7, 7, 7))
-        >>> int(result.teleports.sum())
-        0
 
-    scenario: a name of `cosim list`, the folder of a scenario.toml, or what nmfd.load_scenario made of it
-    controller: a strategy as on the command line, or an object with `reset` and `act` (nmfd.Controller)
-    seed: of the trips, the drivers and the guidance
-    steps: control intervals; the scenario's if None
-    demand_factor: multiplies all flows
-    policy: of a DPC controller by name, if not SCENARIO/NAME.pt
-    city: what else the city does, with a controller that is an object: "max-pressure+rerouting-30"
-    sumo_output: files of SUMO's own outputs: {"tripinfo": "trips.xml"}, also summary, edgedata, emission
-    progress: None for a bar in a notebook or on a terminal, False for none, or your own, which is called as
-        progress(done, steps) after every control interval
-
-    The result holds the arrays of cosim.plant.record.Record too, and the columns of sumo.csv as attributes. The same seed gives the same result, but for wall times. Raises InputError, and RuntimeError while
-    another simulation is open in this process.
+    Raises:
+        InputError: a name, file or value is wrong
+        RuntimeError: another simulation is open in this process
     """
     strategy = parse(controller, city)
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     if steps is not None and steps < 1:
         raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
-    if not 0.0 < demand_factor <= 10.0:
-        raise InputError(f"demand_factor: expected a number above 0 up to 10, got {demand_factor:g} instead")
-    scenario = with_demand(scenario, steps=steps, factor=demand_factor)
+    if not 0.0 < demand <= 10.0:
+        raise InputError(f"demand: expected a number above 0 up to 10, got {demand:g} instead")
     outputs = {kind: Path(file) for kind, file in (sumo_output or {}).items()}
     check(outputs)
     with watched(strategy.name, progress) as show:
-        return drive(
-            scenario,
+        return simulate(
+            with_demand(scenario, steps=steps),
             strategy,
-            strategy.make(scenario, None if policy is None else Path(policy)),
             seed=seed,
-            progress=show,
+            demand=demand,
+            policy=None if policy is None else Path(policy),
             outputs=outputs,
-            planning=strategy.planning(scenario),
-        )
-
-
-def run_tasks(
-    tasks: Task | Sequence[Task],
-    *,
-    out: Path | str,
-    workers: int = 1,
-    progress: Progress = None,
-    tell: Callable[[str], None] | None = None,
-) -> pd.DataFrame:
-    """Closed loops in SUMO with a run folder: those that are not yet in `out`; returns a row for every run there.
-
-    Columns: those of summary.csv and sumo.csv, with units in their names; progress: as in `run`, and called as
-    progress(done, tasks, what); tell: takes one line where the runs of a controller do not count any more because it
-    changed, None: an InputError. Raises InputError, and nmfd.runs.workers.RunFailed at the end if runs failed.
-    """
-    with watched("cosim", progress) as show:
-        return experiment.experiment(
-            [tasks] if isinstance(tasks, Task) else list(tasks),
-            out=Path(out),
-            workers=workers,
             progress=show,
-            tell=tell,
         )
 
 
 def read_run(folder: Path | str, controller: str, seed: int) -> Result:
     """Return a finished run of a run folder. Raises InputError."""
-    return experiment.read_run(Path(folder), controller, seed)
+    return results.read_run(Path(folder), controller, seed)
 
 
 def run_controllers(
-    scenario: Path,
+    scenario: Path | str,
     controllers: Sequence[str],
     *,
     settings: Mapping[str, Any] | None = None,
@@ -139,54 +115,46 @@ def run_controllers(
     """Run strategies on the same trips with a run folder, two at a time; return a report.
 
     settings: see nmfd.load_scenario
-    seed: of trips, drivers and guidance
-    steps: control intervals; the scenario's if None
-    demand: factor on the demand
+    demand: multiple of the scenario's demand
     policy: policy file of the first controller, if not SCENARIO/NAME.pt
     sumo_output: kinds of SUMO's own outputs to write (cosim.sumo.outputs)
     out: run folder, runs/SCENARIO-TIME if None
 
     Raises:
-        InputError: if a file, name or value is wrong
-        RunFailed: if a run failed
+        InputError: a file, name or value is wrong
+        RunFailed: a run failed
     """
-    names = list(dict.fromkeys(controllers))
-    if "no-control" not in names:
-        names.reverse()  # the other controllers are compared with the first one
-    for name in names:
-        parse(name)
-    folder = default_folder(load_scenario(scenario, settings).name) if out is None else out
-    tasks = [
-        Task(
-            scenario=scenario,
-            settings=tuple((settings or {}).items()),
-            controller=name,
-            seed=seed,
-            policy=policy if name == controllers[0] else None,
-            steps=steps,
-            demand_factor=demand,
-            sumo_output=paths(tuple(sumo_output or ()), folder, name, seed),
-        )
-        for name in names
-    ]
-    rows = run_tasks(tasks, out=folder, workers=2, tell=_say)
-    lines = [experiment.overview_table(rows)]
-    if (folder / "estimation.csv").is_file():
-        lines.append(estimation_errors.error_table(pd.read_csv(folder / "estimation.csv")))
-    return "\n".join([*lines, f"Written to {folder}"])
+    loaded = with_demand(load_scenario(scenario, settings), steps=steps)
+    strategies = [parse(name) for name in dict.fromkeys(controllers)]
+    policies = {} if policy is None else {strategies[0].name: policy}
+    if all(strategy.name != "no-control" for strategy in strategies):
+        strategies.reverse()  # the other controllers are compared with the first one
+    out = default_folder(loaded.name) if out is None else out
+    runs = runs_of(
+        loaded, strategies, [seed], demand=demand, policies=policies, sumo_output=tuple(sumo_output or ()), out=out
+    )
+    rows = run_many(runs, out, workers=2)
+    raise_failures(rows)
+    finished = results.read(out)
+    there = [level.read(*name) for level in finished.levels for name in results.rows_of(level)]
+    draw_accumulations(out, loaded, there, outflow=lambda result: regional_outflow(result, result.step))
+    errors = estimation_errors.write_errors(
+        out, loaded.network, there, lambda result: regional_outflow(result, result.step)
+    )
+    lines = [statistics.text(finished.rows), *([estimation_errors.error_table(errors)] if len(errors) else [])]
+    return "\n".join([*lines, f"Written to {out}"])
 
 
 def demo(out: Path, *, seed: int = 1000) -> str:
     """Run the demo city with and without gates, write a page and open it; return a report."""
-    names = ("no-control", "pi-gating")
-    rows = run_tasks([Task(scenario=DEMO, controller=name, seed=seed) for name in names], out=out, workers=2, tell=_say)
-    lines = []
-    for name in names:
-        [row] = rows[(rows["controller"] == name) & (rows["seed"] == seed)].to_dict("records")
-        lines.append(
-            f"{name + ':':12} {row['completed_veh']:,.0f} of {row['trips']:,.0f} trips completed, "
-            f"{card.minutes_per_trip(row):.1f} minutes per trip"
-        )
+    scenario, strategies = load_scenario(DEMO), [parse("no-control"), parse("pi-gating")]
+    rows = run_many(runs_of(scenario, strategies, [seed]), out, workers=2)
+    raise_failures(rows)
+    lines = [
+        f"{row['controller'] + ':':12} {row['completed_veh']:,.0f} of {row['trips']:,.0f} trips completed, "
+        f"{card.minutes_per_trip(row):.1f} minutes per trip"
+        for row in rows[rows["seed"] == seed].to_dict("records")
+    ]
     page = html.write_page(out / "report.html", [results.read(out)], seed=seed)
     if _has_screen():
         webbrowser.open(page.resolve().as_uri())
@@ -194,7 +162,7 @@ def demo(out: Path, *, seed: int = 1000) -> str:
 
 
 def watch(
-    scenario: Path,
+    scenario: Path | str,
     controllers: Sequence[str],
     *,
     settings: Mapping[str, Any] | None = None,
@@ -203,32 +171,22 @@ def watch(
     port: int = 0,
     gui: bool = False,
 ) -> str:
-    """Show runs on a live page, or one run in sumo-gui, until they end and nobody looks; return their outcomes.
+    """Show runs on a live page, or one run in sumo-gui, until they end and the page is closed; return their outcomes.
 
     port: of the page, any that is free if 0; the other arguments as in `run_controllers`
     """
-    tasks = [
-        Task(
-            scenario=scenario,
-            settings=tuple((settings or {}).items()),
-            controller=name,
-            seed=seed,
-            demand_factor=demand,
-        )
-        for name in dict.fromkeys(controllers)
-    ]
-    for task in tasks:
-        parse(task.controller)  # reports mistakes before anything starts
-    scenario_of(tasks[0])
+    loaded, strategies = load_scenario(scenario, settings), [parse(name) for name in dict.fromkeys(controllers)]
     if gui:
         window = Window(options=("--start", "true", "--quit-on-end", "true", "--delay", "20"))
         try:
             with watched("watch", None) as show:
-                rows = {tasks[0].controller: summary(simulate(tasks[0], show, window=window))}
+                result = simulate(loaded, strategies[0], seed=seed, demand=demand, progress=show, window=window)
+                rows = {strategies[0].name: summary(result)}
         except LOST:
             return "The window was closed before the end."
     else:
-        rows = {run.name: run.row for run in live.watch(tasks, port=port, browse=_has_screen(), tell=_say)}
+        runs = live.watch(loaded, strategies, seed=seed, demand=demand, port=port, browse=_has_screen(), tell=_say)
+        rows = {run.name: run.row for run in runs}
     return "\n".join(
         f"{name}, seed {seed}: total time spent {row['total_time_spent_veh_s']:.4g} veh s, "
         f"{row['completed_veh']:,.0f} trips completed"
@@ -237,51 +195,59 @@ def watch(
 
 
 def evaluate(
-    scenario: Path,
+    scenario: Path | str,
     controllers: Sequence[str],
     *,
-    seeds: Sequence[int],
+    seeds: Sequence[int] | None = None,
     settings: Mapping[str, Any] | None = None,
     levels: Sequence[float] = (1.0,),
     steps: int | None = None,
     policies: Mapping[str, Path] | None = None,
     workers: int = 1,
     scheduler: str | None = None,
+    check: int | None = None,
     out: Path | None = None,
 ) -> str:
-    """Run controllers x seeds x demand levels in SUMO, write tables and figures, and return the table as text.
+    """Run controllers x seeds x demand levels in SUMO, write tables and figures, and return the tables as text.
 
+    scenario: a scenario, or the file of a suite (cosim.evaluation.evaluate), which has its own seeds and levels
     controllers: strategies, or patterns such as "dpc-*"
-    levels: factors on the demand
+    seeds: 2000 to 2009 if None
+    settings: see nmfd.load_scenario; of every scenario of a suite
+    levels: multiples of the scenario's demand
     policies: files by controller, if not SCENARIO/NAME.pt
     workers: runs at a time on this machine
     scheduler: address of a Dask scheduler that does the runs instead
+    check: do only so many random runs of `out` again, and compare
     out: folder, runs/SCENARIO-evaluate if None
 
     Raises:
-        InputError: if a file, name or value is wrong
-        RunFailed: if runs failed
+        InputError: a file, name or value is wrong
+        RunFailed: runs failed
     """
-    loaded = load_scenario(scenario, settings)
-    strategies = parse_many(controllers, loaded, regional=False)
-    check_policies(policies or {}, strategies)
-    order = evaluation.Evaluation(
-        scenario=scenario,
-        settings=tuple((settings or {}).items()),
-        controllers=tuple(strategy.name for strategy in strategies),
-        seeds=seeds,
-        levels=tuple(levels),
-        steps=steps,
-        policies=policies or {},
-        out=Path("runs") / f"{file_name(loaded.name)}-evaluate" if out is None else out,
+    if Path(scenario).suffix == ".toml":
+        chosen, seeds = evaluation.read_suite(Path(scenario), settings)
+    else:
+        chosen = [(load_scenario(scenario, settings), levels)]
+    chosen = [(with_demand(loaded, steps=steps), each) for loaded, each in chosen]
+    strategies = parse_many(controllers, chosen[0][0])
+    seeds = list(range(2000, 2010) if seeds is None else seeds)
+    name = Path(scenario).stem if len(chosen) > 1 else chosen[0][0].name
+    out = Path("runs") / f"{file_name(name)}-evaluate" if out is None else out
+    if check is not None:
+        runs = evaluation.plan(chosen, strategies, seeds, policies)
+        lines = evaluation.check(runs, out, check, workers=workers)
+        return "\n".join(lines) or f"{min(check, len(runs))} runs of {out} done again: no difference"
+    rows = evaluation.evaluate(
+        chosen, strategies, seeds, out=out, policies=policies, workers=workers, scheduler=scheduler
     )
-    with watched("evaluate", None) as show:
-        table, failures = evaluation.evaluate(order, workers=workers, scheduler=scheduler, progress=show, tell=_say)
-        if len(table):
-            figures.draw_all(results.read(order.out, scenario))
-    if failures:
-        raise RunFailed(f"{len(failures)} runs failed, and the same command tries them again: {'; '.join(failures)}")
-    return f"{statistics.text(table)}\nWritten to {order.out}: see evaluate.md, pairs.csv and the figures"
+    text = []
+    for each in dict.fromkeys(results.finished_rows(rows).get("scenario", ())):
+        finished = results.read(out, each)
+        figures.draw_all(finished)
+        text += [each] * (len(chosen) > 1) + [statistics.text(finished.rows)]
+    raise_failures(rows)
+    return "\n".join([*text, f"Written to {out}: see evaluate.md, runs.csv and the figures"])
 
 
 def compare(folder: Path, *, controller: str | None = None, seed: int | None = None, model: Path | None = None) -> str:
@@ -290,19 +256,17 @@ def compare(folder: Path, *, controller: str | None = None, seed: int | None = N
     controller, seed: of one run; all runs of the folder if None
     model: folder of the network that predicts, the controller's model if None
     """
+    finished = results.read(folder)
     if controller is None:
-        rows = model_validation.prediction_errors(results.read(folder), model)
-        write_table(folder / "foresight.csv", rows, float_format="%.6g")
-        return f"{model_validation.prediction_table(rows)}\nWritten to {folder / 'foresight.csv'}"
-    found = results.read(folder)
-    if found.evaluation:
-        raise InputError(f"{folder}: has a run folder for every demand level; give one of them, or omit --controller")
-    result = experiment.read_run(folder, controller, seed or 0)
-    steps, factor = (found.levels[0].manifest["configuration"][key] for key in ("steps", "demand_factor"))
-    scenario = with_demand(found.scenario, steps=steps, factor=factor)
+        errors = prediction_error.prediction_errors(finished, model)
+        prediction_error.write_foresights(folder / "foresight.csv", errors)
+        return f"{prediction_error.foresight_table(errors)}\nWritten to {folder / 'foresight.csv'}"
+    level = finished.level()
+    result = level.read(controller, seed or 0)
+    scenario = with_demand(finished.scenario, steps=level.key["steps"], factor=level.demand)
     scenario = replace(scenario, network=parse(controller).planning(scenario, model).network)
-    rows = model_validation.write_comparison(folder, scenario, result)
-    return f"{model_validation.error_table(rows)}\nWritten to {folder}"
+    rows = model_validation.write_comparison(level.folder, scenario, result)
+    return f"{model_validation.error_table(rows)}\nWritten to {level.folder}"
 
 
 def report(folders: Sequence[Path], *, seed: int | None = None, out: Path | None = None) -> Path:
@@ -310,42 +274,44 @@ def report(folders: Sequence[Path], *, seed: int | None = None, out: Path | None
 
     seed: of the runs on the map, the first of both if None
     """
-    found = [results.read(folder) for folder in folders]
     with watched("report", None) as show:
-        return html.write_page(out or folders[0] / "report.html", found, seed=seed, progress=show)
+        runs = [results.read(folder) for folder in folders]
+        return html.write_page(out or folders[0] / "report.html", runs, seed=seed, progress=show)
 
 
 def tune(
-    scenario: Path,
+    scenario: Path | str,
     controller: str,
     *,
-    knobs: Sequence[str],
+    options: Mapping[str, tuple[float, float]],
     settings: Mapping[str, Any] | None = None,
-    candidates: int = 40,
-    seeds: int = 2,
+    trials: int = 40,
+    seeds: int | Sequence[int] = 2,
     levels: Sequence[float] = (1.0,),
+    steps: int | None = None,
+    search_seed: int = 0,
     workers: int = 1,
     scheduler: str | None = None,
     out: Path | None = None,
 ) -> str:
-    """Search the options of a controller in SUMO; return the best ones as text.
+    """Search the options of a controller in SUMO by CMA-ES; return the best ones as text.
 
-    knobs: KEY=LOW:HIGH, an option and its range
-    candidates: how many are tried, the scenario's own options first
-    seeds: runs per candidate and demand level, from seed 1000
+    options: KEY, or KEY[N] for one number of a list, -> (low, high)
+    trials: number of candidates, the scenario's own options first
+    seeds: runs per candidate and demand level, from seed 1000, or the seeds
     """
+    loaded = with_demand(load_scenario(scenario, settings), steps=steps)
     order = tuning.Tuning(
-        scenario=scenario,
-        settings=tuple((settings or {}).items()),
-        controller=controller,
-        knobs=tuple(tuning.knob(text) for text in knobs),
-        candidates=candidates,
-        seeds=range(1000, 1000 + seeds),
-        levels=tuple(levels),
-        out=Path("runs") / f"{file_name(load_scenario(scenario, settings).name)}-tune" if out is None else out,
+        scenario=loaded,
+        strategy=parse(controller),
+        options=options,
+        trials=trials,
+        seeds=range(1000, 1000 + seeds) if isinstance(seeds, int) else list(seeds),
+        levels=levels,
+        search_seed=search_seed,
+        out=Path("runs") / f"{file_name(loaded.name)}-tune" if out is None else out,
     )
-    with watched("tune", None) as show:
-        table = tuning.tune(order, workers=workers, scheduler=scheduler, progress=show, tell=_say)
+    table = tuning.tune(order, workers=workers, scheduler=scheduler)
     return f"{tuning.text(order, table)}\nWritten to {order.out}: see tune.toml and tune.csv"
 
 
@@ -449,7 +415,7 @@ def identify(
         )
         with watched("identify", None) as show:
             text = identification.identify(
-                scenario, loading, out=folder, workers=workers, scheduler=scheduler, progress=show, tell=_say
+                loaded, loading, out=folder, workers=workers, scheduler=scheduler, progress=show
             )
         target = os.path.normpath(loading.target(loaded) / "network.toml")
         report += [text, f"Written to {target}; samples and figures to {folder}"]

@@ -11,7 +11,7 @@ import random
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -32,11 +32,15 @@ from nmfd.types import HOST_TIMES
 
 
 class Suite(TypedDict):
+    """Content of a suite: seeds, and scenario -> demand levels."""
+
     seeds: Annotated[list[int], Field(min_length=1)]
     scenarios: dict[str, Annotated[list[Annotated[float, Field(gt=0.0, le=10.0)]], Field(min_length=1)]]
 
 
-def read_suite(file: Path) -> tuple[list[tuple[Scenario, list[float]]], list[int]]:
+def read_suite(
+    file: Path, settings: Mapping[str, Any] | None = None
+) -> tuple[list[tuple[Scenario, list[float]]], list[int]]:
     """Read the scenarios with their demand levels, and the seeds, of a suite.
 
     Scenarios are shipped names, or folders seen from that of the file.
@@ -51,7 +55,9 @@ def read_suite(file: Path) -> tuple[list[tuple[Scenario, list[float]]], list[int
         raise InputError(f"{file}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
     beside = {name: file.parent / name for name in suite["scenarios"]}
     folders = {name: path if (path / "scenario.toml").is_file() else Path(name) for name, path in beside.items()}
-    return [(load_scenario(folders[name]), levels) for name, levels in suite["scenarios"].items()], suite["seeds"]
+    return [(load_scenario(folders[name], settings), levels) for name, levels in suite["scenarios"].items()], suite[
+        "seeds"
+    ]
 
 
 def evaluate(

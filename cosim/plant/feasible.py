@@ -4,20 +4,20 @@ from cosim.plant.launch import own_files
 from cosim.plant.programmes import CitySignals, city_signals
 from cosim.plant.settings import ESTIMATE, FIXED, PRESSURES, Settings, scenario_file, settings
 from cosim.sumo.net import City
-from nmfd.controllers.strategy import parse
+from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 
 
-def check_strategy(name: str, scenario: Scenario, city: City) -> None:
+def check_strategy(strategy: Strategy, scenario: Scenario, city: City) -> None:
     """InputError, in a line that begins with the strategy, unless it can run in this city."""
     try:
-        chosen = settings(scenario).changed(**parse(name).city)
+        chosen = settings(scenario).changed(**strategy.city)
         check_settings(scenario, chosen)
         if chosen.signals != FIXED:
             signals_of(city, scenario, chosen)
     except InputError as error:
-        raise InputError(f"controller {name} cannot run here: {error}") from None
+        raise InputError(f"controller {strategy.name} cannot run here: {error}") from None
 
 
 def signals_of(city: City, scenario: Scenario, chosen: Settings) -> CitySignals:
