@@ -5,9 +5,8 @@
     result = cosim.run("grid7_peak", "dpc-pcrg", seed=1)
     print(result.mean_trip_time_s, result.to_frame())
 
-`run` is one closed loop in SUMO, `run_tasks` many with a run folder;
-`read_run` reads a run folder, `City` shows a city before anything runs. Names here are
-imported when they are first used.
+`run` is one closed loop in SUMO, `read_run` reads one of a run folder, `City` shows a city. Names here are imported at
+their first use; `cosim.api` has a function for every command.
 """
 
 from importlib import import_module
@@ -15,35 +14,31 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cosim import api as api
-    from cosim.api import read_run, run, run_tasks
-    from cosim.evaluation.experiment import overview
-    from cosim.evaluation.simulate import Result, Task
+    from cosim.api import evaluate, read_run, run, tune
     from cosim.plant.plant import SumoPlant
     from cosim.plant.settings import Settings, settings
     from cosim.report.city import City
+    from nmfd.types import Result
 
 __all__ = [
     "City",
     "Result",
     "Settings",
     "SumoPlant",
-    "Task",
-    "overview",
+    "evaluate",
     "read_run",
     "run",
-    "run_tasks",
     "settings",
+    "tune",
 ]
 _PLACES = {
     "City": "report.city.City",
-    "Result": "evaluation.simulate.Result",
     "Settings": "plant.settings.Settings",
     "SumoPlant": "plant.plant.SumoPlant",
-    "Task": "evaluation.simulate.Task",
-    "overview": "evaluation.experiment.overview",
     "read_run": "api.read_run",
     "run": "api.run",
-    "run_tasks": "api.run_tasks",
+    "evaluate": "api.evaluate",
+    "tune": "api.tune",
     "settings": "plant.settings.settings",
 }
 
@@ -51,6 +46,8 @@ _PLACES = {
 def __getattr__(name: str) -> Any:
     if name == "api":
         return import_module("cosim.api")
+    if name == "Result":
+        return import_module("nmfd.types").Result
     if name not in _PLACES:
         raise AttributeError(f"module 'cosim' has no attribute {name!r}")
     module, _, attribute = _PLACES[name].rpartition(".")

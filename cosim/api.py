@@ -11,7 +11,6 @@ from typing import Any
 from cosim.evaluation import (
     estimation_errors,
     model_validation,
-    prediction_error,
     results,
     statistics,
     tuning,
@@ -32,7 +31,7 @@ from nmfd.controllers.strategy import parse, parse_many
 from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario, with_demand
-from nmfd.runs.files import default_folder, file_name
+from nmfd.runs.files import default_folder, file_name, write_table
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import raise_failures, run_many
 from nmfd.studies.benchmark import draw_accumulations
@@ -258,9 +257,9 @@ def compare(folder: Path, *, controller: str | None = None, seed: int | None = N
     """
     finished = results.read(folder)
     if controller is None:
-        errors = prediction_error.prediction_errors(finished, model)
-        prediction_error.write_foresights(folder / "foresight.csv", errors)
-        return f"{prediction_error.foresight_table(errors)}\nWritten to {folder / 'foresight.csv'}"
+        rows = model_validation.prediction_errors(finished, model)
+        write_table(folder / "foresight.csv", rows, float_format="%.6g")
+        return f"{model_validation.prediction_table(rows)}\nWritten to {folder / 'foresight.csv'}"
     level = finished.level()
     result = level.read(controller, seed or 0)
     scenario = with_demand(finished.scenario, steps=level.key["steps"], factor=level.demand)

@@ -10,17 +10,18 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from cosim.evaluation import experiment, results
+from cosim.evaluation import results
 from cosim.evaluation.model_validation import observed, outflow_samples
-from cosim.evaluation.simulate import Task
+from cosim.evaluation.runs import runs_of
 from cosim.sumo.arrays import Points
 from cosim.sumo.build import network_folder
 from cosim.sumo.net import city_of
-from nmfd.api import load_scenario
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model import authority, identification, mfd
 from nmfd.model.identification import observed_split_ratios
@@ -28,8 +29,8 @@ from nmfd.model.planning import GUIDED, GUIDING
 from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
+from nmfd.runs.run_many import raise_failures, run_many
 from nmfd.runs.tables import wrapped
-from nmfd.runs.workers import ended
 from nmfd.studies import plots
 from nmfd.studies.fit_quality import (
     fit_table,
@@ -86,14 +87,13 @@ def without_model(scenario: Scenario) -> bool:
 
 
 def identify(
-    scenario: Path,
+    loaded: Scenario,
     loading: Loading,
     *,
     out: Path,
     workers: int = 1,
     scheduler: str | None = None,
-    progress: experiment.Progress | None = None,
-    tell: Callable[[str], None] | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> str:
     """Load a city, fit its regional model, and write its network.toml and verdict.txt; return the fit as text.
 
@@ -104,14 +104,14 @@ def identify(
         InputError: for a network without a folder, or a target that must not be written.
         RunFailed: if a loading run failed.
     """
-    loaded = load_scenario(scenario)
     target, own = loading.target(loaded), network_folder(loaded.network)
     _check_target(loading, loaded.name, target, own)
-    more = [run for folder in loading.runs for run in finished(folder, scenario)]
+    more = [run for folder in loading.runs for run in finished(folder, loaded)]
 
     def load(stage: int, **options: object) -> list[Result]:
         named = progress and (lambda done, total, note: progress(done, total, f"loading runs {stage + 1} of 2; {note}"))
-        return _load(scenario, loading, loading.stages[stage], options, out=out, workers=workers, progress=named)
+        more = {"workers": workers, "scheduler": scheduler, "progress": named}
+        return _load(loaded, loading, loading.stages[stage], options, out, **more)
 
     first = load(0)
     network = static_model(loaded, first, guided=loading.guided)
@@ -163,39 +163,27 @@ def _check_target(loading: Loading, name: str, target: Path, own: Path) -> None:
         raise InputError(f"--network: {there} is no folder that can be written to; choose another")
 
 
-def _load(
-    scenario: Path,
-    loading: Loading,
-    controller: str,
-    options: dict,
-    *,
-    out: Path,
-    workers: int,
-    progress: experiment.Progress | None,
-) -> list[Result]:
+def _load(scenario: Scenario, loading: Loading, controller: str, options: dict, out: Path, **how: Any) -> list[Result]:
     """Do the loading runs of one controller at all levels that are not finished; return all of them."""
-    shared = {"scenario": scenario, "controller": controller, "options": tuple(options.items())}
-    plan = [
-        (out / f"level-{level:g}", Task(seed=seed, demand_factor=level, **shared))
+    strategy, tables = parse(controller), scenario.controller_options
+    table = strategy.table(scenario)
+    tuned = replace(scenario, controller_options={**tables, table: {**tables.get(table, {}), **options}})
+    runs = [
+        run
         for level in loading.levels
-        for seed in loading.seeds
+        for run in runs_of(tuned, [strategy], loading.seeds, demand=level, folder=f"level-{level:g}")
     ]
-    failures = experiment.perform(plan, workers=workers, progress=progress, tell=lambda line: None)
-    if failures:
-        raise ended([(experiment.label(task), failure) for task, failure in failures])
-    return [experiment.read_run(folder, controller, task.seed) for folder, task in plan]
+    raise_failures(run_many(runs, out, **how))
+    return [Result.read(out / run.file) for run in runs]
 
 
-def finished(folder: Path, scenario: Path) -> list[Result]:
+def finished(folder: Path, scenario: Scenario) -> list[Result]:
     """Read all runs of a folder of `cosim run` or `cosim evaluate`. Raises InputError for runs of another city."""
-    found = results.read(folder, scenario)
-    if found.changed:
-        raise InputError(f"--runs: {folder}: {found.changed}; run them again, or omit them")
-    return [
-        experiment.read_run(level.folder, row.controller, row.seed)
-        for level in found.levels
-        for row in level.rows.itertuples()
-    ]
+    found = results.read(folder)
+    if found.scenario.name != scenario.name:
+        raise InputError(f"--runs: {folder}: holds runs of {found.scenario.name}, not of {scenario.name}")
+    found.map()
+    return [level.read(*run) for level in found.levels for run in results.rows_of(level)]
 
 
 def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> RegionalModel:

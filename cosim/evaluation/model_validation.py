@@ -11,13 +11,12 @@ import pandas as pd
 import torch
 from jaxtyping import Bool, Float
 
-from cosim.evaluation import experiment, run_metrics
 from cosim.evaluation.results import Finished
+from cosim.evaluation.simulate import regional_outflow
 from cosim.sumo.arrays import Points, RegionCounts
 from nmfd import closed_loop
 from nmfd.arrays import Adjacency
 from nmfd.controllers.strategy import parse
-from nmfd.errors import InputError
 from nmfd.model.dynamics import advance, parameters
 from nmfd.model.identification import Observed
 from nmfd.model.plant import NmfdPlant
@@ -153,7 +152,7 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
     name = run_folder.run_name(result.controller, result.seed)
     files.write_table(folder / f"compare-{name}.csv", rows)
     drawing, axes = plots.panels(network.regions + 1)
-    measured, model = run_metrics.regional_outflow(result, result.step), model_outflow(network)
+    measured, model = regional_outflow(result, result.step), model_outflow(network)
     outflow = cache(lambda run: measured if run.plant == "sumo" else model(run))
     for region, ax in enumerate(axes[:-1]):
         plots.region_accumulation(ax, network, region, [result, predicted], outflow=outflow)
@@ -175,15 +174,14 @@ def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFram
     Raises:
         InputError: if the city has changed since the runs.
     """
-    if found.changed:
-        raise InputError(f"{found.path}: {found.changed}; run them again to compare them")
+    found.map()
     scenario = found.scenario
     scheme = {"step": scenario.step, "substeps": scenario.substeps, "integrator": scenario.integrator}
     tables = []
     for level in found.levels:
         for controller, rows in level.rows.groupby("controller", sort=False):
             network = parse(controller).planning(scenario, model).network
-            runs = [observed(experiment.read_run(level.folder, controller, seed)) for seed in rows["seed"]]
+            runs = [observed(level.read(controller, seed)) for seed in rows["seed"]]
             error = predictions(network, runs, scheme)
             columns = {
                 "demand": level.demand,
@@ -236,7 +234,7 @@ def outflow_samples(results: Sequence[Result], u_max: float, region: int, adjace
     for result in results:
         x = 0.5 * (result.accumulation[1:] + result.accumulation[:-1])
         total, own = x.sum(2), x[:, range(x.shape[1]), range(x.shape[1])]
-        outflow = run_metrics.regional_outflow(result, result.step)
+        outflow = regional_outflow(result, result.step)
         share = np.minimum(result.perimeter[:, region].max(axis=1), u_max)
         weight = own[:, region] + share * (total - own)[:, region]
         points = np.stack([total[:, region], outflow[:, region] * total[:, region] / np.maximum(weight, 1e-9)], axis=1)

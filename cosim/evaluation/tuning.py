@@ -13,6 +13,7 @@ more because it is heavier. Ranges over more than a decade are searched in the l
 import math
 import multiprocessing
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -157,12 +158,7 @@ def tune(order: Tuning, *, workers: int = 1, scheduler: str | None = None, progr
             return _write(order, study)
         for _ in range(0 if running else min(left, generation if len(trials) > 1 else 1)):
             number = len(study.get_trials(deepcopy=False))
-            study.sampler = CmaEsSampler(  # anew for every candidate: a resumed search equals an uninterrupted one
-                x0=order.first(),
-                sigma0=INITIAL_DEVIATION,
-                seed=1_000_003 * order.search_seed + number,
-                warn_independent_sampling=False,
-            )
+            study.sampler = _sampler(order, number)
             study.ask(dict(order.space))
         running = [trial for trial in study.get_trials(deepcopy=False) if trial.state == TrialState.RUNNING]
         rows = _run(order, running, city, workers, scheduler, progress)
@@ -222,6 +218,18 @@ def _study(order: Tuning) -> optuna.Study:
     elif changed := [key for key, value in about.items() if kept[key] != value]:
         raise InputError(f"{order.out}: holds another search ({', '.join(changed)}); choose another folder with --out")
     return study
+
+
+def _sampler(order: Tuning, number: int) -> CmaEsSampler:
+    """Return the sampler of one candidate: anew for each, so that a resumed search equals an uninterrupted one."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # x0 and sigma0 go in Optuna 6, without a successor yet
+        return CmaEsSampler(
+            x0=order.first(),
+            sigma0=INITIAL_DEVIATION,
+            seed=(1_000_003 * order.search_seed + number) % 2**32,
+            warn_independent_sampling=False,
+        )
 
 
 def _run(

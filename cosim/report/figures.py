@@ -1,7 +1,6 @@
 """Figures of an evaluation in SUMO: functions that draw into `ax`, and the files of one demand level."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cosim.evaluation import model_validation, statistics
-from cosim.evaluation.experiment import read_run
 from cosim.evaluation.results import Finished
-from cosim.evaluation.run_metrics import regional_outflow
+from cosim.evaluation.simulate import regional_outflow
 from cosim.sumo.arrays import Series
 from cosim.sumo.net import City
 from nmfd.model.regional_model import RegionalModel
@@ -163,7 +161,7 @@ def teleports(rows: pd.DataFrame) -> str:
 def draw_all(finished: Finished) -> None:
     """Draw the pictures of every demand level into its folder, and those of several levels beside them."""
     for level in finished.levels:
-        draw_level(level.folder, finished.scenario, finished.map(), level.rows, partial(read_run, level.folder))
+        draw_level(level.folder, finished.scenario, finished.map(), level.rows, level.read)
     if len(finished.levels) > 1:
         draw_levels(finished.path, finished.rows)
 

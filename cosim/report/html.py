@@ -14,7 +14,6 @@ from bokeh.resources import Resources
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from cosim.evaluation import explain, statistics
-from cosim.evaluation.experiment import read_run
 from cosim.evaluation.results import Finished, Level
 from cosim.report import card, figures
 from cosim.view.page import with_slider
@@ -101,7 +100,7 @@ def _map(run: Finished, seed: int | None) -> tuple[str, str, str]:
         raise InputError(f"--seed: {' and '.join(names)} have no run with seed {seed}; choose from {common}")
     seed = common[0] if seed is None else seed
     picture = CityPicture.of(run.scenario, run.map())
-    whole = {name: frames(picture, read_run(level.folder, name, seed)) for name in names}
+    whole = {name: frames(picture, level.read(name, seed)) for name in names}
     picture = replace(picture, steps=max(map(len, whole.values())) - 1)
     script, div = components(with_slider(picture, whole), wrap_script=False)
     return f"{' and '.join(names)}, seed {seed}", script, div
@@ -110,7 +109,7 @@ def _map(run: Finished, seed: int | None) -> tuple[str, str, str]:
 def _run(run: Finished) -> dict:
     """Return what the page shows of a folder before its levels."""
     level, rows = run.level(None), run.rows
-    configuration = level.manifest["configuration"]
+    configuration = level.key
     heading, shown, name = card.card(level.rows)
     strategies, seeds = rows["controller"].nunique(), rows["seed"].nunique()
     minutes = configuration["steps"] * configuration["step_s"] / 60
@@ -119,12 +118,14 @@ def _run(run: Finished) -> dict:
         "name": run.name,
         "heading": heading + (f", demand times {level.demand:g}" if len(run.levels) > 1 else ""),
         "figures": shown,
-        "why": explain.at_a_glance(level.demand, level.folder, run.scenario.network, level.rows, name),
+        "why": explain.paragraph(level, run, name),
         "intro": f"Scenario {run.scenario.name}: {_count(strategies, 'strategy', 'strategies')}, "
         f"{_count(len(run.levels), 'demand level')}, {_count(seeds, 'seed')}, {minutes:.0f} min in SUMO. With the same "
         "seed every strategy has the same trips.",
         "pictures": pictures,
-        "manifest": json.dumps(level.manifest, indent=1),
+        "manifest": json.dumps(
+            {"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}, indent=1
+        ),
     }
 
 
@@ -137,7 +138,7 @@ def _level(run: Finished, level: Level) -> dict:
         scenario=run.scenario,
         city=run.map(),
         rows=rows,
-        read=partial(read_run, level.folder),
+        read=level.read,
     )
     return {
         "title": f"Demand times {level.demand:g}",

@@ -8,6 +8,7 @@ import webbrowser
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,15 +17,17 @@ from bokeh.models import Button, RadioButtonGroup, Select
 from bokeh.server.server import Server
 from tornado.ioloop import PeriodicCallback
 
-from cosim.evaluation.simulate import Task, scenario_of, simulate
+from cosim.evaluation.simulate import simulate
 from cosim.plant.settings import settings
 from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
 from cosim.view.page import Page
 from cosim.view.picture import CityPicture, Frame, after, between, first
+from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError, RunFailed
 from nmfd.metrics import summary
-from nmfd.types import Controls, State
+from nmfd.model.scenario import Scenario
+from nmfd.types import Controls, Result, State
 
 REFRESH_MS = 250  # between two pictures
 FRAME_RATE = 8.0  # frames per second of wall time within control intervals, at most
@@ -68,15 +71,16 @@ class Seen:
 class Show:
     """Runs side by side, each in its own process, at a common pace."""
 
-    def __init__(self, tasks: Sequence[Task]):
+    def __init__(self, scenario: Scenario, strategies: Sequence[Strategy], **settings: Any):
+        """settings: seed and demand of cosim.evaluation.simulate.simulate"""
         spawn = multiprocessing.get_context("spawn")
-        self.runs = [Seen(task.controller) for task in tasks]
+        self.runs = [Seen(strategy.name) for strategy in strategies]
         self.picture: CityPicture | None = None
         self._messages = spawn.Queue()
         self._limit, self._delay = spawn.Value("d", FOREVER), spawn.Value("d", 0.0)
         self._processes = [
-            spawn.Process(target=run, args=(n, task, self._messages, self._limit, self._delay), daemon=True)
-            for n, task in enumerate(tasks)
+            spawn.Process(target=run, args=(n, job, scenario, self._messages, self._limit, self._delay), daemon=True)
+            for n, job in enumerate(partial(simulate, scenario, strategy, **settings) for strategy in strategies)
         ]
         for process in self._processes:
             process.start()
@@ -116,7 +120,7 @@ class Show:
                 elif isinstance(message, Frame):
                     self.runs[n].add(message)
                 elif isinstance(message, Exception):
-                    self.runs[n].error = message
+                    self.runs[n].error = type(message)(f"{self.runs[n].name}: {message}")
                 else:
                     self.runs[n].row = message
         for seen, gone, process in zip(self.runs, ended, self._processes, strict=True):
@@ -131,22 +135,22 @@ class Show:
         self._messages.close()
 
 
-def run(n: int, task: Task, messages: Any, limit: Any, delay: Any) -> None:
-    """Run a task as number n, and send its picture, frames, and summary or error."""
+def run(n: int, job: Callable[..., Result], scenario: Scenario, messages: Any, limit: Any, delay: Any) -> None:
+    """Do a job as number n, and send its picture, frames, and summary or error."""
     try:
-        result = simulate(task, observer=Reporter(n, task, messages, limit, delay))
+        result = job(observer=Reporter(n, scenario, messages, limit, delay))
         messages.put((n, summary(result)))
     except (InputError, RunFailed) as error:
-        messages.put((n, type(error)(f"{task.controller}: {error}")))
+        messages.put((n, error))
 
 
 class Reporter:
     """The observer of one run: it sends frames and holds the run to the pace; the run stays the same otherwise."""
 
-    def __init__(self, n: int, task: Task, messages: Any, limit: Any, delay: Any):
+    def __init__(self, n: int, scenario: Scenario, messages: Any, limit: Any, delay: Any):
         """limit: time [s] at which the run waits; delay: least wall time per simulated second; both are shared"""
         self._n, self._messages, self._limit, self._delay = n, messages, limit, delay
-        self._scenario = scenario_of(task)
+        self._scenario = scenario
         self._begin = settings(self._scenario).begin
         self._speed: PerEdge | None = None
         self._sent = self._time = 0.0
@@ -250,26 +254,29 @@ class Viewer:
 
 
 def watch(
-    tasks: Sequence[Task],
+    scenario: Scenario,
+    strategies: Sequence[Strategy],
     *,
+    seed: int = 0,
+    demand: float = 1.0,
     port: int = 0,
     browse: bool = False,
     tell: Callable[[str], None] = print,
 ) -> list[Seen]:
-    """Run the tasks side by side with a live page until they have ended and the page is closed.
+    """Run strategies side by side with a live page until they have ended and the page is closed.
 
     Args:
-        tasks: one or two runs.
+        seed, demand: see cosim.evaluation.simulate.simulate.
         port: of the page on this machine; 0 for a free one.
         browse: open the page in a browser.
         tell: called with a line that has the address.
 
     Raises:
-        InputError: for a port in use, or a wrong task.
+        InputError: for a port in use, or a strategy that cannot run in the city.
         RunFailed: if a run fails.
     """
     logging.getLogger("bokeh").setLevel(logging.ERROR)
-    show = Show(tasks)
+    show = Show(scenario, strategies, seed=seed, demand=demand)
     try:
         while show.picture is None and not show.over:
             show.update()

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from cosim.evaluation.run_metrics import regional_outflow
+from cosim.evaluation.simulate import regional_outflow
 from cosim.importing.maps import rings_round
 from cosim.sumo.arrays import EdgeNumbers, PerEdge, PerGateway, Points
 from cosim.sumo.net import City, edge_shapes
