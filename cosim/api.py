@@ -26,7 +26,7 @@ from cosim.report import card, figures, html
 from cosim.sumo.outputs import check
 from cosim.sumo.session import LOST, Window
 from cosim.view import live
-from nmfd.api import load_scenario
+from nmfd.api import check_policies, load_scenario
 from nmfd.controllers.strategy import parse, parse_many
 from nmfd.errors import InputError
 from nmfd.metrics import summary
@@ -230,6 +230,7 @@ def evaluate(
         chosen = [(load_scenario(scenario, settings), levels)]
     chosen = [(with_demand(loaded, steps=steps), each) for loaded, each in chosen]
     strategies = parse_many(controllers, chosen[0][0])
+    check_policies(policies or {}, strategies)
     seeds = list(range(2000, 2010) if seeds is None else seeds)
     name = Path(scenario).stem if len(chosen) > 1 else chosen[0][0].name
     out = Path("runs") / f"{file_name(name)}-evaluate" if out is None else out

@@ -1,5 +1,6 @@
 """Command line `cosim`: it parses options and calls cosim.api."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,21 @@ DEMAND = click.option("--demand", type=LEVEL, default=1.0, show_default=True, he
 LEVELS = click.option(
     "--demand", "levels", type=listed(LEVEL), default="1", show_default=True, help="Factors on the demand."
 )
+
+
+def parsed_ranges(
+    _ctx: click.Context, _param: click.Parameter, values: Sequence[str]
+) -> dict[str, tuple[float, float]]:
+    """Parse KEY=LOW:HIGH."""
+    ranges = {}
+    for text in values:
+        key, _, span = text.partition("=")
+        low, _, high = span.partition(":")
+        try:
+            ranges[key.strip()] = float(low), float(high)
+        except ValueError:
+            raise click.BadParameter(f"expected KEY=LOW:HIGH, such as kp=0.1:10, got {text!r} instead") from None
+    return ranges
 
 
 @click.group(
@@ -137,12 +153,14 @@ def watch(scenario: Path, controller: str, against: str | None, gui: bool, **opt
 @POLICIES
 @WORKERS
 @click.option("--scheduler", metavar="ADDRESS", help="Dask scheduler that does the runs, such as tls://host:8786.")
+@click.option("--check", type=COUNT, metavar="N", help="Do N random runs of --out again instead, and compare.")
 @out_option("runs/SCENARIO-evaluate")
 def evaluate(scenario: Path, controllers: tuple[str, ...], seeds: int, first_seed: int, **options: Any) -> None:
     """Compare controllers over seeds and demand levels.
 
     Writes tables and figures; several demand levels give the frontier up to which every controller serves all trips.
-    With the same --out, only runs that are not in it yet are done.
+    With the same --out, only runs that are not in it yet are done. SCENARIO may be a suite, a TOML file with
+    seeds = [2000, 2001] and a table [scenarios] of demand levels, such as grid7_peak = [0.8, 1.0].
 
     \b
     Examples:
@@ -193,18 +211,21 @@ def report(folders: tuple[Path, ...], **options: Any) -> None:
 @CONTROLLER
 @click.option(
     "--option",
-    "knobs",
+    "options",
     required=True,
     multiple=True,
     metavar="KEY=LOW:HIGH",
+    callback=parsed_ranges,
     help="Option of the controller and its range; KEY[0], KEY[1] for numbers of a list. May be repeated.",
 )
-@click.option("--candidates", type=COUNT, default=40, show_default=True, help="Candidates, the scenario's own first.")
+@click.option(
+    "--candidates", "trials", type=COUNT, default=40, show_default=True, help="Candidates, the scenario's own first."
+)
 @click.option("--seeds", type=COUNT, default=2, show_default=True, help="Runs per candidate and level, from seed 1000.")
 @LEVELS
 @WORKERS
 @out_option("runs/SCENARIO-tune")
-def tune(scenario: Path, controller: str, **options: Any) -> None:
+def tune(scenario: Path, controller: str, **how: Any) -> None:
     """Search the options of a controller by CMA-ES.
 
     Minimises the geometric mean of the total time spent over seeds and demand levels. Writes tune.csv, and tune.toml
@@ -215,7 +236,7 @@ def tune(scenario: Path, controller: str, **options: Any) -> None:
       cosim tune grid7_peak --controller pi-gating --option kp=0.1:10 --option ki=0.001:0.1
       cosim tune grid7_peak --controller dpc-pcrg+max-pressure --option mfd_scale=0.6:1
     """
-    click.echo(cosim.api.tune(scenario, controller, **options))
+    click.echo(cosim.api.tune(scenario, controller, **how))
 
 
 @main.command()
