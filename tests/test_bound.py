@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
-from commands import nmfd
+from commands import good, nmfd
 
-from nmfd import closed_loop
+from nmfd import api, closed_loop
 from nmfd.api import load_scenario
 from nmfd.controllers import open_loop
 from nmfd.controllers.rules import NoControl, PiGating
-from nmfd.controllers.strategy import CONTROLLERS, parse
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.metrics import total_time_spent
 from nmfd.model.planning import planning_model
@@ -34,10 +34,6 @@ def scenario(folder):
 
 def closed(scenario, controller):
     return total_time_spent(closed_loop.run(NmfdPlant(scenario), controller, scenario, seed=0))
-
-
-def test_names_are_those_of_the_registry():
-    assert set(open_loop.NAMES) < set(CONTROLLERS)
 
 
 def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
@@ -85,32 +81,16 @@ def test_an_interrupted_descent_keeps_the_best_so_far(scenario):
     assert all(short.totals[name] < first.totals[name] for name in start)
 
 
-def test_command_writes_a_plan_that_benchmark_replays(folder, tmp_path):
-    result = nmfd("bound", folder, "--controller", "bound-pcrg", "--iterations", 20)
-    assert result.exit_code == 0, result.stderr
-    *lines, steps, _ = result.stdout.splitlines()
-    assert steps == "20 Adam steps"
-    assert lines[0].endswith("(kept)") and {line.split()[1] for line in lines} == {"open:", "middle:", "pi-gating:"}
-    command = ["benchmark", folder, "--controllers", "no-control,bound-pcrg", "--out", tmp_path / "out"]
-    result = nmfd(*command)
-    assert result.exit_code == 0, result.stderr
-    lines = result.stdout.splitlines()
-    assert "above bound" in lines[1] and "above bound: TTS" in " ".join(lines[-4:-1]).replace("  ", " ")
-    assert any(line.startswith("bound-pcrg ") for line in lines)
+def test_a_plan_that_benchmark_replays(folder, tmp_path):
+    text = api.bound(folder, "bound-pcrg", iterations=20)
+    assert "20 Adam steps" in text and "(kept)" in text and "from pi-gating:" in text
+    text = good(nmfd("benchmark", folder, "--controllers", "no-control,bound-pcrg", "--out", tmp_path / "out"))
+    assert "above bound" in text and any(line.startswith("bound-pcrg ") for line in text.splitlines())
 
 
-def test_wrong_names_and_missing_plans(folder, tmp_path):
-    for arguments, fragment in (
-        (["bound", folder, "--controller", "dpc-pc"], "'dpc-pc' is no bound; choose one of bound-pc, bound-pcrg"),
-        (["bound", folder, "--controller", "bound-pc", "--from", "nobody"], "controller 'nobody' is unknown"),
-        (["bound", folder, "--controller", "bound-pc", "--out", tmp_path / "a" / "b.npz"], "no such folder"),
-        (
-            ["benchmark", folder, "--controllers", "bound-pc", "--out", tmp_path / "out"],
-            f"make one with: nmfd bound {folder} --controller bound-pc",
-        ),
-    ):
-        result = nmfd(*arguments)
-        assert result.exit_code == 2 and result.stderr.count("\n") == 1 and fragment in result.stderr, result.stderr
+def test_wrong_names(scenario):
+    with pytest.raises(InputError, match="'dpc-pc' is no bound; choose one of bound-pc, bound-pcrg"):
+        bound.compute(scenario, "dpc-pc")
 
 
 def test_files_that_do_not_fit(scenario, tmp_path):

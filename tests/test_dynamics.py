@@ -95,13 +95,6 @@ def test_one_region_with_a_linear_mfd_decays_exponentially():
     assert x.item() == pytest.approx(5000.0 * np.exp(-0.0042 * 600.0), rel=1e-8)
 
 
-def test_one_region_decays_exponentially_at_small_accumulation():
-    p = one_region(NETWORK.mfds[0])
-    none = torch.zeros(1, 1, dtype=torch.float64)
-    x = dynamics.advance(p, none + 1.0, none, none, none[None], 600.0, integrator="rk4", substeps=20)
-    assert x.item() == pytest.approx(np.exp(-0.0042 * 600.0), rel=1e-3)
-
-
 @pytest.mark.parametrize("order", [[6, 5, 4, 3, 2, 1, 0], [1, 0, 4, 3, 2, 6, 5]], ids=["turned", "mirrored"])
 def test_a_turned_or_mirrored_hexagon_is_the_same_hexagon(order):
     x, demand, perimeter, splits = random_tensors(3, filling=20_000.0)

@@ -239,11 +239,6 @@ def test_a_region_without_its_detector_is_predicted_on(broken):
     assert rmse((partial - truth)[:, 1:]) < 1.3 * rmse((whole - truth)[:, 1:])
 
 
-def test_the_same_readings_give_the_same_bytes():
-    first, second = (watch(3, equipped(), steps=8)[1] for _ in range(2))
-    assert first.tobytes() == second.tobytes()
-
-
 def test_reset_forgets():
     estimator, crowd = Estimator(planning_model(SCENARIO), equipped()), Crowd(0, equipped())
     observations = [crowd.step(k) for k in range(4)]
@@ -282,12 +277,6 @@ def readings(known, *, mean=40.0, expansion=0.1, crossings=9.0, x=25.0, probes=1
     return [[float(part[0]) for part in kind] for kind in kinds]
 
 
-def test_what_the_readings_are_and_are_expected_to_be():
-    read, expected, _ = readings(equipped(probes=0.1))
-    assert read == [1.0, 2.0, 3.0, 4.0, 0.0]
-    assert expected == pytest.approx([1.1 * 40.0, 9.0, 10.0, 3.0, 10.0 - 0.1 * 25.0])
-
-
 def test_the_noise_of_every_kind_of_reading():
     """Detectors on a share s of the links see a binomial part; so do counts, besides their own error; probes are seen
     exactly; and are a binomial share of the vehicles, as long as the same ones are there."""
@@ -301,15 +290,6 @@ def test_the_noise_of_every_kind_of_reading():
     assert readings(equipped(probes=0.1), leaving=50.0)[2][4] < share  # they are others every time
 
 
-def test_with_everything_seen_readings_are_exact():
-    """Of less than one vehicle, the noise is that of one."""
-    assert readings(equipped(detectors=1.0, probes=1.0, error=0.0))[2] == pytest.approx([estimation.FLOOR] * 5)
-    low = readings(equipped(detectors=0.5, error=0.0), mean=0.2, crossings=0.2)[2]
-    assert low[0] == pytest.approx(1.0 + estimation.FLOOR) and low[1] == pytest.approx(
-        0.5 * (2.0 + estimation.COUNT_ERROR**2 * 0.04 / 2.0) + estimation.FLOOR
-    )
-
-
 def test_probes_move_as_a_share_of_the_vehicles():
     """What arrives, less what leaves, less the ends of trips: with a share of one, what dynamics changes."""
     random = np.random.default_rng(1)
@@ -320,19 +300,6 @@ def test_probes_move_as_a_share_of_the_vehicles():
     after = dynamics.euler(dynamics.parameters(NETWORK), x, torch.zeros_like(x), *controls, 1.0)
     torch.testing.assert_close(change, after - x)
     torch.testing.assert_close(estimation._moved(0.25 * torch.ones_like(x), ends, transfers), 0.25 * change)
-
-
-def test_probes_that_are_not_seen_go_on_with_the_vehicles():
-    """Seen once, then never again: they stay a share of what is there."""
-    estimator, crowd = Estimator(planning_model(SCENARIO), equipped(probes=0.5)), Crowd(0, equipped(probes=0.5))
-    for k in range(10):
-        estimator.step(OPEN, crowd.step(k))
-    before = estimator.belief.probes.sum(), estimator.accumulation.sum()
-    for _ in range(3):
-        estimator.step(OPEN, nothing())
-    share = estimator.belief.probes.sum() / estimator.accumulation.sum()
-    assert share == pytest.approx(before[0] / before[1], abs=0.08)
-    assert (estimator.belief.probes <= estimator.accumulation + 1e-9).all()
 
 
 def test_a_detector_is_stuck_at_its_third_same_reading():

@@ -6,11 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import tiny
-from commands import error_line, good, nmfd
 
 from cosim.evaluation import model_validation
-from nmfd.api import train
-from nmfd.errors import InputError
 from nmfd.model import identification
 from nmfd.model.authority import Boundaries, verdict
 from nmfd.model.identification import Observed
@@ -144,40 +141,3 @@ def test_the_verdict_has_reasons_and_numbers(network, most, started, share, answ
 def test_nobody_crosses(network):
     found = verdict(network, crossing(np.zeros((3, 3)), 1.0), most=np.ones(3), started=np.ones(3), where="in 1 run")
     assert "No: no vehicle crosses" in found.answer or "no gateway" in found.answer
-
-
-TRAIN = ("--controller", "dpc-pc", "--steps", 1, "--no-compile", "--out")
-
-
-@pytest.mark.parametrize(
-    "line, named",
-    [
-        ("placeholder = true\n\n[perimeter]", ("placeholder: is true", "cosim identify")),
-        ("CONTROLLABLE", ("controllable: is 0 at every boundary", "route guidance")),
-    ],
-)
-def test_nothing_is_trained_where_it_cannot_help(tmp_path, line, named):
-    text = tiny.row_network()
-    text = (
-        text.replace("[perimeter]", line)
-        if "placeholder" in line
-        else text.replace("adjacent = [1]", "adjacent = [1]\ncontrollable = [0.0]").replace(
-            "adjacent = [0]", "adjacent = [0]\ncontrollable = [0.0]"
-        )
-    )
-    scenario = tiny.write(tmp_path, network=text)
-    said = error_line(nmfd("train", scenario, *TRAIN, tmp_path / "p.pt"), "nmfd")
-    assert "network.toml" in said and all(part in said for part in (*named, "--anyway"))
-    assert not (tmp_path / "p.pt").exists()
-    with pytest.raises(InputError, match=named[0]):
-        train(scenario, "dpc-pc", out=tmp_path / "p.pt", steps=1)
-    with pytest.raises(InputError, match=named[0]):
-        train(scenario, "dpc-pcrg", out=tmp_path / "p.pt", steps=1)
-    good(nmfd("train", scenario, *TRAIN, tmp_path / "p.pt", "--anyway"))
-    assert (tmp_path / "p.pt").exists()
-
-
-def test_training_on_a_doubtful_model_says_so(tmp_path):
-    text = tiny.row_network().replace("adjacent = [1]", 'adjacent = [1]\ndoubts = ["R2 -0.50", "one seed"]')
-    result = nmfd("train", tiny.write(tmp_path, network=text), *TRAIN, tmp_path / "p.pt")
-    assert result.exit_code == 0 and "region 0 is doubtful: R2 -0.50; one seed" in result.stderr

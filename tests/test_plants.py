@@ -1,6 +1,5 @@
 """The two regional plants: conservation, what the acyclic one forbids, and their agreement without control."""
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,15 +79,6 @@ def test_no_control_forces_no_move():
     plant = AcyclicPlant(SCENARIO)
     run(plant, NoControl(planning_model(SCENARIO)), SCENARIO, seed=0)
     assert plant.forced_moves == 0.0
-
-
-def test_the_acyclic_plant_is_fast():
-    plant, (perimeter, splits) = AcyclicPlant(SCENARIO), random_controls(np.random.default_rng(4), SCENARIO.network)
-    plant.reset(0)
-    begin = time.process_time()
-    for _ in range(SCENARIO.steps):
-        plant.step(Controls(perimeter=perimeter, splits=splits))
-    assert time.process_time() - begin < 2.0
 
 
 def test_no_way_leads_back_to_the_origin_or_the_previous_region():

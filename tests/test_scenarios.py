@@ -1,8 +1,15 @@
-"""Scenarios on a base, and controllers that plan with another model than that of the scenario."""
+"""Scenario and network files: settings, bases, errors, and models that controllers plan with."""
+
+import json
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import tiny
+from hypothesis import HealthCheck, given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
 
 from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
@@ -10,6 +17,8 @@ from nmfd.controllers.dpc import training
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
+from nmfd.model.regional_model import load_network, network_toml
+from nmfd.model.scenario import perturbed, read_scenario
 
 OTHER = """
 name = "other"
@@ -49,17 +58,137 @@ def test_a_base_in_another_folder(base):
     assert load_scenario(deeper).network.hash == load_scenario(base).network.hash
 
 
+def test_settings_replace_those_of_the_file(base):
+    changed = read_scenario(
+        base,
+        {"steps": 12, "controllers.pi-gating.kp": 2, 'controllers."pi-gating+rerouting-30".ki': 0.1, "sumo.seed": 1},
+    )
+    assert changed.steps == 12 and len(changed.demand) == 12 and changed.sumo == {"seed": 1}
+    assert changed.controller_options["pi-gating"] == {"kp": 2, "ki": 0.02}
+    assert changed.controller_options["pi-gating+rerouting-30"] == {"ki": 0.1}
+    with pytest.raises(InputError, match="scenario.toml: stepz"):
+        read_scenario(base, {"stepz": 12})
+
+
+def test_vehicles_at_the_start(base):
+    assert not load_scenario(base).start.any()
+    begun = read_scenario(base, {"initial": [[0.0, 100.0], [0.0, 50.0]]})
+    assert begun.start.tolist() == [[0.0, 100.0], [0.0, 50.0]] and begun.hash != load_scenario(base).hash
+    for wrong in ([[1.0, 2.0]], [[1.0, -2.0], [0.0, 0.0]]):
+        with pytest.raises(InputError, match="scenario.toml: initial: expected 2 lists of 2 numbers"):
+            read_scenario(base, {"initial": wrong})
+
+
+def test_noise_on_the_demand_is_common_to_all_sigmas(base):
+    scenario = load_scenario(base)
+    half, full = (perturbed(scenario, sigma, 3, where="planned").demand - scenario.demand for sigma in (0.001, 0.002))
+    inside = scenario.demand > 0.1
+    np.testing.assert_allclose(full[inside], 2.0 * half[inside], atol=1e-12)
+    assert (perturbed(scenario, 1.0, 3, where="all").demand >= 0.0).all()
+
+
+def test_a_network_is_written_as_it_is_read(tmp_path):
+    network = load_network("grid7")
+    doubted = replace(
+        network, doubts=(("one seed",),) * 7, placeholder=True, controllable=np.where(network.adjacency, 0.25, 0.0)
+    )
+    (tmp_path / "network.toml").write_text(network_toml(doubted, {}, "a test"))
+    again = load_network(tmp_path)
+    assert again.hash == network.hash and again.doubts == doubted.doubts and again.placeholder
+    assert again.observed_split_ratios.keys() == network.observed_split_ratios.keys() != set()
+    np.testing.assert_array_equal(again.controllable, doubted.controllable)
+
+
 @pytest.mark.parametrize(
     "text, message",
     [
         ('name = "x"\nbase = "../nowhere"\n', "nowhere/scenario.toml: no such file"),
         ('name = "x"\nbase = "."\n', "base: the scenarios are each other's base"),
-        ('name = "x"\nbase = "../scenario"\ndemand_factor = -1.0\n', "demand_factor: should be greater"),
+        ('name = "x"\nbase = "../scenario"\ndemand_factor = -1.0\n', "scenario.toml: demand_factor"),
+        ('name = "x"\nbase = "../scenario"\nprotected = [2]\n', "scenario.toml: protected"),
+        ('name = "x"\nbase = "../scenario"\nstep = 300.0\n', "scenario.toml: step: .* at most 238 s"),
+        ('name = "x"\nbase = "../scenario"\nnetwork = "../none"\n', "network.toml: no such file"),
+        ('name = "x"\nbase = "../scenario"\nstepz = 3\n', "scenario.toml: stepz"),
+        ('name = "x"\nbase = "../scenario"\nsteps = "20"\n', "scenario.toml: steps"),
+        ('name = "x"\nnetwork = "../network"\nstep = 30.0\nsteps = 5\n', "scenario.toml: demand: missing"),
+        ("name = tiny", "scenario.toml: is not valid TOML"),
+        (tiny.SCENARIO.replace("to = 1", "to = 7"), r"scenario.toml: demand\[0\].to: region 7 is unknown"),
+        (tiny.SCENARIO.replace("peak = 2.0", "peak = -2.0"), r"scenario.toml: demand\[0\].peak"),
     ],
 )
-def test_errors_of_a_base(base, text, message):
-    with pytest.raises(InputError, match=message):
+def test_wrong_scenarios(base, text, message):
+    with pytest.raises(InputError, match=message) as caught:
         load_scenario(beside(base, text))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "old, new, message",
+    [
+        ("[0]", "[0, 1]", r"regions\[1\].adjacent: region 1 is listed as adjacent to itself"),
+        ("[0]", "[5]", r"regions\[1\].adjacent: .*\[5\]"),
+        ("adjacent = [1]", "adjacent = []", "regions: region 1 cannot be reached from region 0"),
+        ("adjacent = [1]", "adjacent = [1]\ncapacity = [1.0]", r"regions\[0\].capacity: capacity and storage belong"),
+        ("adjacent = [1]", "adjacent = [1]\nexit_rates = [1.0]", r"regions\[0\].exit_rates: .* 2 numbers"),
+        ("adjacent = [0]", "adjacent = [0]\nexit_rates = [1.0, 1.0]", r"regions\[0\].exit_rates: missing"),
+        ("adjacent = [1]", "adjacent = [1]\nobserved_split_ratios.1 = { 1 = 0.5 }", "with sum 1"),
+        ("max =", "mx = 1\nmax =", "perimeter.mx"),
+        ("jam = 1000.0", "jam = true", "mfd.jam"),
+        ("c = 0.0042", "c = -1", "mfd.c: c must be positive"),
+        ("max = 0.9", "max = 0.1", "perimeter: min must be less"),
+    ],
+)
+def test_wrong_networks(tmp_path, old, new, message):
+    folder = tiny.write(tmp_path, network=tiny.row_network().replace(old, new)).parent / "network"
+    with pytest.raises(InputError, match=f"network.toml: {message}|network.toml: .*{message}"):
+        load_network(folder)
+
+
+VALUES = st.recursive(
+    st.one_of(st.booleans(), st.integers(), st.floats(), st.text(max_size=12), st.sampled_from(["../network", "", -1])),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=5,
+)
+KEYS = ("name", "network", "step", "steps", "integrator", "substeps", "protected", "demand_factor", "demand_file")
+MORE = ("base", "initial", "faults", "controllers", "sumo", "forecast_error", "measurement_std", "unknown")
+
+
+def toml(value) -> str:
+    """A value as TOML writes it."""
+    match value:
+        case bool():
+            return str(value).lower()
+        case float() if not math.isfinite(value):
+            return "nan" if value != value else "inf" if value > 0 else "-inf"
+        case str():
+            return json.dumps(value).replace("\x7f", "\\u007f")
+        case list():
+            return f"[{', '.join(map(toml, value))}]"
+        case dict():
+            return f"{{ {', '.join(f'{json.dumps(key)} = {toml(item)}' for key, item in value.items())} }}"
+    return repr(value)
+
+
+@examples(
+    max_examples=100,
+    derandomize=True,
+    deadline=None,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(key=st.sampled_from(KEYS + MORE), value=VALUES)
+def test_any_value_is_read_or_refused_in_one_line(tmp_path, key, value):
+    if not (tmp_path / "network").exists():
+        tiny.write(tmp_path)
+    (tmp_path / "other").mkdir(exist_ok=True)
+    text = "\n".join(line for line in tiny.SCENARIO.splitlines() if not line.startswith(f"{key} ="))
+    (tmp_path / "other" / "scenario.toml").write_bytes(f"{key} = {toml(value)}\n{text}".encode("utf-8", "replace"))
+    try:
+        scenario = load_scenario(tmp_path / "other")
+    except InputError as error:
+        assert "\n" not in str(error)
+    else:
+        assert scenario.demand.shape == (scenario.steps, 2, 2) and (scenario.demand >= 0).all()
 
 
 def test_a_controller_plans_with_the_model_that_it_names(base, tmp_path):

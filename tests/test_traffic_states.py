@@ -69,13 +69,6 @@ def test_a_curve_with_too_little_capacity_makes_no_light_traffic_full():
     assert found[2] == TrafficState.FLOWING and TrafficState.STANDING not in found
 
 
-def test_looks_can_be_told_apart_in_grey():
-    """Lightness falls from state to state, by a fifth at least."""
-    grey = [float(np.dot(to_rgb(look[1]), (0.2126, 0.7152, 0.0722))) for look in traffic_states.LOOKS.values()]
-    assert (np.diff(grey) < -0.05).all() and grey[0] - grey[1] > 0.15 and grey[1] - grey[2] > 0.2
-    assert list(traffic_states.LOOKS) == list(TrafficState)
-
-
 @pytest.fixture(scope="module")
 def scenario():
     return load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")
@@ -111,7 +104,7 @@ def test_a_region_that_nothing_leaves_is_not_green(scenario):
         ax = plots.region_accumulation(
             plots.figure(4, 3).subplots(), network, 0, [held], outflow=lambda t, out=out: np.full((T, 7), out)
         )
-        green = {to_rgb(traffic_states.LOOKS[TrafficState.NEAR_CAPACITY][1]), to_rgb(plots.GREEN)}
+        green = {to_rgb(traffic_states.LOOKS[TrafficState.NEAR_CAPACITY][1])}
         assert bool(green & colours_in(ax)) == (kind == TrafficState.NEAR_CAPACITY)
         assert to_rgb(traffic_states.LOOKS[kind][1]) in colours_in(ax)
 
@@ -121,18 +114,10 @@ def test_strips_hide_no_curve_and_need_an_outflow(scenario):
     ax = plots.region_accumulation(
         plots.figure(4, 3).subplots(), scenario.network, 0, runs, outflow=lambda t: np.zeros((T, 7))
     )
-    below = ax.get_ylim()[1] * (1.0 - 3 * traffic_states.STRIP)
+    below = ax.get_ylim()[1] * (1.0 - 3 * traffic_states.STRIP_HEIGHT)
     assert max(line.get_ydata().max() for line in ax.lines) < below
-    assert (
-        len(
-            colours_in(
-                plots.region_accumulation(
-                    plots.figure(4, 3).subplots(), scenario.network, 0, runs, outflow=lambda t: None
-                )
-            )
-        )
-        == 0
-    )
+    bare = plots.figure(4, 3).subplots()
+    assert not colours_in(plots.region_accumulation(bare, scenario.network, 0, runs, outflow=lambda t: None))
 
 
 def test_a_run_on_the_regional_model_shows_the_outflow_of_its_gates(tmp_path):

@@ -89,17 +89,6 @@ def test_the_gradient_of_the_rounded_kink():
         assert (ahead - behind) / 2e-5 == pytest.approx((gradient * way).sum(), rel=1e-5)
 
 
-def test_rounding_changes_the_rate_at_the_kink_only():
-    exact = replace(edge_model.build(NETWORK, EVERY, guidance=False), jam=np.full(7, 6000.0))
-    rounded = replace(exact, rounding=50.0)
-
-    def difference(n):
-        return np.abs(edge_model.rate(rounded, np.full(7, n))[0] / edge_model.rate(exact, np.full(7, n))[0] - 1.0).max()
-
-    assert 1e-4 < difference(6000.0) < 0.02
-    assert max(difference(0.0), difference(4000.0), difference(9000.0)) < 2e-4
-
-
 def test_vehicles_at_stake():
     model = edge_model.build(NETWORK, SOME, guidance=True)
     start, demand, plan = problem(model, moves=1, horizon=1)

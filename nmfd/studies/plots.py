@@ -128,7 +128,8 @@ def region_accumulation(
     outflow: of each region of a run, (T, R) [veh/s], or None for no strip
     """
     curve = network.mfds[region]
-    ax.axhline(curve.critical, color="0.35", linewidth=1.0, linestyle=":", label=CRITICAL, zorder=1)
+    style = dict(color="0.35", linewidth=1.0, linestyle=":", zorder=1)
+    ax.hlines(curve.critical, 0.0, 1.0, transform=ax.get_yaxis_transform(), label=CRITICAL, **style)
     _curves(ax, trajectories, lambda t: t.accumulation[:, region].sum(axis=1), seed)
     first: dict[tuple[str, str], Result] = {}
     for t in sorted(trajectories, key=lambda t: t.seed != seed):  # stable
