@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from nmfd import closed_loop
 from nmfd.controllers import open_loop
 from nmfd.controllers.dpc import rollout, training
-from nmfd.controllers.strategy import CONTROLLERS, Strategy, check_tables, parse, parse_many
+from nmfd.controllers.strategy import CONTROLLERS, Strategy, check_tables, city_words, parse, parse_many
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario, with_demand
 from nmfd.runs import shipped
@@ -277,6 +277,7 @@ def catalogue() -> str:
             f"{folder.name}/{file.name}": "" for folder in scenarios for file in sorted(folder.glob("dpc-*.pt"))
         },
         "Controllers": {kind.name: kind.text for kind in CONTROLLERS.values()},
+        "Words for a city in SUMO, behind a controller": dict(city_words()),
     }
     width = max(len(name) for rows in sections.values() for name in rows)
     return "\n\n".join(

@@ -72,7 +72,7 @@ def test_a_pattern_stands_for_what_has_a_policy(tmp_path, monkeypatch):
     for name in ("dpc-pc.pt", "dpc-pc+max-pressure.pt", "dpc-pc+nonsense.pt"):
         (folder / name).touch()
     names = [one.name for one in strategy.ready(nmfd.load_scenario(folder))]
-    assert {"dpc-pc", "dpc-pc+max-pressure", "actuated"} <= set(names)
+    assert {"dpc-pc", "dpc-pc+max-pressure"} <= set(names)
     assert not {"dpc-pcrg", "dpc-pc+nonsense"} & set(names)
 
 

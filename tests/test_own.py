@@ -90,7 +90,7 @@ def test_sumo_takes_it(place):
 @pytest.mark.parametrize(
     "source, expected",
     [
-        (None, "mine.py: no such file for controller mine.py:Mine; write one with: nmfd new-controller mine.py"),
+        (None, "mine.py: no such file for controller mine.py:Mine; write one with: nmfd new-controller "),
         ("class Other:\n    act = None\n", "mine.py: has no class Mine; write one"),
         ("import numpy\n\nclass Mine(:\n", r"mine\.py:3: mine\.py:Mine: import: SyntaxError: invalid syntax"),
         ("\nimport nothing_of_the_kind\n", r"mine\.py:2: mine\.py:Mine: import: ModuleNotFoundError: No module named"),

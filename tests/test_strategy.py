@@ -142,7 +142,7 @@ def test_an_object_is_a_strategy(scenario):
     strategy = parse(controller, "max-pressure")
     assert (strategy.name, strategy.city["signals"]) == ("no-control+max-pressure", "max-pressure")
     assert strategy.make(scenario) is controller and strategy.planning(scenario).network.hash == scenario.network.hash
-    with pytest.raises(InputError, match="without act"):
+    with pytest.raises(InputError, match="an object with reset and act"):
         parse(type("Half", (), {"reset": lambda self: None})())
     with pytest.raises(InputError, match="reads no policy"):
         strategy.make(scenario, tiny)

@@ -1,13 +1,13 @@
 """Controllers of the user's own: a class in a file, `path/to/file.py:Class` (template.py shows how to write one)."""
 
 import copy
-import importlib.util
 import re
 import sys
 import traceback
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -25,17 +25,16 @@ LARGEST = {"prices": 100.0, "metering": 1e6}  # -, trips/s: as good as no limit
 
 def load(name: str) -> Any:
     """Return the class FILE.py:CLASS; its module runs once per version of the file. Raise InputError."""
-    path, cls = Path(name.rpartition(":")[0]), name.rpartition(":")[2]
+    path, cls = _path(name), name.rpartition(":")[2]
     if not path.is_file():
         raise InputError(f"{path}: no such file for controller {name}; write one with: nmfd new-controller {path}")
-    key = f"{path.resolve()}:{path.stat().st_mtime_ns}"
+    key = f"{path}:{path.stat().st_mtime_ns}"
     if key not in sys.modules:
-        spec = importlib.util.spec_from_file_location(key, path.resolve())
-        assert spec is not None and spec.loader is not None
-        sys.modules[key] = importlib.util.module_from_spec(spec)  # dataclasses look up their module there
-        sys.path.append(str(path.resolve().parent))  # for modules beside it
+        module = sys.modules[key] = ModuleType(key)  # dataclasses look up their module there
+        module.__file__ = str(path)
+        sys.path.append(str(path.parent))  # for modules beside it
         try:
-            _located(name, "import", spec.loader.exec_module, sys.modules[key])
+            _located(name, "import", lambda: exec(compile(path.read_text("utf-8"), path, "exec"), vars(module)))
         except InputError:
             del sys.modules[key]
             raise
@@ -46,19 +45,18 @@ def load(name: str) -> Any:
 
 def fingerprint(name: str) -> dict[str, object]:
     """Return hashes of the file and of those that the class names in `files`."""
-    path = Path(name.rpartition(":")[0])
-    paths = [path, *(path.parent / str(file) for file in getattr(load(name), "files", ()))]
+    paths = [_path(name), *(_path(name).parent / str(file) for file in getattr(load(name), "files", ()))]
     return {f"{path.name}_hash": file_hash(path) if path.is_file() else None for path in paths}
 
 
 class OwnController:
     """Controller of the user's own with checked controls; its mistakes are InputErrors with file and line."""
 
-    def __init__(self, name: str, planning: PlanningModel, network: RegionalModel):
+    def __init__(self, name: str, planning: PlanningModel):
         """Make the controller and try it on an empty city. Raise InputError."""
-        self.name, self._network, empty = name, copy.deepcopy(network), np.zeros((network.regions, network.regions))
+        self.name, self._network = name, copy.deepcopy(planning.network)
         self._controller = _located(name, "__init__", load(name), planning)
-        self.deadline = getattr(self._controller, "deadline", None)
+        self.deadline, empty = getattr(self._controller, "deadline", None), np.zeros((self._network.regions,) * 2)
         self.reset()
         self.act(Observation(step=0, time=0.0, accumulation=empty, backlog=empty.copy()))
         self.reset()
@@ -77,7 +75,7 @@ def checked(controls: object, network: RegionalModel, name: str) -> Controls:
     edges, allowed, zeros = network.adjacency, network.split_mask, np.zeros(network.regions)
     low, high = np.where(edges, network.u_min, -np.inf), np.where(edges, network.u_max, np.inf)
     perimeter = np.where(edges, _numbers(controls.perimeter, low, high, f"{name}: act: perimeter"), 0.0)
-    controls = replace(controls, perimeter=perimeter, note=" ".join(str(controls.note).split()))
+    controls = replace(controls, perimeter=perimeter)
     for key, most in LARGEST.items():
         if (values := getattr(controls, key)) is not None:
             controls = replace(controls, **{key: _numbers(values, zeros, zeros + most, f"{name}: act: {key}")})
@@ -106,13 +104,17 @@ def _numbers(values: object, low: np.ndarray, high: np.ndarray, where: str) -> n
     return np.clip(array, low, high)
 
 
+def _path(name: str) -> Path:
+    return Path(name.rpartition(":")[0]).resolve()
+
+
 def _located(name: str, doing: str, function: Callable, *arguments: Any) -> Any:
     """Return `function(*arguments)`; raise what the user's code raises as an InputError with file and line."""
     try:
         return function(*arguments)
     except (Exception, SystemExit) as error:
-        file, frames = str(Path(name.rpartition(":")[0]).resolve()), traceback.extract_tb(error.__traceback__)
-        line = next((f"{frame.filename}:{frame.lineno}" for frame in reversed(frames) if frame.filename == file), file)
-        line = f"{error.filename}:{error.lineno}" if isinstance(error, SyntaxError) else line
+        places = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
+        own = [place for place in places if place[0] == str(_path(name))]
+        file, line = (error.filename, error.lineno) if isinstance(error, SyntaxError) else (own or places)[-1]
         text = " ".join(str(error).split())
-        raise InputError(f"{line}: {name}: {doing}: {type(error).__name__}: {text}") from error
+        raise InputError(f"{file}:{line}: {name}: {doing}: {type(error).__name__}: {text}") from error

@@ -53,14 +53,13 @@ class ControllerType:
     """A built-in controller, or a class of the user's own.
 
     name: "pi-gating", "mine.py:Gate"; text: one line for help
-    make: (planning), (file, planning) -> controller; a plan takes (file, scenario)
-    guides: whether it may guide routes; reads: the kind of file that it needs; options: their declaration
-    own: whether it is the user's
+    make: (planning) or (file, planning) -> controller; for a plan (file, scenario)
+    guides: may guide routes; reads: kind of the file that it needs; options: their declaration; own: the user's class
     """
 
     name: str
-    text: str = ""
-    make: Callable[..., Controller] | None = None
+    text: str
+    make: Callable[..., Controller] = field(compare=False)
     guides: bool = False
     reads: tuple[str, str] | None = None
     options: type[Options] = Options
@@ -122,14 +121,12 @@ class Strategy:
     name: as the user wrote it
     city: key of [sumo] (cosim.plant.settings.Settings) -> value, instead of the scenario's
     words: the city's part of the name
-    instance: the controller itself, if the user gave an object
     """
 
     name: str
     controller: ControllerType
-    city: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    city: Mapping[str, Any] = field(default_factory=dict, compare=False)
     words: tuple[str, ...] = ()
-    instance: Controller | None = field(default=None, hash=False)
 
     @property
     def guides(self) -> bool:
@@ -151,22 +148,19 @@ class Strategy:
         return self
 
     def table(self, scenario: Scenario) -> str:
-        """Return the name of its table in [controllers]: the one with most of the strategy's words.
-
-        Raises: InputError if several tables fit equally well
-        """
+        """Return its table in [controllers], the one with most of its words. Raise InputError if several fit."""
         name = self.controller.name
         if self.controller.own:
-            return str(getattr(custom.load(name), "name", name)) if self.instance is None else name
-        fitting = {table: _split(table)[1] for table in scenario.controller_options if _split(table)[0] == name}
-        fitting = {table: words for table, words in fitting.items() if set(words) <= set(self.words)}
-        most = max(map(len, fitting.values()), default=0)
-        best = [table for table, words in fitting.items() if len(words) == most and words]
+            return str(getattr(custom.load(name), "name", name))
+        split = {table: _split(table) for table in scenario.controller_options}
+        fitting = {table: words for table, (first, words) in split.items() if first == name}
+        fitting = {table: len(words) for table, words in fitting.items() if set(words) <= set(self.words)}
+        best = [table for table, count in fitting.items() if count and count == max(fitting.values())]
         if len(best) > 1:
+            tables = " and ".join(f'[controllers."{table}"]' for table in best)
             raise InputError(
-                f"scenario.toml: strategy {self.name!r}: the tables "
-                + " and ".join(f'[controllers."{table}"]' for table in best)
-                + f' fit it equally well; add a table [controllers."{self.name}"]'
+                f"scenario.toml: strategy {self.name!r}: the tables {tables} fit it equally well; add a table "
+                f'[controllers."{self.name}"]'
             )
         return best[0] if best else name
 
@@ -177,15 +171,8 @@ class Strategy:
         Raises: InputError
         """
         file, kind = self.file(scenario, policy), self.controller
-        if self.instance is not None:
-            return self.instance
-        if kind.own:
-            return custom.OwnController(kind.name, self._planning(scenario), scenario.network)
-        assert kind.make is not None
-        if kind.reads == PLAN:
-            return kind.make(file, scenario)
-        planning = self._planning(scenario)
-        return kind.make(planning) if file is None else kind.make(file, planning)
+        known = scenario if kind.reads == PLAN else self._planning(scenario)
+        return kind.make(known) if file is None else kind.make(file, known)
 
     def planning(self, scenario: Scenario, model: Path | None = None) -> PlanningModel:
         """Return the planning model that predicts the runs of the strategy.
@@ -202,8 +189,6 @@ class Strategy:
         return planned
 
     def _planning(self, scenario: Scenario) -> PlanningModel:
-        if self.instance is not None:
-            return planning_model(scenario)
         table = self.table(scenario)
         if self.controller.own:
             tables = scenario.controller_options
@@ -223,11 +208,8 @@ class Strategy:
         text, suffix = self.controller.reads
         if policy is None and scenario.folder is None:
             raise InputError(f"controller {name}: scenario {scenario.name} has no folder with policies; give a file")
-        path = (
-            (scenario.folder or Path()) / (self.table(scenario) + suffix)
-            if policy is None
-            else shipped.found(policy, shipped.SCENARIO)
-        )
+        own = (scenario.folder or Path()) / (self.table(scenario) + suffix)
+        path = own if policy is None else shipped.found(policy, shipped.SCENARIO)
         if not path.is_file():
             command = MAKE_FILE[self.controller.reads].format(folder=scenario.folder, name=self.table(scenario))
             raise InputError(f"{path}: no such {text} for {name}; make one with: {command}")
@@ -241,8 +223,6 @@ class Strategy:
         name = self.controller.name
         if name == ALONE:
             return {}
-        if self.instance is not None:
-            return {"object": name}
         tables, table, file = scenario.controller_options, self.table(scenario), self.file(scenario, policy)
         tables = tables.get(OWN, {}) if self.controller.own else tables
         setup = {**tables.get(name, {}), **tables.get(table, {})}
@@ -280,22 +260,17 @@ def parse(controller: str | Controller, city: str = "") -> Strategy:
     if isinstance(controller, str):
         name = f"{controller}+{city}" if city else controller
         first, words = _split(name)
-        instance = None
         if _city_setting(first) is not None:
             first, words = ALONE, [first, *words]
-        own = custom.FILE_AND_CLASS.fullmatch(first) is not None
-        kind = ControllerType(name=first, own=True, guides=True) if own else CONTROLLERS.get(first)
+        kind = CONTROLLERS.get(first) or _own(first)
         if kind is None:
             raise _unknown(name, first, controllers=True)
     else:
-        for method in ("reset", "act"):
-            if not callable(getattr(controller, method, None)):
-                raise InputError(
-                    f"controller: expected a name or an object with reset and act, got {controller!r} without {method}"
-                )
-        first, instance = getattr(controller, "name", type(controller).__name__), controller
+        if not (callable(getattr(controller, "reset", None)) and callable(getattr(controller, "act", None))):
+            raise InputError(f"controller: expected a name or an object with reset and act, got {controller!r}")
+        first = getattr(controller, "name", type(controller).__name__)
         name, words = (f"{first}+{city}", city.split("+")) if city else (first, [])
-        kind = ControllerType(name=first, own=True)
+        kind = ControllerType(name=first, text="object", make=lambda planning: controller)
     settings: dict[str, Any] = {"gateways_fixed": first != ALONE}
     by_key: dict[str, str] = {}
     for word in words:
@@ -310,47 +285,42 @@ def parse(controller: str | Controller, city: str = "") -> Strategy:
         by_key[key], settings[key] = word, value
     if "metering_level" in settings:
         settings["metering"] = True
-    return Strategy(name=name, controller=kind, city=settings, words=tuple(words), instance=instance)
+    return Strategy(name=name, controller=kind, city=settings, words=tuple(words))
 
 
-def parse_many(
-    names: str | Sequence[str], scenario: Scenario, *, regional: bool = False, where: str = "controllers"
-) -> list[Strategy]:
+def parse_many(given: str | Sequence[str], scenario: Scenario, *, regional: bool = False) -> list[Strategy]:
     """Return the strategies of names and patterns (*, ?, [...]), as a sequence or separated by commas.
 
     A pattern stands for all `ready` strategies that match and are not named besides.
     regional: for the regional model, without words for a city
     Raises: InputError for an unknown or repeated name, none at all, or a pattern without a match
     """
-    given = [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
-    if not any(given):
-        raise InputError(f"{where}: expected at least one controller, got none; name one, such as no-control")
-    plain = [name for name in given if not _is_pattern(name)]
+    names = [name.strip() for name in given.split(",")] if isinstance(given, str) else list(given)
+    if not any(names):
+        raise InputError("controllers: expected at least one controller, got none; name one, such as no-control")
+    plain = [name for name in names if not _is_pattern(name)]
     if repeated := [name for n, name in enumerate(plain) if name in plain[:n]]:
-        raise InputError(f"{where}: {repeated[0]} is there twice; name every controller once")
+        raise InputError(f"controllers: {repeated[0]} is there twice; name every controller once")
     result: dict[str, Strategy] = {}
-    for name in given:
+    for name in names:
         if not _is_pattern(name):
             result[name] = parse(name).regional() if regional else parse(name)
             continue
         known = [strategy for strategy in ready(scenario) if not (regional and strategy.words)]
         matching = [strategy for strategy in known if fnmatchcase(strategy.name, name)]
         if not matching:
-            raise InputError(
-                f"{where}: no controller here matches {name!r}; choose from {', '.join(s.name for s in known)}, and "
-                "others once their policies are trained"
-            )
+            there = ", ".join(strategy.name for strategy in known)
+            raise InputError(f"controllers: no controller here matches {name!r}; choose from {there}")
         result |= {strategy.name: strategy for strategy in matching if strategy.name not in (*plain, *result)}
     return list(result.values())
 
 
 def ready(scenario: Scenario) -> list[Strategy]:
-    """Return the strategies that can be made for `scenario`: built-in ones, with tables or policies, signals alone."""
+    """Return the strategies that can be made for `scenario`: built-in ones, and those with tables or policies."""
     files = sorted(scenario.folder.glob("*+*.pt")) if scenario.folder else []
     variants = dict.fromkeys([*(file.stem for file in files), *scenario.controller_options])
-    signals = [word for word, (key, _, _) in CITY_WORDS.items() if key == "signals"]
     result = []
-    for name in (*CONTROLLERS, *(name for name in variants if "+" in name), *signals):
+    for name in (*CONTROLLERS, *(name for name in variants if "+" in name)):
         try:
             strategy = parse(name)
             strategy.file(scenario)
@@ -370,10 +340,6 @@ def check_tables(scenario: Scenario) -> None:
             kind = parse(table).controller
         except InputError as error:
             raise config.error(planning.where, f"controllers.{table}", str(error)) from None
-        if kind.own:
-            raise config.error(
-                planning.where, f"controllers.{table}", f"a controller of your own has its table in [controllers.{OWN}]"
-            )
         merged = {**scenario.controller_options.get(kind.name, {}), **content}
         model = {"model": merged.pop("model")} if "model" in merged else {}
         config.checked(PlanningOptions, model, planning.where, f"controllers.{table}.")
@@ -407,8 +373,16 @@ def _city_setting(word: str) -> tuple[str, Any] | None:
     return None
 
 
+def _own(name: str) -> ControllerType | None:
+    """Return the controller of the user's own with the name FILE.py:CLASS, else None."""
+    if custom.FILE_AND_CLASS.fullmatch(name) is None:
+        return None
+    make = partial(custom.OwnController, name)
+    return ControllerType(name=name, text="controller of your own", make=make, guides=True, own=True)
+
+
 def _is_pattern(name: str) -> bool:
-    return any(sign in name for sign in "*?[") and custom.FILE_AND_CLASS.fullmatch(name) is None
+    return any(sign in name for sign in "*?[") and _own(name) is None
 
 
 def _unknown(name: str, word: str, *, controllers: bool) -> InputError:
