@@ -6,7 +6,6 @@ import pytest
 from trajectories import trajectory
 
 from cosim.report import figures
-from nmfd.api import load_scenario
 from nmfd.studies import plots
 
 
@@ -30,7 +29,8 @@ def test_strategies_get_colours_of_their_own():
 
 
 def test_demand_figure_has_the_levels_as_ticks(ax):
-    figures.over_demand(ax, {"dpc-pc": {0.8: (0.9, 0.1), 1.3: (0.5, np.nan)}, "pi-gating": {0.8: (0.7, 0.1)}})
+    points = {"dpc-pc": {0.8: (0.9, 0.1), 1.3: (0.5, np.nan)}, "pi-gating": {0.8: (0.7, 0.1)}}
+    assert figures.over_levels(ax, points, "ratio [-]").get_ylabel() == "ratio [-]"
     assert [tick.get_text() for tick in ax.get_xticklabels()] == ["0.8", "1.3"]
     assert ax.get_ylim()[0] == 0.0 and len(ax.containers) == 2
 
@@ -48,18 +48,5 @@ def test_the_frontier_has_the_share_of_due_trips_over_demand(tmp_path, monkeypat
     figures.draw_levels(tmp_path, rows)
     assert [name for name, _ in drawn] == ["frontier.png", "demand.png"]
     shares = {one.get_label(): one.lines[0].get_ydata() for one in drawn[0][1].containers}
-    np.testing.assert_allclose(shares["a"], [100.0, 80.0])
-    np.testing.assert_allclose(shares["b"], [90.0, 30.0])
-
-
-def test_prices_of_the_regions_that_have_one_and_the_trips_that_wait_there(monkeypatch, tmp_path):
-    network, drawn = load_scenario("two_region_2013").network, []
-    run, title = trajectory("dpc-pcrg", 0), [plots.region_title(network, region) for region in (0, 1)]
-    added, waiting = np.zeros(run.perimeter.shape[:2]), np.zeros(run.backlog.shape)
-    added[1:, 1], waiting[2:, 0, 1], waiting[:, 1, 0] = 0.25, 40.0, 1.0  # one waits for a gap in traffic anywhere
-    monkeypatch.setattr(plots, "save", lambda drawing, path: drawn.extend(drawing.axes) or path)
-    figures._draw_prices(tmp_path / "x.png", network, run.assign(prices=added, backlog=waiting), "no teleport")
-    shown = [{step.get_label(): step.get_data().values for step in ax.patches} for ax in drawn]
-    assert [list(each) for each in shown] == [title[1:], title[:1]]
-    np.testing.assert_allclose(shown[0][title[1]], 100.0 * added[:, 1])
-    np.testing.assert_allclose(shown[1][title[0]], waiting[1:, 0].sum(axis=1))  # at the end of the interval
+    np.testing.assert_allclose(shares["a"], [1.0, 0.8])
+    np.testing.assert_allclose(shares["b"], [0.9, 0.3])

@@ -110,15 +110,13 @@ def city():
 
 
 def test_a_city_without_a_run(city):
-    regions, gateways, flows = city.regions, city.gateways, city.flows
+    regions, gateways = city.regions, city.gateways
     assert len(regions) == 7 and regions["lane_km"].between(10, 30).all()
     assert regions["critical_veh"].tolist() == [mfd.critical for mfd in city.network.mfds]
     joined = {(g.source, g.target) for g in gateways.itertuples()}
     assert joined == {(i, h) for i, h in np.argwhere(city.network.adjacency)}
     assert set(gateways["control"]) == {"controlled"}
-    scenario = city.scenario
-    assert flows["trips_veh"].sum() == pytest.approx(scenario.step * scenario.demand.sum())
-    assert "3 centre" in city._repr_html_() and "max outflow [veh/s]" in city._repr_html_()
+    assert "centre" in city._repr_html_() and "max_outflow_veh_s" in city._repr_html_()
 
 
 def test_the_map_is_drawn_into_the_axes_it_is_given(city):
@@ -126,10 +124,8 @@ def test_the_map_is_drawn_into_the_axes_it_is_given(city):
 
     ax = Figure().subplots()
     assert city.plot(ax) is ax
-    arrows = [text for text in ax.texts if getattr(text, "arrow_patch", None)]
-    assert len(ax.collections[0].get_paths()) == city.regions["edges"].sum() and len(arrows) > 10
-    ax = Figure().subplots()
-    assert not [text for text in cosim.City("networks/grid7").plot(ax).texts if getattr(text, "arrow_patch", None)]
+    assert len(ax.collections[0].get_paths()) == city.regions["edges"].sum()
+    assert cosim.City("networks/grid7").plot().collections
 
 
 @pytest.mark.parametrize(
@@ -143,8 +139,3 @@ def test_the_map_is_drawn_into_the_axes_it_is_given(city):
 def test_no_city(folder, expected):
     with pytest.raises(nmfd.InputError, match=re.escape(expected)):
         cosim.City(folder)
-
-
-def test_a_network_has_no_flows():
-    with pytest.raises(nmfd.InputError, match="give the folder of a scenario"):
-        _ = cosim.City("networks/grid7").flows

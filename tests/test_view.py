@@ -15,10 +15,12 @@ from bokeh.models import Button
 from bokeh.resources import CDN
 from commands import cosim, error_line
 
-from cosim.evaluation.simulate import Task, scenario_of, simulate
+from cosim.evaluation.simulate import simulate
 from cosim.sumo.net import city_of
 from cosim.view import live, page, picture
 from cosim.view.picture import CityPicture, Frame
+from nmfd.api import load_scenario
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError, RunFailed
 from nmfd.metrics import total_time_spent
 
@@ -27,31 +29,34 @@ EVIL = "<script>alert(1)</script>"
 
 
 @pytest.fixture(scope="module")
-def task(tmp_path_factory):
-    folder = tiny_city.imported(tmp_path_factory.mktemp("view"))
-    return Task(scenario=folder, controller="no-control+guided", seed=3, steps=STEPS)
+def scenario(tmp_path_factory):
+    return load_scenario(tiny_city.imported(tmp_path_factory.mktemp("view")), {"steps": STEPS})
 
 
 @pytest.fixture(scope="module")
-def drawn(task):
-    scenario = scenario_of(task)
+def strategy():
+    return parse("no-control+guided")
+
+
+@pytest.fixture(scope="module")
+def drawn(scenario):
     return CityPicture.of(scenario, city_of(scenario.network))
 
 
 @pytest.fixture(scope="module")
-def plain(task):
-    return simulate(task)
+def plain(scenario, strategy):
+    return simulate(scenario, strategy, seed=3)
 
 
 @pytest.fixture(scope="module")
-def seen(task, drawn):
+def seen(scenario, strategy, drawn):
     """The messages and the result of a run that is held at the end of its first interval for a while."""
     messages, context = queue.Queue(), multiprocessing.get_context("spawn")
     limit, delay = context.Value("d", drawn.step), context.Value("d", 0.0)
     release = threading.Timer(1.0, lambda: setattr(limit, "value", live.FOREVER))
-    reporter, begin = live.Reporter(0, task, messages, limit, delay), time.perf_counter()
+    reporter, begin = live.Reporter(0, scenario, messages, limit, delay), time.perf_counter()
     release.start()
-    result = simulate(task, observer=reporter)
+    result = simulate(scenario, strategy, seed=3, observer=reporter)
     assert time.perf_counter() - begin > 1.0
     return [messages.get()[1] for _ in range(messages.qsize())], result
 
@@ -71,15 +76,14 @@ def test_frames_of_a_finished_run_are_those_of_the_live_one(drawn, plain, seen, 
     assert [frame.time for frame in later] == [k * drawn.step for k in range(STEPS + 1)]
     for there, here in zip(whole, later, strict=True):
         for name, value in vars(here).items():
-            if name not in ("speed", "note"):  # not in the result
+            if name != "note":  # not in the result of a plant problem
                 np.testing.assert_array_equal(getattr(there, name), value, err_msg=name)
     assert later[-1].time_spent == pytest.approx(total_time_spent(plain), rel=1e-12)
-    assert 0.0 < np.nanmean(whole[-1].speed) < 1.3 and np.isnan(later[-1].speed).all()
     assert all(np.diff([one.time for one in seen[0] if isinstance(one, Frame)]) >= 0)
 
 
-def test_the_picture_of_a_city(task, drawn):
-    city = city_of(scenario_of(task).network)
+def test_the_picture_of_a_city(scenario, drawn):
+    city = city_of(scenario.network)
     assert len(drawn.shapes) == len(drawn.edges) == len(drawn.lane_km) == len(city.edges)
     assert sorted(n for gate in drawn.gates for n in gate.gateways) == list(range(len(city.gateways)))
     assert all(len(rings) >= 1 for rings in drawn.outlines) and (drawn.critical > 0).all()
@@ -90,22 +94,19 @@ def test_the_picture_of_a_city(task, drawn):
 def test_the_frame_at_a_time(whole):
     seen = live.Seen("x")
     assert seen.at(100.0) is None
-    for frame in whole:
-        seen.add(frame)
-    seen.add(replace(whole[-1], time=whole[-1].time + 20.0, whole=False))
-    assert seen.at(whole[2].time + 1.0) is whole[2] and seen.at(1e9) is seen.latest and len(seen.whole) == STEPS + 1
+    seen.whole, seen.latest = whole, replace(whole[-1], time=whole[-1].time + 20.0, whole=False)
+    assert seen.at(whole[2].time + 1.0) is whole[2] and seen.at(1e9) is seen.latest
 
 
 def test_the_page_draws_every_street_and_escapes_names(drawn, whole):
     named = replace(drawn, name=EVIL, region_names=(EVIL,) * drawn.regions)
     one, document = page.Page(named, [EVIL, "no-control"]), Document()
     document.add_root(one.layout([Button(label=EVIL)]))
-    one.show([replace(whole[-1], note=EVIL), None], whole[-1].time, "speed")
+    one.show([replace(whole[-1], note=EVIL), None], whole[-1].time)
     one.trace([whole, whole[:2]], whole[-1].time)
     streets = one.maps[0].streets.data
     assert list(streets["edge"]) == list(drawn.edges) and len(streets["xs"]) == len(drawn.edges)
-    speed = np.nan_to_num(whole[-1].speed.astype(np.float32), nan=-1.0)
-    np.testing.assert_array_equal(streets["value"], speed)
+    np.testing.assert_array_equal(streets["density"], whole[-1].density.astype(np.float32))
     assert one.maps[0].arrows.data["width"].any()
     one.show([replace(whole[-1], guided=np.full_like(whole[-1].guided, -1.0)), None], whole[-1].time)
     assert not one.maps[0].arrows.data["width"].any()
@@ -123,7 +124,7 @@ def test_finished_runs_on_one_page_with_a_slider(drawn, plain):
     layout = page.with_slider(drawn, runs)
     slider = next(layout.select({"name": "time"}))
     arguments = slider.js_property_callbacks["change:value"][0].args
-    film = [table.data["value"] for _, table, names in arguments["film"] if names == ["value"]]
+    film = [table.data["density"] for _, table, names in arguments["film"] if names == ["density"]]
     for run, values in zip(runs.values(), film, strict=True):
         for frame, row in zip(run, values, strict=True):
             np.testing.assert_array_equal(row, frame.density.astype(np.float32))
@@ -136,9 +137,11 @@ def test_finished_runs_on_one_page_with_a_slider(drawn, plain):
     assert EVIL not in script and EVIL not in div
 
 
-def test_runs_in_processes_of_their_own(task):
+def test_runs_in_processes_of_their_own(scenario, strategy, tmp_path):
     """One run ends, one is wrong, and pausing holds a run."""
-    show = live.Show([task, replace(task, controller="nobody")])
+    (tmp_path / "wrong.py").write_text("class Wrong:\n    pass\n")
+    wrong = parse(f"{tmp_path / 'wrong.py'}:Wrong")
+    show = live.Show(scenario, [strategy, wrong], seed=3)
 
     def wait(condition):
         end = time.monotonic() + 60.0
@@ -149,25 +152,22 @@ def test_runs_in_processes_of_their_own(task):
 
     try:
         wait(lambda: show.picture is not None)
-        show.pause(True)
-        assert show.paused
-        viewer, document = None, Document()
-        viewer = live.Viewer(show, document)
+        viewer = live.Viewer(show, Document())
+        viewer._toggle()
+        assert show.limit.value == 0.0
         wait(lambda: show.runs[1].over)
-        show.pace(0.0)
-        show.pause(False)
+        viewer._toggle()
         wait(lambda: show.over)
-        viewer._tapped("indices", [], [len(show.picture.outlines) - 1])
-        viewer._colour(1)
-        assert viewer._pause.label == "Finished" and viewer._page.region == show.picture.regions - 1
+        viewer._choose(1)
+        assert viewer._pause.label == "Finished" and viewer._page.region == 1
         assert show.runs[0].row["completed_veh"] > 0 and len(show.runs[0].whole) == STEPS + 1
         assert isinstance(show.runs[1].error, InputError) and show.now == show.runs[0].latest.time
     finally:
         show.close()
 
 
-def test_a_process_that_dies_is_an_error(task):
-    show = live.Show([task])
+def test_a_process_that_dies_is_an_error(scenario, strategy):
+    show = live.Show(scenario, [strategy], seed=3)
     try:
         show._processes[0].kill()
         show._processes[0].join()
@@ -177,8 +177,8 @@ def test_a_process_that_dies_is_an_error(task):
         show.close()
 
 
-def test_wrong_ways_to_watch(task):
-    base = ("watch", task.scenario, "--controller", "no-control")
+def test_wrong_ways_to_watch(scenario):
+    base = ("watch", scenario.folder, "--controller", "no-control")
     assert "--gui: shows one run" in error_line(cosim(*base, "--gui", "--against", "pi-gating"))
     assert cosim(*base, "--port", 70000).exit_code == 2
     assert "nobody" in error_line(cosim(*base, "--against", "nobody"))

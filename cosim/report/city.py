@@ -1,4 +1,4 @@
-"""A city before anything runs: its regions, gateways and flows as tables and on a map."""
+"""A city before anything runs: its regions and gateways as tables and on a map."""
 
 from functools import cached_property
 from pathlib import Path
@@ -15,13 +15,11 @@ from cosim.sumo import net
 from cosim.sumo.build import ensure_built
 from nmfd.api import load_scenario
 from nmfd.arrays import Positions
-from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel, load_network
 from nmfd.model.scenario import Scenario
 from nmfd.studies import plots
 
 REGION_COLUMNS = ["region", "name", "edges", "lane_km", "signals", "pieces", "gateways", "controlled_gateways"]
-LEAST_FLOW_SHARE, WIDEST_FLOW = 0.05, 4.5  # of the largest flow; points
 
 
 class City:
@@ -29,7 +27,7 @@ class City:
 
         city = cosim.City("scenarios/grid7_peak")
         city.plot()
-        city.regions, city.gateways, city.flows
+        city.regions, city.gateways
 
     network: the regional model; scenario: None for a network alone
     """
@@ -62,54 +60,17 @@ class City:
         """One row per movement over a boundary: edges, lanes, signal with its links, and its control."""
         return pd.DataFrame(self._tables.gateways).drop(columns="flow_veh")
 
-    @cached_property
-    def flows(self) -> pd.DataFrame:
-        """One row per pair of regions with demand: origin, destination, trips_veh in all, peak_veh_s.
-
-        Raises:
-            InputError: for a network alone.
-        """
-        if self.scenario is None:
-            raise InputError(f"{self.name}: is a network, without demand; give the folder of a scenario on it")
-        demand, trips = self.scenario.demand, self._trips
-        origin, destination = np.nonzero(trips)
-        peak = demand.max(axis=0)[trips > 0]
-        columns = {"origin": origin, "destination": destination, "trips_veh": trips[trips > 0], "peak_veh_s": peak}
-        return pd.DataFrame(columns)
-
-    def plot(self, ax: Axes | None = None, *, flows: bool = True) -> Axes:
-        """Draw streets in the colour of their region, gateways, and arrows for the demand between regions.
-
-        Args:
-            ax: where to draw; a new figure if None.
-            flows: draw the arrows, if there is a scenario.
-        """
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw streets in the colour of their region, and gateways, into `ax` or a new figure."""
         ax = plots.figure(6.5, 6.0).subplots() if ax is None else ax
         maps.region_map(ax, self._streets, self._regions, self.network.region_names, self._places)
-        maps.gateway_marks(ax, self._streets, self._tables)
-        if flows and self.scenario is not None:
-            self._draw_flows(ax)
-        return ax
+        return maps.gateway_marks(ax, self._streets, self._tables)
 
     def __repr__(self) -> str:
         return f"<City {self.name}: {len(self.regions)} regions, {len(self.gateways)} gateways>"
 
     def _repr_html_(self) -> str:
         return self.regions.to_html(index=False)
-
-    def _draw_flows(self, ax: Axes) -> None:
-        between = self._trips * ~np.eye(len(self._trips), dtype=bool)
-        most = float(between.max(initial=0.0))
-        for i, j in np.argwhere((between > 0) & (between >= LEAST_FLOW_SHARE * most)):
-            style = {"arrowstyle": "-|>", "connectionstyle": "arc3,rad=0.15", "color": "black", "alpha": 0.35}
-            style |= {"shrinkA": 14, "shrinkB": 14, "linewidth": WIDEST_FLOW * between[i, j] / most}
-            ax.annotate("", self._places[j], self._places[i], zorder=4, arrowprops=style)
-        ax.set_title(f"demand between regions, widest arrow {most:,.0f} trips", fontsize="medium")
-
-    @cached_property
-    def _trips(self) -> np.ndarray:
-        """Trips of the whole scenario, (R, R) [veh]."""
-        return self.scenario.step * self.scenario.demand.sum(axis=0)
 
     @cached_property
     def _city(self) -> net.City:

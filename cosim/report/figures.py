@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Real
+from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -18,30 +18,21 @@ from cosim.sumo.net import City
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.studies import plots
-from nmfd.studies.benchmark import REFERENCE, draw_accumulations
+from nmfd.studies.benchmark import draw_accumulations, interval
 from nmfd.types import Result
 
 Read = Callable[[str, int], Result]  # controller, seed -> run
 
 SATURATION_FLOW = 0.5  # veh/s and lane
 COMMANDED, GREEN_SHOWN, FLOWED = "#333333", "#009e73", "#0059a8"
-SHOWN_PANELS = 11  # boundaries, or pairs of region and destination, that are shown one by one
-WAITING_TRIPS = 5  # a region with more of them is shown; a few always wait for a gap in traffic
+SHOWN_PANELS = 12  # boundaries, or pairs of region and destination, that are shown one by one
 SHARE_WINDOW = 3  # control intervals over which realised shares are taken
 NAMED_CONTROLLERS = 2  # with the most teleports, in a title
 MARKERS = "o^sDvPX"
 
 
 def perimeter(ax: Axes, step: float, commanded: Series, green: Series, flow: Series) -> Axes:
-    """Draw one boundary over time.
-
-    Args:
-        ax: where to draw.
-        step: control interval (s).
-        commanded: u (-, (T,)).
-        green: share of the original green (-, (T,)).
-        flow: share of the saturation flow of the original green (-, (T,)).
-    """
+    """Draw commanded u (T,) of one boundary, with green and flow (T,) as shares of the original programme."""
     time = plots.time_axis(ax, step * np.arange(len(commanded) + 1))
     for values, tone, label, width in (
         (flow, FLOWED, "flow / saturation flow of the original green", 1.2),
@@ -51,14 +42,6 @@ def perimeter(ax: Axes, step: float, commanded: Series, green: Series, flow: Ser
         ax.stairs(values, time, color=tone, linewidth=width, label=label, baseline=None)
     ax.set_ylim(0.0, max(1.08, 1.05 * float(np.nanmax([green, flow], initial=1.0))))
     return _finished(ax, None, "share [-]")
-
-
-def green_against_command(ax: Axes, commanded: Float[np.ndarray, " n"], green: Float[np.ndarray, " n"]) -> Axes:
-    """Draw the share of the original green against the commanded u, for all boundaries and intervals."""
-    ax.scatter(commanded, green, s=5, color=GREEN_SHOWN, alpha=0.35, linewidths=0)
-    ax.set_xlim(0.0, 1.0)
-    ax.set_ylim(0.0, max(1.08, 1.05 * float(np.nanmax(green, initial=1.0))))
-    return _finished(ax, "commanded u [-]", "green shown / original [-]")
 
 
 def splits(
@@ -78,58 +61,18 @@ def splits(
     return _finished(ax, None, "share [-]")
 
 
-def split_totals(
-    ax: Axes, commanded: Float[np.ndarray, " n"], realised: Float[np.ndarray, " n"], vehicles: Real[np.ndarray, " n"]
-) -> Axes:
-    """Draw realised against commanded split ratios of the whole run, with an area by vehicles."""
-    size = 90.0 * vehicles / max(vehicles.max(initial=0.0), 1.0) + 3.0
-    ax.plot([0, 1], [0, 1], color="#bbbbbb", linewidth=1.0, zorder=1)
-    ax.scatter(commanded, realised, s=size, color=FLOWED, alpha=0.45, linewidths=0, zorder=2)
-    ax.set_xlim(-0.04, 1.04)
-    ax.set_ylim(-0.04, 1.04)
-    return _finished(ax, "commanded θ [-], mean of the run", "realised share [-]")
-
-
-def by_region(
-    ax: Axes, step: float, values: Float[np.ndarray, "T R"], regions: Sequence[int], network: RegionalModel, label: str
-) -> Axes:
-    """Draw a quantity of some regions over time."""
-    time = plots.time_axis(ax, step * np.arange(len(values) + 1))
-    for region in regions:
-        tone, title = colormaps["tab10"](region % 10), plots.region_title(network, region)
-        ax.stairs(values[:, region], time, color=tone, linewidth=1.6, baseline=None, label=title)
+def over_levels(ax: Axes, values: Mapping[str, Mapping[float, tuple[float, float]]], label: str) -> Axes:
+    """Draw a quantity over the demand level: controller -> level -> mean and half of its 95 % interval."""
+    tones, levels = plots.colours([*values]), sorted({level for points in values.values() for level in points})
+    for number, (controller, points) in enumerate(values.items()):
+        mean, half = np.array([*points.values()]).T
+        aside = 0.012 * max(levels[-1] - levels[0], 0.1) * (number - (len(values) - 1) / 2)  # intervals stay apart
+        style = {"color": tones[controller], "marker": MARKERS[number % len(MARKERS)], "markersize": 4, "capsize": 3}
+        ax.errorbar(np.array([*points]) + aside, mean, np.nan_to_num(half), label=controller, linewidth=1.6, **style)
+    ax.axhline(1.0, color="#777777", linestyle="--", linewidth=1.0)
+    ax.set_xticks(levels, [f"{level:g}" for level in levels])
     ax.set_ylim(bottom=0.0)
-    return _finished(ax, None, label)
-
-
-def over_demand(ax: Axes, ratios: Mapping[str, Mapping[float, tuple[float, float]]], against: str = REFERENCE) -> Axes:
-    """Draw total time spent relative to `against` over the demand level.
-
-    Args:
-        ax: where to draw.
-        ratios: controller -> level -> mean and half of its 95 % interval (-), NaN for a single seed.
-        against: the controller with ratio 1.
-    """
-    tones = plots.colours([against, *ratios])
-    ax.axhline(1.0, color=tones[against], linewidth=1.0)
-    for number, (controller, points) in enumerate(ratios.items()):
-        mean, half = np.array(list(points.values())).reshape(-1, 2).T
-        style = _style(number, controller, tones)
-        ax.errorbar(_aside([*points], number, len(ratios)), mean, np.nan_to_num(half), label=controller, **style)
-    _level_ticks(ax, {level for points in ratios.values() for level in points})
-    ax.set_ylim(bottom=0.0)
-    return _finished(ax, "demand, multiple of the scenario's", f"total time spent / that of {against} [-]")
-
-
-def frontier(ax: Axes, shares: Mapping[str, Mapping[float, float]]) -> Axes:
-    """Draw the share of the due trips that was served over the demand level, controller -> level -> share."""
-    tones = plots.colours([*shares])
-    for number, (controller, points) in enumerate(shares.items()):
-        levels = _aside([*points], number, len(shares))
-        ax.errorbar(levels, 100.0 * np.array([*points.values()]), label=controller, **_style(number, controller, tones))
-    ax.axhline(100.0, color="#777777", linestyle="--", linewidth=1.0)
-    _level_ticks(ax, {level for points in shares.values() for level in points})
-    return _finished(ax, "demand, multiple of the scenario's", "trips served [%]")
+    return _finished(ax, "demand, multiple of the scenario's", label)
 
 
 def ranked(rows: pd.DataFrame) -> list[str]:
@@ -167,15 +110,7 @@ def draw_all(finished: Finished) -> None:
 
 
 def draw_level(out: Path, scenario: Scenario, city: City, rows: pd.DataFrame, read: Read) -> None:
-    """Draw all pictures of one demand level into the folder `out`.
-
-    Args:
-        out: an existing folder.
-        scenario: of the runs.
-        city: of the scenario.
-        rows: a row per run, as in cosim.evaluation.statistics.
-        read: returns a run.
-    """
+    """Draw all pictures of one demand level into the folder `out`; rows: one per run; read: returns a run."""
     seed, note, network = shown_seed(rows), teleports(rows), scenario.network
     runs = [read(row.controller, row.seed) for row in rows.itertuples()]
     shaded = ", shaded: all seeds" if rows["seed"].nunique() > 1 else ""
@@ -191,30 +126,30 @@ def draw_level(out: Path, scenario: Scenario, city: City, rows: pd.DataFrame, re
         _draw_perimeter(out / "perimeter.png", city, network, gating, note)
     if guiding := next((run for run in results if run.guided.sum() > 0), None):
         _draw_splits(out / "splits.png", network, guiding, note)
-    if priced := next((run for run in results if run.prices.any()), None):
-        _draw_prices(out / "prices.png", network, priced, note)
 
 
 def draw_levels(out: Path, rows: pd.DataFrame) -> None:
-    """Draw time spent and trips served over several demand levels into the folder `out`."""
+    """Draw trips served (the frontier) and time spent over several demand levels into the folder `out`."""
     against = statistics.compared_with(rows)
     ratios: dict[str, dict[float, tuple[float, float]]] = {}
-    shares: dict[str, dict[float, float]] = {}
+    shares: dict[str, dict[float, tuple[float, float]]] = {}
     for level, names in statistics.groups(rows).items():
         reference = statistics.by_seed(rows, level, against)
         for name in names:
             part = rows[(rows["demand"] == level) & (rows["controller"] == name)]
-            shares.setdefault(name, {})[level] = float(part["completed_veh"].sum() / max(part["trips"].sum(), 1))
+            served = part["completed_veh"] / part["trips"].clip(lower=1)
+            shares.setdefault(name, {})[level] = served.mean(), interval(list(served))
             pair = statistics.paired(statistics.by_seed(rows, level, name), reference)
             if name != against and not np.isnan(pair.percent):
                 ratios.setdefault(name, {})[level] = 1.0 + pair.percent / 100.0, pair.percent_half / 100.0
-    drawing = plots.figure(7.5, 4.8)
-    ax = frontier(drawing.subplots(), shares)
-    _save(drawing, [ax], out / "frontier.png", f"mean over seeds; {teleports(rows)}")
-    if ratios:
-        drawing = plots.figure(7.5, 4.8)
-        ax = over_demand(drawing.subplots(), ratios, against)
-        _save(drawing, [ax], out / "demand.png", f"paired by seed, 95 % intervals; {teleports(rows)}")
+    for file, values, label in (
+        ("frontier.png", shares, "trips served / trips due [-]"),
+        ("demand.png", ratios, f"total time spent / that of {against} [-]"),
+    ):
+        if values:
+            drawing = plots.figure(7.5, 4.8)
+            ax = over_levels(drawing.subplots(), values, label)
+            _save(drawing, [ax], out / file, f"mean over seeds, 95 % intervals; {teleports(rows)}")
 
 
 def _gates(result: Result, network: RegionalModel) -> bool:
@@ -234,7 +169,7 @@ def _draw_mfds(path: Path, network: RegionalModel, results: Sequence[Result]) ->
 
 
 def _draw_perimeter(path: Path, city: City, network: RegionalModel, run: Result, note: str) -> None:
-    """Draw the boundaries that were closed most over time, and all in one cloud."""
+    """Draw the boundaries that were closed most over time."""
     pairs = {}
     for pair in map(tuple, np.argwhere(network.adjacency)):
         members = [
@@ -247,20 +182,18 @@ def _draw_perimeter(path: Path, city: City, network: RegionalModel, run: Result,
         if members and original.sum() > 0:
             flow = run.gateway_flow[:, members].sum(axis=1) / (SATURATION_FLOW * original.sum(axis=1))
             pairs[pair] = run.perimeter[:, *pair], shown.sum(axis=1) / original.sum(axis=1), flow
-    if not pairs:
-        return
     closed = [pair for pair in pairs if pairs[pair][0].min() < network.u_max - 1e-9]
+    if not closed:
+        return
     shown_pairs = sorted(sorted(closed, key=lambda pair: pairs[pair][0].mean())[:SHOWN_PANELS])
-    drawing, axes = plots.panels(len(shown_pairs) + 1)
-    for ax, pair in zip(axes, shown_pairs, strict=False):
+    drawing, axes = plots.panels(len(shown_pairs))
+    for ax, pair in zip(axes, shown_pairs, strict=True):
         perimeter(ax, run.step, *pairs[pair]).set_title(f"{pair[0]} > {pair[1]}", fontsize="medium")
-    commanded, green, _ = (np.concatenate(values) for values in zip(*pairs.values(), strict=True))
-    green_against_command(axes[-1], commanded, green).set_title("all boundaries", fontsize="medium")
     _save(drawing, axes, path, f"{run.controller}, seed {run.seed}; {note}")
 
 
 def _draw_splits(path: Path, network: RegionalModel, run: Result, note: str) -> None:
-    """Draw the busiest choices between neighbours over time, and all in one cloud."""
+    """Draw the busiest choices between neighbours over time."""
     crossings = run.crossings.astype(float)
     leaving = crossings.sum(axis=2)  # (T, R, R), from i bound for j
     choices = [
@@ -270,59 +203,24 @@ def _draw_splits(path: Path, network: RegionalModel, run: Result, note: str) -> 
     ]
     if not choices:
         return
-    totals = []
-    for i, j in choices:
-        neighbours = np.flatnonzero(network.split_mask[i, :, j])
-        weight = leaving[:, i, j][:, None]
-        commanded = (run.splits[:, i, neighbours, j] * weight).sum(axis=0) / weight.sum()
-        realised = crossings[:, i, neighbours, j].sum(axis=0) / weight.sum()
-        totals.append(np.stack([commanded, realised, np.full(len(neighbours), weight.sum())]))
     shown = sorted(sorted(choices, key=lambda pair: -leaving[:, *pair].sum())[:SHOWN_PANELS])
-    drawing, axes = plots.panels(len(shown) + 1)
+    drawing, axes = plots.panels(len(shown))
     kernel = np.ones(min(SHARE_WINDOW, len(crossings)))
-    for ax, (i, j) in zip(axes, shown, strict=False):
+    for ax, (i, j) in zip(axes, shown, strict=True):
         neighbours = np.flatnonzero(network.split_mask[i, :, j])
         moved = np.stack([np.convolve(crossings[:, i, h, j], kernel, mode="same") for h in neighbours], axis=1)
         every = moved.sum(axis=1, keepdims=True)
         realised = np.where(every > 0, moved / np.maximum(every, 1.0), np.nan)
         splits(ax, run.step, run.splits[:, i, neighbours, j], realised, neighbours)
         ax.set_title(f"in {i}, bound for {j}", fontsize="medium")
-    split_totals(axes[-1], *np.concatenate(totals, axis=1)).set_title("all", fontsize="medium")
     how = f"commanded θ (lines), shares over {SHARE_WINDOW} intervals (dots)"
     _save(drawing, axes, path, f"{run.controller}, seed {run.seed}: {how}; {note}")
-
-
-def _draw_prices(path: Path, network: RegionalModel, run: Result, note: str) -> None:
-    """Draw the added travel times that guided drivers were given, and the trips that waited to begin."""
-    added, waiting = 100.0 * run.prices, run.backlog[1:].sum(axis=2)
-    drawing, axes = plots.panels(2)
-    for ax, values, least, title, label in (
-        (axes[0], added, 0.0, "ways through", "added travel time [%]"),
-        (axes[1], waiting, WAITING_TRIPS, "trips that begin in", "waiting trips [veh]"),
-    ):
-        by_region(ax, run.step, values, np.flatnonzero(values.max(axis=0) > least).tolist(), network, label)
-        ax.set_title(title, fontsize="medium")
-    _save(drawing, axes, path, f"{run.controller}, seed {run.seed}; {note}")
 
 
 def _save(drawing: Figure, axes: Sequence[Axes], path: Path, title: str) -> None:
     drawing.suptitle(title, fontsize="medium")
     plots.legend_below(drawing, axes)
     plots.save(drawing, path)
-
-
-def _style(number: int, controller: str, tones: Mapping[str, str]) -> dict:
-    marker = MARKERS[number % len(MARKERS)]
-    return {"color": tones[controller], "linewidth": 1.6, "capsize": 3, "marker": marker, "markersize": 4}
-
-
-def _aside(levels: Sequence[float], number: int, count: int) -> np.ndarray:
-    """Return demand levels moved a little, so that intervals do not hide each other."""
-    return np.array(levels) + 0.012 * max(max(levels) - min(levels), 0.1) * (number - (count - 1) / 2)
-
-
-def _level_ticks(ax: Axes, levels: set[float]) -> None:
-    ax.set_xticks(sorted(levels), [f"{level:g}" for level in sorted(levels)])
 
 
 def _finished(ax: Axes, x: str | None, y: str) -> Axes:

@@ -31,7 +31,6 @@ PICTURES = {  # file -> caption
     "perimeter": "Perimeter control: commanded u of the boundaries that were closed most, green shown and flow, as "
     "shares of the original programme.",
     "splits": "Route guidance: commanded and realised split ratios.",
-    "prices": "Prices: travel time added for guided drivers, and trips that wait to begin.",
 }
 PICTURE_DPI, CSS_DPI = 150, 96  # of nmfd.studies.plots.save, and of browsers
 LEVEL_PICTURES = {
@@ -88,13 +87,11 @@ def write_page(
 def _map(run: Finished, seed: int | None) -> tuple[str, str, str]:
     """Return title, script and HTML of the best run beside its reference, with a slider over their time."""
     level = run.level(None)
-    best, against = figures.ranked(level.rows)[0], statistics.compared_with(level.rows)
-    if best == against:
-        against = next((name for name in figures.ranked(level.rows) if name != best), best)
-    names = list(dict.fromkeys((against, best)))
+    against = statistics.compared_with(level.rows)
+    names = [against, *(name for name in figures.ranked(level.rows) if name != against)][:2]
     seeds = [set(level.rows.loc[level.rows["controller"] == name, "seed"]) for name in names]
     if not set.intersection(*seeds):
-        names, seeds = [best], seeds[-1:]
+        names, seeds = names[:1], seeds[:1]
     common = sorted(set.intersection(*seeds))
     if seed is not None and seed not in common:
         raise InputError(f"--seed: {' and '.join(names)} have no run with seed {seed}; choose from {common}")
@@ -111,7 +108,6 @@ def _run(run: Finished) -> dict:
     level, rows = run.level(None), run.rows
     configuration = level.key
     heading, shown, name = card.card(level.rows)
-    strategies, seeds = rows["controller"].nunique(), rows["seed"].nunique()
     minutes = configuration["steps"] * configuration["step_s"] / 60
     pictures = _pictures(partial(figures.draw_levels, rows=rows), LEVEL_PICTURES) if len(run.levels) > 1 else []
     return {
@@ -119,9 +115,8 @@ def _run(run: Finished) -> dict:
         "heading": heading + (f", demand times {level.demand:g}" if len(run.levels) > 1 else ""),
         "figures": shown,
         "why": explain.paragraph(level, run, name),
-        "intro": f"Scenario {run.scenario.name}: {_count(strategies, 'strategy', 'strategies')}, "
-        f"{_count(len(run.levels), 'demand level')}, {_count(seeds, 'seed')}, {minutes:.0f} min in SUMO. With the same "
-        "seed every strategy has the same trips.",
+        "intro": f"Scenario {run.scenario.name}, {minutes:.0f} min in SUMO; seeds {_seeds(rows)}. With the same seed "
+        "every strategy has the same trips.",
         "pictures": pictures,
         "manifest": json.dumps(
             {"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}, indent=1
@@ -168,5 +163,5 @@ def _html(frame: pd.DataFrame) -> str:
     return frame.to_html(index=False, border=0, na_rep="–", float_format="{:.7g}".format)
 
 
-def _count(number: int, one: str, many: str | None = None) -> str:
-    return f"{number} {one if number == 1 else many or one + 's'}"
+def _seeds(rows: pd.DataFrame) -> str:
+    return ", ".join(map(str, sorted(set(rows["seed"]))))

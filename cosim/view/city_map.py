@@ -1,4 +1,4 @@
-"""The map of one run: streets by density or speed, regions with their numbers, gates with their green."""
+"""The map of one run: streets by density, regions with their numbers, gates with their green."""
 
 from typing import Any
 
@@ -12,29 +12,25 @@ from bokeh.models import (
     PanTool,
     ResetTool,
     ScaleBar,
-    TapTool,
     WheelZoomTool,
 )
 from bokeh.plotting import figure
 
-from cosim.sumo.arrays import PerGateway
 from cosim.view import colours
 from cosim.view.picture import CityPicture, Frame
 
 JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
-LABELS = {"density": "density [veh/km and lane]", "speed": "speed / speed limit [-]"}
 LINE_OFFSET = 0.006  # of the map's width, by which the two directions of a street are drawn apart
 MAP_HEIGHT = 500  # pixels
 GATE_RADII = ((60, 6.0), (150, 4.5), (10**9, 3.5))  # up to so many gates, pixels
 ARROW_WIDTH = 9.0  # pixels, of the widest arrow
-MISSING = -1.0  # value of a street without a measurement
 
 
 class CityMap:
     """One run on the map; `show` sets its sources to a frame."""
 
     def __init__(self, picture: CityPicture, title: str):
-        self._picture, self._by = picture, "density"
+        self._picture = picture
         self._radius = next(radius for count, radius in GATE_RADII if len(picture.gates) <= count)
         self.plot = figure(
             height=MAP_HEIGHT,
@@ -56,15 +52,11 @@ class CityMap:
         self.gates = self._add_gates()
         self._add_numbers()
 
-    def show(self, frame: Frame, by: str = "density") -> None:
-        """Draw a frame; by: "density" or "speed", the colour of the streets."""
-        if by != self._by:
-            self._by = by
-            self._lines.glyph.line_color = {"field": "value", "transform": self._bars[by].color_mapper}
-            for name, bar in self._bars.items():
-                bar.visible = name == by
-        patch(self.streets, value=np.nan_to_num(getattr(frame, by).astype(np.float32), nan=MISSING))
-        share, queue = mean_by_gate(self._picture, frame.green), mean_by_gate(self._picture, frame.queue)
+    def show(self, frame: Frame) -> None:
+        """Draw a frame."""
+        patch(self.streets, density=frame.density.astype(np.float32))
+        members = [list(gate.gateways) for gate in self._picture.gates]
+        share, queue = (np.array([mean(x[n]) for n in members]) for x in (frame.green, frame.queue))
         patch(
             self.gates,
             end=_wedge_end(np.nan_to_num(np.clip(share, 0.0, 1.0), nan=1.0)).astype(np.float32),
@@ -104,17 +96,7 @@ class CityMap:
                 "fill": [colours.LAND] * len(rings),
             }
         )
-        drawn = self.plot.patches(
-            "xs",
-            "ys",
-            source=source,
-            fill_color="fill",
-            line_color="line",
-            line_width="width",
-            nonselection_fill_alpha=1.0,
-            nonselection_line_alpha=1.0,
-        )
-        self.plot.add_tools(TapTool(renderers=[drawn]))
+        self.plot.patches("xs", "ys", source=source, fill_color="fill", line_color="line", line_width="width")
         return source
 
     def _add_streets(self) -> ColumnDataSource:
@@ -127,22 +109,21 @@ class CityMap:
                 "xs": [_floats(line[:, 0]) for line in lines],
                 "ys": [_floats(line[:, 1]) for line in lines],
                 "edge": list(picture.edges),
-                "value": np.zeros(len(lines), np.float32),
+                "density": np.zeros(len(lines), np.float32),
                 "width": _floats(thin + per_lane * picture.lanes),
             }
         )
-        self._bars = {by: _colour_bar(by) for by in LABELS}
-        for bar in self._bars.values():
-            self.plot.add_layout(bar, "below")
-        self._lines = self.plot.multi_line(
+        mapper = LinearColorMapper(palette=colours.SCALE, low=0.0, high=JAM_DENSITY)
+        self.plot.add_layout(colour_bar(mapper, "density [veh/km and lane]", [0.0, 50.0, 100.0]), "below")
+        drawn = self.plot.multi_line(
             "xs",
             "ys",
             source=source,
             line_width="width",
             line_cap="round",
-            line_color={"field": "value", "transform": self._bars["density"].color_mapper},
+            line_color={"field": "density", "transform": mapper},
         )
-        self._hover(self._lines, ("street", "@edge"), ("value", "@value{0.00}"))
+        self._hover(drawn, ("street", "@edge"), ("density [veh/km and lane]", "@density{0.0}"))
         return source
 
     def _add_gates(self) -> ColumnDataSource:
@@ -250,17 +231,13 @@ def patch(source: ColumnDataSource, **columns: Any) -> None:
         source.patch({name: [(slice(len(values)), values)] for name, values in columns.items()})
 
 
-def mean_by_gate(picture: CityPicture, values: PerGateway) -> np.ndarray:
-    """Return the mean of the gateways' values for every gate of the map; NaN if all are NaN."""
-    means = np.full(len(picture.gates), np.nan)
-    for n, gate in enumerate(picture.gates):
-        members = values[list(gate.gateways)]
-        if not np.isnan(members).all():
-            means[n] = np.nanmean(members)
-    return means
+def mean(values: np.ndarray) -> float:
+    """Return the mean without NaN, NaN if nothing is left."""
+    values = values[~np.isnan(values)]
+    return float(values.mean()) if len(values) else float("nan")
 
 
-def colour_bar(mapper: LinearColorMapper, title: str, ticks: list[float], **more: Any) -> ColorBar:
+def colour_bar(mapper: LinearColorMapper, title: str, ticks: list[float]) -> ColorBar:
     """Return a small horizontal scale to stand below a plot."""
     return ColorBar(
         color_mapper=mapper,
@@ -277,14 +254,7 @@ def colour_bar(mapper: LinearColorMapper, title: str, ticks: list[float], **more
         major_label_text_font_size="11px",
         bar_line_color=None,
         major_tick_line_color=None,
-        **more,
     )
-
-
-def _colour_bar(by: str) -> ColorBar:
-    high, ticks = (1.0, [0.0, 0.5, 1.0]) if by == "speed" else (JAM_DENSITY, [0.0, 50.0, 100.0])
-    mapper = LinearColorMapper(palette=colours.scale(by == "speed"), low=0.0, high=high, low_color=colours.EMPTY)
-    return colour_bar(mapper, LABELS[by], ticks, visible=by == "density")
 
 
 def _wedge_end(share: np.ndarray | float) -> np.ndarray:

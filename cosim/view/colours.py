@@ -1,16 +1,11 @@
-"""Colours of the page, distinct for colour-blind readers and in greyscale: dark is full or slow."""
+"""Colours of the page, distinct for colour-blind readers and in greyscale: dark is full."""
 
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap, to_hex
 
 INK, FAINT, LINE, PAPER = "#22303c", "#6b7885", "#d5dae0", "#ffffff"
-LAND, CHOSEN, CHOSEN_LAND, EMPTY = "#f3f5f7", "#0b5c8a", "#dcebf5", "#c3cbd2"
+LAND, CHOSEN, CHOSEN_LAND = "#f3f5f7", "#0b5c8a", "#dcebf5"
 GREEN, QUEUE, GUIDED = "#0b7a5b", "#a3123a", "#3a5a9b"
 RUNS = (("#0b5c8a", "solid"), ("#c96a00", "dashed"))  # colour and dash of the runs side by side
 STOPS = ("#c3cbd2", "#f2c14e", "#e2711d", "#a3123a", "#2d0a2e")  # from light to dark
-
-
-def scale(reverse: bool = False) -> list[str]:
-    """Return 256 colours from empty to full, or reversed from standing to free flow."""
-    palette = [to_hex(tone) for tone in LinearSegmentedColormap.from_list("load", STOPS)(np.linspace(0.0, 1.0, 256))]
-    return palette[::-1] if reverse else palette
+SCALE = [to_hex(tone) for tone in LinearSegmentedColormap.from_list("load", STOPS)(np.linspace(0.0, 1.0, 256))]

@@ -16,7 +16,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from cosim.view import colours
-from cosim.view.city_map import colour_bar
+from cosim.view.city_map import colour_bar, mean
 from cosim.view.picture import CityPicture, Frame
 
 TRAIL_INTERVALS = 30  # behind the present point in the MFD plane
@@ -40,7 +40,7 @@ class Load:
         self.plot.yaxis.ticker = FixedTicker(ticks=list(range(picture.regions)))
         self.plot.grid.visible = False
         self._source = ColumnDataSource({"image": [self._values([])]})
-        mapper = LinearColorMapper(palette=colours.scale(), low=0.0, high=DARKEST_LOAD, nan_color=colours.LAND)
+        mapper = LinearColorMapper(palette=colours.SCALE, low=0.0, high=DARKEST_LOAD, nan_color=colours.LAND)
         self.plot.image(
             "image", x=0.0, y=-0.5, dw=horizon, dh=picture.regions, source=self._source, color_mapper=mapper
         )
@@ -97,21 +97,15 @@ class Curves:
         legend = self.gates.legend[0]  # values are at the top and at the bottom
         legend.update(location="left", ncols=2, margin=0)
         self.gates.add_layout(legend, "below")
+        self.titles = [plot.title for plot in (self.region, self.plane, self.gates)]  # they name the region
         self.now = [_now(plot) for plot in over_time]
-
-    @property
-    def titles(self) -> list:
-        """Titles that name the region."""
-        return [plot.title for plot in (self.region, self.plane, self.gates)]
 
     def choose(self, region: int) -> None:
         """Select the region of the curves; `show` draws it."""
         self._region = region
         self._gateways = [n for gate in self._picture.gates if gate.target == region for n in gate.gateways]
         self._sources = sorted({gate.source for gate in self._picture.gates if gate.target == region and gate.signal})
-        name = f"Region {region}" + f", {self._picture.region_names[region]}" * (
-            self._picture.region_names[region] != str(region)
-        )
+        name = f"Region {region}, {self._picture.region_names[region]}"
         for title, text in zip(self.titles, ("accumulation", "MFD plane", "gates into it, mean"), strict=True):
             title.text = f"{name}: {text}"
         horizon, level = self._picture.steps * self._picture.step / MINUTE, float(self._picture.critical[region])
@@ -126,8 +120,8 @@ class Curves:
                 "time": [frame.time / MINUTE for frame in whole],
                 "accumulation": [frame.accumulation[self._region] for frame in whole],
                 "outflow": [frame.outflow[self._region] for frame in whole],
-                "u": [_mean(frame.perimeter[self._sources, self._region]) for frame in whole],
-                "green": [_mean(frame.green[self._gateways]) for frame in whole],
+                "u": [mean(frame.perimeter[self._sources, self._region]) for frame in whole],
+                "green": [mean(frame.green[self._gateways]) for frame in whole],
                 "completed": [frame.completed for frame in whole],
                 "spent": [frame.time_spent / HOUR for frame in whole],
             }
@@ -168,12 +162,6 @@ class Curves:
         self.lines.append(source)
         self.past.append(past)
         self.present.append(present)
-
-
-def _mean(values: np.ndarray) -> float:
-    """Return the mean without NaN, NaN if nothing is left."""
-    values = values[~np.isnan(values)]
-    return float(values.mean()) if len(values) else float("nan")
 
 
 def _figure(title: str, x: str, y: str, height: int = CURVE_HEIGHT) -> Plot:

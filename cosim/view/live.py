@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from bokeh.document import Document
-from bokeh.models import Button, RadioButtonGroup, Select
+from bokeh.models import Button, Select
 from bokeh.server.server import Server
 from tornado.ioloop import PeriodicCallback
 
@@ -31,8 +31,9 @@ from nmfd.types import Controls, Result, State
 
 REFRESH_MS = 250  # between two pictures
 FRAME_RATE = 8.0  # frames per second of wall time within control intervals, at most
+HOLD_PERIOD_S = 0.05  # between two looks at the limit of a run that is held
 OPENING_S = 10.0  # time to open the page of runs that have ended
-PACES = {"as fast as possible": 0.0, "60 s per s": 1 / 60, "20 s per s": 1 / 20, "5 s per s": 1 / 5, "real time": 1.0}
+PACES = {"as fast as possible": 0.0, "slow": 0.02, "slower": 0.1, "slowest": 0.5}  # wall time per simulated second [s]
 FOREVER = float("inf")
 
 
@@ -55,12 +56,6 @@ class Seen:
         """True if the run has ended."""
         return self.row is not None or self.error is not None
 
-    def add(self, frame: Frame) -> None:
-        """Store a new frame."""
-        self.latest = frame
-        if frame.whole:
-            self.whole.append(frame)
-
     def at(self, time: float) -> Frame | None:
         """Return the last frame until a time [s], None before the first."""
         if self.latest is not None and self.latest.time <= time:
@@ -69,7 +64,10 @@ class Seen:
 
 
 class Show:
-    """Runs side by side, each in its own process, at a common pace."""
+    """Runs side by side, each in its own process, at a common pace.
+
+    limit: time [s] at which the runs wait; delay: least wall time per simulated second [s]; both are shared values
+    """
 
     def __init__(self, scenario: Scenario, strategies: Sequence[Strategy], **settings: Any):
         """settings: seed and demand of cosim.evaluation.simulate.simulate"""
@@ -77,9 +75,9 @@ class Show:
         self.runs = [Seen(strategy.name) for strategy in strategies]
         self.picture: CityPicture | None = None
         self._messages = spawn.Queue()
-        self._limit, self._delay = spawn.Value("d", FOREVER), spawn.Value("d", 0.0)
+        self.limit, self.delay = spawn.Value("d", FOREVER), spawn.Value("d", 0.0)
         self._processes = [
-            spawn.Process(target=run, args=(n, job, scenario, self._messages, self._limit, self._delay), daemon=True)
+            spawn.Process(target=run, args=(n, job, scenario, self._messages, self.limit, self.delay), daemon=True)
             for n, job in enumerate(partial(simulate, scenario, strategy, **settings) for strategy in strategies)
         ]
         for process in self._processes:
@@ -92,22 +90,8 @@ class Show:
 
     @property
     def now(self) -> float:
-        """Return the time [s] that all runs under way have reached."""
-        times = [seen.latest.time if seen.latest else 0.0 for seen in self.runs if not seen.over]
-        return min(times, default=max((seen.latest.time for seen in self.runs if seen.latest), default=0.0))
-
-    @property
-    def paused(self) -> bool:
-        """True if the runs are held."""
-        return self._limit.value != FOREVER
-
-    def pause(self, hold: bool) -> None:
-        """Hold all runs at their next frame, or release them."""
-        self._limit.value = 0.0 if hold else FOREVER
-
-    def pace(self, delay: float) -> None:
-        """Set the least wall time per simulated second [s]."""
-        self._delay.value = delay
+        """Return the time [s] that all runs without an error have reached."""
+        return min((seen.latest.time for seen in self.runs if seen.latest and not seen.error), default=0.0)
 
     def update(self) -> None:
         """Take what the runs have sent."""
@@ -118,7 +102,8 @@ class Show:
                 if isinstance(message, CityPicture):
                     self.picture = self.picture or message
                 elif isinstance(message, Frame):
-                    self.runs[n].add(message)
+                    self.runs[n].latest = message
+                    self.runs[n].whole += [message] * message.whole
                 elif isinstance(message, Exception):
                     self.runs[n].error = type(message)(f"{self.runs[n].name}: {message}")
                 else:
@@ -152,9 +137,7 @@ class Reporter:
         self._n, self._messages, self._limit, self._delay = n, messages, limit, delay
         self._scenario = scenario
         self._begin = settings(self._scenario).begin
-        self._speed: PerEdge | None = None
         self._sent = self._time = 0.0
-        self._due = time.perf_counter()
 
     def began(self, city: City, state: State) -> None:
         """Send the city and the first frame."""
@@ -166,16 +149,16 @@ class Reporter:
 
     def sampled(self, time_: float, vehicles: PerEdge, speed: PerEdge) -> None:
         """Send a frame within a control interval if the last one is old enough."""
-        now, self._speed = time_ - self._begin, np.where(vehicles > 0, speed, np.nan)
+        now = time_ - self._begin
         if now < (self._state.step + 1) * self._picture.step - 1e-6:  # else `recorded` follows
             if now >= self._limit.value or time.perf_counter() - self._sent > 1.0 / FRAME_RATE:
-                self._send(between(self._picture, self._frame, now, vehicles, speed))
+                self._send(between(self._picture, self._frame, now, vehicles))
             self._wait(now)
 
     def recorded(self, controls: Controls, state: State, row: Mapping[str, np.ndarray]) -> None:
         """Send the frame at the end of a control interval."""
         spent = float(self._state.unfinished.sum())
-        self._frame = after(self._picture, self._frame, spent, controls, state, row, self._speed)
+        self._frame = after(self._picture, self._frame, spent, controls, state, row)
         self._state = state
         self._send(self._frame)
         self._wait(state.time)
@@ -186,14 +169,13 @@ class Reporter:
 
     def _wait(self, now: float) -> None:
         """Return when the run may go on from a time [s]."""
-        parent = multiprocessing.parent_process()
-        self._due = max(self._due + self._delay.value * (now - self._time), time.perf_counter() - 1.0)
+        time.sleep(self._delay.value * (now - self._time))
         self._time = now
-        while now >= self._limit.value or time.perf_counter() < self._due:
+        parent = multiprocessing.parent_process()
+        while now >= self._limit.value:
             if parent is not None and not parent.is_alive():
                 raise RunFailed("the page was closed")
-            left = self._due - time.perf_counter()
-            time.sleep(min(max(left, 0.001), 0.05) if now < self._limit.value else 0.05)
+            time.sleep(HOLD_PERIOD_S)
 
 
 class Viewer:
@@ -202,28 +184,24 @@ class Viewer:
     def __init__(self, show: Show, document: Document):
         """show: has its picture already"""
         assert show.picture is not None
-        self._show, self._page, self._by = show, Page(show.picture, [seen.name for seen in show.runs]), "density"
+        self._show, self._page = show, Page(show.picture, [seen.name for seen in show.runs])
         self._traced: tuple[object, ...] = ()
         self._pause = Button(label="Pause", button_type="primary", name="pause", width=90)
         self._pause.on_click(self._toggle)
         pace = Select(title="Pace", name="pace", width=170, value=next(iter(PACES)), options=list(PACES))
-        pace.on_change("value", lambda _, __, new: show.pace(PACES[new]))
-        colour = RadioButtonGroup(labels=["Density", "Speed"], active=0, name="colour")
-        colour.on_change("active", lambda _, __, new: self._colour(new))
+        pace.on_change("value", lambda _, __, new: setattr(show.delay, "value", PACES[new]))
         self._page.regions.on_change("value", lambda _, __, new: self._choose(int(new)))
-        for one in self._page.maps:
-            one.regions.selected.on_change("indices", self._tapped)
         document.title = f"{show.picture.name}: {' against '.join(self._page.names)}"
-        document.add_root(self._page.layout([self._pause, pace, self._page.regions, colour]))
+        document.add_root(self._page.layout([self._pause, pace, self._page.regions]))
         self.refresh()
         document.add_periodic_callback(self.refresh, REFRESH_MS)
 
     def refresh(self) -> None:
         """Draw what has changed."""
         show, now = self._show, self._show.now
-        self._pause.label = "Finished" if show.over else ("Go on" if show.paused else "Pause")
+        self._pause.label = "Finished" if show.over else ("Go on" if show.limit.value == 0.0 else "Pause")
         self._pause.disabled = show.over
-        self._page.show([seen.at(now) for seen in show.runs], now, self._by)
+        self._page.show([seen.at(now) for seen in show.runs], now)
         runs = [[frame for frame in seen.whole if frame.time <= now] for seen in show.runs]
         traced = (self._page.region, *map(len, runs))
         if traced != self._traced:
@@ -231,26 +209,12 @@ class Viewer:
             self._traced = traced
 
     def _toggle(self) -> None:
-        self._show.pause(not self._show.paused)
-        self.refresh()
-
-    def _colour(self, number: int) -> None:
-        self._by = ("density", "speed")[number]
+        self._show.limit.value = 0.0 if self._show.limit.value else FOREVER
         self.refresh()
 
     def _choose(self, region: int) -> None:
-        if region != self._page.region:
-            self._page.choose(region)
-            self._page.regions.value = str(region)
-            self.refresh()
-
-    def _tapped(self, _: str, __: list[int], indices: list[int]) -> None:
-        if indices:
-            source = self._page.maps[0].regions
-            region = int(source.data["region"][indices[0]])
-            for one in self._page.maps:
-                one.regions.selected.indices = []
-            self._choose(region)
+        self._page.choose(region)
+        self.refresh()
 
 
 def watch(
@@ -266,6 +230,8 @@ def watch(
     """Run strategies side by side with a live page until they have ended and the page is closed.
 
     Args:
+        scenario: where they run.
+        strategies: one or two.
         seed, demand: see cosim.evaluation.simulate.simulate.
         port: of the page on this machine; 0 for a free one.
         browse: open the page in a browser.

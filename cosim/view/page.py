@@ -15,7 +15,6 @@ from cosim.view.picture import CityPicture, Frame
 
 PLAY_PERIOD_MS = 150  # wall time per control interval
 NARROWEST = 330  # pixels, of a plot; on a narrower screen plots stand below each other
-WIDE = ".bk-clearfix { display: block !important; }"  # a Div is only as wide as its text otherwise
 KEY = (
     f"<span style='color:{colours.GREEN}'>◕</span> gate, green part: share of its original green time &ensp; "
     f"<span style='color:{colours.QUEUE}'>●</span> halo: queue before it &ensp; "
@@ -61,7 +60,7 @@ class Page:
         self.maps = [CityMap(picture, name) for name in names]
         self.loads = [Load(picture, f"{name}: load of the regions") for name in names]
         self.curves = Curves(picture, names)
-        self.numbers = Div(sizing_mode="stretch_width", stylesheets=[WIDE])
+        self.numbers = Div(sizing_mode="stretch_width")
         ends = [region for gate in picture.gates for region in (gate.source, gate.target)]
         self.choose(max(range(picture.regions), key=ends.count))
         options = [(str(n), name if name == str(n) else f"{n} {name}") for n, name in enumerate(picture.region_names)]
@@ -74,11 +73,11 @@ class Page:
             one.choose(region)
         self.curves.choose(region)
 
-    def show(self, frames: Sequence[Frame | None], time: float, by: str = "density") -> None:
+    def show(self, frames: Sequence[Frame | None], time: float) -> None:
         """Draw maps and numbers at a time [s]: a frame of every run, None before its first one."""
         for one, frame in zip(self.maps, frames, strict=True):
             if frame is not None:
-                one.show(frame, by)
+                one.show(frame)
         for load in self.loads:
             load.now.location = time / MINUTE
         self.curves.mark(time)
@@ -120,7 +119,7 @@ def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> La
     inside = [[frames[min(k, len(frames) - 1)].accumulation.sum() for k in range(last + 1)] for frames in whole]
     begin = int(np.argmax(np.abs(np.subtract(inside[0], inside[-1]) if len(inside) > 1 else inside[0])))
     moving = [
-        *((one.streets, ["value"]) for one in page.maps),
+        *((one.streets, ["density"]) for one in page.maps),
         *((one.gates, ["end", "green", "queue", "halo"]) for one in page.maps),
         *((one.arrows, ["width", "head", "guided"]) for one in page.maps),
     ]
@@ -199,29 +198,21 @@ def _wrapped(parts: Sequence[LayoutDOM], narrowest: int = NARROWEST) -> LayoutDO
 
 
 def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -> str:
-    """Return the totals of the runs at a time [s], as HTML."""
+    """Return the totals of the runs at a time [s], as an HTML table."""
+    labels = ("inside [veh]", "waiting [veh]", "completed [veh]", "time spent [veh h]", "removed [veh]")
+    heads = "".join(f"<td style='color:{colours.FAINT};padding:0 14px'>{label}</td>" for label in labels)
     lines = []
-    for n, (name, frame) in enumerate(zip(names, frames, strict=True)):
-        colour, dash = colours.RUNS[n]
-        cells = note = ""
+    for (colour, _), name, frame in zip(colours.RUNS, names, frames, strict=False):
+        totals: list[float] = []
         if frame is not None:
-            totals = {
-                "inside [veh]": frame.accumulation.sum(),
-                "waiting to enter [veh]": frame.waiting,
-                "completed trips [veh]": frame.completed,
-                "time spent [veh h]": frame.time_spent / HOUR,
-                "removed [veh]": frame.removed,
-            }
-            cells = "".join(
-                f"<div style='flex:0 0 138px'><div style='font-size:19px'>{value:,.0f}</div>"
-                f"<div style='font-size:12px;color:{colours.FAINT}'>{label}</div></div>"
-                for label, value in totals.items()
-            )
-        if frame is not None and frame.note:
-            note = f"<div style='flex-basis:100%;color:{colours.QUEUE}'>{escape(frame.note[:200])}</div>"
+            totals = [frame.accumulation.sum(), frame.waiting, frame.completed, frame.time_spent / HOUR, frame.removed]
+        cells = "".join(f"<td style='font-size:18px;padding:0 14px'>{value:,.0f}</td>" for value in totals)
+        note = "" if frame is None else escape(frame.note[:200])
         lines.append(
-            f"<div style='display:flex;flex-wrap:wrap;gap:2px 10px;align-items:center;border-left:4px {dash} {colour};"
-            f"padding-left:12px;margin:5px 0'><div style='flex:1 1 140px;font-weight:650;color:{colour}'>{escape(name)}"
-            f"</div>{cells}{note}</div>"
+            f"<tr><th style='color:{colour};text-align:left;font-size:15px'>{escape(name)}</th>{cells}"
+            f"<td style='color:{colours.QUEUE}'>{note}</td></tr>"
         )
-    return f"<div style='font-size:22px;font-weight:650'>{time / MINUTE:.1f} min</div>{''.join(lines)}"
+    return (
+        f"<table style='text-align:right'><tr><th style='font-size:20px;text-align:left'>{time / MINUTE:.1f} min</th>"
+        f"{heads}</tr>{''.join(lines)}</table>"
+    )

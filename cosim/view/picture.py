@@ -48,7 +48,7 @@ class CityPicture:
     """The constant part of a picture.
 
     name: of the scenario; region_names: R; edges: E ids; shapes: E lines (n, 2) [m]
-    lane_km: (E,) length times lanes; limit: (E,) [m/s]; lanes, region: (E,)
+    lane_km: (E,) length times lanes; lanes, region: (E,)
     outlines: rings (n, 2) [m] of every region; places: (R, 2) [m] of its number
     critical: (R,) [veh]; curves: R MFDs (n, 2) in veh and veh/s; step: control interval [s]; steps: number of them
     """
@@ -58,7 +58,6 @@ class CityPicture:
     edges: tuple[str, ...]
     shapes: Sequence[Points]
     lane_km: PerEdge
-    limit: PerEdge
     lanes: EdgeNumbers
     region: EdgeNumbers
     outlines: Sequence[Sequence[Points]]
@@ -86,7 +85,6 @@ class CityPicture:
             edges=city.edges,
             shapes=shapes,
             lane_km=np.array([city.length[edge] * city.lanes[edge] for edge in city.edges]) / 1000.0,
-            limit=np.array([city.speed[edge] for edge in city.edges]),
             lanes=np.array([city.lanes[edge] for edge in city.edges]),
             region=region,
             outlines=rings_round(shapes, np.ones(len(shapes), dtype=bool), region, REGION_REACH),
@@ -104,8 +102,8 @@ class Frame:
     """The city at one moment; flows and signals are those of the last complete control interval.
 
     time: since the start [s]; intervals: completed ones; whole: True at the end of an interval
-    density: (E,) [veh/km and lane]; speed: (E,) share of the speed limit, NaN without a measurement
-    accumulation: (R,) [veh]; outflow: (R,) [veh/s]; waiting: to enter [veh]; completed, removed: since the start [veh]
+    density: (E,) [veh/km and lane]; accumulation: (R,) [veh]; outflow: (R,) [veh/s]; waiting: to enter [veh]
+    completed, removed: since the start [veh]
     time_spent: total since the start [veh s]; perimeter: (R, R) commanded u; green: (G,) share of the original green,
     NaN without control; queue: (G,) halting vehicles; guided: (R, R) reroutes from i to h [veh]; note: a warning
     """
@@ -114,7 +112,6 @@ class Frame:
     intervals: int
     whole: bool
     density: PerEdge
-    speed: PerEdge
     accumulation: PerRegion
     outflow: PerRegion
     waiting: float
@@ -136,7 +133,6 @@ def first(picture: CityPicture, gateways: int, state: State) -> Frame:
         intervals=0,
         whole=True,
         density=np.zeros(edges, np.float16),
-        speed=np.full(edges, np.nan, np.float16),
         accumulation=state.accumulation.sum(axis=1),
         outflow=np.zeros(regions),
         waiting=float(state.backlog.sum()),
@@ -150,13 +146,13 @@ def first(picture: CityPicture, gateways: int, state: State) -> Frame:
     )
 
 
-def between(picture: CityPicture, before: Frame, time: float, vehicles: PerEdge, speed: PerEdge) -> Frame:
-    """Return a frame within a control interval: the last whole one with new vehicles (E,) and speeds (E,) [m/s]."""
+def between(picture: CityPicture, before: Frame, time: float, vehicles: PerEdge) -> Frame:
+    """Return a frame within a control interval: the last whole one with new vehicles (E,)."""
     return replace(
         before,
         time=time,
         whole=False,
-        **_streets(picture, vehicles, speed),
+        density=_density(picture, vehicles),
         accumulation=np.bincount(picture.region, vehicles, picture.regions),
     )
 
@@ -168,7 +164,6 @@ def after(
     controls: Controls,
     state: State,
     row: Mapping[str, np.ndarray],
-    speed: PerEdge | None = None,
 ) -> Frame:
     """Return the frame at the end of a control interval.
 
@@ -177,7 +172,6 @@ def after(
         controls: the commands of the interval.
         state: the state at its end.
         row: one row of the record.
-        speed: mean speeds (m/s, (E,)), None without a measurement.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         green = row["gateway_green"] / row["gateway_original_green"]
@@ -186,7 +180,7 @@ def after(
         time=state.time,
         intervals=state.step,
         whole=True,
-        **_streets(picture, row["edge_vehicles"].astype(float), speed),
+        density=_density(picture, row["edge_vehicles"].astype(float)),
         accumulation=state.accumulation.sum(axis=1),
         outflow=regional_outflow(flows, picture.step)[0],
         waiting=float(state.backlog.sum()),
@@ -222,21 +216,9 @@ def frames(picture: CityPicture, result: Any) -> list[Frame]:
     return made
 
 
-def _length(shape: Points) -> float:
-    """Return the length of a line [m]."""
-    return max(float(np.hypot(*np.diff(shape, axis=0).T).sum()), 1e-9)
-
-
-def _along(shape: Points, shares: np.ndarray) -> Points:
-    """Return the points (n, 2) of a line at these shares of its length."""
-    at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shape, axis=0).T))])
-    return np.stack([np.interp(shares * at[-1], at, shape[:, axis]) for axis in (0, 1)], axis=1)
-
-
-def _streets(picture: CityPicture, vehicles: PerEdge, speed: PerEdge | None) -> dict[str, np.ndarray]:
-    """Return density and speed of a frame in half precision."""
-    share = np.full(len(vehicles), np.nan) if speed is None else np.where(vehicles > 0, speed / picture.limit, np.nan)
-    return {"density": (vehicles / picture.lane_km).astype(np.float16), "speed": share.astype(np.float16)}
+def _density(picture: CityPicture, vehicles: PerEdge) -> PerEdge:
+    """Return the density of the streets in half precision."""
+    return (vehicles / picture.lane_km).astype(np.float16)
 
 
 def _curve(critical: float, jam: float, outflow: Any) -> Points:
@@ -252,7 +234,8 @@ def _gates(city: City, shapes: Mapping[str, Points]) -> tuple[Gate, ...]:
     setback = GATE_SETBACK * float(np.ptp(np.concatenate(list(shapes.values())), axis=0).max())
     gates = []
     for (edge, target), numbers in members.items():
-        [(x, y)] = _along(shapes[edge], np.array([max(1.0 - setback / _length(shapes[edge]), 0.5)]))
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shapes[edge], axis=0).T))])
+        x, y = (np.interp(max(along[-1] - setback, 0.5 * along[-1]), along, values) for values in shapes[edge].T)
         gates.append(
             Gate(
                 source=city.gateways[numbers[0]].source,
