@@ -46,7 +46,7 @@ def test_streets_and_signals_of_a_file(tmp_path):
             assert len(streets.edges) == 2 * 24 - 2 * 4
             assert streets.drivable.all()
             assert set(streets.logics) == {"11", "12", "21", "22"}
-            assert {logics[-1].kind for logics in streets.logics.values()} == {"actuated"}
+            assert {logic.kind for logic in streets.logics.values()} == {"actuated"}
             assert "ODbL-1.0" in found.notice
         assert not found.net.exists()
     assert written[0] == written[1] and b"osm.net.xml" not in written[0]

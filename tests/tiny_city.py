@@ -27,8 +27,6 @@ ADDITIONAL = """<additional>
   <busStop id="stop" lane="B1C1_0" startPos="20" endPos="40"/>
   <inductionLoop id="loop" lane="A0A1_0" pos="5" freq="60" file="counts.xml"/>
   <edgeData id="all" file="edges.xml"/>
-  <taz id="west" edges="A0A1 A1A2"/>
-  <taz id="east"><tazSink id="D1D2" weight="1"/><tazSource id="D2D1" weight="1"/></taz>
 </additional>"""
 CARS = """<routes>
   <vehicle id="round" depart="610" type="mixed" route="loop"/>
@@ -38,7 +36,7 @@ CARS = """<routes>
   <trip id="astray" depart="620" from="A0A1" to="nowhere"/>
   <vehicle id="gap" depart="620"><route edges="A0A1 D1D2"/></vehicle>
   <trip id="short" depart="0:10:30" from="B1C1" to="B1C1"/>
-  <flow id="zones" begin="600" end="1200" number="30" fromTaz="west" toTaz="east"/>
+  <flow id="zones" begin="600" end="1200" number="30" from="A0A1" to="D1D2"/>
   <flow id="across" begin="600" end="1200" period="8" from="A1B1" to="C1D1" type="mixed"/>
   <flow id="back" begin="600" end="1200" vehsPerHour="360" from="D2C2" to="B2A2"/>
   <flow id="chance" begin="600" end="1200" probability="0.1" from="B3C3" to="C0B0"/>

@@ -5,9 +5,6 @@ route that would have been fastest in it, and chooses among the known routes by 
 algorithm to determine the dynamic user equilibrium in a traffic simulation model", 1998). SUMO's mesoscopic model, a
 tenth of the cost, finds most of the equilibrium; a city in car-following gets more iterations in that model, as queues
 differ (streets of Bologna: routes with a gap of 18 % in the former had 36 % in the latter).
-
-The relative gap is the time that drivers would have saved on the routes that were fastest at their departures, over the
-time on these routes.
 """
 
 import gzip
@@ -33,33 +30,20 @@ CAR_FOLLOWING_SHARE = 0.5  # of the iterations, in the car-following model after
 TRAVEL_TIME_PERIOD_S = 300
 GAP_SAMPLE = 2000  # drivers from whom the gap is estimated, at most
 NAME = "peak"  # of the files that duaIterate.py makes
-
-
-@dataclass(frozen=True, kw_only=True)
-class Iteration:
-    """Results of one simulation: relative gap [-] of its routes, mean trip time [s], completed trips."""
-
-    mesoscopic: bool
-    gap: float
-    trip_time: float
-    completed: int
+ALWAYS = f"""--aggregation {TRAVEL_TIME_PERIOD_S} --routing-algorithm CH --disable-warnings --disable-summary
+    --continue-on-unbuild"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Assigned:
     """Routes with the smallest gap in the model in which the city is driven.
 
-    routes: vehicle -> edges; best: the iteration they are from
+    routes: vehicle -> edges; gaps: [-] of every iteration; best: the iteration they are from
     """
 
     routes: Mapping[str, Sequence[str]]
-    iterations: Sequence[Iteration]
+    gaps: Sequence[float]
     best: int
-
-    @property
-    def gap(self) -> float:
-        """Relative gap [-] of the routes."""
-        return self.iterations[self.best].gap
 
 
 def assign(
@@ -89,7 +73,7 @@ def assign(
     with temporary_folder() as folder:
         root = ElementTree.Element("routes")
         root.extend(elements)
-        _step(folder, 0).mkdir()
+        (folder / "000").mkdir()
         for kind in ("rou", "rou.alt"):  # as if step 0 had found them
             with gzip.open(_routes(folder, 0, kind), "wb") as stream:
                 stream.write(ElementTree.tostring(root))
@@ -97,110 +81,79 @@ def assign(
         options += [f"--time-to-teleport={time_to_teleport:g}"]
         options += ["--additional", file_list(additional)] if additional else []
         options += ["duarouter--seed", str(seed), "sumo--seed", str(seed)]
-        done: list[Iteration] = []
+        gaps: list[float] = []
         routes, best = dict[str, list[str]](), 0
         models = [(True, iterations)] + [(False, int(np.ceil(CAR_FOLLOWING_SHARE * iterations)))] * (not mesoscopic)
         for meso, most in models:
             least = np.inf
             for k in range(most):
-                n, gap = len(done), f", gap {100 * done[-1].gap:.0f} %" if done else ""
+                n, gap = len(gaps), f", gap {100 * gaps[-1]:.0f} %" if gaps else ""
                 progress(f"assignment{'' if meso else ', car-following'}, at most {most} iterations{gap}", k / most)
                 _iterate(folder, n, ["--mesosim", "--meso-junctioncontrol"] * meso + options, where=str(net))
-                done.append(_judged(folder, net, n, begin=begin, seed=seed, mesoscopic=meso))
-                if done[-1].gap <= least:
-                    least, routes, best = done[-1].gap, _read_routes(_routes(folder, n)), n
-                if done[-1].gap <= GAP:
+                gaps.append(_relative_gap(folder, net, n, begin=begin, seed=seed))
+                if gaps[-1] <= least:
+                    least, best = gaps[-1], n
+                    vehicles = read_xml(_routes(folder, n)).iter("vehicle")
+                    routes = {attribute(v, "id"): attribute(child(v, "route"), "edges").split() for v in vehicles}
+                if gaps[-1] <= GAP:
                     break
-        return Assigned(routes=routes, iterations=tuple(done), best=best)
+        return Assigned(routes=routes, gaps=gaps, best=best)
 
 
 def _iterate(folder: Path, n: int, options: Sequence[str], *, where: str) -> None:
     """Run step n of duaIterate.py: routes, except in step 0, and a simulation."""
     program = Path(sumo.SUMO_HOME) / "tools" / "assign" / "duaIterate.py"
     start = ["--skip-first-routing", "--routes", str(_routes(folder, 0))] if n == 0 else ["--trips", f"{NAME}.xml"]
-    start += ["--first-step", str(n), "--last-step", str(n + 1), "--aggregation", str(TRAVEL_TIME_PERIOD_S)]
-    start += ["--routing-algorithm", "CH", "--disable-warnings", "--disable-summary", "--continue-on-unbuild"]
     done = subprocess.run(
-        [sys.executable, str(program), *start, *options],
+        [sys.executable, program, *start, "--first-step", str(n), "--last-step", str(n + 1), *ALWAYS.split(), *options],
         cwd=folder,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         stdin=subprocess.DEVNULL,
         env=os.environ | {"SUMO_HOME": sumo.SUMO_HOME, "PYTHONHASHSEED": "0"},
     )
-    if done.returncode or not _tripinfo(folder, n).exists():
+    if done.returncode:
         log = folder / "dua.log"
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.exists() else []
         reason = " ".join(next((line for line in lines if "rror" in line), "no reason given").split())
         raise InputError(f"{where}: duaIterate.py cannot assign routes: {reason}; correct the input")
 
 
-def relative_gap(
-    net: Path, elements: Sequence[ElementTree.Element], weights: Path, *, begin: float, seed: int
-) -> float:
-    """Return the relative gap [-] of routes, estimated from at most GAP_SAMPLE drivers.
+def _relative_gap(folder: Path, net: Path, n: int, *, begin: float, seed: int) -> float:
+    """Return the relative gap [-] of the routes of iteration n, estimated from at most GAP_SAMPLE drivers.
 
-    Args:
-        elements: as in `assign`.
-        weights: edgeData file with the travel times.
+    It is the time that drivers would have saved on the routes that were fastest at their departures, over the time on
+    these routes, all at the travel times of the iteration's simulation.
     """
-    with temporary_folder() as folder:
-        vehicles = [n for n, element in enumerate(elements) if element.tag == "vehicle"]
-        order = np.random.default_rng([seed, 0x676170]).permutation(len(vehicles))
-        left_out = {vehicles[n] for n in order[GAP_SAMPLE:]}
-        root = ElementTree.Element("routes")
-        root.extend(element for n, element in enumerate(elements) if n not in left_out)
-        ElementTree.ElementTree(root).write(folder / "sample.rou.xml")
-        # Every driver comes with one route; duarouter adds the fastest, and writes the costs of both.
-        options = {
-            "net-file": file_list([net]),
-            "route-files": folder / "sample.rou.xml",
-            "weight-files": weights,
-            "weights.expand": "true",
-            "gawron.beta": "1",
-            "keep-all-routes": "true",
-            "routing-algorithm": "astar",
-            "begin": f"{begin:g}",
-            "output-file": folder / "fastest.rou.xml",
-            "alternatives-output": folder / "ways.xml",
-            "no-warnings": "true",
-            "no-step-log": "true",
-            "ignore-errors": "true",
-        }
-        run_sumo("duarouter", options, where=str(net))
-        spent = least = 0.0
-        for vehicle in read_xml(folder / "ways.xml").iter("vehicle"):
-            costs = [float(attribute(route, "cost")) for route in vehicle.iter("route")]
-            spent, least = spent + costs[0], least + min(costs)
+    (weights,) = (folder / f"{n:03d}").glob("dump_*.xml.gz")
+    root = read_xml(_routes(folder, n))
+    vehicles = root.findall("vehicle")
+    for k in np.random.default_rng([seed, 0x676170]).permutation(len(vehicles))[GAP_SAMPLE:]:
+        root.remove(vehicles[k])
+    ElementTree.ElementTree(root).write(folder / "sample.rou.xml")
+    # Every driver comes with one route; duarouter adds the fastest, and writes the costs of both.
+    options = {
+        "net-file": file_list([net]),
+        "route-files": folder / "sample.rou.xml",
+        "weight-files": weights,
+        "weights.expand": "true",
+        "gawron.beta": "1",
+        "keep-all-routes": "true",
+        "routing-algorithm": "astar",
+        "begin": f"{begin:g}",
+        "output-file": folder / "fastest.rou.xml",
+        "alternatives-output": folder / "ways.xml",
+        "no-warnings": "true",
+        "no-step-log": "true",
+        "ignore-errors": "true",
+    }
+    run_sumo("duarouter", options, where=str(net))
+    spent = least = 0.0
+    for vehicle in read_xml(folder / "ways.xml").iter("vehicle"):
+        costs = [float(attribute(route, "cost")) for route in vehicle.iter("route")]
+        spent, least = spent + costs[0], least + min(costs)
     return (spent - least) / least if least else 0.0
 
 
-def _judged(folder: Path, net: Path, n: int, *, begin: float, seed: int, mesoscopic: bool) -> Iteration:
-    """Read the results of iteration n."""
-    durations = [float(attribute(trip, "duration")) for trip in read_xml(_tripinfo(folder, n)).iter("tripinfo")]
-    (weights,) = _step(folder, n).glob("dump_*.xml.gz")
-    return Iteration(
-        mesoscopic=mesoscopic,
-        gap=relative_gap(net, list(read_xml(_routes(folder, n))), weights, begin=begin, seed=seed),
-        trip_time=float(np.mean(durations)) if durations else np.nan,
-        completed=len(durations),
-    )
-
-
-def _read_routes(path: Path) -> dict[str, list[str]]:
-    return {
-        attribute(vehicle, "id"): attribute(child(vehicle, "route"), "edges").split()
-        for vehicle in read_xml(path).iter("vehicle")
-    }
-
-
-def _step(folder: Path, n: int) -> Path:
-    return folder / f"{n:03d}"
-
-
 def _routes(folder: Path, n: int, kind: str = "rou") -> Path:
-    return _step(folder, n) / f"{NAME}_{n:03d}.{kind}.xml.gz"
-
-
-def _tripinfo(folder: Path, n: int) -> Path:
-    return _step(folder, n) / f"tripinfo_{n:03d}.xml"
+    return folder / f"{n:03d}" / f"{NAME}_{n:03d}.{kind}.xml.gz"

@@ -2,7 +2,7 @@
 
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +20,15 @@ from nmfd.runs.files import temporary_folder
 INTERVAL_S = 300.0  # of the densities
 PEAK_INTERVALS = 3  # in a row: those with the most vehicles count for the partition
 JITTER_S = 10.0  # of departures, in which seeds differ, as in the scenario that is written
+SILENT = {
+    "step-log.period": 10,
+    "no-warnings": "true",
+    "ignore-route-errors": "true",
+    "vehroute-output.exit-times": "true",
+    "vehroute-output.last-route": "true",
+    "vehroute-output.write-unfinished": "true",
+    "duration-log.statistics": "true",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,117 +94,86 @@ class Baseline:
 
 def averaged_runs(
     streets: Streets,
-    *,
-    routes: Sequence[Path],
-    background: Sequence[Path],
+    folder: Path,
+    files: Mapping[str, Sequence[str]],
+    times: Mapping[str, str],
     factor: float,
     mesoscopic: bool,
     seeds: int,
-    end: float,
     progress: Progress,
-    inspect: Callable[[Path], None],
-    **run,
 ) -> Baseline:
     """Run the city with seeds 0, 1, ... and average the presence; all else is that of seed 0.
 
     Args:
-        routes: of the demand; background: of all other vehicles.
+        files: routes of the demand, background and additional -> names of files in the folder.
+        times: SUMO's options begin, end [s], and others.
         factor: multiplies the demand [-]; seed 0 departs as recorded.
-        inspect: called with SUMO's edgeData of seed 0, which is removed afterwards.
-        run: other arguments of `run_baseline`.
+
+    Raises:
+        InputError: with SUMO's own words if it refuses.
     """
+    routes, background, additional = (
+        [folder / f for f in files[key]] for key in ("routes", "background", "additional")
+    )
+    begin, end = float(times["begin"]), float(times["end"])
     original = read_recorded_trips(routes)
+    options: dict[str, object] = dict(times)
+    # A vehicle with a new route by a rerouter makes SUMO fail when it writes the times of the edges it has left.
+    if any(next(read_xml(path).iter("routeProbReroute"), None) is not None for path in additional):
+        options["vehroute-output.exit-times"] = "false"
     runs = []
     for seed in range(seeds):
 
         def reached(time: float, seed: int = seed) -> None:
-            done = min((time - run["begin"]) / (end - run["begin"]), 1.0)
-            progress(f"simulating without control, {seed + 1} of {seeds}", (seed + done) / seeds)
+            share = (seed + min((time - begin) / (end - begin), 1.0)) / seeds
+            progress(f"simulating without control, {seed + 1} of {seeds}", share)
 
-        reached(run["begin"])
-        with temporary_folder() as folder:
-            files, vehicles = routes, [vehicle.get("id", "") for vehicle in original.elements]
+        reached(begin)
+        with temporary_folder() as scratch:
+            jitter = JITTER_S if seed else 0.0
+            own, ids = routes, [attribute(vehicle, "id") for vehicle in original.elements]
             if factor != 1.0 or seed:
-                jitter = JITTER_S if seed else 0.0
-                drawn = draw(original, seed=seed, factor=factor, jitter=jitter, begin=run["begin"])
-                files, vehicles = [folder / "vehicles.rou.xml"], [name for _, _, name in drawn]
-                write_recorded_trips(original, drawn, files[0])
-            runs.append(
-                run_baseline(
-                    streets,
-                    routes=[*files, *background],
-                    vehicles=vehicles,
-                    seed=seed,
-                    end=end,
-                    mesoscopic=mesoscopic,
-                    reached=reached,
-                    inspect=inspect if seed == 0 else lambda edges: None,
-                    **run,
-                )
+                drawn = draw(original, seed=seed, factor=factor, jitter=jitter, begin=begin)
+                own, ids = [scratch / "vehicles.rou.xml"], [name for _, _, name in drawn]
+                write_recorded_trips(original, drawn, own[0])
+            measure = scratch / "measure.add.xml"
+            data = f'<edgeData id="all" freq="{INTERVAL_S:g}" file="edges.xml" excludeEmpty="true"/>'
+            measure.write_text(f"<additional>{data}</additional>")
+            options |= {
+                "net-file": file_list([streets.path]),
+                "route-files": file_list([*own, *background]),
+                "additional-files": file_list([*additional, measure]),
+                "seed": seed,
+                "vehroute-output": scratch / "ways.xml",
+                "statistic-output": scratch / "statistic.xml",
+            }
+            run_sumo(
+                "sumo",
+                SILENT | options,
+                *(MESOSCOPIC if mesoscopic else ()),
+                where=str(streets.path),
+                reached=reached,
             )
-    return replace(runs[0], presence=np.mean([one.presence for one in runs], axis=0))
+            runs.append(_measured(scratch, streets, begin, end, set(ids)))
+    return replace(runs[0], presence=np.mean([run.presence for run in runs], axis=0))
 
 
-def run_baseline(
-    streets: Streets,
-    *,
-    routes: Sequence[Path],
-    additional: Sequence[Path],
-    begin: float,
-    end: float,
-    step_length: float,
-    time_to_teleport: float,
-    mesoscopic: bool,
-    vehicles: Collection[str],
-    seed: int,
-    inspect: Callable[[Path], None],
-    reached: Callable[[float], None],
-) -> Baseline:
-    """Simulate without control. Raises InputError with SUMO's own words if it refuses."""
-    # A vehicle with a new route by a rerouter makes SUMO fail when it writes the times of the edges it has left.
-    rerouted = any(next(read_xml(path).iter("routeProbReroute"), None) is not None for path in additional)
-    with temporary_folder() as folder:
-        edges, measure = folder / "edges.xml", folder / "measure.add.xml"
-        measure.write_text(
-            f'<additional><edgeData id="all" freq="{INTERVAL_S:g}" file="{edges}" excludeEmpty="true"/></additional>',
-            encoding="utf-8",
-        )
-        options = {
-            "net-file": file_list([streets.path]),
-            "route-files": file_list(routes),
-            "additional-files": file_list([*additional, measure]),
-            "begin": begin,
-            "end": end,
-            "seed": seed,
-            "step-length": f"{step_length:g}",
-            "time-to-teleport": f"{time_to_teleport:g}",
-            "step-log.period": 10,
-            "no-warnings": "true",
-            "ignore-route-errors": "true",
-            "vehroute-output": folder / "ways.xml",
-            "vehroute-output.exit-times": str(not rerouted).lower(),
-            "vehroute-output.last-route": "true",
-            "vehroute-output.write-unfinished": "true",
-            "statistic-output": folder / "statistic.xml",
-            "duration-log.statistics": "true",
-        }
-        meso = MESOSCOPIC if mesoscopic else ()
-        run_sumo("sumo", options, *meso, where=str(streets.path), reached=reached)
-        statistic = ElementTree.parse(folder / "statistic.xml").getroot()
-        counts, trips = child(statistic, "vehicles"), child(statistic, "vehicleTripStatistics")
-        waiting = int(attribute(counts, "waiting"))
-        ways, driven = _ways(folder / "ways.xml", streets)
-        inspect(edges)
-        return Baseline(
-            presence=_presence(edges, streets, begin, end),
-            ways=ways,
-            teleports=int(attribute(child(statistic, "teleports"), "total")),
-            waiting=waiting,
-            running=int(attribute(counts, "running")),
-            dropped=max(len(set(vehicles) - driven) - waiting, 0),
-            delay=float(attribute(trips, "totalDepartDelay"))
-            + waiting * max(float(attribute(trips, "departDelayWaiting")), 0.0),
-        )
+def _measured(folder: Path, streets: Streets, begin: float, end: float, vehicles: set[str]) -> Baseline:
+    """Read the outputs of a run with these vehicles of the demand."""
+    statistic = ElementTree.parse(folder / "statistic.xml").getroot()
+    counts, trips = child(statistic, "vehicles"), child(statistic, "vehicleTripStatistics")
+    waiting = int(attribute(counts, "waiting"))
+    ways, driven = _ways(folder / "ways.xml", streets)
+    return Baseline(
+        presence=_presence(folder / "edges.xml", streets, begin, end),
+        ways=ways,
+        teleports=int(attribute(child(statistic, "teleports"), "total")),
+        waiting=waiting,
+        running=int(attribute(counts, "running")),
+        dropped=max(len(vehicles - driven) - waiting, 0),
+        delay=float(attribute(trips, "totalDepartDelay"))
+        + waiting * max(float(attribute(trips, "departDelayWaiting")), 0.0),
+    )
 
 
 def _presence(path: Path, streets: Streets, begin: float, end: float) -> np.ndarray:

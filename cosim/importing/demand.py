@@ -2,11 +2,11 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -25,8 +25,7 @@ WRITERS = ("Detector", "Loop", "calibrator", "routeProbe")  # ends of names of e
 WRITING = ("file", "has.ssm.device", "device.toc.file")  # parameters that only make SUMO write files
 SAFE_SPEEDS = ("max", "random", "0", "0.0", "0.00")  # departure speeds that can wait for a green
 FLOW = ("begin", "end", "number", "period", "vehsPerHour", "perHour", "probability")
-ENDS = {"from": ("fromTaz", "fromJunction"), "to": ("toTaz", "toJunction")}
-Option = TypeVar("Option")
+ZONES = ("fromTaz", "toTaz", "fromJunction", "toJunction")
 ENDLESS_FLOW_S = 3600.0  # length of a flow without an end in a simulation without an end
 Kept = tuple[float, int, int, bool, Element]  # departure [s], first and last edge, has a route, vehicle
 
@@ -56,7 +55,7 @@ class Traffic:
 def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
     """Read all route and additional files of a case.
 
-    Flows become single vehicles; TAZ and junctions become edges that are drawn for them by `seed`.
+    Flows become single vehicles, with departures and routes drawn by `seed` where they are random.
 
     Raises:
         InputError: for a file that is no XML, a broken time or number, and an id that two vehicles have.
@@ -70,7 +69,6 @@ class _Reader:
         self._moves, self._car_moves = set(map(tuple, streets.all_links)), set(map(tuple, streets.links))
         self._classes: dict[str, str] = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_PEDTYPE": "pedestrian"}
         self._routes: dict[str, list[str]] = {}
-        self._zones: dict[str, dict[str, list[tuple[str, float]]]] = {}
         self._notes: Counter[str] = Counter()
 
     def read(self) -> Traffic:
@@ -85,7 +83,8 @@ class _Reader:
                 elif element.tag in OTHERS:
                     background.append(element)
                 elif element.tag not in DROPPED:
-                    self._learn(element, path)
+                    with _blamed(element, path):
+                        self._learn(element)
                     switched |= {name for e in element.iter("wautJunction") if (name := e.get("junctionID"))}
                     shared.append(element)
         vehicles = []
@@ -104,16 +103,8 @@ class _Reader:
                 vehicles.append((element, path))
         return self._checked(vehicles, background, shared, switched)
 
-    def _learn(self, element: Element, path: Path) -> None:
-        """Store types, routes and zones that vehicles refer to. Raises InputError."""
-        try:
-            self._learn_one(element)
-        except Missing as error:
-            raise InputError(f"{path}: {error}; add it") from None
-        except ValueError as error:
-            raise _no_number(element, path, error) from None
-
-    def _learn_one(self, element: Element) -> None:
+    def _learn(self, element: Element) -> None:
+        """Store types and routes that vehicles refer to. Raises ValueError."""
         if element.tag == "vType":
             self._classes[attribute(element, "id")] = element.get("vClass", "passenger")
         elif element.tag == "vTypeDistribution":
@@ -130,17 +121,8 @@ class _Reader:
                 if edges := route.get("edges"):
                     self._routes[route.get("id", "")] = edges.split()
             if element.tag == "routeDistribution":
-                self._routes[attribute(element, "id")] = self._likeliest(element)
-        for zone in element.iter("taz"):
-            inside = [(edge, 1.0) for edge in zone.get("edges", "").split()]
-            self._zones[attribute(zone, "id")] = {
-                key: inside + [(attribute(e, "id"), float(e.get("weight", 1.0))) for e in zone.iter(tag)]
-                for key, tag in (("from", "tazSource"), ("to", "tazSink"))
-            }
-
-    def _likeliest(self, distribution: Element) -> list[str]:
-        """Return the edges of the most probable route in a distribution."""
-        return max(self._distribution(distribution), key=lambda route: route[0], default=(0.0, []))[1]
+                likeliest = max(self._distribution(element), key=lambda route: route[0], default=(0.0, []))
+                self._routes[attribute(element, "id")] = likeliest[1]
 
     def _distribution(self, distribution: Element) -> list[tuple[float, list[str]]]:
         """Return (probability, edges) of every route in a distribution."""
@@ -208,7 +190,7 @@ class _Reader:
         number = self._streets.number
         kept: list[Kept] = []
         begin, end = self._case.begin, np.inf if self._case.end is None else self._case.end
-        files: dict[str, Path] = {}
+        names: set[str] = set()
         for element, path in vehicles:
             try:
                 depart = begin if element.get("depart") == "begin" else seconds(element.get("depart", ""), "")
@@ -219,12 +201,12 @@ class _Reader:
             if not begin <= depart < end:
                 self._notes["vehicles outside the simulated time, left out"] += 1
                 continue
-            try:
+            with _blamed(element, path):
                 edges, driven = self._edges(element)
-            except ValueError as error:
-                raise _no_number(element, path, error) from None
-            if not edges and any(key.endswith(("XY", "LonLat")) for key in element.keys()):
-                self._notes["trips between coordinates, left out: give them edges with duarouter"] += 1
+            if not edges and any(key in ZONES or key.endswith(("XY", "LonLat")) for key in element.keys()):
+                self._notes[
+                    "trips between zones, junctions or coordinates, left out: give them edges with duarouter"
+                ] += 1
             elif not edges or any(edge not in number for edge in edges):
                 self._notes["vehicles with unknown edges or none, left out"] += 1
             elif driven and not self._moves.issuperset(pairwise(map(number.get, edges))):
@@ -232,14 +214,10 @@ class _Reader:
             elif self._is_car(element) and not self._open_to_cars([number[edge] for edge in edges], driven):
                 self._notes["cars on streets that are closed to cars, left out"] += 1
             else:
-                name = element.get("id")
-                if not name or name in files:
-                    raise InputError(
-                        f"{path}: {element.tag}: id: expected one that no other vehicle has, got {name!r}"
-                        + (f", which {files[name]} has too" if name else "")
-                        + "; give it another one"
-                    )
-                files[name] = path
+                name = element.get("id", "")
+                if not name or name in names:
+                    raise InputError(f"{path}: {element.tag}: id: expected one that no other vehicle has, got {name!r}")
+                names.add(name)
                 element.set("depart", f"{depart:.2f}")
                 kept.append((depart, number[edges[0]], number[edges[-1]], driven, element))
         kept.sort(key=lambda row: row[0])
@@ -273,69 +251,50 @@ class _Reader:
         nested = element.find("routeDistribution")
         route = element.find("route") if nested is None else None
         if nested is not None:  # as marouter and duarouter write them: a vehicle keeps the route drawn for it here
-            edges = self._pick([(edges, share) for share, edges in self._distribution(nested)]) or []
+            edges = self._draw(self._distribution(nested))
             element.remove(nested)
             element.append(Element("route", {"edges": " ".join(edges)}))
-            for other in (*ENDS["from"], *ENDS["to"]):
-                element.attrib.pop(other, None)
+            for name in ZONES:
+                element.attrib.pop(name, None)
             return edges, True
         if route is not None:
             route.attrib.pop("id", None)
             return route.get("edges", "").split(), True
         if name := element.get("route"):
             return self._routes.get(name, []), True
-        for key, alike in ENDS.items():
-            if not element.get(key):
-                edge = self._draw(element, key, alike)
-                for other in alike:
-                    element.attrib.pop(other, None)
-                if edge is None:
-                    return [], False
-                element.set(key, edge)
-        return [attribute(element, "from"), *element.get("via", "").split(), attribute(element, "to")], False
+        if not element.get("from") or not element.get("to"):
+            return [], False
+        return [element.get("from", ""), *element.get("via", "").split(), element.get("to", "")], False
 
-    def _draw(self, element: Element, key: str, alike: tuple[str, str]) -> str | None:
-        """Draw an edge of the zone, or at the junction, where a trip begins or ends."""
-        zone, junction = (element.get(name) for name in alike)
-        if zone in self._zones:
-            options = self._usable(self._zones[zone][key], key)
-        else:
-            place = self._streets.places.get(junction or "", -1)
-            at = self._streets.junctions[:, 0 if key == "from" else 1] == place
-            options = [(self._streets.edges[n], 1.0) for n in np.flatnonzero(at & self._streets.drivable)]
-        return self._pick(options)
-
-    def _pick(self, options: Sequence[tuple[Option, float]]) -> Option | None:
-        """Draw one of (option, weight) by weight; None without any."""
-        weights = np.cumsum([weight for _, weight in options])
-        if not options or weights[-1] <= 0:
-            return None
-        return options[int(np.searchsorted(weights, self._random.random() * weights[-1], side="right"))][0]
-
-    def _usable(self, options: list[tuple[str, float]], key: str) -> list[tuple[str, float]]:
-        """Return the edges of a zone for cars; only those connected to the core, if there are any."""
-        number, joined = self._streets.number, self._streets.onward if key == "from" else self._streets.reached
-        options = [
-            (edge, weight) for edge, weight in options if edge in number and self._streets.drivable[number[edge]]
-        ]
-        return [option for option in options if joined[number[option[0]]]] or options
+    def _draw(self, routes: Sequence[tuple[float, list[str]]]) -> list[str]:
+        """Draw the edges of one of (probability, edges); none without any."""
+        shares = np.cumsum([share for share, _ in routes])
+        if not routes or shares[-1] <= 0:
+            return []
+        return routes[int(np.searchsorted(shares, self._random.random() * shares[-1], side="right"))][1]
 
     def _reachable(self, kept: list[Kept]) -> list[Kept]:
         """Leave out trips without a path from their first to their last edge."""
-        lost = set()
+        connected = set()
         for cars in (False, True):
             pairs = {row[1:3] for row in kept if not row[3] and self._is_car(row[4]) == cars}
-            lost |= {(*pair, cars) for pair, ok in self._streets.connected(pairs, cars=cars).items() if not ok}
-        good = [row for row in kept if row[3] or (*row[1:3], self._is_car(row[4])) not in lost]
+            connected |= {(*pair, cars) for pair in self._streets.connected(pairs, cars=cars)}
+        good = [row for row in kept if row[3] or (*row[1:3], self._is_car(row[4])) in connected]
         if len(good) < len(kept):
             self._notes["trips without a way to their end, left out"] += len(kept) - len(good)
         return good
 
 
-def _no_number(element: Element, path: Path, error: ValueError) -> InputError:
-    return InputError(
-        f"{path}: {element.tag} {element.get('id')}: weight or probability: expected a number ({error}); correct it"
-    )
+@contextmanager
+def _blamed(element: Element, path: Path) -> Iterator[None]:
+    """Raise InputError for a missing attribute or a broken number of an element."""
+    try:
+        yield
+    except Missing as error:
+        raise InputError(f"{path}: {error}; add it") from None
+    except ValueError as error:
+        where = f"{path}: {element.tag} {element.get('id')}"
+        raise InputError(f"{where}: weight or probability: expected a number ({error}); correct it") from None
 
 
 def _silent(element: Element) -> Element:

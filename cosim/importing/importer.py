@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from cosim.importing import maps, model, quality
-from cosim.importing.assignment import GAP, ITERATIONS, Assigned, assign, relative_gap
+from cosim.importing.assignment import GAP, ITERATIONS, Assigned, assign
 from cosim.importing.baseline import Baseline, averaged_runs
 from cosim.importing.case import Box, Progress, SumoInput, sumo_input
 from cosim.importing.demand import Traffic, read_traffic, wrapped
@@ -21,7 +21,7 @@ from cosim.importing.partition import partition, read_regions
 from cosim.importing.regions import finish
 from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.arrays import EdgeNumbers
-from cosim.sumo.net import City, load_city
+from cosim.sumo.net import load_city
 from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
 from nmfd.model import authority
@@ -31,7 +31,6 @@ from nmfd.runs.files import temporary_folder
 from nmfd.studies import plots
 
 LARGE_CITY_EDGES = 5000  # for cars: beyond, the run without control is mesoscopic, so that it takes a minute
-LITTLE_CONTROL = 0.3  # share of the boundary flow without a signal that is worth a line
 NET = "city.net.xml.gz"
 FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz", "additional": "city.add.xml.gz"}
 TYPES = ("vType", "vTypeDistribution")
@@ -95,30 +94,10 @@ def import_city(
             )
         elif begin is None:
             case = model.without_idle(case, traffic)
-        clock, gaps = model.clock(case, streets, traffic), []
-
-        def inspect(edges: Path) -> None:
-            if assigned is not None:
-                gaps.append(relative_gap(streets.path, _routed(traffic), edges, begin=clock.begin, seed=seed))
-
+        clock = model.clock(case, streets, traffic)
         with _folders(out, scenario) as (net_folder, folder):
             files = _write_traffic(folder, traffic)
-            paths = {key: [folder / name for name in names] for key, names in files.items()}
-            baseline = averaged_runs(
-                streets,
-                routes=paths["routes"],
-                background=paths["background"],
-                additional=paths["additional"],
-                factor=factor,
-                mesoscopic=meso,
-                seeds=seeds,
-                begin=clock.begin,
-                end=clock.end,
-                step_length=model.step_length(case, clock),
-                time_to_teleport=case.time_to_teleport,
-                progress=progress,
-                inspect=inspect,
-            )
+            baseline = averaged_runs(streets, folder, files, model.options(case, clock), factor, meso, seeds, progress)
             progress("partition")
             left = quality.left_alone(streets, traffic.switched)
             if own is None:
@@ -126,10 +105,7 @@ def import_city(
             else:
                 labels = finish(streets, own, renumber=False)
             if labels.max() < 1:
-                raise InputError(
-                    f"{streets.path}: no two regions can be made that can be reached from each other; give a network "
-                    "with more streets, or other regions"
-                )
+                raise InputError(f"{streets.path}: no two regions can be made that can be reached from each other")
             network = model.network_of(streets, labels, out.name, baseline)
             content = case.net.read_bytes()
             _zip(net_folder / NET, gzip.decompress(content) if case.net.suffix == ".gz" else content)
@@ -139,59 +115,53 @@ def import_city(
             verdict = quality.import_verdict(network, tables.gateways, labels, baseline)
             network = replace(network, controllable=verdict.boundaries.shares)
             progress("writing")
-            _write_network(net_folder, streets, labels, network, tables, case)
-            (net_folder / authority.FILE).write_text(verdict.text(), encoding="utf-8")
-            _write_demand(folder / "demand.csv", model.region_demand(traffic, labels, clock))
-            text = model.scenario_text(
-                network,
-                clock,
-                case,
-                name=scenario.name,
-                files=files,
-                leave=traffic.switched,
-                network_path=os.path.relpath(out, scenario).replace(os.sep, "/"),
-                protected=_densest(streets, labels, baseline),
-                factor=factor,
-                mesoscopic=mesoscopic,
-            )
-            (folder / "scenario.toml").write_text(text, encoding="utf-8")
-            report = _report(case, streets, traffic, clock, network, city, tables, left, baseline)
-            report += _assignment_lines(assigned, gaps)
+            report = _report(case, streets, traffic, clock, tables, left, baseline, assigned)
             if isinstance(regions, int) and network.regions < regions:
                 report.append(
-                    f"fewer regions than the requested {regions}: the others could not be reached or fell apart"
+                    f"{network.regions} regions instead of {regions}: others could not be reached, or fell apart"
                 )
-            elif own is not None and (moved := _moved(own, labels, streets.drivable & (own >= 0))):
-                report.append(f"{moved:,} streets are in other regions than in {regions}, which must be connected")
-            if meso != mesoscopic:
-                report.append(f"simulated by SUMO's mesoscopic model: more than {LARGE_CITY_EDGES:,} edges for cars")
+            elif own is not None and (moved := int((own != labels)[streets.drivable & (own >= 0)].sum())):
+                report.append(f"{moved:,} streets are in other regions than in {regions}: regions must be connected")
             report += verdict.sentences
-            (net_folder / "import.txt").write_text("\n".join(report) + "\n", encoding="utf-8")
+            texts = {
+                net_folder / "network.toml": model.network_text(network, NET, case.source.name),
+                net_folder / "import.txt": "\n".join(report) + "\n",
+                net_folder / authority.FILE: verdict.text(),
+                folder / "scenario.toml": model.scenario_text(
+                    network,
+                    clock,
+                    case,
+                    name=scenario.name,
+                    files=files,
+                    leave=traffic.switched,
+                    network_path=os.path.relpath(out, scenario).replace(os.sep, "/"),
+                    protected=_densest(streets, labels, baseline),
+                    factor=factor,
+                    mesoscopic=mesoscopic,
+                ),
+                **({net_folder / "NOTICE.txt": case.notice} if case.notice else {}),
+            }
+            for path, text in texts.items():
+                path.write_text(text, encoding="utf-8")
+            _write_tables(net_folder, folder, tables, model.region_demand(traffic, labels, clock))
+            _draw(net_folder / "map.png", streets, labels, network, tables)
     return "\n".join(report)
 
 
 def _check_free(out: Path, scenario: Path, force: bool) -> None:
-    for folder, file, option in ((out, "network.toml", "--out"), (scenario, "scenario.toml", "--out")):
-        if folder.name in ("", "..") or "," in str(folder):
-            raise InputError(
-                f"{option}: expected a folder such as networks/mycity, without a comma, got {folder} instead"
-            )
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"{option}: {folder}: is not a folder; choose another name")
+    for folder, file in ((out, "network.toml"), (scenario, "scenario.toml")):
+        if folder.name in ("", "..") or "," in str(folder) or (folder.exists() and not folder.is_dir()):
+            raise InputError(f"--out: expected a folder such as networks/mycity, without a comma, got {folder} instead")
         if (folder / file).exists() and not force:
-            raise InputError(f"{option}: {folder / file} exists; choose another folder, or --force to replace it")
+            raise InputError(f"--out: {folder / file} exists; choose another folder, or --force to replace it")
 
 
 def _window(case: SumoInput, begin: float | None, end: float | None) -> SumoInput:
     """Apply --begin and --end to a case. Raises InputError."""
-    first, last = case.begin if begin is None else begin, case.end if end is None else end
-    if first < 0:
-        where = f"{case.source}: begin" if begin is None else "--begin"
-        raise InputError(f"{where}: expected a time from 0 s up, got {first:g} instead")
-    if last is not None and last <= first:
-        where = f"{case.source}: end" if end is None else "--end"
-        raise InputError(f"{where}: expected a time after the beginning at {first:g} s, got {last:g} instead")
-    return replace(case, begin=first, end=last)
+    case = replace(case, begin=case.begin if begin is None else begin, end=case.end if end is None else end)
+    if case.begin < 0 or (case.end is not None and case.end <= case.begin):
+        raise InputError(f"{case.source}: expected 0 s <= begin < end, got begin {case.begin:g} s, end {case.end} s")
+    return case
 
 
 def _peak(
@@ -205,17 +175,18 @@ def _peak(
     progress: Progress,
 ) -> tuple[Traffic, Assigned]:
     """Generate a morning peak beside the city's other traffic, and assign its routes. Only cars drive in that."""
-    if len(beside.depart):
-        raise InputError(
-            f"--demand: {case.source} has {len(beside.depart):,} vehicles of its own; omit --demand, or give the "
-            "network alone"
-        )
+    if count := len(beside.depart):
+        raise InputError(f"--demand: {case.source} has {count:,} vehicles; omit --demand, or give the network alone")
     peak = morning_peak(streets, level=level, begin=case.begin, seed=seed)
     known = {part.get("id") for element in beside.shared for part in element.iter("vType")}
     types = tuple(e for e in peak.shared if e.get("id") not in known)  # the city may define a type car
-    notes = {**beside.notes, **peak.notes}
-    traffic = replace(beside, vehicles=peak.vehicles, depart=peak.depart, origin=peak.origin, notes=notes)
-    traffic = replace(traffic, destination=peak.destination, shared=beside.shared + types)
+    traffic = replace(
+        peak,
+        background=beside.background,
+        shared=beside.shared + types,
+        switched=beside.switched,
+        notes={**beside.notes, **peak.notes},
+    )
     clock = model.clock(case, streets, traffic)
     others = [element for element in traffic.shared if element.tag not in TYPES]
     with temporary_folder() as folder:
@@ -224,7 +195,7 @@ def _peak(
             ElementTree.ElementTree(wrapped(others, "additional")).write(path)
         assigned = assign(
             streets.path.absolute(),
-            _routed(traffic),
+            [*(element for element in traffic.shared if element.tag in TYPES), *traffic.vehicles],
             begin=clock.begin,
             end=clock.end,
             seed=seed,
@@ -238,11 +209,6 @@ def _peak(
         if (route := vehicle.find("route")) is not None and (name := vehicle.get("id", "")) in assigned.routes:
             route.set("edges", " ".join(assigned.routes[name]))
     return traffic, assigned
-
-
-def _routed(traffic: Traffic) -> list[ElementTree.Element]:
-    """Return the vehicles of a generated demand after the types that they need."""
-    return [*(element for element in traffic.shared if element.tag in TYPES), *traffic.vehicles]
 
 
 @contextmanager
@@ -281,32 +247,19 @@ def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
     return {key: [FILES[key]] if len(elements) else [] for key, (elements, _) in contents.items()}
 
 
-def _write_network(
-    folder: Path,
-    streets: Streets,
-    regions: EdgeNumbers,
-    network: RegionalModel,
-    tables: quality.Tables,
-    case: SumoInput,
-) -> None:
-    """Write network.toml, its tables and its map."""
-    text = model.network_text(network, {"net": NET, "regions": "regions.csv"}, case.source.name)
-    (folder / "network.toml").write_text(text, encoding="utf-8")
-    pd.DataFrame(tables.quality).to_csv(folder / "quality.csv", index=False)
-    pd.DataFrame(tables.gateways).to_csv(folder / "gateways.csv", index=False)
-    if case.notice:
-        (folder / "NOTICE.txt").write_text(case.notice)
+def _write_tables(net_folder: Path, folder: Path, tables: quality.Tables, demand: PairsOverTime) -> None:
+    pd.DataFrame(tables.quality).to_csv(net_folder / "quality.csv", index=False)
+    pd.DataFrame(tables.gateways).to_csv(net_folder / "gateways.csv", index=False)
+    rows = [(k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)]
+    pd.DataFrame(rows, columns=["interval", "from", "to", "veh_s"]).to_csv(folder / "demand.csv", index=False)
+
+
+def _draw(path: Path, streets: Streets, regions: EdgeNumbers, network: RegionalModel, tables: quality.Tables) -> None:
     width, height = np.ptp(streets.centre, axis=0) + 1.0
     drawing = plots.figure(6.2, float(np.clip(6.2 * height / width, 3.0, 8.0)) + 0.8)
-    ax = drawing.subplots()
-    maps.region_map(ax, streets, regions, network.region_names, network.positions)
+    ax = maps.region_map(drawing.subplots(), streets, regions, network.region_names, network.positions)
     maps.gateway_marks(ax, streets, tables)
-    drawing.savefig(folder / "map.png", dpi=130, metadata={"Software": None})
-
-
-def _write_demand(path: Path, demand: PairsOverTime) -> None:
-    rows = [(k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)]
-    pd.DataFrame(rows, columns=["interval", "from", "to", "veh_s"]).to_csv(path, index=False)
+    drawing.savefig(path, dpi=130, metadata={"Software": None})
 
 
 def _zip(path: Path, content: bytes) -> None:
@@ -320,13 +273,6 @@ def _densest(streets: Streets, regions: np.ndarray, baseline: Baseline) -> int:
     return int(np.argmax(load / np.bincount(regions, streets.lane_metres)))
 
 
-def _moved(labels: np.ndarray, regions: np.ndarray, members: np.ndarray) -> int:
-    """Count the edges that are not in the region of most edges with the same label."""
-    votes = np.zeros((int(labels.max()) + 1, int(regions.max()) + 1), dtype=int)
-    np.add.at(votes, (labels[members], regions[members]), 1)
-    return int(votes.sum() - votes.max(axis=1).sum())
-
-
 def _notes(traffic: Traffic) -> str:
     return "".join(f"; {note}: {count:,}" for note, count in sorted(traffic.notes.items()))
 
@@ -336,54 +282,43 @@ def _report(
     streets: Streets,
     traffic: Traffic,
     clock: model.Clock,
-    network: RegionalModel,
-    city: City,
     tables: quality.Tables,
     left: Mapping[str, str],
     baseline: Baseline,
+    assigned: Assigned | None,
 ) -> list[str]:
     """Return what was imported, left alone and left out, in lines."""
-    usable, detached = streets.drivable.sum(), (streets.drivable & ~streets.main_part).sum()
-    at_gateways = {g["signal"] for g in tables.gateways if g["signal"]}
-    skipped = sorted(signal for signal in left if signal in at_gateways)
+    source, gateway_signals = case.source.name, {g["signal"] for g in tables.gateways if g["signal"]}
+    detached = (streets.drivable & ~streets.main_part).sum()
+    skipped = sorted(gateway_signals.intersection(left))
     left_out = list(case.left_out)
-    if case.step_length != model.step_length(case, clock):
-        left_out.append(f"step-length = {case.step_length:g}")
+    if case.step_length != (step := float(model.options(case, clock)["step-length"])):
+        left_out.append(f"step-length = {case.step_length:g}, not {step:g}")
     lines = [
-        f"{case.source.name}: {len(streets.edges):,} edges, {usable:,} for cars"
+        f"{source}: {len(streets.edges):,} edges, {streets.drivable.sum():,} for cars"
         + (f" ({detached:,} of them cut off from the rest)" if detached else "")
         + (", left-hand traffic" if streets.left_hand else "")
-        + f"; {len(set(city.signals.values())):,} signals; {len(traffic.vehicles):,} vehicles in {clock.steps} "
-        f"intervals of {clock.step:g} s{_notes(traffic)}",
-        f"{network.regions} regions",
+        + f"; {len(streets.logics):,} signals; {len(traffic.vehicles):,} vehicles in {clock.steps} intervals of "
+        f"{clock.step:g} s{_notes(traffic)}",
         quality.quality_table(tables),
         f"without control: driving takes {baseline.pace(streets):.1f} times as long as at the speed limits; "
         f"{baseline.teleports} teleports, {baseline.running} vehicles on the road and {baseline.waiting} waiting to "
         "enter at the end",
     ]
+    if assigned is not None:
+        gap, iteration, count = assigned.gaps[assigned.best], assigned.best + 1, len(assigned.gaps)
+        lines.append(f"routes by duaIterate.py: relative gap {100 * gap:.1f} % in iteration {iteration} of {count}")
+        if gap > GAP:
+            lines.append(f"WARNING: a relative gap above {100 * GAP:g} %: rerouting gains what drivers know already")
     if skipped:
         lines.append(
-            f"left alone at boundaries: {len(skipped)} of {len(at_gateways)} signals, such as {skipped[0]} "
+            f"left alone at boundaries: {len(skipped)} of {len(gateway_signals)} signals, such as {skipped[0]} "
             f"({left[skipped[0]]}); see gateways.csv"
         )
-    if tables.uncontrolled > LITTLE_CONTROL:
-        lines.append(f"perimeter control reaches only {100 * (1 - tables.uncontrolled):.0f} % of the boundary flow")
     if baseline.dropped:
         lines.append(f"{baseline.dropped:,} vehicles never drove: SUMO found no route or no free lane for them")
     if case.scale != 1.0:
-        lines.append(f"vehicles times {case.scale:g}, the scale in {case.source.name}")
+        lines.append(f"vehicles times {case.scale:g}, the scale in {source}")
     if left_out:
-        lines.append(f"not taken over from {case.source.name}: {', '.join(left_out)}")
+        lines.append(f"not taken over from {source}: {', '.join(left_out)}")
     return lines
-
-
-def _assignment_lines(assigned: Assigned | None, gaps: Sequence[float]) -> list[str]:
-    """Return how far a generated demand is from an equilibrium. gaps: in the run without control."""
-    if assigned is None:
-        return []
-    line = f"routes by duaIterate.py: relative gap {100 * assigned.iterations[0].gap:.1f} % at free flow, "
-    line += f"{100 * assigned.gap:.1f} % in iteration {assigned.best + 1} of {len(assigned.iterations)}"
-    line += "".join(f", {100 * gap:.1f} % in the run without control" for gap in gaps)
-    if assigned.gap <= GAP:
-        return [line]
-    return [line, f"WARNING: the relative gap is above {100 * GAP:g} %: rerouting here gains what drivers know already"]

@@ -72,7 +72,7 @@ def without_idle(case: SumoInput, traffic: Traffic) -> SumoInput:
 
 def clock(case: SumoInput, streets: Streets, traffic: Traffic) -> Clock:
     """Return control intervals of the most common signal cycle, until RECOVERY_S after the last departure."""
-    running = [logics[-1] for logics in streets.logics.values() if round(logics[-1].cycle) > 0]
+    running = [logic for logic in streets.logics.values() if round(logic.cycle) > 0]
     cycles = Counter(round(logic.cycle) for logic in running if logic.kind == "static")
     cycle = float(max(sorted(cycles), key=cycles.__getitem__)) if cycles else DEFAULT_CYCLE_S
     step = cycle * np.ceil(SHORTEST_STEP_S / cycle)
@@ -118,14 +118,23 @@ def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline) -> 
     return tuple(Mfd(a=c * ALPHA / n**2, b=c * BETA / n, c=c, jam=n) for c, n in zip(rate, jam, strict=True))
 
 
-def network_text(network: RegionalModel, sumo: Mapping[str, str], source: str) -> str:
-    """Return the network.toml with a table [sumo]; `source` names the imported file."""
-    return network_toml(
-        network,
-        sumo,
-        f"Imported from {source}. The MFDs are PLACEHOLDERS from lane length and speed limits:\n"
-        "# cosim identify replaces them by measured ones.",
-    )
+def network_text(network: RegionalModel, net: str, source: str) -> str:
+    """Return the network.toml; `source` names the imported file."""
+    comment = f"Imported from {source}. The MFDs are PLACEHOLDERS from lane length and speed limits:\n"
+    comment += "# cosim identify replaces them by measured ones."
+    return network_toml(network, {"net": net, "regions": "regions.csv"}, comment)
+
+
+def options(case: SumoInput, clock: Clock) -> dict[str, str]:
+    """Return SUMO's time options; the city's own step length if it divides the control interval, else 1 s."""
+    own = case.step_length
+    fits = 0.0 < own <= 1.0 and abs(clock.step / own - round(clock.step / own)) < 1e-9
+    return {
+        "begin": f"{clock.begin:.1f}",
+        "end": f"{clock.end:.1f}",
+        "step-length": f"{own if fits else 1.0:g}",
+        "time-to-teleport": f"{case.time_to_teleport:g}",
+    }
 
 
 def scenario_text(
@@ -136,42 +145,32 @@ def scenario_text(
     name: str,
     network_path: str,
     protected: int,
-    files: Mapping,
+    files: Mapping[str, Sequence[str]],
     leave: Sequence[str],
-    factor: float = 1.0,
-    mesoscopic: bool = False,
+    factor: float,
+    mesoscopic: bool,
 ) -> str:
     """Return the scenario.toml; `files` maps routes, background and additional to file names beside it."""
-    fastest = max(mfd.c for mfd in network.mfds)
-    substeps = int(np.ceil(clock.step / min(30.0, 0.5 / fastest)))
-    lines = [
-        f"# Imported from {case.source.name}: its own vehicles, with their routes, departures and types.",
-        f"name = {quoted(name)}",
-        f"network = {quoted(network_path)}",
-        f"step = {clock.step:.1f}                 # s, control interval = most common signal cycle",
-        f"steps = {clock.steps}",
-        f"substeps = {substeps}",
-        f"protected = [{protected}]             # the densest region; {network.region_names[protected]}",
-        'demand_file = "demand.csv"  # veh/s by interval and pair of regions, counted from the vehicles',
-        f"demand_factor = {factor:g}         # vehicles are left out, or drive twice",
-        "forecast_error = 0.0        # standard deviation of the logarithm of forecast over demand",
-        "",
-        "[sumo]",
-        f"begin = {clock.begin:.1f}",
-        f"step_length = {step_length(case, clock):g}",
-        f"time_to_teleport = {case.time_to_teleport:g}      # s; every table counts the teleports",
-        "departure_jitter = 10.0     # s, either way: what seeds differ in, beside SUMO's own randomness",
-        "ways_return = true          # guided drivers may leave a region and come back, as main roads here do",
-        *(f"{key} = [{', '.join(quoted(value) for value in values)}]" for key, values in files.items() if values),
-    ]
-    if mesoscopic:
-        lines.append("mesoscopic = true           # SUMO's queue model: fast, without lanes; for quick studies")
-    if leave:
-        lines.append(f"leave_signals = [{', '.join(quoted(signal) for signal in leave)}]")
-    return "\n".join(lines) + "\n" + TRAINING
-
-
-def step_length(case: SumoInput, clock: Clock) -> float:
-    """Return the city's own step [s] if it divides the control interval, else 1 s."""
-    own = case.step_length
-    return own if 0.0 < own <= 1.0 and abs(clock.step / own - round(clock.step / own)) < 1e-9 else 1.0
+    times = options(case, clock)
+    lists = {key: values for key, values in {**files, "leave_signals": leave}.items() if values}
+    return (
+        f"# Imported from {case.source.name}: its own vehicles, with their routes, departures and types.\n"
+        f"name = {quoted(name)}\n"
+        f"network = {quoted(network_path)}\n"
+        f"step = {clock.step:.1f}                 # s, control interval = most common signal cycle\n"
+        f"steps = {clock.steps}\n"
+        f"substeps = {int(np.ceil(clock.step / min(30.0, 0.5 / max(mfd.c for mfd in network.mfds))))}\n"
+        f"protected = [{protected}]             # the densest region; {network.region_names[protected]}\n"
+        'demand_file = "demand.csv"  # veh/s by interval and pair of regions, counted from the vehicles\n'
+        f"demand_factor = {factor:g}         # vehicles are left out, or drive twice\n"
+        "forecast_error = 0.0        # standard deviation of the logarithm of forecast over demand\n"
+        "\n[sumo]\n"
+        f"begin = {times['begin']}\n"
+        f"step_length = {times['step-length']}\n"
+        f"time_to_teleport = {times['time-to-teleport']}      # s; every table counts the teleports\n"
+        "departure_jitter = 10.0     # s, either way: seeds differ in it, beside SUMO's own randomness\n"
+        "ways_return = true          # guided drivers may leave a region and come back, as main roads here do\n"
+        + "".join(f"{key} = [{', '.join(map(quoted, values))}]\n" for key, values in lists.items())
+        + ("mesoscopic = true           # SUMO's queue model: fast, without lanes\n" if mesoscopic else "")
+        + TRAINING
+    )

@@ -52,6 +52,7 @@ def tables(
     for gateway in city.gateways:
         if gateway.signal is not None:
             pairs.setdefault(gateway.signal, set()).add((gateway.source, gateway.target))
+    kinds = {signal: "fixed" if logic.kind == FIXED else logic.kind for signal, logic in streets.logics.items()}
     gateways = [
         {
             "source": g.source,
@@ -64,7 +65,7 @@ def tables(
             "links": " ".join(map(str, g.links)),
             "signal_serves": " ".join(f"{i}-{h}" for i, h in sorted(pairs.get(g.signal or "", ()))),
             "control": "no signal" if g.signal is None else left_alone.get(g.signal, CONTROLLED),
-            "kind": _kind(streets, g.signal),
+            "kind": kinds.get(g.signal or "", ""),
             "flow_veh": moves[streets.number[g.from_edge], streets.number[g.to_edge]],
         }
         for g in city.gateways
@@ -123,16 +124,10 @@ def left_alone(streets: Streets, switched: Sequence[str] = ()) -> dict[str, str]
         switched: signals whose programme a timetable changes.
     """
     reasons = {signal: "no programme" for signal in streets.link_signals if signal and signal not in streets.logics}
-    for signal, logics in streets.logics.items():
-        if logics[-1].kind not in HELD or logics[-1].programme == "off":
-            reasons[signal] = "switched off" if logics[-1].programme == "off" else f"{logics[-1].kind} signal"
+    for signal, logic in streets.logics.items():
+        if logic.kind not in HELD or logic.programme == "off":
+            reasons[signal] = "switched off" if logic.programme == "off" else f"{logic.kind} signal"
     return reasons | {signal: "programme follows a timetable" for signal in switched}
-
-
-def _kind(streets: Streets, signal: str | None) -> str:
-    """Return the kind of a signal's programme: "fixed", SUMO's word for others, "" without one."""
-    logics = streets.logics.get(signal or "")
-    return "" if not logics else "fixed" if logics[-1].kind == FIXED else logics[-1].kind
 
 
 def pieces(streets: Streets, members: EdgeMask) -> int:

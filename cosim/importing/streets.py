@@ -27,7 +27,6 @@ class Logic:
     cycle [s]
     """
 
-    signal: str
     programme: str
     kind: str
     cycle: float
@@ -44,7 +43,7 @@ class Streets:
     links: (L, 2) edges that a connection joins, both drivable, by lanes for cars; all_links: for any vehicle
     link_signals: L signals, of each of the links, None without one
     roundabouts: lists of edges
-    logics: signal -> its programmes, the one that runs last
+    logics: signal -> the programme that runs, which is the last one
     left_hand: the traffic keeps left
     """
 
@@ -62,7 +61,7 @@ class Streets:
     all_links: Int[np.ndarray, "_ 2"]
     link_signals: tuple[str | None, ...]
     roundabouts: tuple[tuple[int, ...], ...]
-    logics: Mapping[str, tuple[Logic, ...]]
+    logics: Mapping[str, Logic]
     left_hand: bool
 
     @cached_property
@@ -85,35 +84,16 @@ class Streets:
         """Largest set of edges (E,) of which each can be reached from each."""
         return self._largest("strong")
 
-    @cached_property
-    def onward(self) -> EdgeMask:
-        """Edges (E,) from which the core can be reached."""
-        return self._reached(self.links[:, ::-1])
-
-    @cached_property
-    def reached(self) -> EdgeMask:
-        """Edges (E,) that can be reached from the core."""
-        return self._reached(self.links)
-
-    def _reached(self, links: Int[np.ndarray, "L 2"]) -> EdgeMask:
-        found = np.zeros(len(self.edges), dtype=bool)
-        found[
-            breadth_first_order(graph(links, len(self.edges)), int(np.argmax(self.core)), return_predecessors=False)
-        ] = True
-        return found
-
-    def connected(self, pairs: Iterable[tuple[int, int]], *, cars: bool) -> dict[tuple[int, int], bool]:
-        """Return pair -> a path leads from its first edge to its second, for cars, or for any vehicle."""
-        onward = graph(self.links if cars else self.all_links, len(self.edges))
-        wanted: dict[int, list[int]] = {}
-        for first, last in sorted(set(pairs)):
-            wanted.setdefault(first, []).append(last)
-        found: dict[tuple[int, int], bool] = {}
-        for first, ends in wanted.items():
-            reached = np.zeros(len(self.edges), dtype=bool)
-            reached[breadth_first_order(onward, first, return_predecessors=False)] = True
-            found |= {(first, last): bool(reached[last]) for last in ends}
-        return found
+    def connected(self, pairs: Iterable[tuple[int, int]], *, cars: bool) -> set[tuple[int, int]]:
+        """Return the pairs with a path from the first edge to the second, for cars, or for any vehicle."""
+        onward, ends = graph(self.links if cars else self.all_links, len(self.edges)), dict[int, set[int]]()
+        for first, last in pairs:
+            ends.setdefault(first, set()).add(last)
+        return {
+            (first, last)
+            for first in ends
+            for last in ends[first].intersection(breadth_first_order(onward, first, return_predecessors=False).tolist())
+        }
 
     def _largest(self, kind: str) -> EdgeMask:
         count, part = connected_components(graph(self.links, len(self.edges)), directed=True, connection=kind)
@@ -137,16 +117,6 @@ class _Edge(NamedTuple):
     end: str
 
 
-class _Link(NamedTuple):
-    """Connection from a lane of one edge to a lane of another, and its signal."""
-
-    source: str
-    target: str
-    lane: int
-    to_lane: int
-    signal: str | None
-
-
 def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
     """Read a net.xml(.gz), and the signal programmes of additional files, which replace those of the network.
 
@@ -154,9 +124,9 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
         InputError: for a file that is no network, or has no edge for cars.
     """
     rows: dict[str, _Edge] = {}
-    links: list[_Link] = []
+    links: list[Mapping[str, str]] = []  # attributes of connections
     roundabouts: list[list[str]] = []
-    logics: dict[str, list[Logic]] = {}
+    logics: dict[str, Logic] = {}
     try:
         with opened(net) as stream:
             events = ElementTree.iterparse(stream, events=("start", "end"))
@@ -171,44 +141,60 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
                 if element.tag == "edge" and element.get("function", "normal") in ("normal", "connector"):
                     rows[attribute(element, "id")] = _edge(element)
                 elif element.tag == "connection" and not attribute(element, "from").startswith(":"):
-                    links.append(
-                        _Link(
-                            attribute(element, "from"),
-                            attribute(element, "to"),
-                            int(attribute(element, "fromLane")),
-                            int(attribute(element, "toLane")),
-                            element.get("tl"),
-                        )
-                    )
+                    links.append(dict(element.attrib))
                 elif element.tag == "roundabout":
                     roundabouts.append(element.get("edges", "").split())
                 elif element.tag == "tlLogic":
-                    logics.setdefault(attribute(element, "id"), []).append(_logic(element, net))
+                    logics[attribute(element, "id")] = _logic(element, net)
                 element.clear()
                 root.clear()
     except BROKEN as error:
         raise InputError(f"{net}: is not a SUMO network ({error}); build it with netconvert") from None
     for path in additional:
         for element in read_xml(path).iter("tlLogic"):
-            logic = _logic(element, path)
-            logics.setdefault(logic.signal, []).append(logic)
+            logics[attribute(element, "id")] = _logic(element, path)
     if not any(row.cars for row in rows.values()):
         raise InputError(f"{net}: has no edge that cars may use; give a road network")
-    return _streets(net, rows, links, roundabouts, logics, left_hand)
+    edges = tuple(sorted(rows))
+    number, places = {edge: n for n, edge in enumerate(edges)}, dict[str, int]()
+    ends = [[places.setdefault(name, len(places)) for name in (rows[edge].start, rows[edge].end)] for edge in edges]
+    every, signal_of = set(), {}
+    for link in links:
+        if link["from"] in number and link["to"] in number:
+            pair = number[link["from"]], number[link["to"]]
+            every.add(pair)
+            if int(link["fromLane"]) in rows[link["from"]].cars and int(link["toLane"]) in rows[link["to"]].cars:
+                signal_of[pair] = link.get("tl")
+    cars = sorted(signal_of)
+    return Streets(
+        path=net,
+        edges=edges,
+        drivable=np.array([bool(rows[edge].cars) for edge in edges]),
+        length=np.array([rows[edge].length for edge in edges]),
+        lanes=np.array([len(rows[edge].cars) for edge in edges]),
+        speed=np.array([rows[edge].speed for edge in edges]),
+        shapes=tuple(rows[edge].shape for edge in edges),
+        centre=np.array([_middle(rows[edge].shape) for edge in edges]),
+        junctions=np.array(ends),
+        places=places,
+        links=np.array(cars, dtype=int).reshape(-1, 2),
+        all_links=np.array(sorted(every), dtype=int).reshape(-1, 2),
+        link_signals=tuple(signal_of[pair] for pair in cars),
+        roundabouts=tuple(tuple(number[e] for e in ring if e in number) for ring in roundabouts),
+        logics=dict(sorted(logics.items())),
+        left_hand=left_hand,
+    )
 
 
 def _edge(element: ElementTree.Element) -> _Edge:
     lanes = list(element.iter("lane"))
     cars = {int(attribute(lane, "index")): lane for lane in lanes if for_cars(lane)}
-    lane = next(iter(cars.values()), lanes[0])
     shape = element.get("shape") or attribute(lanes[len(lanes) // 2], "shape")
-    points = np.array([[float(x) for x in point.split(",")[:2]] for point in shape.split()])
-    speed = max(size(lane, "speed") for lane in cars.values() or lanes)
     return _Edge(
         cars=frozenset(cars),
-        length=size(lane, "length"),
-        speed=speed,
-        shape=points,
+        length=size(next(iter(cars.values()), lanes[0]), "length"),
+        speed=max(size(lane, "speed") for lane in cars.values() or lanes),
+        shape=np.array([[float(x) for x in point.split(",")[:2]] for point in shape.split()]),
         start=attribute(element, "from"),
         end=attribute(element, "to"),
     )
@@ -220,55 +206,8 @@ def _logic(element: ElementTree.Element, path: Path) -> Logic:
     kind = element.get("type", "static")
     if kind == "static" and any(phase.get("next") for phase in phases):
         kind = "branching"
-    return Logic(
-        signal=attribute(element, "id"),
-        programme=element.get("programID", "0"),
-        kind=kind,
-        cycle=sum(seconds(phase.get("duration", "0"), where) for phase in phases),
-    )
-
-
-def _streets(
-    net: Path,
-    rows: Mapping[str, _Edge],
-    links: Iterable[_Link],
-    roundabouts: Iterable[Iterable[str]],
-    logics: Mapping[str, list[Logic]],
-    left_hand: bool,
-) -> Streets:
-    edges = tuple(sorted(rows))
-    number = {edge: n for n, edge in enumerate(edges)}
-    places: dict[str, int] = {}
-    ends = np.array(
-        [[places.setdefault(name, len(places)) for name in (rows[edge].start, rows[edge].end)] for edge in edges]
-    )
-    known = [link for link in links if link.source in number and link.target in number]
-    every = sorted({(number[link.source], number[link.target]) for link in known})
-    signal_of = {
-        (number[link.source], number[link.target]): link.signal
-        for link in known
-        if link.lane in rows[link.source].cars and link.to_lane in rows[link.target].cars
-    }
-    cars = sorted(signal_of)
-    shapes = tuple(rows[edge].shape for edge in edges)
-    return Streets(
-        path=net,
-        edges=edges,
-        drivable=np.array([bool(rows[edge].cars) for edge in edges]),
-        length=np.array([rows[edge].length for edge in edges]),
-        lanes=np.array([len(rows[edge].cars) for edge in edges]),
-        speed=np.array([rows[edge].speed for edge in edges]),
-        shapes=shapes,
-        centre=np.array([_middle(shape) for shape in shapes]),
-        junctions=ends,
-        places=places,
-        links=np.array(cars, dtype=int).reshape(-1, 2),
-        all_links=np.array(every, dtype=int).reshape(-1, 2),
-        link_signals=tuple(signal_of[pair] for pair in cars),
-        roundabouts=tuple(tuple(number[e] for e in ring if e in number) for ring in roundabouts),
-        logics={signal: tuple(found) for signal, found in sorted(logics.items())},
-        left_hand=left_hand,
-    )
+    cycle = sum(seconds(phase.get("duration", "0"), where) for phase in phases)
+    return Logic(programme=element.get("programID", "0"), kind=kind, cycle=cycle)
 
 
 def _middle(shape: Points) -> Float[np.ndarray, " 2"]:
