@@ -157,7 +157,7 @@ def test_a_fingerprint_changes_with_what_the_runs_depend_on(scenario):
     assert parse(ALONE).fingerprint(scenario) == {}
     network = replace(scenario.network, mfds=tuple(replace(m, jam=2 * m.jam) for m in scenario.network.mfds))
     moved = replace(scenario, network=network)
-    assert gating.fingerprint(moved)["model_hash"] != before["model_hash"]
+    assert gating.fingerprint(moved)["model"] != before["model"]
     assert parse("probing-pc").fingerprint(moved) == parse("probing-pc").fingerprint(scenario)
 
 

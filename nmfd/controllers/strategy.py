@@ -6,7 +6,6 @@ mine.py:Gate+actuated    a controller of the user's own (nmfd.controllers.custom
 """
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -38,12 +37,10 @@ from nmfd.types import Controller
 
 ALONE = "no-control"  # the controller of a name that consists of city words
 OWN = "own"  # table in [controllers] with the tables of the user's own controllers
-POLICY, PLAN, VALUE = ("policy", ".pt"), ("plan", ".npz"), ("value function", ".npz")  # files that controllers read
-MAKE_FILE = {
-    POLICY: "nmfd train {folder} --controller {name}",
-    PLAN: "nmfd bound {folder} --controller {name}",
-    VALUE: "python scenarios/economic_mpc/terminal_cost.py {name}",
-}
+# Files that controllers read: kind, end of the name, command that makes them.
+POLICY = ("policy", ".pt", "nmfd train {folder} --controller {name}")
+PLAN = ("plan", ".npz", "nmfd bound {folder} --controller {name}")
+VALUE = ("value function", ".npz", "python scenarios/economic_mpc/terminal_cost.py {name}")
 TERMINAL = {"mpc-pc-terminal": "dpc-pc", "mpc-pcrg-terminal": "dpc-pcrg"}  # MPC -> policy of its value function
 MODEL_FREE = ("no-control", "route-guidance", "probing-pc", "probing-pcrg")  # use no regional model
 
@@ -61,7 +58,7 @@ class ControllerType:
     text: str
     make: Callable[..., Controller] = field(compare=False)
     guides: bool = False
-    reads: tuple[str, str] | None = None
+    reads: tuple[str, str, str] | None = None
     options: type[Options] = Options
     own: bool = False
 
@@ -175,11 +172,10 @@ class Strategy:
         return kind.make(known) if file is None else kind.make(file, known)
 
     def planning(self, scenario: Scenario, model: Path | None = None) -> PlanningModel:
-        """Return the planning model that predicts the runs of the strategy.
+        """Return the planning model that predicts the runs of the strategy. Raise InputError.
 
-        That of the controller, or, if routes are guided without a plan, the city's model with guided drivers.
+        It is that of the controller, or the city's model with guided drivers if nothing else guides routes.
         model: folder of a network instead
-        Raises: InputError
         """
         if model is not None:
             return with_model(planning_model(scenario), scenario, model)
@@ -200,19 +196,17 @@ class Strategy:
 
         Raises: InputError for a missing file, or a `policy` without use
         """
-        name = self.controller.name
-        if self.controller.reads is None:
+        kind, table = self.controller, self.table(scenario)
+        if kind.reads is None:
             if policy is not None:
-                raise InputError(f"{policy}: controller {name} reads no policy; omit it")
+                raise InputError(f"{policy}: controller {kind.name} reads no policy; omit it")
             return None
-        text, suffix = self.controller.reads
-        if policy is None and scenario.folder is None:
-            raise InputError(f"controller {name}: scenario {scenario.name} has no folder with policies; give a file")
-        own = (scenario.folder or Path()) / (self.table(scenario) + suffix)
-        path = own if policy is None else shipped.found(policy, shipped.SCENARIO)
+        text, suffix, command = kind.reads
+        folder = scenario.folder or Path()
+        path = folder / (table + suffix) if policy is None else shipped.found(policy, shipped.SCENARIO)
         if not path.is_file():
-            command = MAKE_FILE[self.controller.reads].format(folder=scenario.folder, name=self.table(scenario))
-            raise InputError(f"{path}: no such {text} for {name}; make one with: {command}")
+            command = command.format(folder=folder, name=table)
+            raise InputError(f"{path}: no such {text} for {kind.name}; make one with: {command}")
         return path
 
     def fingerprint(self, scenario: Scenario, policy: Path | None = None) -> dict[str, Any]:
@@ -230,22 +224,14 @@ class Strategy:
         if name in MODEL_FREE:
             splits = scenario.network.nominal_splits if self.controller.guides else np.empty(0)
             return {"options": setup, "splits_hash": hashlib.sha256(splits.round(9).tobytes()).hexdigest()[:16]}
-        network = self._planning(scenario).network
-        model = json.dumps([network.hash, scenario.integrator, scenario.substeps, scenario.protected])
-        return {
-            "options": setup,
-            **({} if file is None else {"policy_hash": file_hash(file)}),
-            **(custom.fingerprint(name) if self.controller.own else {}),
-            "model_hash": hashlib.sha256(model.encode()).hexdigest()[:16],
-        }
+        model = [self._planning(scenario).network.hash, scenario.integrator, scenario.substeps, *scenario.protected]
+        files = {} if file is None else {"policy_hash": file_hash(file)}
+        return {"options": setup, "model": model, **files, **(custom.fingerprint(name) if self.controller.own else {})}
 
     def outside_training(self, scenario: Scenario, level: float, policy: Path | None = None) -> str:
         """Return a sentence if `level` times the demand is outside the training range of its policy, else ""."""
-        if self.controller.reads != POLICY:
-            return ""
-        file = self.file(scenario, policy)
-        assert file is not None
-        return policy_file.outside_training(policy_file.read_policy_file(file), level)
+        file = self.file(scenario, policy) if self.controller.reads == POLICY else None
+        return "" if file is None else policy_file.outside_training(policy_file.read_policy_file(file), level)
 
 
 def parse(controller: str | Controller, city: str = "") -> Strategy:
