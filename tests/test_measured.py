@@ -212,7 +212,7 @@ def test_the_command(tmp_path, made):
 @pytest.mark.parametrize(
     "name, text, expected",
     [
-        ("about", "region,lane_km\nnorth,2\n", "lane_km: 2 is less than the 10 km that its detectors stand for"),
+        ("about", "region,lane_km\nnorth,2\n", "lane_km: 2 is less than the 10 km of its detectors"),
         ("about", "region,lane_km\nnorht,20\n", "region 'norht' has no detector; did you mean north?"),
         ("about", "region,trip_length\nnorth,1.5\n", "line 2: trip_length: expected m, from 10"),
         ("adjacency", "region,neighbour\nnorth,north\n", "line 2: region 'north' is no neighbour of itself"),

@@ -224,11 +224,11 @@ class _Model:
             uncertain = (spread.diagonal().numpy() > 10.0 * FLOOR)[measured].sum()
             surprise = float((whitened[measured, -1] ** 2).sum()) / max(int(uncertain), 1)
         posterior = (0.5 * (posterior + posterior.T)).numpy()
-        known = np.isfinite(readings.probes)
-        probes = np.where(known, readings.probes, np.maximum(z[self._probes].reshape(known.shape), 0.0))
-        lower = np.concatenate([np.full(self._x.start, -0.95), np.where(known, probes, 0.0).ravel()])
+        counted = np.isfinite(readings.probes)
+        probes = np.where(counted, readings.probes, np.maximum(z[self._probes].reshape(counted.shape), 0.0))
+        lower = np.concatenate([np.full(self._x.start, -0.95), np.where(counted, probes, 0.0).ravel()])
         mean = bounded(mean, posterior, lower)
-        probes = np.minimum(probes, mean[self._x].reshape(known.shape))
+        probes = np.minimum(probes, mean[self._x].reshape(counted.shape))
         return Belief(mean=mean, covariance=posterior, probes=probes, surprise=surprise)
 
     def _predicted(
@@ -240,7 +240,7 @@ class _Model:
         inputs = torch.cat([torch.arange(first), torch.arange(errors, self._states)])
         points = mean[inputs].repeat(len(inputs) + 1, 1)
         points[1:] += DIFFERENCE * torch.eye(len(inputs), dtype=torch.float64)
-        outputs, moves, seen = self._rollout(points, belief.probes, demand, perimeter, splits)
+        outputs, moves, of_probes = self._rollout(points, belief.probes, demand, perimeter, splits)
         jacobian = torch.zeros(self._size, self._states, dtype=torch.float64)
         jacobian[:errors, :errors] = torch.diag(self._kept)
         jacobian[errors:, inputs] = (outputs[1:] - outputs[0]).T / DIFFERENCE
@@ -249,7 +249,7 @@ class _Model:
         leaving = torch.zeros(self._cells, dtype=torch.float64).index_add_(
             0, self._from, moves[: len(self._from)]
         )  # the turns and ends of trips
-        covariance[errors:, errors:] += self._flow_noise(belief, moves, seen, leaving)
+        covariance[errors:, errors:] += self._flow_noise(belief, moves, of_probes, leaving)
         return torch.cat([self._kept * mean[:errors], outputs[0]]).numpy(), covariance, leaving.numpy()
 
     def _rollout(
@@ -259,7 +259,7 @@ class _Model:
         point, of all vehicles and of probes."""
         regions, batch = self._regions, len(points)
         duration = self._step / self._substeps
-        controls = [torch.tensor(given, dtype=torch.float64) for given in (perimeter, splits)]
+        controls = [torch.tensor(values, dtype=torch.float64) for values in (perimeter, splits)]
         x = points[:, 2 * regions :].reshape(batch, regions, regions)
         outflow, wish = (1.0 + points[:, : 2 * regions].reshape(batch, 2, regions)).clamp(min=0.0).unbind(1)
         outflow = outflow.minimum(1.0 / (duration * self._fastest))  # at most all vehicles leave
@@ -292,19 +292,19 @@ class _Model:
         return outputs, every, events[1].clamp(min=0.0).minimum(every)
 
     def _flow_noise(
-        self, belief: Belief, moves: torch.Tensor, seen: torch.Tensor, leaving: torch.Tensor
+        self, belief: Belief, moves: torch.Tensor, of_probes: torch.Tensor, leaving: torch.Tensor
     ) -> torch.Tensor:
-        """Return the covariance of Z, without relative errors, due to the flows (events,) [veh], `seen` of probes:
+        """Return the covariance of Z, without relative errors, due to the flows (events,) [veh], `of_probes` of them:
         Poisson counts and errors of the modelled flows."""
         x, turns = torch.from_numpy(belief.mean[self._x]), len(self._turns)
         cell = self._from[:turns]
         error = FLOW_ERROR * moves
         error[:turns] += STRAY * leaving[cell]
-        share = seen / moves.clamp(min=1e-9)
+        share = of_probes / moves.clamp(min=1e-9)
         in_cell = torch.from_numpy(belief.probes.ravel()) / x.clamp(min=1e-9)
         share[:turns] = torch.where(moves[:turns] > 1e-9, share[:turns], in_cell[cell].clamp(max=1.0))
         wrong = self._lasting * error**2
-        weights = moves + wrong, seen + share * wrong, seen + share**2 * wrong
+        weights = moves + wrong, of_probes + share * wrong, of_probes + share**2 * wrong
         parts = [
             torch.zeros(shape, dtype=x.dtype).index_put_(index[:2], value * weight[index[2]], accumulate=True)
             for (shape, index, value), weight in zip(self._pairs, weights, strict=True)
@@ -319,12 +319,13 @@ class _Model:
         The last R^2 are pseudo-readings against model drift: probes are a fixed share of the vehicles. The same probes
         count less each time, because they stay until they leave, MEMORY at most.
         """
-        known = self._instruments
+        instruments = self._instruments
         here, to = self._boundaries.T
         mean, expansion, counts = z[self._mean], z[self._expansion], z[self._crossings]
-        share = np.maximum(known.detector_share, 1e-6)
+        share = np.maximum(instruments.detector_share, 1e-6)
         boundary, gateways = (
-            np.maximum(part[here, to], low) for part, low in ((known.counted_share, 1e-6), (known.counted_gateways, 1))
+            np.maximum(part[here, to], low)
+            for part, low in ((instruments.counted_share, 1e-6), (instruments.counted_gateways, 1))
         )
         cells, p = np.full(self._cells, FLOOR), self._probe_share
         there = np.maximum(z[self._x], 1.0)
@@ -335,7 +336,7 @@ class _Model:
             (
                 loops,
                 (1.0 + expansion) * mean,
-                np.maximum(mean, 1.0) * (1.0 - share) / share + (known.detector_noise * mean) ** 2 + FLOOR,
+                np.maximum(mean, 1.0) * (1.0 - share) / share + (instruments.detector_noise * mean) ** 2 + FLOOR,
             ),
             (
                 readings.crossings[here, to],

@@ -27,7 +27,5 @@ def __getattr__(name: str) -> Any:
 if find_spec("gymnasium"):
     import gymnasium  # of the extra
 
-    gymnasium.register(id="nmfd/Scenario-v0", entry_point="nmfd.rl.env:RegionalEnv")
-    gymnasium.register(
-        id="nmfd/Hexagon7-v0", entry_point="nmfd.rl.env:RegionalEnv", kwargs={"scenario": "economic_mpc"}
-    )
+    for name, options in (("Scenario", {}), ("Hexagon7", {"scenario": "economic_mpc"})):
+        gymnasium.register(id=f"nmfd/{name}-v0", entry_point="nmfd.rl.env:RegionalEnv", kwargs=options)

@@ -106,38 +106,6 @@ class Interface:
         return Controls(perimeter=self.perimeter(action), splits=self.splits(action))
 
 
-class Episode:
-    """A closed loop stepped from outside, with the noise and states of nmfd.closed_loop.run of the same seed."""
-
-    def __init__(self, scenario: Scenario | Path | str, plant: Plant | None):
-        self.scenario = scenario if isinstance(scenario, Scenario) else read_scenario(scenario)
-        self._plant = NmfdPlant(self.scenario) if plant is None else plant
-        self.unit = sum(mfd.critical for mfd in self.scenario.network.mfds)
-        self.close = self._plant.close
-
-    def reset(self, seed: int) -> Observation:
-        """Return the first observation."""
-        self._random, self._k = noise_of(seed), 0
-        self._state = self._plant.reset(seed)
-        return self._observation()
-
-    def step(self, controls: Controls) -> tuple[Observation, PerRegion, bool]:
-        """Return the observation, unfinished trips (R,) [veh] before the interval by region, and whether it ends."""
-        unfinished, self._k = self._state.unfinished.sum(axis=1), self._k + 1
-        self._state = self._plant.step(controls)
-        return self._observation(), unfinished, self._k >= self.scenario.steps
-
-    @property
-    def completed(self) -> float:
-        """Completed trips [veh]."""
-        return self._state.completed
-
-    def _observation(self) -> Observation:
-        noise = self.scenario.measurement_std * self._random.standard_normal(self._state.accumulation.shape)
-        own = self._plant.observe()
-        return noisy(self._state, noise) if own is None else own
-
-
 class RegionalEnv(gymnasium.Env):
     """One agent for all regions; an episode is the whole scenario and ends by truncation.
 
@@ -162,34 +130,52 @@ class RegionalEnv(gymnasium.Env):
         guidance: bool = False,
         metering: bool = False,
     ):
-        self._episode = Episode(scenario, plant)
-        self.interface = Interface(self._episode.scenario.network, guidance=guidance, metering=metering)
-        self.unit = self._episode.unit
-        self.observation_space = self.interface.observation_space(self._episode.scenario)
+        self.scenario = scenario if isinstance(scenario, Scenario) else read_scenario(scenario)
+        self.plant = NmfdPlant(self.scenario) if plant is None else plant
+        self.interface = Interface(self.scenario.network, guidance=guidance, metering=metering)
+        self.unit = sum(mfd.critical for mfd in self.scenario.network.mfds)
+        self.observation_space = self.interface.observation_space(self.scenario)
         self.action_space = self.interface.action_space
+
+    def begin(self, seed: int) -> Observation:
+        """Reset the plant; return what a controller observes."""
+        self._random, self._k, self._spent = noise_of(seed), 0, 0.0
+        self._state = self.plant.reset(seed)
+        return self._observe()
+
+    def advance(self, controls: Controls) -> tuple[Observation, PerRegion, bool]:
+        """Return the observation, unfinished trips (R,) [veh] before the interval by region, and whether it ends."""
+        unfinished, self._k = self._state.unfinished.sum(axis=1), self._k + 1
+        self._spent += self.scenario.step * float(unfinished.sum())
+        self._state = self.plant.step(controls)
+        return self._observe(), unfinished, self._k >= self.scenario.steps
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Vector, dict]:
         """Begin an episode; without a seed, the next one of the sequence begun by the last seed."""
         super().reset(seed=seed)
-        observation = self._episode.reset(int(self.np_random.integers(2**31)) if seed is None else seed)
-        self._spent = 0.0
-        return self._observed(observation), self._info(observation)
+        observation = self.begin(int(self.np_random.integers(2**31)) if seed is None else seed)
+        return self._clipped(observation), self._info()
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict]:
         """Advance by one control interval."""
-        observation, vehicles, over = self._episode.step(self.interface.controls(action))
-        self._spent += self._episode.scenario.step * float(vehicles.sum())
-        return self._observed(observation), -float(vehicles.sum()) / self.unit, False, over, self._info(observation)
+        observation, vehicles, over = self.advance(self.interface.controls(action))
+        return self._clipped(observation), -float(vehicles.sum()) / self.unit, False, over, self._info()
 
     def close(self) -> None:
         """Close the plant."""
-        self._episode.close()
+        self.plant.close()
 
-    def _observed(self, observation: Observation) -> Vector:
+    def _observe(self) -> Observation:
+        noise = self.scenario.measurement_std * self._random.standard_normal(self._state.accumulation.shape)
+        own = self.plant.observe()
+        return noisy(self._state, noise) if own is None else own
+
+    def _clipped(self, observation: Observation) -> Vector:
         return np.clip(self.interface.observed(observation), self.observation_space.low, self.observation_space.high)
 
-    def _info(self, seen: Observation) -> dict:
-        return {"time_s": seen.time, "total_time_spent_veh_s": self._spent, "completed_veh": self._episode.completed}
+    def _info(self) -> dict:
+        state = self._state
+        return {"time_s": state.time, "total_time_spent_veh_s": self._spent, "completed_veh": state.completed}
 
 
 class RegionsEnv(ParallelEnv):
@@ -209,30 +195,31 @@ class RegionsEnv(ParallelEnv):
         guidance: bool = False,
         cooperative: bool = True,
     ):
-        self._episode, self._cooperative = Episode(scenario, plant), cooperative
-        loaded = self._episode.scenario
+        self._env, self._cooperative = RegionalEnv(scenario, plant), cooperative
+        loaded = self._env.scenario
         self.possible_agents = [f"region_{region}" for region in range(loaded.network.regions)]
         self.agents: list[str] = []
         self.interfaces = {
             agent: Interface(loaded.network, guidance=guidance, regions=[region])
             for region, agent in enumerate(self.possible_agents)
         }
-        self._whole, self._random = Interface(loaded.network), np.random.default_rng()
+        self._random = np.random.default_rng()
         self.observation_spaces = {agent: part.observation_space(loaded) for agent, part in self.interfaces.items()}
         self.action_spaces = {agent: part.action_space for agent, part in self.interfaces.items()}
         self.observation_space, self.action_space = self.observation_spaces.get, self.action_spaces.get
+        self.close = self._env.close
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         """Begin an episode; without a seed, the next one of the sequence begun by the last seed."""
         if seed is not None:
             self._random = np.random.default_rng(seed)
         self.agents = list(self.possible_agents)
-        self._seen = self._episode.reset(int(self._random.integers(2**31)) if seed is None else seed)
-        return self._observations(), self._infos()
+        self._seen = self._env.begin(int(self._random.integers(2**31)) if seed is None else seed)
+        return self._observations(), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict) -> tuple[dict, dict, dict, dict, dict]:
         """Advance by one control interval; the region of an agent without an action is open."""
-        network = self._episode.scenario.network
+        network = self._env.scenario.network
         perimeter, splits, guided = (
             np.where(network.adjacency, network.u_max, 0.0),
             network.nominal_splits.copy(),
@@ -243,35 +230,25 @@ class RegionsEnv(ParallelEnv):
             perimeter[region] = controls.perimeter[region]
             if controls.splits is not None:
                 splits[region], guided = controls.splits[region], True
-        self._seen, vehicles, over = self._episode.step(
-            Controls(perimeter=perimeter, splits=splits if guided else None)
-        )
+        self._seen, vehicles, over = self._env.advance(Controls(perimeter=perimeter, splits=splits if guided else None))
         amounts = np.full(len(vehicles), vehicles.sum()) if self._cooperative else vehicles
-        agents, rewards = self.agents, (-amounts / self._episode.unit).tolist()
+        agents, rewards = self.agents, (-amounts / self._env.unit).tolist()
         result = (
             self._observations(),
             dict(zip(agents, rewards, strict=True)),
             dict.fromkeys(agents, False),
             dict.fromkeys(agents, over),
-            self._infos(),
+            {agent: {"time_s": self._seen.time} for agent in agents},
         )
         self.agents = [] if over else agents
         return result
 
     def state(self) -> Vector:
         """Return the observation of all regions together."""
-        return self._whole.observed(self._seen)
-
-    def close(self) -> None:
-        """Close the plant."""
-        self._episode.close()
+        return self._env.interface.observed(self._seen)
 
     def _observations(self) -> dict:
         return {
             agent: np.clip(self.interfaces[agent].observed(self._seen), space.low, space.high)
             for agent, space in self.observation_spaces.items()
-            if agent in self.agents
         }
-
-    def _infos(self) -> dict:
-        return {agent: {"time_s": self._seen.time} for agent in self.agents}

@@ -90,8 +90,8 @@ def identify(
 ) -> Identified:
     """Fit an MFD to each region; write network.toml, mfd.png, samples.csv, fit.csv and identify.txt.
 
-        found = nmfd.identify("counts.csv", detectors="detectors.csv", trip_length=1500.0, out="networks/mine")
-        print(found.text), found.network.mfds, found.to_frame()
+        identified = nmfd.identify("counts.csv", detectors="detectors.csv", trip_length=1500.0, out="networks/mine")
+        print(identified.text), identified.network.mfds, identified.to_frame()
 
     counts, detectors, regions, about: tables (nmfd.model.detector_tables)
     out: folder of the network
@@ -107,8 +107,7 @@ def identify(
     Raises InputError, before anything is written.
     """
     out, counts = Path(out), Path(counts)
-    files_given = {"detectors": detectors, "regions": regions, "about": about, "adjacency": adjacency}
-    paths = {key: None if file is None else Path(file) for key, file in files_given.items()}
+    paths = [None if file is None else Path(file) for file in (detectors, regions, about, adjacency)]
     for key, value, low, high in (
         ("--vehicle-length", vehicle_length, 1.0, 50.0),
         ("--trip-length", trip_length, 10.0, 1e5),
@@ -119,11 +118,11 @@ def identify(
     if (out / "network.toml").exists() and not force:
         raise InputError(f"{out / 'network.toml'}: exists; choose another --out, or replace it with --force")
     rows, left = detector_tables.read_counts(counts, city=city, skip_bad=skip_bad)
-    stations = detector_tables.read_detectors(paths["detectors"], paths["regions"], rows, counts, city=city)
-    base = _base_network(paths["adjacency"], stations)
+    stations = detector_tables.read_detectors(paths[0], paths[1], rows, counts, city=city)
+    base = _base_network(paths[3], stations)
     names = _sorted(set(stations["region"])) if base is None else list(base.region_names)
-    table = detector_tables.read_about(paths["about"], names)
-    lane_km, coverage = _lane_km(stations, table, names, paths["about"] or counts)
+    table = detector_tables.read_about(paths[2], names)
+    lane_km, coverage = _lane_km(stations, table, names, paths[2] or counts)
     trip_km, assumed = _trip_lengths(stations, table, names, trip_length)
     intervals = _intervals(rows, stations, vehicle_length, least_share)
     for column, per_lane in (("accumulation_veh", "density_veh_km"), ("production_veh_km_h", "flow_veh_h")):
@@ -146,7 +145,7 @@ def identify(
         u_min=U_MIN,
         u_max=U_MAX,
         mfds=(),
-        adjacency=_adjacency(paths["adjacency"], stations, names),
+        adjacency=_adjacency(paths[3], stations, names),
     )
     network = replace(
         network,
@@ -216,8 +215,8 @@ def _check_units(intervals: pd.DataFrame, path: Path, vehicle_length: float) -> 
 def _cloud(part: pd.DataFrame) -> dict[str, Points]:
     """Return "loading" and "unloading" -> (n, 2) of accumulation [veh] and outflow [veh/s] of a region, by days."""
     rising = part.groupby("day")["accumulation_veh"].diff().fillna(0.0) >= 0
-    points, seen = part[["accumulation_veh", "outflow_veh_s"]].to_numpy(dtype=float), part["accumulation_veh"] > 0
-    return {"loading": points[seen & rising], "unloading": points[seen & ~rising]}
+    points, occupied = part[["accumulation_veh", "outflow_veh_s"]].to_numpy(dtype=float), part["accumulation_veh"] > 0
+    return {"loading": points[occupied & rising], "unloading": points[occupied & ~rising]}
 
 
 def _sorted(names: set[str]) -> list[str]:
@@ -251,29 +250,29 @@ def _lane_km(
     detectors: pd.DataFrame, about: pd.DataFrame, regions: Sequence[str], where: Path
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return lane-kilometres (R,) and the share of them with detectors (R,), NaN where unknown."""
-    seen = detectors["lane_km"].groupby(detectors["region"]).sum(min_count=1).reindex(list(regions)).to_numpy()
-    given = about["lane_km"].to_numpy()
-    if (unknown := np.isnan(seen) & np.isnan(given)).any():
+    covered = detectors["lane_km"].groupby(detectors["region"]).sum(min_count=1).reindex(list(regions)).to_numpy()
+    total = about["lane_km"].to_numpy()
+    if (unknown := np.isnan(covered) & np.isnan(total)).any():
         raise InputError(
             f"{where}: the lane-kilometres of region {regions[int(unknown.argmax())]} are unknown; give the length of "
             "the detectors' links with --detectors, or lane_km of every region with --about"
         )
-    if (seen > 1.05 * given).any():
-        n = int(np.nanargmax(seen / given))
+    if (covered > 1.05 * total).any():
+        n = int(np.nanargmax(covered / total))
         raise InputError(
-            f"{where}: region {regions[n]}: lane_km: {given[n]:g} is less than the {seen[n]:.4g} km that its detectors "
-            "stand for; correct it, or length and lanes in the detectors' table"
+            f"{where}: region {regions[n]}: lane_km: {total[n]:g} is less than the {covered[n]:.4g} km of its "
+            "detectors; correct it, or length and lanes in the detectors' table"
         )
-    return np.where(np.isnan(given), seen, given), seen / given
+    return np.where(np.isnan(total), covered, total), covered / total
 
 
 def _trip_lengths(
     detectors: pd.DataFrame, about: pd.DataFrame, regions: Sequence[str], trip_length: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return mean trip lengths within the regions (R,) [km], and which are assumed (R,)."""
-    given = about["trip_length"].fillna(np.nan if trip_length is None else trip_length)
-    lengths = given.to_numpy(dtype=float) / 1000.0
-    for n in np.flatnonzero(np.isnan(lengths)):
+    lengths = about["trip_length"].fillna(np.nan if trip_length is None else trip_length).to_numpy(dtype=float) / 1000.0
+    assumed = np.isnan(lengths)
+    for n in np.flatnonzero(assumed):
         points = detectors.loc[detectors["region"] == regions[n], ["x_m", "y_m"]].dropna().to_numpy()
         try:
             lengths[n] = 2.0 / 3.0 * np.sqrt(ConvexHull(points).volume) / 1000.0  # volume of a plane hull: its area
@@ -282,7 +281,7 @@ def _trip_lengths(
                 f"region {regions[n]}: the mean trip length is unknown and cannot be assumed without positions; "
                 "give --trip-length METRES, or a column trip_length with --about"
             ) from None
-    return lengths, given.isna().to_numpy()
+    return lengths, assumed
 
 
 def _adjacency(path: Path | None, detectors: pd.DataFrame, regions: Sequence[str]) -> Adjacency:

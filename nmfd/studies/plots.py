@@ -178,9 +178,11 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> 
     clouds = {label: np.asarray(cloud) for label, cloud in (samples or {}).items() if len(cloud)}
     right = 1.15 * (mfd.jam if np.isfinite(mfd.jam) else 2.0 * mfd.critical)
     if clouds:
-        seen = max(cloud[:, 0].max() for cloud in clouds.values())
-        right = min(right, max(1.5 * mfd.critical, 1.1 * seen))
-        ax.axvspan(seen, max(right, seen), facecolor="none", edgecolor="0.75", hatch="///", linewidth=0, label=UNSEEN)
+        largest = max(cloud[:, 0].max() for cloud in clouds.values())
+        right = min(right, max(1.5 * mfd.critical, 1.1 * largest))
+        ax.axvspan(
+            largest, max(right, largest), facecolor="none", edgecolor="0.75", hatch="///", linewidth=0, label=UNSEEN
+        )
     ax.axvline(mfd.critical, color="0.35", linewidth=1.0, linestyle=":", label=CRITICAL, zorder=1)
     known = CONTROLLER_COLOURS | CITY_COLOURS
     for (label, cloud), tone in zip(clouds.items(), _tones(len(clouds)), strict=True):
@@ -308,10 +310,10 @@ def _curves(
         time = time_axis(ax, members[0].step * np.arange(values.shape[1]))
         label = [controller] * (len(groups) > len(plants) or len(plants) == 1)
         label += [PLANT_LABELS.get(plant, plant)] * (len(plants) > 1)
-        shown = next((row for row, member in zip(values, members, strict=True) if member.seed == seed), None)
+        one = next((row for row, member in zip(values, members, strict=True) if member.seed == seed), None)
         ax.plot(
             time,
-            values.mean(axis=0) if shown is None else shown,
+            values.mean(axis=0) if one is None else one,
             color=tones[controller],
             linewidth=1.6,
             label=", ".join(label),
