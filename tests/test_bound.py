@@ -41,7 +41,7 @@ def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
     plan = bound.compute(free, "bound-pc", starts=[], iterations=100)
     assert plan.perimeter[:8, 0, 1].min() > 0.85  # later intervals move vehicles that the horizon does not count
     uncontrolled = closed(free, NoControl(planning_model(free)))
-    assert closed(free, open_loop.OpenLoop(plan)) == pytest.approx(uncontrolled, rel=1e-3)
+    assert closed(free, plan) == pytest.approx(uncontrolled, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", bound.NAMES)
@@ -57,7 +57,7 @@ def test_plans_are_admissible_and_replayed_exactly(name):
         np.testing.assert_allclose(
             plan.splits.sum(axis=2), np.broadcast_to(1.0 - np.eye(7), (40, 7, 7)), rtol=0.0, atol=1e-12
         )
-    assert closed(scenario, open_loop.OpenLoop(plan)) == pytest.approx(plan.totals[plan.start], rel=1e-12)
+    assert closed(scenario, plan) == pytest.approx(plan.totals[plan.start], rel=1e-12)
     assert plan.totals[plan.start] == min(plan.totals.values())
     assert set(plan.totals) == {"open", "middle", "pi-gating"}
 
@@ -99,7 +99,7 @@ def test_files_that_do_not_fit(scenario, tmp_path):
     assert open_loop.read(path, replace(scenario, measurement_std=9.0), guidance=False).start in start
     with pytest.raises(InputError, match="another demand or network"):
         open_loop.read(path, replace(scenario, demand=2.0 * scenario.demand), guidance=False)
-    with pytest.raises(InputError, match="without route guidance, expected one with"):
+    with pytest.raises(InputError, match="is a plan of bound-pc"):
         open_loop.read(path, scenario, guidance=True)
     path.write_bytes(b"nothing")
     with pytest.raises(InputError, match="is no plan"):

@@ -1,4 +1,4 @@
-"""Open-loop controllers that replay a plan, and the plan files that `nmfd bound` writes."""
+"""Open-loop plans as controllers, and their files, which `nmfd bound` writes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ NAMES = {"bound-pc": False, "bound-pcrg": True}  # controller -> with route guid
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """Controls of all T intervals, fixed in advance.
+    """Open-loop controller with the controls of all T intervals, whatever is measured.
 
     perimeter: u_ih (-, (T, R, R) [k, i, h])
     splits: theta_ihj (-, (T, R, R, R) [k, i, h, j]); None without route guidance
@@ -32,22 +32,17 @@ class Plan:
     totals: Mapping[str, float]
     iterations: int
 
-
-class OpenLoop:
-    """Open-loop controller that replays a plan, whatever is measured."""
-
-    def __init__(self, plan: Plan):
-        self.name, self._plan = "bound-pc" if plan.splits is None else "bound-pcrg", plan
+    @property
+    def name(self) -> str:
+        """Name of the controller."""
+        return "bound-pc" if self.splits is None else "bound-pcrg"
 
     def reset(self, seed: int = 0) -> None:
         pass
 
     def act(self, observation: Observation) -> Controls:
-        splits = self._plan.splits
-        return Controls(
-            perimeter=self._plan.perimeter[observation.step],
-            splits=None if splits is None else splits[observation.step],
-        )
+        k = observation.step
+        return Controls(perimeter=self.perimeter[k], splits=None if self.splits is None else self.splits[k])
 
 
 def model_hash(scenario: Scenario) -> str:
@@ -57,47 +52,30 @@ def model_hash(scenario: Scenario) -> str:
 
 def write(plan: Plan, scenario: Scenario, path: Path) -> None:
     """Write `plan` and the hash of its scenario to an .npz file."""
-    splits = {} if plan.splits is None else {"splits": plan.splits}
+    content = {"perimeter": plan.perimeter, "start": plan.start, "iterations": plan.iterations}
+    content |= {"scenario": scenario.name, "model": model_hash(scenario)}
+    content |= {"names": list(plan.totals), "totals": list(plan.totals.values())}
+    content |= {} if plan.splits is None else {"splits": plan.splits}
     with atomic(path) as temporary:
-        np.savez_compressed(
-            temporary,
-            scenario=np.array(scenario.name),
-            model=np.array(model_hash(scenario)),
-            perimeter=plan.perimeter,
-            start=np.array(plan.start),
-            names=np.array(list(plan.totals)),
-            totals=np.array(list(plan.totals.values())),
-            iterations=np.array(plan.iterations),
-            **splits,
-        )
+        np.savez_compressed(temporary, **content)
 
 
 def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
     """Read a plan. Raise InputError if it is of another scenario or of the other set of controls."""
     try:
         with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            content = {name: file[name] for name in file.files}
-        plan = Plan(
-            perimeter=content["perimeter"],
-            splits=content.get("splits"),
-            start=str(content["start"]),
-            totals=dict(zip(content["names"].tolist(), content["totals"].tolist(), strict=True)),
-            iterations=int(content["iterations"]),
-        )
-        model = str(content["model"])
+            plan = Plan(
+                perimeter=file["perimeter"],
+                splits=file["splits"] if "splits" in file else None,
+                start=str(file["start"]),
+                totals=dict(zip(file["names"].tolist(), file["totals"].tolist(), strict=True)),
+                iterations=int(file["iterations"]),
+            )
+            model = str(file["model"])
     except Exception:
         raise InputError(f"{path}: is no plan; compute one with 'nmfd bound'") from None
     if model != model_hash(scenario):
-        raise InputError(
-            f"{path}: was computed for another demand or network than {scenario.name}'s; compute it again "
-            "with 'nmfd bound'"
-        )
+        raise InputError(f"{path}: was computed for another demand or network than {scenario.name}'s; compute it again")
     if (plan.splits is not None) != guidance:
-        wanted, other = ("with", "without") if guidance else ("without", "with")
-        raise InputError(f"{path}: is a plan {other} route guidance, expected one {wanted}; choose another file")
+        raise InputError(f"{path}: is a plan of {plan.name}; choose another file")
     return plan
-
-
-def load(path: Path, scenario: Scenario, *, guidance: bool) -> OpenLoop:
-    """Return the plan in `path` as a controller. Raise InputError as `read`."""
-    return OpenLoop(read(path, scenario, guidance=guidance))

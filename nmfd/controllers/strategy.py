@@ -27,8 +27,8 @@ from nmfd.model.planning import (
     PlanningOptions,
     guided_model,
     options,
+    other_model,
     planning_model,
-    with_model,
 )
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, shipped
@@ -85,7 +85,7 @@ CONTROLLERS: Mapping[str, ControllerType] = {
         *_pair("mpc-{}-terminal", "economic MPC with terminal cost", mpc.load, reads=VALUE, options=mpc.Mpc),
         *_pair("probing-{}", "random excitation for cosim identify", Probing, options=SetPoint),
         *_pair("dpc-{}", "trained policy", policy_file.load, reads=POLICY, options=training.Training),
-        *_pair("bound-{}", "best plan with all demand known (nmfd bound)", open_loop.load, reads=PLAN),
+        *_pair("bound-{}", "best plan with all demand known (nmfd bound)", open_loop.read, reads=PLAN),
     )
 }
 
@@ -178,10 +178,10 @@ class Strategy:
         model: folder of a network instead
         """
         if model is not None:
-            return with_model(planning_model(scenario), scenario, model)
+            return replace(planning_model(scenario), network=other_model(scenario, model))
         planned, guided = self._planning(scenario), guided_model(scenario.network)
         if planned.network.folder == scenario.network.folder and self.guides and guided is not None:
-            return with_model(planned, scenario, guided)
+            return replace(planned, network=other_model(scenario, guided))
         return planned
 
     def _planning(self, scenario: Scenario) -> PlanningModel:

@@ -5,7 +5,7 @@ It shares no array with the scenario, so that a controller cannot change the pla
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
@@ -134,17 +134,8 @@ def planning_model(scenario: Scenario, controller: str = "", table: str = "") ->
     )
 
 
-def with_model(planning: PlanningModel, scenario: Scenario, folder: Path) -> PlanningModel:
-    """Return `planning` with the regional model in `folder`. Raise InputError if it is of another city."""
-    return replace(planning, network=other_model(scenario, folder))
-
-
 def other_model(scenario: Scenario, folder: Path, where: str = "") -> RegionalModel:
-    """Return the regional model in `folder`, of the scenario's city.
-
-    where: file and key that name the folder, for errors
-    Raises: InputError
-    """
+    """Return the regional model in `folder`. Raise InputError, which names `where`, if it is of another city."""
     model = load_network(folder)
     if not np.array_equal(model.adjacency, scenario.network.adjacency):
         raise InputError(
