@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from trajectories import made
+from tiny import made
 
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import CONTROLLERS

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tiny
 from matplotlib.colors import to_rgb
-from trajectories import made
+from tiny import made
 
 from nmfd.api import load_scenario, run
 from nmfd.model.mfd import Mfd

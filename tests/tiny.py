@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from nmfd.model.regional_model import RegionalModel
+from nmfd.types import Result
 
 NETWORK = """
 name = "{name}"
@@ -92,3 +93,20 @@ def random_controls(random, network, batch=()):
     splits = random.uniform(size=(*shape, network.regions)) ** 3 * network.split_mask
     sums = splits.sum(axis=-2, keepdims=True)
     return perimeter, splits / np.where(sums > 0, sums, 1.0)
+
+
+def made(**fields) -> Result:
+    """A Result of `fields`, by default of a run without noise, faults or failures."""
+    steps = len(fields["perimeter"])
+    usual = {
+        "observed": fields["accumulation"],
+        "observed_backlog": fields["backlog"],
+        "estimated": False,
+        "decision_time": np.zeros(steps),
+        "status": np.zeros(steps, dtype=int),
+        "note": ("",) * steps,
+        "wall_time": 1.0,
+    }
+    values = usual | fields
+    attrs = {name: values.pop(name) for name in ("controller", "plant", "seed", "step", "estimated", "wall_time")}
+    return Result.make(attrs, **values)

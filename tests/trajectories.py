@@ -1,28 +1,12 @@
 """Trajectories that nobody drove, for tests of what is made of them."""
 
 import numpy as np
+from tiny import made
 
 from cosim.evaluation.simulate import FACTS, Task
 from cosim.plant.record import Record
 from nmfd.quantities import quantities, variables
 from nmfd.types import Result, Status
-
-
-def made(**fields) -> Result:
-    """A Result of `fields`; what they do not say is as in a run without noise, faults or failures."""
-    steps = len(fields["perimeter"])
-    usual = {
-        "observed": fields["accumulation"],
-        "observed_backlog": fields["backlog"],
-        "estimated": False,
-        "decision_time": np.zeros(steps),
-        "status": np.zeros(steps, dtype=int),
-        "note": ("",) * steps,
-        "wall_time": 1.0,
-    }
-    values = usual | fields
-    attrs = {name: values.pop(name) for name in ("controller", "plant", "seed", "step", "estimated", "wall_time")}
-    return Result.make(attrs, **values)
 
 
 def recorded(run: Result, arrays: dict[str, np.ndarray], facts: dict) -> Result:
