@@ -62,7 +62,10 @@ def listed(kind: click.ParamType) -> Callable[[str], tuple]:
     """Return a parser of values of a kind that are separated by commas."""
 
     def parse(text: str) -> tuple:
-        return tuple(kind.convert(word.strip(), None, None) for word in text.split(","))
+        values = tuple(kind.convert(word.strip(), None, None) for word in text.split(","))
+        if len(set(values)) < len(values) or any(value != value for value in values):
+            raise click.BadParameter(f"expected distinct values separated by commas, got {text!r} instead")
+        return values
 
     parse.__name__ = "A,B,..."
     return parse
