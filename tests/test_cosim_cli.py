@@ -148,7 +148,7 @@ IMPORT = ("import", "--out", "{tmp}/out/city")
         (("run", "{small}"), "Missing option '--controller'"),
         (("run", "{tmp}/none", "--controller", "no-control"), "scenario.toml: no such file"),
         ((*EVALUATE, "no-control,nobody"), "'nobody' is unknown"),
-        ((*EVALUATE, "no-control,no-control"), "no-control is there twice"),
+        ((*EVALUATE, "no-control,no-control"), "expected distinct values"),
         ((*EVALUATE, "no-control", "--demand", "1,x"), "'--demand': 'x' is not a valid float"),
         ((*EVALUATE, "no-control", "--policy", "dpc-pc=x.pt"), "--policy: 'dpc-pc' is not among no-control; add it"),
         (("compare", "{tmp}"), "holds no finished runs"),
